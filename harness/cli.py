@@ -21,9 +21,9 @@ from harness.processes import Interruption, interruptible, open_streams
 
 @click.group(
     epilog=examples(
-        "harness check scenarios/smoke.yaml                  # is it right, and what will it cost?",
-        "harness run scenarios/smoke.yaml --out runs/smoke   # the crash rate, with its interval",
-        "harness replay runs/smoke 17                        # the same episode again, bit for bit",
+        "harness run my_av.py:MyClass           # how often it crashes, with an interval",
+        "harness run my.yaml --out runs/mine    # the same, in a campaign of your own",
+        "harness replay runs/mine 17            # the same episode again, bit for bit",
     ),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )

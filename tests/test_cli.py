@@ -89,7 +89,7 @@ def test_wrong_campaign_leaves_nothing_behind(capsys, tmp_path):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["run", SMOKE],
+        ["run"],
         ["run", SMOKE, "--out", "x", "--workers", "0"],
         ["nothing"],
         ["check", SMOKE, "--nothing"],

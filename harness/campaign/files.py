@@ -5,9 +5,12 @@ How YAML is read stands in `harness.campaign.yaml_text`, what is wrong with a va
 
 from __future__ import annotations
 
+import ast
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -16,11 +19,11 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.drivers import default_surrogates
+from harness.campaign.drivers import ModelName, default_surrogates
 from harness.campaign.problems import MOST_SHOWN, NAME_PATTERN, describe_found, did_you_mean, in_words
 from harness.campaign.sections import Section
-from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle
-from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml, yaml_text
+from harness.campaign.vehicle import AV_SOURCES, CONTROLLERS, AutomatedVehicle, with_another_driver
+from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_text, read_yaml, yaml_text
 from harness.errors import CampaignError
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -30,6 +33,7 @@ SHIPPED_PARAMETERS = Path(__file__).parents[1] / "traffic"
 
 SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"
 _FILES = {
+    ("av", "controller"): "a Python file with the controller",
     ("av", "fmu", "file"): "an FMI 2.0 co-simulation FMU",
     ("pool", "library"): "a surrogate library, or the name of a shipped one",
     ("environment", "parameters"): "a parameter file, or the name of a shipped one",
@@ -45,29 +49,37 @@ def load_campaign(
     Parameters
     ----------
     path : str or Path
-        Campaign file.
+        Campaign file; or a vehicle (`named_vehicle`), which is driven until its rate is known to 30 %.
     overrides : sequence of str
         ``section.key=value`` each, as after ``--set``: ``["stop.rhw=0.3", "av.parameters.min_acceleration_mps2=-6"]``.
     av : str, optional
-        Vehicle that replaces the campaign's, as after ``--av``: ``PANEL.yaml:NAME``, or ``NAME`` in the shipped panel.
-        Overrides are laid over it.
+        Vehicle that replaces the campaign's, as after ``--av``; overrides are laid over it.
     check_files : bool
         Whether files that the campaign names must exist; False to look at a run whose environment file is gone.
 
     Raises `CampaignError`: the file cannot be read, is not YAML, or says something wrong; the error names every place.
     """
-    laid = [] if av is None else [Override(("av",), panel_av(av).model_dump(exclude_unset=True), f"--av {av}")]
-    campaign, place = _read(path, Campaign, [*laid, *map(parse_override, overrides)])
-    folder = Path(path).parent
+    laid = [] if av is None else [Override(("av",), named_vehicle(av, "--av "), f"--av {av}")]
+    of_file, folder = names_a_campaign(path), Path(path).parent
+    data, lines = read_yaml(path) if of_file else (_default_campaign(str(path)), {})
+    place = Places(str(path), lines, [*laid, *map(parse_override, overrides)])
+    campaign = _checked(data, Campaign, place)
     for where, expected in _FILES.items():
-        name = campaign.at(where)
-        if name is None or (where[-1] != "file" and not names_a_file(name)):
+        name, end = campaign.at(where), ""
+        if where[-1] == "controller" and name is not None and ".py:" in name:
+            name, _, end = name.rpartition(":")
+        elif name is None or (where[-1] != "file" and not names_a_file(name)):
             continue
-        file = _absolute(name, folder)
+        file = _absolute(name, folder if of_file else Path.cwd())
+        if not Path(file).exists() and place(where).startswith("--set"):  # typed in another folder than the campaign's
+            file = _absolute(name, Path.cwd())
         if check_files and not Path(file).is_file():
-            mend = "Correct the path; it is relative to the folder of the campaign file."
+            meant = did_you_mean(
+                Path(name).name, [each.name for each in Path(file).parent.glob("*" + Path(name).suffix)]
+            )
+            mend = meant or "Correct the path; it is relative to the folder of the campaign file."
             raise CampaignError(place(where), f"{name}, but there is no file {file}", expected, mend)
-        campaign = campaign.replaced(where, file)
+        campaign = campaign.replaced(where, f"{file}:{end}" if end else file)
     if check_files:
         shipped_or_own(campaign.environment.parameters, SHIPPED_PARAMETERS, place(("environment", "parameters")))
     runtime_env = {
@@ -130,7 +142,10 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict
     A path that leads through something that is not a section is a `CampaignError`.
     """
     changed = dict(data)
-    for override in overrides:
+    # What replaces the vehicle comes first: what is said of the vehicle is said of the new one.
+    for override in sorted(overrides, key=lambda each: not _names_the_driver(each)):
+        if _names_the_driver(override) and len(override.path) > 1:
+            changed = with_another_driver(changed, override.path[1], override.value)
         if override.path[0] == "surrogates" and len(override.path) > 1 and "surrogates" not in changed:
             # The file leaves the surrogates to their default: changing one must not drop the others.
             changed["surrogates"] = {name: driver.model_dump() for name, driver in default_surrogates().items()}
@@ -147,6 +162,11 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict
     return changed
 
 
+def _names_the_driver(override: Override) -> bool:
+    section, *key = override.path
+    return section == "av" and (not key or (key[0] in AV_SOURCES and override.value is not None))
+
+
 @dataclass(frozen=True)
 class Places:
     """Where values were written: in a file (lines from 1, by path), or by an override, of which later ones win."""
@@ -157,7 +177,7 @@ class Places:
 
     def line_of(self, where: YamlPath) -> int:
         """Line of the value at ``where``, or of its nearest ancestor that is in the file."""
-        return next(self.lines[at] for n in range(len(where), -1, -1) if (at := tuple(where[:n])) in self.lines)
+        return next((self.lines[at] for n in range(len(where), -1, -1) if (at := tuple(where[:n])) in self.lines), 1)
 
     def __call__(self, where: YamlPath) -> str:
         """``--set a.b=c``; or ``a.b (smoke.yaml:12)``, with overrides of its parts; file and line for the whole."""
@@ -171,7 +191,61 @@ class Places:
         return f"{place} with {' '.join(inside)}" if inside and section else place
 
 
-# -- a panel of vehicles --
+# -- vehicles by name --
+
+_OTHER_FORMS = "my_av.py:MyClass, package.module:MyClass, my_av.fmu, sumo:MODEL, PANEL.yaml:NAME, or "
+
+
+def names_a_campaign(path: str | Path) -> bool:
+    """Whether it is the path of a campaign, not a vehicle: a YAML file, or any that is there and is none of code."""
+    suffix, text = Path(path).suffix, str(path)
+    if suffix in (".yaml", ".yml"):
+        return True
+    return suffix not in (".py", ".fmu") and (Path(path).exists() or ("/" in text and ":" not in text))
+
+
+def _default_campaign(vehicle: str) -> dict[str, Any]:
+    place, _, name = vehicle.rpartition(":")
+    words = Path(vehicle).stem if vehicle.endswith(".fmu") else f"{Path(place).name.removesuffix('.py')}-{name}"
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", words).strip("-._")
+    return {"name": name, "av": named_vehicle(vehicle), "stop": {"rhw": 0.3}}
+
+
+def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
+    """The ``av`` section that a word stands for; a `CampaignError` if it stands for none.
+
+    That is a Python class or function, ``my_av.py:MyClass`` or ``package.module:MyClass``; the path of an FMU; one of
+    SUMO's car-following models, ``sumo:ACC``; a vehicle of a panel, ``PANEL.yaml:NAME``; or, without a colon, one of
+    the shipped panel, a built-in model, or an entry point of group ``harness.controllers``.
+    """
+    place, colon, name = text.rpartition(":")
+    if text.endswith(".fmu"):
+        return {"fmu": {"file": str(Path(text).resolve())}}
+    if place == "sumo":
+        return {"sumo": {"carFollowModel": name}}
+    if colon and not place.endswith((".yaml", ".yml")):
+        return {"controller": f"{Path(place).resolve()}:{name}" if place.endswith(".py") else text}
+    panel = load_panel(place or SHIPPED_PANEL).avs
+    if name in panel:
+        return panel[name].model_dump(exclude_unset=True)
+    models, installed = ((), ()) if colon else (get_args(ModelName), entry_points(group=CONTROLLERS).names)
+    if name in models or name in installed:
+        return {"model" if name in models else "controller": name}
+    known = sorted({*panel, *models, *installed})
+    files = [] if colon else [str(file) for file in Path().glob("*.y*ml")]
+    found = f"no vehicle '{name}' in {place}" if colon else f"no {'' if option else 'campaign file, and no '}vehicle"
+    expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(known)}"
+    mend = did_you_mean(name, [*files, *known]) or _in_python_file(text) or "Name one of them."
+    raise CampaignError(f"{option}{text}", found, expected, mend)
+
+
+def _in_python_file(text: str) -> str:
+    """What of a Python file may be meant; empty if it is none."""
+    if not text.endswith(".py") or not Path(text).is_file():
+        return ""
+    tree = ast.parse(read_text(Path(text)))
+    names = [each.name for each in tree.body if isinstance(each, ast.ClassDef | ast.FunctionDef)]
+    return f"Name its class or function: {' or '.join(f'{text}:{name}' for name in names)}."
 
 
 class Panel(Section):
@@ -193,17 +267,6 @@ def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
         for name, av in panel.avs.items()
     }
     return panel.replaced(("avs",), avs)
-
-
-def panel_av(text: str) -> AutomatedVehicle:
-    """The vehicle that ``PANEL.yaml:NAME`` names, or a bare ``NAME`` in the shipped panel; else a `CampaignError`."""
-    file, _, name = text.rpartition(":")
-    avs = load_panel(file or SHIPPED_PANEL).avs
-    if name not in avs:
-        expected = f"one of {', '.join(avs)}; or PANEL.yaml:NAME for a panel of your own"
-        mend = did_you_mean(name, list(avs)) or "Name one of them."
-        raise CampaignError(f"--av {text}", f"no vehicle '{name}' in {file or 'the shipped panel'}", expected, mend)
-    return avs[name]
 
 
 # -- a file as a model, or every problem by its place --
@@ -228,13 +291,12 @@ class InvalidFileError(CampaignError):
 
 def read_model(path: str | Path, model: type[Model], overrides: Sequence[Override] = ()) -> Model:
     """Read a YAML file into a model, or name the path and line of every problem (`CampaignError`)."""
-    return _read(path, model, overrides)[0]
-
-
-def _read(path: str | Path, model: type[Model], overrides: Sequence[Override]) -> tuple[Model, Places]:
     data, lines = read_yaml(path)
-    places = Places(str(path), lines, overrides)
-    return validated(apply_overrides(data, overrides), model, str(path), places), places
+    return _checked(data, model, Places(str(path), lines, overrides))
+
+
+def _checked(data: dict[str, Any], model: type[Model], places: Places) -> Model:
+    return validated(apply_overrides(data, places.overrides), model, places.path, places)
 
 
 def validated(data: Any, model: type[Model], path: str, place: Places) -> Model:

@@ -128,7 +128,7 @@ class Testing(Section):
     """How maneuvers are drawn at critical moments."""
 
     method: Method = Field(
-        "episode_mixture",
+        "shells",
         description="nde: no control; forced: cut-in time drawn given that one happens; step_mixture: published NADE; "
         "episode_mixture: one importance function per episode, forced cut-in as defence; shells: cut-ins of a pool, "
         "counted within shells of known probability",

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shlex
 from pathlib import Path
 from string import Formatter
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from harness.campaign.drivers import (
+    PARAMETERS,
     PERCEIVES_LATERAL_M,
     RISK_EVALUATION_S,
     BuiltInParameters,
@@ -29,7 +31,27 @@ READS_NO_PARAMETERS = {
     "fmu": "Write them under av.fmu.start_values.",
 }
 """Sources of an AV beside which parameters would be lost, and where to write them."""
-CONTROLLER_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*|[A-Za-z0-9][A-Za-z0-9_.-]*)$"
+CONTROLLERS = "harness.controllers"
+"""Group of entry points."""
+CONTROLLER_PATTERN = r"^(([A-Za-z_][A-Za-z0-9_.]*|.+\.py):[A-Za-z_][A-Za-z0-9_]*|[A-Za-z0-9][A-Za-z0-9_.-]*)$"
+
+
+def with_another_driver(data: dict[str, Any], source: str, value: Any) -> dict[str, Any]:
+    """A campaign's data without what belongs to its driver alone, where another (`AV_SOURCES`) is to take its place."""
+    av, world = data.get("av") or {}, data.get("world")
+    if not isinstance(av, dict):
+        return data
+    last = next((name for name in AV_SOURCES if av.get(name) is not None), "model")
+    av = {key: each for key, each in av.items() if key == source or key not in AV_SOURCES}
+    if source != last:
+        lost = {"parameters", "reaction"} | ({"before_cut_in"} if source == "model" else set())
+        av = {key: each for key, each in av.items() if key not in lost}
+    elif source == "model" and isinstance(parameters := av.get("parameters"), dict) and value in PARAMETERS:
+        before, after = (set(PARAMETERS.get(name, BaseModel).model_fields) for name in (av.get("model", "idm"), value))
+        av["parameters"] = {key: each for key, each in parameters.items() if key in after or key not in before}
+    if source in ("sumo", "traci") and isinstance(world, dict) and world.get("engine") == "twin":
+        data = {**data, "world": {key: each for key, each in world.items() if key != "engine"}}
+    return {**data, "av": av}
 
 
 class Limits(Section):
@@ -80,9 +102,13 @@ class FmuController(Section):
 
     file: str = Field(min_length=1, description="path of the .fmu, relative to the campaign file")
     inputs: dict[str, str] = Field(
-        description="FMU input variable for each observation: speed_mps, gap_m, lead_speed_mps, time_s, ..."
+        default_factory=dict,
+        description="FMU input variable for each observation: speed_mps, gap_m, lead_speed_mps, time_s, ...; when left "
+        "out, the inputs that are named as an observation",
     )
-    output: str = Field(min_length=1, description="FMU output variable that holds the acceleration, m/s2")
+    output: str | None = Field(
+        None, min_length=1, description="FMU output variable that holds the acceleration, m/s2; when left out, the only"
+    )
     start_values: dict[str, float] = Field(default_factory=dict, description="values set before initialisation")
 
 
@@ -114,8 +140,9 @@ class AutomatedVehicle(Section):
     controller: str | None = Field(
         None,
         pattern=CONTROLLER_PATTERN,
-        examples=["my_package.my_module:MyController", "an_entry_point"],
-        description="your own: 'package.module:Class', or the name of an entry point in group harness.controllers",
+        examples=["my_av.py:MyClass", "my_package.my_module:MyClass", "an_entry_point"],
+        description="your own: 'file.py:Class', relative to the campaign file, 'package.module:Class', or the name of "
+        f"an entry point in group {CONTROLLERS}; instead of a class a function step(seen)",
     )
     sumo: dict[str, str | float] | None = Field(
         None, description="SUMO drives it: carFollowModel and any other vType attribute"
@@ -172,6 +199,8 @@ class AutomatedVehicle(Section):
         del content["limits"]["construction_time_s"]  # changes no test
         if not self.warm_up_steps:  # as before there was one
             del content["warm_up_s"]
+        if self.controller is not None:  # as a module that is found from where it lies
+            content["controller"] = re.sub(r"^(?:.*/)?([^/]+)\.py:", r"\1:", self.controller)
         if self.fmu is not None and (file := Path(self.fmu.file)).is_file():
             content["fmu"]["file"] = hashlib.sha256(file.read_bytes()).hexdigest()
         if self.traci is not None:

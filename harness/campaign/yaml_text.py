@@ -19,6 +19,7 @@ from yaml.error import MarkedYAMLError
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from yaml.reader import ReaderError
 
+from harness.campaign.problems import did_you_mean
 from harness.errors import CampaignError
 
 YamlPath = Sequence[str | int]
@@ -47,7 +48,7 @@ def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
     Any other file, and one that says a key twice, is a `CampaignError`.
     """
     name = str(path)
-    data, lines = _load(_read_text(Path(path)), name)
+    data, lines = _load(read_text(Path(path)), name)
     if not lines:
         raise CampaignError(name, "an empty file", "YAML keys and values", "Is it the right file, fully written?")
     if not isinstance(data, dict):
@@ -69,7 +70,8 @@ def parse_value(text: str, where: str) -> Any:
     return data
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """Text of a UTF-8 file of no more than `LARGEST_FILE` bytes; else a `CampaignError`."""
     try:
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)  # not all of what may be a device without an end
@@ -77,7 +79,8 @@ def _read_text(path: Path) -> str:
             return content.decode("utf-8-sig")
         found, mend = f"more than {LARGEST_FILE:,} bytes", "Is it the right file?"
     except FileNotFoundError:
-        found, mend = "no such file", "Check the spelling and the folder that you are in."
+        meant = did_you_mean(path.name, [file.name for file in path.parent.glob("*.y*ml")])
+        found, mend = "no such file", meant or "Check the spelling and the folder that you are in."
     except IsADirectoryError:
         found, mend = "a folder", "Name the file inside it."
     except UnicodeDecodeError as error:

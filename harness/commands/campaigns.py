@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Sequence
 from contextlib import nullcontext
+from itertools import count
 from pathlib import Path
 
 import click
@@ -12,6 +14,7 @@ import click
 from harness.commands.options import (
     CAMPAIGN,
     FOLDER,
+    RUNS,
     av_option,
     examples,
     executor_option,
@@ -29,15 +32,16 @@ from harness.numbers import leaves, words
 @click.command(
     short_help="Validate a campaign, print it resolved, and its cost.",
     epilog=examples(
-        "harness check scenarios/smoke.yaml", "harness check scenarios/smoke.yaml --set av.model=fvdm > resolved.yaml"
+        "harness check scenarios/smoke.yaml",
+        "harness check my_av.py:MyClass > my.yaml          # a campaign of one's own to begin with",
     ),
 )
-@click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
+@click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
 @av_option
 @set_option
 @json_option
 def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_json: bool) -> None:
-    """Validate CAMPAIGN; print it with every default filled in, and what it will cost.
+    """Validate CAMPAIGN, or that of VEHICLE; print it with every default filled in, and what it will cost.
 
     No test is run and nothing is written; an AV that is not built in is run for about a second, to see what it costs.
     The output is itself a campaign file; its cost stands in comments.
@@ -57,16 +61,17 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
 @click.command(
     short_help="Run a campaign until it is precise enough.",
     epilog=examples(
+        "harness run my_av.py:MyClass                        # or module:Class, my_av.fmu, sumo:ACC, r157-cc",
+        "harness run my_av.py:MyClass --set av.parameters.hardest_mps2=8",
         "harness run scenarios/smoke.yaml --out runs/smoke",
         "harness run scenarios/smoke.yaml --out runs/smoke --resume --set stop.rhw=0.03",
-        "harness run scenarios/smoke.yaml --out runs/hard --set av.parameters.min_acceleration_mps2=-8",
-        "harness run scenarios/smoke.yaml --out runs/late --av late-600ms",
+        "harness run scenarios/smoke.yaml --out runs/mine --set av.controller=my_av.py:MyClass",
         "harness run scenarios/smoke.yaml --out runs/gate --accept 3e-7 --junit gate.xml",
         "harness run scenarios/smoke.yaml --out runs/cluster --executor ray",
     ),
 )
-@click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
-@click.option("--out", "folder", type=FOLDER, required=True, help="Run folder; made if it is not there.")
+@click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
+@click.option("--out", "folder", type=FOLDER, help="Run folder; made if it is not there. Default: a new one in runs/.")
 @workers_option
 @executor_option
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
@@ -85,7 +90,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
 def run(
     ctx: click.Context,
     campaign_file: Path,
-    folder: Path,
+    folder: Path | None,
     *,
     workers: int | None,
     executor: str | None,
@@ -97,7 +102,10 @@ def run(
     overrides: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Run CAMPAIGN until it is precise enough, and print the crash rate.
+    """Run CAMPAIGN until it is precise enough, and print the crash rate; that of VEHICLE is known to 30 %.
+
+    VEHICLE is a Python class or function (my_av.py:MyClass, package.module:MyClass), an FMU (my_av.fmu), a model of
+    SUMO's (sumo:ACC), of a panel (PANEL.yaml:NAME) or built in (r157-cc). A function is asked step(seen) each 0.1 s.
 
     The same campaign gives the same records, bit for bit, whatever the number of workers, and also when it was
     interrupted and resumed. The run folder holds the resolved campaign, all records (Parquet), estimates.json and
@@ -109,6 +117,9 @@ def run(
     limit = [] if accept is None else [f"accept.crash_rate_below={accept!r}"]
     where = [] if executor is None else [f"run.executor={executor}"]
     campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
+    if folder is None:
+        folder = _run_folder(campaign.name, resume=resume)
+        say(f"Run folder: {folder}", err=True)
     from harness.processes import imports_ahead, worker_modules  # noqa: PLC0415 - keeps --help fast
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
@@ -132,15 +143,22 @@ def run(
     ctx.exit(result.exit_code)
 
 
+def _run_folder(name: str, *, resume: bool) -> Path:
+    """``runs/NAME``, or the first ``runs/NAME-2``, ``-3``, … that is not there; to resume, the last that is there."""
+    last, folder = None, RUNS / name
+    for number in count(2):
+        if not folder.exists():
+            return last if resume and last is not None else folder
+        last, folder = folder, RUNS / f"{name}-{number}"
+    raise AssertionError  # count() has no end
+
+
 @click.command(
     name="av-check",
     short_help="Look at the AV before a campaign is spent on it.",
-    epilog=examples(
-        "harness av-check scenarios/smoke.yaml",
-        "harness av-check scenarios/smoke.yaml --set av.model=null --set 'av.parameters={}' --set av.controller=m:MyAV",
-    ),
+    epilog=examples("harness av-check my_av.py:MyClass", "harness av-check my.yaml --set av.parameters.hardest_mps2=8"),
 )
-@click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
+@click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
 @click.option("--episodes", type=click.IntRange(min=2), default=48, show_default=True, help="Episodes to run.")
 @av_option
 @set_option
@@ -149,7 +167,7 @@ def run(
 def av_check(
     ctx: click.Context, campaign_file: Path, *, episodes: int, av: str | None, overrides: Sequence[str], as_json: bool
 ) -> None:
-    """Run a few dozen cut-ins with the AV of CAMPAIGN, twice, and say what it is like.
+    """Run a few dozen cut-ins with VEHICLE, or that of CAMPAIGN, twice, and say what it is like.
 
     Shown are whether it gives the same bits in another order and in other cells, whether it stays finite and within
     limits, how it reacts to cut-ins, and its time per step beside the built-in IDM. Nothing is written.
@@ -164,30 +182,31 @@ def av_check(
     if as_json:
         print_json(found.to_json())
     else:
-        print_table("What the AV is like", [{"what": name, "found": value} for name, value in leaves(found.to_json())])
+        values = dict(leaves(found.to_json()))
+        of_idm = {name: values.pop(f"idm_{name}", "") for name in tuple(values) if not name.startswith("idm_")}
+        rows = [{"what": name, "found": value, "built-in IDM": of_idm[name]} for name, value in values.items()]
+        print_table("What the AV is like", rows)
     ctx.exit(found.exit_code)
 
 
 @click.command(
     short_help="Two AVs on common random numbers: the interval of the difference.",
     epilog=examples(
-        "harness compare old.yaml new.yaml --out runs/old_new",
+        "harness compare old_av.py:MyClass new_av.py:MyClass --out runs/old_new",
         "harness compare runs/old new.yaml --margin 0.1 --out runs/old_new       # is the new one 10 % worse?",
         "harness compare scenarios/smoke.yaml --av idm --against-av late-600ms --out runs/late",
     ),
 )
 @click.argument("source_a", metavar="A", type=CAMPAIGN)
 @click.argument("file_b", metavar="[B]", type=CAMPAIGN, required=False)
-@click.option("--out", "folder", type=FOLDER, required=True, help="Folder; run folders a and b are made in it.")
+@click.option("--out", "folder", type=FOLDER, help="Folder of the run folders a and b. Default: runs/A-B.")
 @click.option(
     "--against",
     multiple=True,
     metavar="A.B=C",
     help="Value that B has instead; with it B may be left out. May be given several times.",
 )
-@click.option(
-    "--against-av", metavar="[PANEL.yaml:]NAME", help="Vehicle that B has instead; with it B may be left out."
-)
+@click.option("--against-av", metavar="VEHICLE", help="Vehicle that B has instead; with it B may be left out.")
 @click.option(
     "--margin",
     type=click.FloatRange(min=0.0),
@@ -205,7 +224,7 @@ def compare(
     ctx: click.Context,
     source_a: Path,
     file_b: Path | None,
-    folder: Path,
+    folder: Path | None,
     *,
     against: Sequence[str],
     against_av: str | None,
@@ -217,7 +236,7 @@ def compare(
     overrides: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Drive the AVs of campaigns A and B, which differ in nothing else, in the same traffic; print the difference.
+    """Drive the AVs of A and B, campaigns or vehicles, in the same traffic; print the difference.
 
     Both meet the same cut-ins (testing.method: shells), round by round, until the half-width of the difference is
     stop.rhw of the larger rate, or --margin is decided.
@@ -237,7 +256,10 @@ def compare(
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
-    labels = a.name, label_b
+    labels = (a.name, label_b) if a.name != label_b else (str(source_a), str(file_b))
+    if folder is None:
+        folder = RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b)}"
+        say(f"Folder: {folder}", err=True)
     with shown_progress(a.stop.rhw, a.min_crashes, quiet=quiet) as bar:
         from harness.runner.compare import compare_campaigns  # noqa: PLC0415 - slow to import: the bar is there meanwhile
 

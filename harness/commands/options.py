@@ -31,6 +31,8 @@ FOLDER = FolderPath(path_type=Path, file_okay=False)
 RUN_FOLDER = FolderPath(path_type=Path, file_okay=False, exists=True)
 FILE = click.Path(path_type=Path, dir_okay=False)
 CAMPAIGN = click.Path(path_type=Path)
+RUNS = Path("runs")
+"""Where run folders are made that nobody has named."""
 
 
 def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Path | None], Path | None]:
@@ -63,8 +65,8 @@ set_option = click.option(
 av_option = click.option(
     "--av",
     "av",
-    metavar="[PANEL.yaml:]NAME",
-    help="Test this vehicle of a panel instead of the campaign's; a bare NAME is one of the shipped panel.",
+    metavar="VEHICLE",
+    help="Test this vehicle instead of the campaign's; it is named as by `harness run`.",
 )
 workers_option = click.option(
     "--workers",
@@ -95,7 +97,7 @@ def examples(*lines: str, heading: str = "Examples:") -> str:
 
 
 def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None) -> Campaign:
-    """Read the campaign that a command was given, with what was replaced on the command line."""
+    """Read the campaign, or that of the vehicle, that a command was given, with what was replaced beside it."""
     from harness.campaign.files import load_campaign  # noqa: PLC0415 - keeps --help fast
 
     return load_campaign(campaign_file, overrides, av=av)

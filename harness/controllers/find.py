@@ -10,13 +10,16 @@ from contextlib import closing
 from copy import deepcopy
 from functools import partial
 from importlib.metadata import entry_points
-from inspect import signature
+from importlib.util import module_from_spec, spec_from_file_location
+from inspect import Parameter, Signature, isfunction, signature
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar, get_type_hints
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.vehicle import AutomatedVehicle
+from harness.campaign.problems import did_you_mean
+from harness.campaign.vehicle import CONTROLLERS, AutomatedVehicle
 from harness.controllers.hosts import (
     BatchHost,
     ControllerHost,
@@ -26,11 +29,10 @@ from harness.controllers.hosts import (
     cause_of,
     death_cause,
 )
-from harness.controllers.protocol import BatchController
+from harness.controllers.protocol import Observation
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.processes import CONSTRUCTOR, Apart, ForkServer, WorkerDeath, first_to_answer, tell
 
-GROUP = "harness.controllers"
 _Answer = TypeVar("_Answer")
 
 
@@ -41,35 +43,54 @@ class AvEndedProcessError(HarnessError):
 
 
 def controller_class(name: str) -> Callable[..., Any]:
-    """The class that ``package.module:Class``, or an entry point of group ``harness.controllers``, names.
+    """The class, or function, that a name stands for: ``my_av.py:Class``, ``package.module:Class``, an entry point.
 
-    The folder that the harness was started in is importable, as it is for a script. Where there is no such module,
-    class or entry point, a `CampaignError` says so.
+    The folder that the harness was started in is importable, as it is for a script, and so is that of a file. Where
+    there is no such module, class or entry point, a `CampaignError` says so.
     """
     if ":" not in name:
         return _from_entry_point(name)
-    module_name, _, class_name = name.partition(":")
-    if (here := str(Path.cwd())) not in sys.path:
+    module_name, _, class_name = name.rpartition(":")
+    is_file = module_name.endswith(".py")
+    if (here := str(Path(module_name).parent.resolve() if is_file else Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
-        module = importlib.import_module(module_name)
+        module = _of_file(Path(module_name)) if is_file else importlib.import_module(module_name)
     except (Exception, SystemExit) as error:
         cause = f"{name}, whose module cannot be imported ({cause_of(error)})"
-        mend = "Start the harness in the folder that holds it, or install it beside the harness."
-        raise CampaignError("av.controller", cause, "a Python module that can be imported", mend) from error
+        meant = did_you_mean(module_name, [file.stem for file in Path.cwd().glob("*.py")])
+        mend = "Mend the module." if is_file else "Name its file, my_av.py:Class, or install it beside the harness."
+        raise CampaignError("av.controller", cause, "a Python module that can be imported", meant or mend) from error
     found = getattr(module, class_name, None)
     if not callable(found):
-        what = f"no class {class_name} in {getattr(module, '__file__', module_name)}"
-        mend = f"It has: {', '.join(name for name, value in vars(module).items() if isinstance(value, type))}."
-        raise CampaignError("av.controller", what, "a controller class (see docs/controllers.md)", mend)
+        own = [name for name, each in vars(module).items() if getattr(each, "__module__", "") == module.__name__]
+        what = f"no class or function {class_name} in {getattr(module, '__file__', module_name)}"
+        mend = did_you_mean(class_name, own) or f"It has: {', '.join(own) or 'none'}."
+        raise CampaignError("av.controller", what, "a controller (see docs/controllers.md)", mend)
     return found  # type: ignore[no-any-return]
 
 
+def _of_file(file: Path) -> ModuleType:
+    """The module that a file makes; its name is not that of another file, or of an installed module, of this name."""
+    name = f"{file.stem}_{hashlib.sha256(bytes(file.resolve())).hexdigest()[:8]}"
+    if name not in sys.modules:
+        spec = spec_from_file_location(name, file)
+        if spec is None or spec.loader is None:
+            raise ImportError(f"{file} is no Python file")
+        sys.modules[name] = module_from_spec(spec)
+        try:
+            spec.loader.exec_module(sys.modules[name])
+        except BaseException:
+            del sys.modules[name]
+            raise
+    return sys.modules[name]
+
+
 def _from_entry_point(name: str) -> Callable[..., Any]:
-    points = entry_points(group=GROUP)
+    points = entry_points(group=CONTROLLERS)
     if name not in points.names:
-        expected = f"an entry point of group {GROUP}: {', '.join(sorted(points.names)) or 'none is installed'}"
-        mend = "Install the package that brings it, or write 'package.module:Class'."
+        expected = f"an entry point of group {CONTROLLERS}: {', '.join(sorted(points.names)) or 'none is installed'}"
+        mend = did_you_mean(name, sorted(points.names)) or "Install what brings it, or write my_av.py:Class."
         raise CampaignError("av.controller", name, expected, mend)
     return points[name].load()  # type: ignore[no-any-return]
 
@@ -93,7 +114,7 @@ def build_host(
     if av.fmu is None:
         make = _maker(av)
         first = _made(make, str(av.controller), guard)
-        if isinstance(first, BatchController):
+        if _is_batch(first):
             return BatchHost(first, av, seed, guard)
     else:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
@@ -104,23 +125,61 @@ def build_host(
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
     """Makes controllers, each with parameters of its own: what one does to a list among them is nobody else's."""
-    make = controller_class(str(av.controller))
-    _require_controller(_what_it_makes(make), str(av.controller))
+    name = str(av.controller)
+    found = controller_class(name)
     parameters = av.parameters if isinstance(av.parameters, dict) else {}
+    make, handed = _as_class(found, name)
     try:
-        signature(make).bind(**parameters)
+        _signature(found).bind(**handed, **parameters)
     except TypeError as error:
-        found = f"{', '.join(parameters) or 'none'}, which {av.controller} does not take ({error})"
-        mend = "Correct av.parameters, or the constructor."
-        expected = "keyword arguments of the controller's constructor"
-        raise CampaignError("av.parameters", found, expected, mend) from error
-    except ValueError:
-        pass  # a class in C may have no signature
+        takes = [each for each in _signature(found).parameters if each not in handed]
+        wrong = next((each for each in parameters if each not in takes), "")
+        what = f"{', '.join(parameters) or 'none'}, which {name} does not take ({error})"
+        mend = did_you_mean(wrong, takes) or "Correct av.parameters, or the constructor."
+        expected = f"keyword arguments of the controller: {', '.join(takes) or 'it has none'}"
+        raise CampaignError("av.parameters", what, expected, mend) from error
     return lambda: make(**deepcopy(parameters))
 
 
+class StepFunction:
+    """A function ``step(seen, **parameters)`` as a controller; it remembers nothing."""
+
+    def __init__(self, function: Callable[..., float], **parameters: Any) -> None:
+        self._function, self._parameters = function, parameters
+
+    def step(self, observation: Observation) -> float:
+        """Acceleration (m/s²) for the coming step."""
+        return self._function(observation, **self._parameters)
+
+
+def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """What is called with the parameters to make a controller; and what else ``found`` is handed, by name.
+
+    Nothing is called that a campaign names but a class, a function that says by its annotation which controller it
+    makes, and one that is itself the vehicle: its first argument is what the vehicle sees.
+    """
+    takes = _signature(found).parameters
+    first = next(iter(takes.values()), None)
+    made = _what_it_makes(found)
+    if isfunction(found) and not _is_controller(made) and first is not None and first.default is Parameter.empty:
+        return partial(StepFunction, found), {first.name: None}
+    _require_controller(made, name)
+    if isinstance(found, type) and "traci" in takes and not _is_batch(found):
+        from harness.controllers.traci_style import StepListenerController  # noqa: PLC0415 - it looks up names here
+
+        return partial(StepListenerController, name), {"traci": None}
+    return found, {}
+
+
+def _signature(found: Callable[..., Any]) -> Signature:
+    try:
+        return signature(found)
+    except ValueError:  # a class in C may have none
+        return signature(lambda **parameters: parameters)
+
+
 def _what_it_makes(make: Callable[..., Any]) -> Any:
-    """The class itself, or the one that a function says it returns: nothing else that a campaign names is called."""
+    """The class itself, or the one that a function says it returns."""
     if isinstance(make, type):
         return make
     try:
@@ -129,14 +188,20 @@ def _what_it_makes(make: Callable[..., Any]) -> Any:
         return None
 
 
+def _is_batch(made: Any) -> bool:
+    return callable(getattr(made, "step_batch", None))
+
+
+def _is_controller(made: Any) -> bool:
+    return callable(getattr(made, "step", None)) or _is_batch(made)
+
+
 def _require_controller(made: Any, name: str) -> None:
-    missing = [method for method in ("start", "step", "close") if not callable(getattr(made, method, None))]
-    if missing and not isinstance(made, BatchController):
-        expected = "start, step and close (per vehicle), or start_batch, step_batch and close (arrays)"
-        mend = (
-            "See docs/controllers.md for both, in ten lines each. A function says what it makes: `def make() -> MyAv:`."
-        )
-        raise CampaignError("av.controller", f"{name} without {', '.join(missing)}", expected, mend)
+    if not _is_controller(made):
+        expected = "a function step(seen), or a class with step (per vehicle) or step_batch (arrays)"
+        mend = "See docs/controllers.md. A function without arguments says what it makes: `def make() -> MyAv:`."
+        meant = did_you_mean("step", [each for each in dir(made) if each[0] != "_"])
+        raise CampaignError("av.controller", f"{name} without step", expected, meant or mend)
 
 
 def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:

@@ -19,6 +19,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, NamedTuple
 
+from harness.campaign.problems import did_you_mean
 from harness.campaign.vehicle import FmuController
 from harness.compiled import cache_root
 from harness.controllers.protocol import BatchObservation, EpisodeStart, Observation, VehicleController
@@ -105,15 +106,36 @@ def _unpacked(file: Path) -> Path:
 
 def wire(fmu: FmuController, description: Any) -> Wiring:
     """Check ``av.fmu`` against the FMU's variables: a `CampaignError` names the key, and what there is."""
-    for name in fmu.inputs:
+    connected = fmu.inputs or _by_name(fmu, description)
+    for name in connected:
         if name not in OBSERVATIONS:
-            expected, mend = f"one of {', '.join(OBSERVATIONS)}", "The values are the FMU's input variables."
+            expected = f"one of {', '.join(OBSERVATIONS)}"
+            mend = did_you_mean(name, list(OBSERVATIONS)) or "The values are the FMU's input variables."
             raise CampaignError(f"av.fmu.inputs.{name}", "no such observation", expected, mend)
-    inputs = [_reference(f"av.fmu.inputs.{key}", name, description, ("input",)) for key, name in fmu.inputs.items()]
+    inputs = [_reference(f"av.fmu.inputs.{key}", name, description, ("input",)) for key, name in connected.items()]
     starts = [_reference("av.fmu.start_values", name, description, ("parameter", "input", "local", "output"))
               for name in fmu.start_values]  # fmt: skip
-    output = _reference("av.fmu.output", fmu.output, description, ("output",))
-    return Wiring(inputs, [OBSERVATIONS[key] for key in fmu.inputs], output, starts, [*fmu.start_values.values()])
+    outputs = [fmu.output] if fmu.output else _reals(description, "output")
+    if len(outputs) != 1:
+        found, mend = f"{', '.join(outputs) or 'none'}", "Say which: --set av.fmu.output=NAME."
+        raise CampaignError("av.fmu.output", found, "one Real output, the acceleration in m/s2", mend)
+    output = _reference("av.fmu.output", outputs[0], description, ("output",))
+    return Wiring(inputs, [OBSERVATIONS[key] for key in connected], output, starts, [*fmu.start_values.values()])
+
+
+def _reals(description: Any, causality: str) -> list[str]:
+    return [each.name for each in description.modelVariables if (each.type, each.causality) == ("Real", causality)]
+
+
+def _by_name(fmu: FmuController, description: Any) -> dict[str, str]:
+    """The FMU's inputs, where each is named as an observation."""
+    names = _reals(description, "input")
+    if not names or not set(names) <= set(OBSERVATIONS):
+        expected = f"inputs that are named as observations ({', '.join(OBSERVATIONS)}), or connected to them"
+        example = f"{{speed_mps: {names[0]}}}" if names else "{speed_mps: NAME}"
+        mend = f"Say which is what, as in --set 'av.fmu.inputs={example}'."
+        raise CampaignError("av.fmu.inputs", f"{fmu.file} with inputs {', '.join(names) or 'none'}", expected, mend)
+    return dict(zip(names, names, strict=True))
 
 
 def _reference(where: str, name: str, description: Any, causalities: Sequence[str]) -> int:

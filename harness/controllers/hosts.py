@@ -13,13 +13,15 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from operator import methodcaller
 from pathlib import Path
+from sysconfig import get_path
+from traceback import walk_tb
 from types import FrameType
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from harness.campaign.problems import did_you_mean
 from harness.campaign.vehicle import AutomatedVehicle, Limits
 from harness.controllers.protocol import (
     BatchController,
@@ -82,12 +84,29 @@ def require_fault(error: BaseException) -> None:
 
 
 def cause_of(error: BaseException) -> str:
-    """One line for the record, which is UTF-8: the text is the user's, and so is the code that makes it."""
+    """One line for the record, which is UTF-8: the text is the user's, and so is the code that makes it.
+
+    With it comes the place in the user's code, and the name that was meant where it asks for one that is not there.
+    """
     try:
         text = f"{type(error).__name__}: {error}"
     except BaseException as again:  # noqa: BLE001 - whatever a user's code raises
         text = f"{type(error).__name__}, whose text raised {type(again).__name__}"
-    return text.encode("utf-8", "backslashreplace").decode().splitlines()[0][:500]
+    asked = type(error.obj) if isinstance(error, AttributeError) else object
+    if isinstance(error, AttributeError) and asked.__module__.startswith("harness."):
+        text += f". {did_you_mean(error.name, [name for name in dir(asked) if name[0] != '_'])}".rstrip(". ")
+    return text.encode("utf-8", "backslashreplace").decode().splitlines()[0][:500] + _place_of(error)
+
+
+_NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), "<"
+
+
+def _place_of(error: BaseException) -> str:
+    """`` (my_av.py:12)``: the last line of the user's code on the way to an error; empty where there is none."""
+    places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
+    theirs = [place for place in places if not place[0].startswith(_NOT_THE_USERS)]
+    own = [place for place in theirs if "site-packages" not in place[0]] or theirs
+    return f" ({Path(own[-1][0]).name}:{own[-1][1]})" if own else ""
 
 
 class StepTimeoutError(BaseException):
@@ -161,7 +180,7 @@ class Guard:
         """Close controllers; what they raise is nobody's concern: they have failed before, or the run is over."""
         for controller in controllers:
             if controller is not None:
-                self.call(CLOSE, methodcaller("close"), controller)
+                self.call(CLOSE, optional("close"), controller)
 
     def end(self, controllers: Iterable[Any]) -> None:
         """Close the last controllers, and leave SIGALRM as it is by default."""
@@ -196,6 +215,11 @@ class Guard:
             since = self._since
             if since is not None and time.monotonic() - since > 2.0 * self._seconds + 1.0:
                 os._exit(HUNG_EXIT_CODE)
+
+
+def optional(name: str, *arguments: Any) -> Callable[[Any], None]:
+    """Calls a controller's method of this name, if it has one."""
+    return lambda controller: getattr(controller, name, lambda *_: None)(*arguments)
 
 
 class _Host:
@@ -239,7 +263,7 @@ class VehicleHost(_Host):
                     self._controllers[k], wrong = self._guard.call(*made, episode=episode, step=MAKING, makes=True)
                 if wrong is None:
                     start = EpisodeStart(index, STEP_S, controller_random(self._seed, index))
-                    begin = OF_EPISODE, methodcaller("start", start), self._controllers[k]
+                    begin = OF_EPISODE, optional("start", start), self._controllers[k]
                     _, wrong = self._guard.call(*begin, episode=episode)
                 if wrong is not None:
                     failures[k] = f"start: {wrong}"
@@ -306,7 +330,7 @@ class BatchHost(_Host):
         random = [controller_random(self._seed, index) for index in announced.tolist()]
         handed = read_only(cells.copy()), read_only(announced.copy())
         with self._guard:
-            _, wrong = self._guard.call(START_BATCH, lambda: self._controller.start_batch(*handed, random))
+            _, wrong = self._guard.call(START_BATCH, optional("start_batch", *handed, random), self._controller)
         return {} if wrong is None else dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")
 
     def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:

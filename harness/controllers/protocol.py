@@ -6,9 +6,8 @@ anything but the AV: the motion of LV and BV is what the likelihood ratios are a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -97,29 +96,23 @@ class BatchObservation(NamedTuple):
     bv_overlaps: IntArray
 
 
-@runtime_checkable
 class VehicleController(Protocol):
-    """One AV. The class is called once per cell with the campaign's ``av.parameters`` as keyword arguments."""
+    """One AV. The class is called once per cell with the campaign's ``av.parameters`` as keyword arguments.
 
-    def start(self, episode: EpisodeStart) -> None:
-        """Begin an episode: forget the last one."""
+    Where it has them, ``start(EpisodeStart)`` begins an episode and forgets the last one, and ``close()`` releases in
+    the end what the controller holds.
+    """
 
     def step(self, observation: Observation) -> float:
         """Acceleration (m/s²) for the coming step."""
 
-    def close(self) -> None:
-        """Release what the controller holds; called once, at the end."""
 
-
-@runtime_checkable
 class BatchController(Protocol):
-    """All AVs of a worker. The class is called once with the campaign's ``av.parameters`` as keyword arguments."""
+    """All AVs of a worker. The class is called once with the campaign's ``av.parameters`` as keyword arguments.
 
-    def start_batch(self, cells: IntArray, episodes: IntArray, random: Sequence[np.random.Generator]) -> None:
-        """Begin episodes in the given cells, each with the only randomness that its controller may use."""
+    Where it has them, ``start_batch(cells, episodes, random)`` begins episodes in these cells, each with the only
+    randomness that its controller may use, and ``close()`` releases in the end what the controller holds.
+    """
 
     def step_batch(self, observation: BatchObservation) -> FloatArray:
         """Accelerations (m/s²) for the coming step, shape (n,)."""
-
-    def close(self) -> None:
-        """Release what the controller holds; called once, at the end."""

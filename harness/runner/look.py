@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import count
@@ -60,24 +61,20 @@ class Behaviour:
 
 @dataclass(frozen=True)
 class Speed:
-    """Time per episode step, and episodes per second, beside the built-in IDM on the same episodes and cells.
-
-    ``ratio`` is that of the times per step.
-    """
+    """Time per episode step, and episodes per second."""
 
     us_per_step: float
     episodes_per_s: float
-    idm_us_per_step: float
-    idm_episodes_per_s: float
-    ratio: float
 
 
 @dataclass(frozen=True)
 class AvCheck:
     """What a few dozen episodes say about an AV, run on an engine with cut-ins that a method brought about.
 
-    ``failures`` are numbers of episodes of the first run by the cause that they failed with, ``differing`` those whose
-    motion was not the same bits in the two layouts, ``limits_mps2`` the accelerations that count as its limits.
+    ``failures`` are numbers of episodes of the first run by the cause that they failed with, where one stands for all
+    that differ from it in digits alone; ``differing`` are those whose motion was not the same bits in the two layouts,
+    with the ``likely_cause`` if there are any; ``limits_mps2`` are the accelerations that count as its limits. The
+    built-in IDM has driven the same episodes in the same cells.
     """
 
     source: str
@@ -86,9 +83,12 @@ class AvCheck:
     n_episodes: int
     failures: dict[str, int]
     differing: tuple[int, ...]
+    likely_cause: str
     limits_mps2: tuple[float, float]
     behaviour: Behaviour
+    idm_behaviour: Behaviour
     speed: Speed
+    idm_speed: Speed
 
     @property
     def exit_code(self) -> int:
@@ -117,19 +117,24 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
     first, own_speed = _timed_run(source, n_episodes, black_box)
     again = _run_in_another_order(source, n_episodes, black_box)
     idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
-    _, idm_speed = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
+    of_idm, idm_speed = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
     own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
     limits = own.min_acceleration_mps2, own.max_acceleration_mps2
+    differing = tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i])
+    early = tested.av.acts_before_cut_in
     return AvCheck(
         source=tested.av.source,
         engine=tested.world.engine,
         method=tested.testing.method,
         n_episodes=n_episodes,
-        failures=dict(Counter(first.failures.values())),
-        differing=tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i]),
+        failures=_by_cause(first.failures.values()),
+        differing=differing,
+        likely_cause=_likely_cause(source, differing[0], black_box) if differing else "",
         limits_mps2=limits,
-        behaviour=_behaviour(first, limits, early=tested.av.acts_before_cut_in),
-        speed=Speed(*own_speed, *idm_speed, own_speed[0] / idm_speed[0]),
+        behaviour=_behaviour(first, limits, early=early),
+        idm_behaviour=_behaviour(of_idm, limits, early=early),
+        speed=own_speed,
+        idm_speed=idm_speed,
     )
 
 
@@ -167,8 +172,8 @@ def _opened(source: Source, black_box: Path | None, n_cells: int | None = None) 
         world.close()
 
 
-def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, tuple[float, float]]:
-    """First run of the episodes, with μs per step and episodes per second in the fastest of several."""
+def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, Speed]:
+    """First run of the episodes, and the speed of the fastest of several."""
     with _opened(source, black_box) as loop:
         loop.run(0, source.states(0, min(WARM_UP_EPISODES, n_episodes)))  # compiles
         states = source.states(0, n_episodes)
@@ -179,7 +184,7 @@ def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -
             loop.run(0, states)
             elapsed_s = min(elapsed_s, time.perf_counter() - again)
     steps = max(1, int(shard.results.episode["n_steps"].sum()))
-    return shard, (1e6 * elapsed_s / steps, n_episodes / elapsed_s)
+    return shard, Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s)
 
 
 def _run_in_another_order(source: Source, n_episodes: int, black_box: Path | None) -> dict[int, Bits]:
@@ -191,6 +196,33 @@ def _run_in_another_order(source: Source, n_episodes: int, black_box: Path | Non
             shard = loop.run(begin, source.states(begin, end - begin))
             found.update({begin + row: bits_of(shard, row) for row in range(end - begin)})
     return found
+
+
+def _by_cause(causes: Iterable[str]) -> dict[str, int]:
+    """How often each was; of causes that differ in digits alone the first stands for all."""
+    shown: dict[str, str] = {}
+    return dict(Counter(shown.setdefault(re.sub(r"\d[\d.]*(e[-+]?\d+)?", "0", cause), cause) for cause in causes))
+
+
+def _likely_cause(source: Source, episode: int, black_box: Path | None) -> str:
+    """Why an episode is not the same again, by what it takes: nothing, another one before it, or one beside it."""
+
+    def bits(n_cells: int, begin: int, n_before: int) -> Bits:
+        with _opened(source, black_box, n_cells) as loop:
+            for each in range(begin, begin + n_before):
+                loop.run(each, source.states(each, 1))
+            n = min(n_cells, source.campaign.stop.episodes - episode)
+            return bits_of(loop.run(episode, source.states(episode, n)), 0)
+
+    alone, begin = bits(1, episode, 0), max(0, episode - OTHER_CELLS)
+    if any(bits(1, episode, 0) != alone for _ in range(2)):
+        return (
+            "It differs also when nothing does: random numbers of its own (random, numpy.random), the clock, or a "
+            "variable of its module or class that outlives the object. Draw from episode.random; keep state in self."
+        )
+    if any(bits(1, first, episode - first or 1) != alone for first in (begin, episode)):
+        return "It differs after another episode: it remembers the last one. Set all its state in start."
+    return "It differs beside other vehicles: they share something. Keep state in self, not in the class or module."
 
 
 def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:

@@ -4,6 +4,7 @@ import json
 import pickle
 import re
 import shutil
+from pathlib import Path
 
 import jsonschema
 import pytest
@@ -17,7 +18,6 @@ from harness.campaign.files import (
     InvalidFileError,
     load_campaign,
     load_panel,
-    panel_av,
     read_model,
     schema_text,
 )
@@ -54,14 +54,14 @@ MISTAKES = (
     ("surrogates:\n  a.b: {model: idm}", "surrogates.a.b", 3, "another name"),
     ("av:\n  model: idm\n  controller: a:B", "av", 2, "An AV has one driver"),
     ("av:\n  controller:", "av.controller", 3, "Write a value after 'controller:'"),
-    ("av:\n  controller: my module.py", "av.controller", 3, "text such as my_package.my_module:MyController"),
+    ("av:\n  controller: my module.py", "av.controller", 3, "text such as my_av.py:MyClass"),
     ("av:\n  sumo:\n    carFollowModel: ACC\n    minGap: true", "av.sumo.minGap", 5, "text or a number"),
     ("av:\n  traci: {command: ''}", "av.traci.command", 3, "starts the program"),
-    ("av:\n  fmu: {file: a.fmu, output: a}", "av.fmu.inputs", 3, "Add 'inputs: …'"),
+    ("av:\n  fmu: {output: a}", "av.fmu.file", 3, "Add 'file: …'"),
 )
 """Which an editor's schema refuses, too."""
 BROKEN_RULES = (
-    ("surrogates: {}", "surrogates", 2, "at least one surrogate"),
+    ("testing: {method: episode_mixture}\nsurrogates: {}", "surrogates", 3, "at least one surrogate"),
     ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.2}", "testing.alpha", 3, "sum to 1.1"),
     ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.5}", "testing.alpha", 3, "SM-I, SM-II, SM-III"),
     ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
@@ -73,7 +73,7 @@ BROKEN_RULES = (
     ("stop:\n  rhw: 1\n  rhw: 2", "stop.rhw", 4, "again, first written on line 3"),
     ("world: {cells: 257}", "world.cells", 2, "at most 256"),
     ("testing: {method: step_mixture}\nstop:\n  rhw: 0.3", "stop.rhw", 4, "a fixed number of tests"),
-    ("accept: {crash_rate_below: 0.1}", "accept", 2, "testing.method shells"),
+    ("testing: {method: forced}\naccept: {crash_rate_below: 0.1}", "accept", 3, "testing.method shells"),
 )
 SCHEMA = jsonschema.Draft202012Validator(json.loads(schema_text()))
 
@@ -225,11 +225,108 @@ def test_every_number_of_the_shipped_panel_carries_a_tag():
 def test_a_vehicle_replaces_the_campaigns_and_overrides_are_laid_over_it(load, panel):
     text = "av: {model: fvdm, parameters: {kappa_per_s: 0.5}}\nsurrogates: {S: {model: idm}}"
     by_name = load(text, av="brakes-3")
-    assert (by_name.av, by_name.surrogates) == (panel_av("brakes-3"), {"S": Surrogate(model="idm")})
+    assert (by_name.av, by_name.surrogates) == (load_panel().avs["brakes-3"], {"S": Surrogate(model="idm")})
     file = panel("  mine: {model: idm, parameters: {time_headway_s: 2}, reaction: {delay_s: 0.2}}\n")
     mine = load(text, "av.parameters.min_acceleration_mps2=-7", av=f"{file}:mine").av
     assert mine.parameters == IDMParameters(time_headway_s=2.0, min_acceleration_mps2=-7.0)
     assert mine.reaction.delay_s == 0.2
+
+
+OWN = """
+class MyAV:
+    def step(self, seen): ...
+
+def step(seen): ...
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A folder with a vehicle and a campaign, in which the harness is started."""
+    monkeypatch.chdir(tmp_path)
+    Path("my_av.py").write_text(OWN)
+    Path("mine.yaml").write_text("name: mine\n")
+    Path("my.fmu").touch()
+    Path("campaigns").mkdir()
+    return tmp_path
+
+
+NAMED = {
+    "my_av.py:MyAV": ("my_av-MyAV", {"controller": "{}/my_av.py:MyAV"}),
+    "./my_av.py:step": ("my_av-step", {"controller": "{}/my_av.py:step"}),
+    "package.module:Class": ("package.module-Class", {"controller": "package.module:Class"}),
+    "my.fmu": ("my", {"fmu": {"file": "{}/my.fmu"}}),
+    "sumo:ACC": ("sumo-ACC", {"sumo": {"carFollowModel": "ACC"}}),
+    "r157-cc": ("r157-cc", {"model": "r157-cc"}),
+    "late-600ms": ("late-600ms", {"model": "idm", "reaction": {"delay_s": 0.6}}),
+}
+
+
+@pytest.mark.parametrize(("vehicle", "name", "av"), [(key, *value) for key, value in NAMED.items()], ids=NAMED)
+def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, own):
+    campaign = load_campaign(vehicle, ["seed=2"])
+    av = json.loads(json.dumps(av).replace("{}", str(own)))
+    assert campaign == Campaign(name=name, av=av, seed=2, testing={"method": "shells"}, stop={"rhw": 0.3})
+    assert load_campaign("mine.yaml", av=vehicle).av == campaign.av
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("my_av.py", "Name its class or function: my_av.py:MyAV or my_av.py:step"),
+        ("my_aw.py:MyAV", "no file .*my_aw.py.* Did you mean 'my_av.py'"),
+        ("mine", "no campaign file, and no vehicle.* Did you mean 'mine.yaml'"),
+        ("mime.yaml", "no such file.* Did you mean 'mine.yaml'"),
+        ("late-60ms", "Did you mean 'late-600ms'"),
+        ("mine.yaml:idm", "format"),  # which is no panel
+    ],
+)
+def test_what_is_neither_campaign_nor_vehicle_says_what_was_meant(given, said, own):
+    with pytest.raises(CampaignError, match=said) as caught:
+        load_campaign(given)
+    assert given.partition(":")[0] in f"{caught.value}"
+
+
+ANOTHER_DRIVER = [
+    ("model: idm, parameters: {time_headway_s: 2}, reaction: {delay_s: 0.2}", "controller=my_av.py:MyAV", {}),
+    (
+        "model: idm, parameters: {time_headway_s: 2, max_acceleration_mps2: 1}",
+        "model=fvdm",
+        {"max_acceleration_mps2": 1},
+    ),
+    ("model: idm, parameters: {wrong: 2}", "model=fvdm", "unknown key 'wrong'"),
+    ("controller: 'a:B', parameters: {x: 1}, before_cut_in: controller", "model=constant", {}),
+    ("controller: 'a:B', parameters: {x: 1}", "controller=a:C", {"x": 1}),
+    ("fmu: {file: x.fmu}", "sumo.tau=2", {}),
+    ("sumo: {tau: 2}", "fmu.file=my.fmu", {}),
+]
+
+
+@pytest.mark.parametrize(("written", "option", "parameters"), ANOTHER_DRIVER)
+def test_one_override_changes_the_vehicle(written, option, parameters, own):
+    file = own / "campaigns" / "c.yaml"
+    file.write_text(f"name: c\nav: {{{written}, limits: {{step_time_s: 3}}}}\n")
+    if isinstance(parameters, str):
+        with pytest.raises(CampaignError, match=parameters):
+            load_campaign(file, [f"av.{option}"])
+        return
+    campaign = load_campaign(file, [f"av.{option}"])  # a file is looked for beside the campaign, then where one is
+    of_new = AutomatedVehicle.model_validate(
+        parse_av(option, own) | {"parameters": parameters, "limits": {"step_time_s": 3}}
+    )
+    assert campaign.av == of_new
+
+
+def parse_av(option, folder):
+    """The ``av`` section that an option alone makes."""
+    return load_campaign("mine.yaml", [f"av.{option}"]).av.model_dump(exclude_unset=True)
+
+
+def test_a_file_counts_as_the_module_that_it_is(own):
+    hashes = {load_campaign(each).content_hash("p") for each in ("my_av:MyAV", "my_av.py:MyAV")}
+    Path("moved").mkdir()
+    moved = Path("my_av.py").rename("moved/my_av.py")
+    assert {load_campaign(f"{moved}:MyAV").content_hash("p")} == hashes
 
 
 def test_an_fmu_lies_beside_the_panel(load, panel, tmp_path):
@@ -258,8 +355,8 @@ def test_a_mistake_in_a_panel_names_its_place(panel, entries, where, words):
 @pytest.mark.parametrize(
     ("av", "override", "said"),
     [
-        ("late-60ms", [], r"--av late-60ms: found no vehicle .* Did you mean 'late-600ms'"),
-        ("{}:idm", [], r"expected one of a; or PANEL"),
+        ("late-60ms", [], r"--av late-60ms: found no vehicle.*Did you mean 'late-600ms'"),
+        ("{}:idm", [], r"mine.yaml; expected one of a"),
         ("sumo-acc", ["world.engine=twin"], r"^--set world\.engine=twin"),
         ("sumo-acc", ["av.reaction.delay_s=0.1"], "sumo-acc"),
     ],
@@ -278,7 +375,7 @@ def test_the_commands_take_a_vehicle(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("harness.runner.compare.compare_campaigns", lambda a, b, *_, **__: seen.extend([a, b]) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["compare", str(file), "--out", str(tmp_path / "c"), "--av", "idm", "--against-av", "SM-II", "--quiet"])
-    assert [campaign.av for campaign in seen] == [AutomatedVehicle(), panel_av("SM-II")]
+    assert [campaign.av for campaign in seen] == [AutomatedVehicle(), load_panel().avs["SM-II"]]
     assert main(["run", str(file), "--out", str(tmp_path / "r"), "--av", "nobody"]) == 2
     assert capsys.readouterr().err.startswith("error: --av nobody\n")
 

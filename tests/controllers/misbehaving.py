@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from examples.idm import IDM
+from examples.idm import IDM, idm_acceleration
 
 THIRD_CALL = 3
 
@@ -138,6 +138,26 @@ class Always(IDM):
 
 def idm_of_a_function() -> IDM:
     return IDM()
+
+
+def only_a_function(seen, min_acceleration_mps2):
+    return idm_acceleration(seen.speed_mps, seen.lead_speed_mps, seen.gap_m, min_acceleration_mps2)
+
+
+class OnlyStep:
+    def step(self, seen):
+        return only_a_function(seen, -4.0)
+
+
+class OnlyStepBatch:
+    def step_batch(self, seen):
+        columns = zip(seen.speed_mps, seen.lead_speed_mps, seen.gap_m, strict=True)
+        return [idm_acceleration(*map(float, row)) for row in columns]
+
+
+class Misspelt(IDM):
+    def step(self, seen):
+        return seen.speed
 
 
 def says_nothing():

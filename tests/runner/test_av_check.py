@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 
 import pytest
@@ -52,6 +53,28 @@ class Remembering(Steady):
         return -0.01 * self.seen
 
 
+class Sharing(Steady):
+    """Brakes by how many there are."""
+
+    all_of_them = set()
+
+    def start(self, episode):
+        self.all_of_them.add(id(self))
+
+    def step(self, seen):
+        return -0.01 * len(self.all_of_them)
+
+    def close(self):
+        self.all_of_them.discard(id(self))
+
+
+class Misspelt(Steady):
+    def step(self, seen):
+        if seen.speed_mps > 30.0:
+            raise ValueError(f"too fast: {seen.speed_mps}")
+        return seen.gap
+
+
 def check(name, *overrides):
     controller = name if ":" in name else f"{__name__}:{name}"
     return check_av(load_campaign(MIXTURE_FILE, ["av={}", f"av.controller={controller}", *overrides]), 24)
@@ -66,16 +89,29 @@ def test_the_built_in_idm_is_fine():
 
 
 @pytest.mark.parametrize(
-    ("name", "differs"),
-    [("Steady", False), ("Noisy", False), ("tests.controllers.misbehaving:Global", True), ("Remembering", True)],
+    ("name", "cause"),
+    [
+        ("Steady", ""),
+        ("Noisy", ""),
+        ("tests.controllers.misbehaving:Global", "random numbers of its own"),
+        ("Remembering", "it remembers the last one"),
+        ("Sharing", "they share something"),
+    ],
 )
-def test_a_controller_that_is_not_reproduced_is_found_out(name, differs):
-    found = check(name)
+def test_a_controller_that_is_not_reproduced_is_found_out(name, cause):
+    found, differs = check(name), bool(cause)
+    assert cause in found.likely_cause
     assert (found.exit_code, bool(found.differing), bool(found.failures)) == (3 if differs else 0, differs, False)
     if name == "Steady":
         did = found.behaviour
         assert did.mean_acceleration_mps2 == did.min_acceleration_mps2 == did.max_acceleration_mps2 == -1.5
         assert (did.reaction_s, did.braking_share, did.share_at_min) == (0.0, 1.0, 0.0)
+
+
+def test_failures_that_differ_in_digits_are_one_and_name_line_and_what_was_meant():
+    fast, misspelt = sorted(check("Misspelt").failures, reverse=True)
+    assert re.fullmatch(r"step, warming up: ValueError: too fast: \d\d\.\d+ \(test_av_check\.py:\d+\)", fast)
+    assert re.search(r"no attribute 'gap'. Did you mean 'gap_m'\? \(test_av_check\.py:\d+\)$", misspelt)
 
 
 def test_a_controller_that_acts_early_is_checked_without_forcing():
@@ -86,7 +122,10 @@ def test_a_controller_that_acts_early_is_checked_without_forcing():
 def test_the_command_line(capfd):
     call = ["av-check", MIXTURE_FILE, "--episodes", "6"]
     assert main(call) == 0
-    assert "speed.idm_us_per_step" in capfd.readouterr().out
+    out = capfd.readouterr().out
+    assert re.search(r"built-in IDM +[│┃]\n", out)
+    (mean,) = re.findall(r"behaviour.mean_acceleration_mps2 +│ +(\S+) +│ +(\S+) +│", out)
+    assert mean[0] == mean[1]  # it is the built-in IDM
     assert main([*call, "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["deterministic"] is True
     assert main([*call, "--set", "av={}", "--set", "av.controller=not_there:X"]) == 2
