@@ -42,7 +42,6 @@ from studies.replication.populations import (
     SuperPopulation,
     preventable_by,
     ratio_to,
-    reference_drivers,
 )
 
 FREE = "shells"
@@ -398,12 +397,9 @@ class OvertakingShells:
         )
         design = design_shells(pool, limit)
         cells = cells_in_strata(pool, shells_in_strata(pool, limit))[0]
-        tested = np.flatnonzero(cells >= 0)
-        joined = np.zeros((tested.size, design.cell_p.size))
-        joined[np.arange(tested.size), cells[tested]] = 1.0
-        mass = drawn[:, tested] @ joined
-        failing = self.failing, self.failing_tests
-        return [DrawnPool(design, mass, each[rows][:, tested] @ joined, *failing) for each in self.crashing]
+        joined = np.eye(design.cell_p.size + 1)[cells, :-1]  # the last row is for what is not tested
+        mass, failing = drawn @ joined, (self.failing, self.failing_tests)
+        return [DrawnPool(design, mass, each[rows] @ joined, *failing) for each in self.crashing]
 
 
 class Division:
@@ -428,21 +424,19 @@ class Division:
         names = tuple(name for name in conservative_first if name in reduced.surrogates)
         self._population = population
         self._shell = shells_of(population.bits, np.array([bit[name] for name in names])).astype(np.int64)
-        references = list(reference_drivers(library).values())
-        crash_too = sum(
-            (population.crashes(driver).astype(np.int64) << r for r, driver in enumerate(references)),
-            start=np.zeros(population.bits.size, np.int64),
-        )
-        nobody = len(names) << len(references)
-        kinds, cell = np.unique(np.append((self._shell << len(references)) | crash_too, nobody), return_inverse=True)
+        n_references = len(library.references)
+        each_reference = (1 << n_references) - 1
+        crash_too = (population.bits >> len(library.surrogates)) & each_reference
+        nobody = len(names) << n_references
+        kinds, cell = np.unique(np.append((self._shell << n_references) | crash_too, nobody), return_inverse=True)
         self._cell, self._n_cells = cell[:-1], kinds.size
         mass = self.by_cell(population.mass)
         mass[:, cell[-1]] += np.maximum(population.cut_in - mass.sum(1), 0.0)
         left_out = tuple(name for name in conservative_first if name not in reduced.surrogates)
         unknown: Any = np.zeros(0)
         content: dict[str, Any] = dict.fromkeys(Pool.__dataclass_fields__, unknown) | {
-            "cell_shell": kinds >> len(references),
-            "cell_references": kinds & ((1 << len(references)) - 1),
+            "cell_shell": kinds >> n_references,
+            "cell_references": kinds & each_reference,
             "cell_p": mass.mean(0),
             "p_cut_in": float(mass.sum(1).mean()),
             "cut_ins": CutIns(
