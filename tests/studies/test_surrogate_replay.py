@@ -17,7 +17,6 @@ from harness.campaign.drivers import IDMParameters, Reaction
 from harness.campaign.sections import PoolSettings
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.loop import Shard
-from harness.errors import RunFolderError
 from harness.estimators.block import Block, block_from_tables
 from harness.importance.functions import mixture_weights
 from harness.pool.build import campaign_pool
@@ -110,27 +109,6 @@ def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, setti
     assert not found["raised"]
 
 
-def test_the_pool_knows_how_likely_a_cut_in_is_where_surrogates_crash(forced):
-    """Forced cut-ins weigh exactly that, so that their mean squares are known; four standard errors."""
-    one, table, pool = forced
-    block, crashes = replayed(one, table, pool)
-    h = crashes * block.weights()[:, None]
-    distance = h * h - pool.mu * pool.p_cut_in_at_crash
-    error = distance.std(axis=0) / np.sqrt(len(h))
-    assert np.all(distance.mean(axis=0) < 4.0 * error)  # told with three of the pool's errors on top
-    assert np.all(distance.mean(axis=0) > -4.0 * error - 0.4 * pool.mu * pool.p_cut_in_at_crash)
-
-
 @pytest.mark.parametrize("wrong", [0.7, 1.25])
 def test_weights_that_are_all_wrong_raise_the_alarm(forced, wrong):
     assert alarmed(*forced, wrong)["raised"]
-
-
-def test_maneuvers_that_do_not_fit_are_refused(forced):
-    one, table, pool = forced
-    paths = table.column("bv_maneuvers").to_pylist()
-    paths[7] = [m for m in paths[7] if m != 31]
-    at = table.column_names.index("bv_maneuvers")
-    damaged = table.set_column(at, table.schema.field(at), pa.array(paths, pa.list_(pa.int8())))
-    with pytest.raises(RunFolderError, match="episode 7"):
-        surrogates_crash(damaged, resolve(one), pool)

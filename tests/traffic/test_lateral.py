@@ -6,11 +6,9 @@ import math
 
 import numpy as np
 import pytest
-import yaml
 
 from harness.campaign.files import read_model
 from harness.campaign.sections import EnvironmentSettings
-from harness.errors import CampaignError
 from harness.pool.cut_ins import environment_hash
 from harness.traffic.lateral import (
     constant_lead,
@@ -19,7 +17,7 @@ from harness.traffic.lateral import (
     log_normal_speed,
     perceived_in,
 )
-from harness.traffic.loading import load_environment, load_parameters
+from harness.traffic.loading import load_environment
 from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from tests.kernels import alone
 
@@ -93,23 +91,3 @@ def test_what_says_nothing_of_leads_has_the_hash_of_before(settings, of_before):
     """Written down before cut-ins could take time; those of campaigns are in tests/campaign."""
     found = environment_hash(load_environment(EnvironmentSettings(**settings)))
     assert (found == "e5b943592be3f1b7d3db2db8") == of_before
-
-
-@pytest.mark.parametrize(
-    ("section", "found"),
-    [
-        ({"distance_m": 1.7}, "neither"),
-        ({"distance_m": 1.7, "lead_s": 1.0, "speed_median_mps": 0.7}, "lead_s, speed_median_mps"),
-        ({"distance_m": 1.7, "lead_s": 0.55}, "0.55"),
-        ({"distance_m": 0.0, "lead_s": 0.5}, "0"),
-    ],
-)
-def test_a_section_that_says_too_little_or_too_much_is_refused(section, found, tmp_path):
-    content = yaml.safe_load((SHIPPED_FOLDER / f"{PAPER}.yaml").read_text(encoding="utf-8"))
-    content["lateral"] = {name: {"value": value, "source": "user"} for name, value in section.items()}
-    file = tmp_path / "mine.yaml"
-    file.write_text(yaml.safe_dump(content), encoding="utf-8")
-    with pytest.raises(CampaignError) as error:
-        load_parameters(EnvironmentSettings(parameters=str(file)))
-    assert "lateral" in error.value.where
-    assert found in error.value.found

@@ -94,3 +94,19 @@ def test_the_level_of_lane_changing_is_part_of_the_laws(mine):
     rare = mine(changed(("cut_in", "intercept", "-440")))  # e^-440 is 1e-191
     assert refusal(rare) is None
     assert "a wish to change lanes" in refusal(rare.model_copy(update={"lane_change_level": 1e-10}))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "found"),
+    [
+        ({"distance_m": 1.7}, "neither"),
+        ({"distance_m": 1.7, "lead_s": 1.0, "speed_median_mps": 0.7}, "lead_s, speed_median_mps"),
+        ({"distance_m": 1.7, "lead_s": 0.55}, "0.55"),
+        ({"distance_m": 0.0, "lead_s": 0.5}, "found 0"),
+    ],
+)
+def test_a_lateral_section_that_says_too_little_or_too_much_is_refused(mine, numbers, found):
+    lines = [f"  {name}: {{value: {value}, source: user}}\n" for name, value in numbers.items()]
+    said = refusal(mine(TEXT + "lateral:\n" + "".join(lines)))
+    assert "lateral" in said
+    assert found in said
