@@ -132,16 +132,16 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
 
 
 def gains_of_parts(
-    blocks: Iterator[Block], sizes: Sequence[int], n: int, most: int, confidence: float
+    blocks: Iterator[Block], sizes: Sequence[int], n: int, parts: int, confidence: float
 ) -> dict[int, dict[str, Any]]:
-    """NADE's variance over SCV's by size, between the estimates of several parts of the same run, three at least."""
-    found = {size: list[tuple[float, float]]() for size in sizes if n >= 3 * size}
+    """NADE's variance over SCV's by size, between the estimates of as many parts of the same run, if it has them."""
+    found = {size: list[tuple[float, float]]() for size in sizes if n >= parts * size}
     states = {size: Claims() for size in found}
-    ends = sorted({k * size for size in found for k in range(1, 1 + min(most, n // size))})
+    ends = sorted({k * size for size in found for k in range(1, 1 + parts)})
     for block in cut_at(blocks, ends) if ends else ():
         stop = block.first_episode + len(block)
         for size, rates in found.items():
-            if len(rates) < most:
+            if len(rates) < parts:
                 states[size].add(block)
                 if stop % size == 0:
                     rates.append(states[size].rates())

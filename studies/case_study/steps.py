@@ -91,7 +91,8 @@ def step_keys(study: Study) -> dict[str, str]:
         if step.kind in ("twin_tests", "run"):  # long ones, whose records follow from these sources alone
             code = source_hash(WORLD_SOURCES), sources_of("case_study/tested.py", "rnot.py")
         else:
-            code = source_hash((*WORLD_SOURCES, "estimators/*.py")), sources_of("*.py", "*/*.py")
+            made_by = "*.py", "chains/*.py", "replication/*.py", "case_study/[!p]*.py"  # not page.py and plots.py
+            code = source_hash((*WORLD_SOURCES, "estimators/*.py")), sources_of(*made_by)
         content = {
             "step": step.model_dump(mode="json", exclude=set(FILES)),
             "file": _content(step),

@@ -56,7 +56,9 @@ class ControlVariates(Section):
     spread_tests: Whole | None = Field(
         200_000, ge=10, description="first tests whose results are shown one by one; null to leave strata out"
     )
-    parts: Whole = Field(10, ge=3, le=1_000, description="most parts of a size, for the gain by replication")
+    parts: Whole = Field(
+        10, ge=3, le=1_000, description="of each size that the run has so many of, for the gain by replication"
+    )
 
 
 class RequiredNumbers(Section):
