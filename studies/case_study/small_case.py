@@ -221,6 +221,8 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     world = _world(step.lane_change_level)
     nearest: dict[str, Any] = {}
     figures = {"nde": exactly(tests_for(1.0 / world.crash_rate - 1.0, step.rhw, context.confidence))}
+    gains = [marked(row["gain_known"], settled=is_settled(row["nade_claimed"])) for row in rows]
+    figures["gain_known"] = range_of(sorted(filter(is_settled, gains), key=lambda gain: -(gain["value"] or 0.0)))
     for name, wanted in step.reported.items():  # NADE's exact numbers, or what SCV claims: the nearest first
         found = [exactly(row["nade_exact"]) if name == "nade" else row["scv_claimed"] for row in rows]
         known = [(one, row) for one, row in zip(found, rows, strict=True) if one["value"] and is_settled(one)]
