@@ -36,6 +36,7 @@ from studies.case_study.study import Convergence, Line, Made, Study, Variants
 
 _COLOURS = {"low": GREY, "nade": BLUE, "scv": VERMILLION, "nde": INK, "": GREEN}
 """Of a method in all plots, by what its step or label contains."""
+_HOLLOW: dict[str, Any] = {"markerfacecolor": "none", "markersize": 7, "linewidth": 0.9}
 _DASHED: dict[str, Any] = {"color": MUTED, "linewidth": 0.9, "linestyle": (0, (4, 3))}
 
 
@@ -63,9 +64,11 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
     figure = new_figure(FULL_WIDTH_IN, 3.6)
     axes = figure.subplots()
     axes.set_yscale("log")
+    for line in ("NDE", "NADE", "SCV claims"):
+        at = [place for place, label in enumerate(ours) if label.partition("\n")[0] == line]
+        axes.plot(at, [picture[list(ours)[place]].paper or np.nan for place in at], ":D", color=INK, **_HOLLOW)
+        axes.plot(at, [found["value"] or np.nan for found in (list(ours.values())[place] for place in at)], color=BLUE)
     for place, (label, found) in enumerate(ours.items()):
-        if (paper := picture[label].paper) is not None:
-            axes.plot(place, paper, "D", markerfacecolor="none", color=INK, markersize=8)
         if (value := found["value"] or found["low"]) is None:
             continue
         colour = GREY if not is_settled(found) else next(c for name, c in _COLOURS.items() if name in label.lower())
@@ -82,7 +85,8 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
     axes.set_ylabel(f"tests for a relative half-width of {rhw:g}")
     caption = (
         "Filled: here, with intervals (triangles: lower limits; grey, †: not converged). NADE's are by the spread of "
-        "repeated campaigns around the known rate, the others by what their intervals say. Hollow: the paper's."
+        "repeated campaigns around the known rate, the others by what their intervals say. Hollow: the paper's, whose "
+        "share ε is not published."
     )
     return Plot("tests", figure, "Number of tests by method, on a logarithmic axis. " + caption, caption)
 
@@ -152,16 +156,17 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
         head(axes, title)
         only_horizontal_grid(axes)
     caption = (
-        "Left: tests, control variates and rank of the columns. Right: spread of Y (NADE), of Z = Y − Hβ (SCV), and of "
-        "Z with degrees of freedom."
+        "Left: tests, control variates and rank of the columns. Right: spread of Y (NADE) and of Z = Y − Hβ (SCV)."
     )
     return Plot(name, figure, "By number of control steps. " + caption, caption)
 
 
+LEAST_GAIN = 0.1
+"""Least gain that is drawn; worse ones are on the axis."""
 _GAINS = (
     ("claimed", "claimed", _COLOURS["scv"]),
-    ("degrees_of_freedom", "with degrees of freedom", INK),
-    ("leave_one_out", "by leave-one-out", GREEN),
+    ("degrees_of_freedom", "degrees of freedom", INK),
+    ("leave_one_out", "leave-one-out", GREEN),
 )
 
 
@@ -176,9 +181,11 @@ def growth_plot(name: str, looks: list[dict[str, Any]], rhw: float) -> Plot | No
         style: dict[str, Any] = {"color": _COLOURS[key], "linewidth": 4.0 if key == "nade" else 1.4, "markersize": 3}
         left.plot(n, [row[f"{key}_rhw"] for row in known], "o-", label=label, **style)
     for key, label, colour in _GAINS:
-        right.plot(n, [row[f"gain_{key}"] or np.nan for row in known], "o-", color=colour, markersize=3, label=label)
+        gains = [max(row[f"gain_{key}"] or np.nan, LEAST_GAIN) for row in known]
+        right.plot(n, gains, "o-", color=colour, markersize=3, label=label)
     again = [row["gain_replicated"]["value"] or np.nan for row in known]
-    right.plot(n, again, "D", color=BLUE, markersize=5, markerfacecolor="none", label="by replication")
+    right.plot(n, again, "D", color=BLUE, markersize=5, markerfacecolor="none", label="replication")
+    right.set_ylim(bottom=max(right.get_ylim()[0], LEAST_GAIN))
     left.axhline(rhw, **_DASHED)
     right.axhline(1.0, **_DASHED)
     for axes, title in ((left, "relative half-width"), (right, "NADE's variance over SCV's")):
