@@ -325,9 +325,6 @@ def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, A
         found["nade_beside_scv"] = _required(made, fewer, context, step.scv_tests)
         found["scv"] = _required(made, fewer, context, step.scv_tests, scv=True)
         pairs["nade_over_scv"] = "nade_beside_scv", "scv"
-    for name, each in found.items():
-        columns = {"shuffle": np.arange(len(each.rnot.n)), "tests": each.rnot.n}
-        write_table(context.folder / f"{name}.parquet", pa.table({**columns, "never_reached": each.rnot.never_reached}))
     figures = {name: each.figure(context.confidence) for name, each in found.items()}
     ratios = {name: found[a].over(found[b], context.confidence) for name, (a, b) in pairs.items()}
     return {

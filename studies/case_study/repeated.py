@@ -8,7 +8,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from scipy.stats import ttest_1samp
 
 from harness.campaign.campaign import Campaign
@@ -36,7 +35,6 @@ from studies.case_study.study import Context, Variants
 from studies.case_study.tested import AT_ONCE, IN_THE_TWIN, figures_of_shells
 from studies.replication.weighted import prepared_twin, twin_episodes
 from studies.rnot import Procedure, Tests, over_shuffles
-from studies.work import write_table
 
 
 def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
@@ -72,7 +70,6 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
         done = run_campaign(campaign, folder, workers=context.workers, resume=True, progress=context.progress)
         found = figures_of_shells(done, context.rhw)
         row |= {"shells_rate": found["crash_rate"], "shells_tests": found["tests_for_rhw"]}
-    write_table(context.folder / "variants.parquet", pa.Table.from_pylist(rows))
     figures = {row["variant"]: row["gain_claimed"] for row in rows}
     mean = mean_of((gain["value"] for gain in figures.values()), context.confidence)
     figures |= {f"{key}, {row['variant']}": row[key] for row in rows for key in SHOWN}

@@ -19,7 +19,6 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
 
 from harness.campaign.drivers import default_surrogates
 from harness.campaign.sections import EnvironmentSettings
@@ -44,7 +43,6 @@ from harness.vocabulary import (
 from studies.case_study.counted import Claims, KnownMeans
 from studies.case_study.figures import covered, exactly, is_settled, marked, mean_of, range_of, tests_for
 from studies.case_study.study import Context, SmallCase
-from studies.work import write_table
 
 LV_MPS, BV_MPS, AV_MPS = 3.0, 8.0, 13.0
 R1_M, R2_M = (30.0, 32.0), 5.0
@@ -217,7 +215,6 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     """Exact rate and variances, and what drawn tests claim, for every challenge, threshold and epsilon."""
     settings = list(enumerate(product((False, True), step.thresholds, step.epsilons)))
     rows = context.by_workers(settings, partial(claims_of_setting, step, context.confidence))
-    write_table(context.folder / "settings.parquet", pa.Table.from_pylist(rows))
     world = _world(step.lane_change_level)
     nearest: dict[str, Any] = {}
     figures = {"nde": exactly(tests_for(1.0 / world.crash_rate - 1.0, step.rhw, context.confidence))}

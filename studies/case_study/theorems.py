@@ -12,7 +12,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from harness.estimators.scv import MixtureCv, Scv
 from harness.vocabulary import FloatArray
@@ -20,7 +19,6 @@ from studies.case_study.figures import exactly
 from studies.case_study.study import Context, Theorems
 from studies.chains.chain import DECISIVE, Chain, Episodes, enumerate_episodes, overtaking
 from studies.chains.sampler import with_optimal_function
-from studies.work import write_table
 
 
 def small_chains() -> list[Chain]:
@@ -48,10 +46,8 @@ def check_theorems(step: Theorems, context: Context) -> dict[str, Any]:
         estimated.append(found.crash_rate / world.crash_rate)
         claimed.append(found.std_error / world.crash_rate)
         context.progress.advance(1)
-    write_table(context.folder / "theorem_3.parquet", pa.table({"known": known, "estimated": estimated}))
     return {
         "chains": chains,
-        "draws": {"estimated": estimated},
         "figures": {
             "largest_bias": exactly(max(abs(mean - 1.0) for chain in chains for mean in chain["means"].values())),
             "variance_over_bound": exactly(max(chain["best"] / chain["bound"] for chain in chains)),
