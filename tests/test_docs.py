@@ -105,12 +105,6 @@ def test_links_and_named_files_lead_somewhere():
     assert missing == []
 
 
-def test_the_index_names_every_page():
-    linked = set(_LINK.findall((ROOT / "docs/index.md").read_text(encoding="utf-8")))
-    pages = {page.relative_to(ROOT / "docs").as_posix() for page in PAGES if ROOT / "docs" in page.parents}
-    assert pages - {"index.md"} <= linked
-
-
 def test_python_lines_run(tmp_path, monkeypatch, capsys):
     """README first, then the other pages, in one folder: later lines use the runs of earlier ones."""
     monkeypatch.chdir(tmp_path)
@@ -126,13 +120,6 @@ def test_python_lines_run(tmp_path, monkeypatch, capsys):
 def test_generated_parts_are_current():
     stale = [page for page in generate.pages() if generate.regenerate(text := page.read_text("utf-8")) != text]
     assert stale == [], "run: python docs/generate.py"
-
-
-def test_every_long_run_is_in_the_table():
-    shown = {name for names in generate.RESULTS.values() for name in names}
-    shown |= {file for name in generate.VARIED for file in generate.varied_files(name)}
-    shown |= {*generate.VALIDATED, *generate.METHODS, "limits", "gate", "shells_bounds"}
-    assert {path.stem for path in (ROOT / "docs/validation").glob("*.json")} <= shown
 
 
 def test_the_lock_pins_what_the_project_depends_on():

@@ -76,16 +76,6 @@ def test_the_grid_rises_to_the_total():
     assert Procedure(first=10).grid(4).tolist() == [4]
 
 
-@pytest.mark.parametrize("weight", [1.0, 0.3, 1e-200])
-def test_equal_weighted_crashes_have_no_width_at_all(weight):
-    """Y constant: RHW is exactly 0 everywhere, nothing is above, and the first of equals is the largest."""
-    rhw = plain_rhw(np.full(1_000, weight), 1_000, QUICK)
-    assert (rhw == 0.0).all()
-    found = required_tests(rhw, QUICK.grid(1_000), 0.3)
-    assert found.never_above.all()
-    assert found.mean == QUICK.first
-
-
 @pytest.mark.parametrize("p", [0.05, 0.2])
 def test_bernoulli_crashes_need_what_the_formula_says(p):
     """RHW of a share is z·sqrt((1-p)/(p·n)), so that 0.1 takes z²(1-p)/(p·0.1²) tests.
