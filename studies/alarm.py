@@ -81,12 +81,9 @@ def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, follo
     room = empty_trajectory(environment)
     wrong = replay_surrogates(unboxed(stored), unboxed(environment), unboxed(followers), unboxed(room), bits)
     if wrong >= 0:
-        raise RunFolderError(
-            f"episodes, episode {stored.episode[wrong]}",
-            f"maneuvers that do not lead to a cut-in in step {stored.cut_step[wrong]}",
-            "the maneuvers that were driven: they determine the episode",
-            MEND_SHARD,
-        )
+        at, step = f"episodes, episode {stored.episode[wrong]}", stored.cut_step[wrong]
+        expected = "the maneuvers that were driven: they determine the episode"
+        raise RunFolderError(at, f"maneuvers that do not lead to a cut-in in step {step}", expected, MEND_SHARD)
     found: BoolArray = ((bits[:, None] >> np.arange(followers.drivers.size)) & 1).astype(np.bool_)
     return found
 
@@ -206,14 +203,14 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
     progress, manifest = progress or Progress(), read_manifest(folder)
     resolved = resolve(load_campaign(folder / "campaign.yaml", check_files=False))
     campaign = resolved.campaign
-    if (drawn := campaign.testing.method == "shells") or campaign.av.acts_before_cut_in:
-        raise HarnessError(
-            str(folder),
-            "tests drawn from shells" if drawn else "an AV that acted before the cut-in",
-            "weighted tests of an AV that keeps its speed until the cut-in: "
-            + ("shells have used the surrogates' outcomes" if drawn else "where it was when BV cut in depends on it"),
-            "Choose another run; that SUMO and the twin agree is checked in each by retracing.",
+    shells = campaign.testing.method == "shells"
+    if shells or campaign.av.acts_before_cut_in:
+        found = "tests drawn from shells" if shells else "an AV that acted before the cut-in"
+        expected = (
+            "weighted tests of an AV that keeps its speed until the cut-in: then pools know the surrogates' rates"
         )
+        mend = "Choose another run; that SUMO and the twin agree is checked in each by retracing."
+        raise HarnessError(str(folder), found, expected, mend)
     pool = campaign_pool(resolved, progress)
     alarm, alpha = Alarm(KnownRates.of(pool)), mixture_weights(campaign)
     lead = [LEAD] if resolved.environment.lateral.present else []
