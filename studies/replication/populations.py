@@ -111,12 +111,9 @@ class Drivers:
             parameters += [cast(BuiltInParameters, av.parameters)] * len(shares)
             reactions += reflexes
         if len(parameters) > MOST_DRIVERS:
-            raise CampaignError(
-                "avs",
-                f"{len(parameters)} drivers with the library's {len(models)}",
-                f"at most {MOST_DRIVERS}",
-                "Divide the experiment; an inattentive vehicle counts as two.",
-            )
+            found = f"{len(parameters)} drivers with the library's {len(models)}"
+            mend = "Divide the experiment; an inattentive vehicle counts as two."
+            raise CampaignError("avs", found, f"at most {MOST_DRIVERS}", mend)
         enclosed = all(acceleration_limit(av) <= library.envelope_mps2 for av in avs.values())
         envelope = list(library.surrogates).index(library.envelope) if enclosed else NO_ENVELOPE
         records = driver_records(parameters, reactions, see_onset=see_onset)
@@ -140,12 +137,10 @@ def reference_drivers(library: Library) -> dict[str, int]:
 
 def _reactions(av: AutomatedVehicle) -> list[tuple[Reflexes, float]]:
     """The reflexes that a vehicle can have in an episode, and how probable each is."""
-    own = av.reaction
+    own, late = av.reaction, av.reaction.inattention_probability * (av.reaction.inattention_delay_s > 0.0)
     reflexes = Reflexes(**own.model_dump(include=set(Reflexes.model_fields)))
-    if own.inattention_probability == 0.0 or own.inattention_delay_s == 0.0:
-        return [(reflexes, 1.0)]
-    late = reflexes.model_copy(update={"delay_s": own.delay_s + own.inattention_delay_s})
-    return [(reflexes, 1.0 - own.inattention_probability), (late, own.inattention_probability)]
+    delayed = reflexes.model_copy(update={"delay_s": own.delay_s + own.inattention_delay_s})
+    return [(reflexes, 1.0 - late), (delayed, late)][: 1 + (late > 0.0)]
 
 
 def enumerate_paths(
@@ -292,17 +287,12 @@ def walk_paths(campaign: Campaign, paths: BaselinePaths, executor: Executor, pro
 
     Raises `HarnessError`: the vehicle failed, or did something else in a test than in its shadow run.
     """
-    firsts = range(0, len(paths), WALKED_CHUNK)
-    parts = (
-        replace(paths, **{name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in _BY_PATH})
-        for first in firsts
-    )
-    jobs = list(zip(firsts, parts, strict=True))
-    name, walk = "walked paths", partial(_walk, campaign.model_dump_json())
-    return joined(results_of(name, jobs, walk, progress, run=executor.map, size=lambda job: len(job[1])))
-
-
-_BY_PATH = ("index", "state", "weight")
+    jobs = []
+    for first in range(0, len(paths), WALKED_CHUNK):
+        part = {name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in ("index", "state", "weight")}
+        jobs.append((first, replace(paths, **part)))
+    walk = partial(_walk, campaign.model_dump_json())
+    return joined(results_of("walked paths", jobs, walk, progress, run=executor.map, size=lambda job: len(job[1])))
 
 
 def _walk(campaign_json: str, job: tuple[int, BaselinePaths]) -> SuperPopulation:
@@ -325,12 +315,10 @@ def _walk(campaign_json: str, job: tuple[int, BaselinePaths]) -> SuperPopulation
     traffic = PrescribedTraffic(lv, bv, step, nowhere, weightless, first + row, motion, lead)
     tests = loop.run(0, paths.state[row], traffic)
     if n_failed := int(runs.failed.sum()) + len(tests.failures):
-        raise HarnessError(
-            f"avs: {campaign.av.controller or campaign.av.fmu}",
-            f"{n_failed:,} of {len(paths):,} shadow runs and {row.size:,} tests failed",
-            "none: what a vehicle would have done is not known, and so neither is its crash rate",
-            "Mend the vehicle (`harness av-check` looks at it in seconds), or leave it out of the experiment.",
-        )
+        found = f"{n_failed:,} of {len(paths):,} shadow runs and {row.size:,} tests failed"
+        expected = "none: what a vehicle would have done is not known, and so neither is its crash rate"
+        mend = "Mend the vehicle (`harness av-check` looks at it in seconds), or leave it out of the experiment."
+        raise HarnessError(f"avs: {campaign.av.controller or campaign.av.fmu}", found, expected, mend)
     crashes = tests.results.episode["outcome"] == CRASH
     of_cut_ins = bits[row, step] | (crashes.astype(np.int64) << library.n_drivers)  # the vehicle comes after these
     somebody = of_cut_ins != 0
