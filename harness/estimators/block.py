@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -112,19 +111,6 @@ class Block:
     columns: Mapping[str, Column]
     drawn: Drawn
 
-    def __post_init__(self) -> None:
-        n = len(self.outcome)
-        wide = {
-            "log_q": (n, len(self.drawn.alpha)),
-            "first_ratios": (n, MAX_CONTROL_STEPS, None),
-            "cell_mass": (n, None),
-        }
-        for name, array in {**self.columns, "outcome": self.outcome, "log_weight": self.log_weight}.items():
-            if not _fits(array.shape, expected := wide.get(name, (n,))):
-                raise ValueError(f"Block.{name} has shape {array.shape}, expected {expected}")
-        if np.isnan(self.log_weight).any():
-            raise ValueError("Block.log_weight has NaN entries")
-
     def __len__(self) -> int:
         return len(self.outcome)
 
@@ -175,7 +161,7 @@ class Block:
 
     def ending(self, rows: BoolArray, outcome: int) -> Block:
         """The same episodes, had some of them ended otherwise, each with the weight that it has on record."""
-        return _unchecked(self, outcome=np.where(rows, np.int8(outcome), self.outcome)) if rows.any() else self
+        return replace(self, outcome=np.where(rows, np.int8(outcome), self.outcome)) if rows.any() else self
 
     def failed_as_crashes(self) -> Block:
         """The same episodes had every failed one crashed, each with the weight that it has on record.
@@ -196,7 +182,7 @@ class Block:
         """Block of any rows, numbered anew."""
         columns = {name: column[rows] for name, column in self.columns.items()}
         outcome, log_weight = self.outcome[rows], self.log_weight[rows]
-        return _unchecked(self, first_episode=first_episode, outcome=outcome, log_weight=log_weight, columns=columns)
+        return replace(self, first_episode=first_episode, outcome=outcome, log_weight=log_weight, columns=columns)
 
 
 def joined(blocks: Sequence[Block]) -> Block:
@@ -204,19 +190,8 @@ def joined(blocks: Sequence[Block]) -> Block:
     if len(blocks) == 1:
         return blocks[0]
     columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
-    fields = {name: np.concatenate([vars(block)[name] for block in blocks]) for name in ("outcome", "log_weight")}
-    return _unchecked(blocks[0], columns=columns, **fields)
-
-
-def _unchecked(block: Block, **fields: Any) -> Block:
-    """The block with other content; checking it again takes longer than all the rest."""
-    other = copy(block)
-    vars(other).update(fields)
-    return other
-
-
-def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(expected) and all(n in (size, None) for size, n in zip(shape, expected, strict=True))
+    outcome, log_weight = (np.concatenate([vars(each)[name] for each in blocks]) for name in ("outcome", "log_weight"))
+    return replace(blocks[0], outcome=outcome, log_weight=log_weight, columns=columns)
 
 
 def block_from_tables(

@@ -4,4 +4,8 @@ Built once per environment and surrogate library, in the twin: initial states, p
 probabilities, and the outcome of every surrogate on each. A shell is the set of cut-ins on which one surrogate is the
 most conservative to crash; its probability is known, so that crashes of the AV counted within shells add up to its
 rate.
+
+What a shell is says `shells`: `shells_of` and `cells_of`, and `shells_in_strata` for the strata made of them. A change
+goes through `build.pool_of` as well, which asks for it, `cut_ins.Pool`, which keeps it, and `harness.strata`, which
+tells estimators and allocation what strata there are: these know nothing else of a shell.
 """

@@ -99,11 +99,3 @@ def test_take_keeps_indices_right():
     some = block([True, False, True], first_episode=40, first_ratios=np.ones((3, 9, 2)))
     part = some.take(slice(1, 3))
     assert (part.first_episode, part.crash.tolist(), part.first_ratios.shape) == (41, [False, True], (2, 9, 2))
-
-
-@pytest.mark.parametrize(
-    ("change", "text"), [({"log_q": np.zeros((2, 5))}, "log_q has shape"), ({"log_weight": [0.0, np.nan]}, "NaN")]
-)
-def test_contradictions_are_refused(change, text):
-    with pytest.raises(ValueError, match=text):
-        block([True, False], **change)
