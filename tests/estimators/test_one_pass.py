@@ -94,15 +94,6 @@ def test_convergence_points_are_thinned_but_end_at_the_end():
     assert len(numbers) < 300
 
 
-@pytest.mark.parametrize(
-    ("kept", "text"), [([0, 2], "expected a block from episode 10 on, got one from 20"), ([], "at least one episode")]
-)
-def test_a_gap_is_refused(kept, text):
-    parts = list(blocks(SHORT, "nde", [10] * 3, SEED))
-    with pytest.raises(ValueError, match=text):
-        one_pass([parts[k] for k in kept])
-
-
 def diagnosed(*parts, names=()) -> dict:
     return fed(Diagnostics(), parts).result(names)
 
