@@ -224,10 +224,9 @@ def struck_command(name: str, folder: Path, run: Path, chance: random.Random, ki
 
 
 def differing_files(a: Path, b: Path, ignored: Collection[str]) -> list[str]:
-    """Files of two folders that differ; unfinished files are of killed writers."""
+    """Files of two folders that differ."""
     names = {path.relative_to(side) for side in (a, b) for path in side.rglob("*") if path.is_file()}
-    compared = [name for name in names if name.name not in ignored and name.suffix != ".part"]
-    return sorted(str(name) for name in compared if _bytes(a / name) != _bytes(b / name))
+    return sorted(str(name) for name in names if name.name not in ignored and _bytes(a / name) != _bytes(b / name))
 
 
 def unlike(a: Path, b: Path) -> list[str]:

@@ -43,7 +43,7 @@ def without_page() -> Iterator[None]:
 class WorkerInThisProcess:
     """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
 
-    def __init__(self, server: ForkServer, resolved: Path, baseline: Path) -> None:
+    def __init__(self, server: ForkServer, serve: Callable[..., None], resolved: Path, baseline: Path) -> None:
         self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), baseline)
 
     def give(self, spec: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:

@@ -35,7 +35,6 @@ from harness.processes import (
     OF_EPISODE,
     Apart,
     Call,
-    ForkServer,
     SharedFile,
     WorkerDeath,
     first_to_answer,
@@ -233,9 +232,6 @@ class WorkerLostError(HarnessError):
 class WorkerProcess(Apart):
     """A process that runs one shard after another: what any worker is, also one on another machine."""
 
-    def __init__(self, server: ForkServer, resolved: Path, baseline: Path) -> None:
-        super().__init__(server, serve, resolved, baseline)
-
     def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
         """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
         try:
@@ -399,7 +395,7 @@ class LocalWorkers(Workers):
 
     def new_worker(self) -> WorkerProcess:
         """See `Workers.new_worker`."""
-        return WorkerProcess(self._server, self._resolved.path, self._baseline.path)
+        return WorkerProcess(self._server, serve, self._resolved.path, self._baseline.path)
 
     def follow_from(self, baseline: bytes) -> None:
         """See `Workers.follow_from`."""

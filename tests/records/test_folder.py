@@ -62,13 +62,17 @@ def test_a_write_that_fails_leaves_nothing_but_the_old_file(tmp_path):
 
 
 def test_what_a_killed_writer_has_left_goes_with_the_next_write(tmp_path):
-    left, in_use, foreign = (tmp_path / f".{name}.part" for name in ("harness-a", "harness-b", "download"))
+    names = "harness-a", "harness-b", "harness-c", "harness-d", "download"
+    left, empty, new, in_use, foreign = (tmp_path / f".{name}.part" for name in names)
     for path in (left, in_use, foreign):
         path.write_text("half of it")
+    empty.touch()
+    new.touch()
+    os.utime(empty, (0, 0))
     with in_use.open() as writer:
         fcntl.flock(writer, fcntl.LOCK_EX)
         write_json(tmp_path / "file.json", {})
-    assert files_below(tmp_path) == {"file.json", in_use.name, foreign.name}
+    assert files_below(tmp_path) == {"file.json", new.name, in_use.name, foreign.name}
 
 
 def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, tables):
