@@ -99,15 +99,14 @@ def test_entry_points_are_found_by_name(folder, tmp_path, monkeypatch):
 def test_the_first_vehicle_of_a_new_user_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(sys.modules, "my_av", raising=False)  # the page's, where it has been imported here
-    blocks = re.findall(
+    ((name, text),) = re.findall(
         r"^```(?:py|yaml)\n# (\S+)\n(.*?)^```$", (ROOT / page).read_text("utf-8"), re.MULTILINE | re.DOTALL
     )
-    assert [name for name, _ in blocks] == ["my_av.py", "my.yaml"]
-    for name, text in blocks:
-        Path(name).write_text(text, encoding="utf-8")
+    Path(name).write_text(text, encoding="utf-8")
     short = [f"--set={setting}" for setting in ("stop.rhw=0.5", *SMALL_POOL)]
-    code = main(["run", "my.yaml", "--out", "runs/mine", "--workers", "1", "--quiet", *short])
+    (command,) = re.findall(r"^harness (run my_av.py:\w+)  ", (ROOT / page).read_text("utf-8"), re.MULTILINE)
+    code = main([*command.split(), "--workers", "1", "--quiet", *short])
     sys.modules.pop("my_av", None)
     assert code == 0
-    statement = json.loads(Path("runs/mine/estimates.json").read_text("utf-8"))["statement"]
+    statement = json.loads(Path("runs/my_av-MyAV/estimates.json").read_text("utf-8"))["statement"]
     assert "times as often as a careful and competent driver" in statement
