@@ -53,7 +53,7 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
     Raises `HarnessError`: SUMO's system libraries are missing.
     """
     require_world(campaign)
-    controller_sha256 = require_controller(campaign)
+    controller_sha256 = require_controller(campaign.av)
     if campaign.av.sumo is not None:
         av_type(campaign.av.sumo)
     if campaign.av.traci is not None:

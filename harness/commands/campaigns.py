@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -20,13 +21,22 @@ from harness.commands.options import (
     executor_option,
     json_option,
     junit_option,
-    loaded,
     quiet_option,
     set_option,
     workers_option,
 )
 from harness.commands.printing import in_folder, print_json, print_plan, print_statements, print_table, say
 from harness.numbers import leaves, words
+
+if TYPE_CHECKING:
+    from harness.campaign.campaign import Campaign
+
+
+def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None) -> Campaign:
+    """Read the campaign, or that of the vehicle, that a command was given, with what was replaced beside it."""
+    from harness.campaign.files import load_campaign  # noqa: PLC0415 - keeps --help fast
+
+    return load_campaign(campaign_file, overrides, av=av)
 
 
 @click.command(

@@ -1,17 +1,14 @@
-"""What several commands share: kinds of paths, options, and how a campaign is read."""
+"""What several commands share: kinds of paths, and options."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from harness.errors import HarnessError
-
-if TYPE_CHECKING:
-    from harness.campaign.campaign import Campaign
 
 
 class FolderPath(click.Path):
@@ -94,10 +91,3 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON o
 def examples(*lines: str, heading: str = "Examples:") -> str:
     """Lay out lines below a help text, kept as they are (the backspace is click's mark for that)."""
     return f"\b\n{heading}\n" + "\n".join(f"  {line}" for line in lines)
-
-
-def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None) -> Campaign:
-    """Read the campaign, or that of the vehicle, that a command was given, with what was replaced beside it."""
-    from harness.campaign.files import load_campaign  # noqa: PLC0415 - keeps --help fast
-
-    return load_campaign(campaign_file, overrides, av=av)

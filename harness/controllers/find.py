@@ -17,7 +17,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar, get_type_hints
 
-from harness.campaign.campaign import Campaign
 from harness.campaign.problems import did_you_mean
 from harness.campaign.vehicle import CONTROLLERS, AutomatedVehicle
 from harness.controllers.hosts import (
@@ -215,9 +214,9 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     return controller
 
 
-def has_foreign_code(campaign: Campaign) -> bool:
+def has_foreign_code(av: AutomatedVehicle) -> bool:
     """Whether the AV is code of the user's that runs inside of the harness's own processes."""
-    return campaign.av.source in ("controller", "fmu")
+    return av.source in ("controller", "fmu")
 
 
 def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
@@ -245,22 +244,21 @@ def _work_and_tell(
     tell(connection, partial(work, *arguments, black_box=black_box))
 
 
-def require_controller(campaign: Campaign) -> str | None:
-    """Find and make the AV's controller once, before anything is written, in a process of its own.
+def require_controller(av: AutomatedVehicle) -> str | None:
+    """Find and make an AV's controller once, before anything is written, in a process of its own.
 
     Returns the SHA-256 of the source file of its class; None for an AV without one, or without a source. Raises a
     `CampaignError` if it cannot be found or made, or is of neither kind.
     """
-    if not has_foreign_code(campaign):
+    if not has_foreign_code(av):
         return None
     try:
-        return run_apart(campaign.av, _source_of_made, campaign)
+        return run_apart(av, _source_of_made, av)
     except AvEndedProcessError as error:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
 
 
-def _source_of_made(campaign: Campaign, *, black_box: Path | None = None) -> str | None:
-    av = campaign.av
+def _source_of_made(av: AutomatedVehicle, *, black_box: Path | None = None) -> str | None:
     host = build_host(av, n_cells=1, seed=0, black_box=black_box)
     if host is not None:
         host.close()

@@ -143,7 +143,7 @@ def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
 
     If that ends the process, the `AvEndedProcessError` names its last call.
     """
-    if not has_foreign_code(campaign):
+    if not has_foreign_code(campaign.av):
         return check_av(campaign, n_episodes)
     return run_apart(campaign.av, check_av, campaign, n_episodes)
 

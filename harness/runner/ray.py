@@ -83,7 +83,7 @@ class OnMachine:
         """Fill the cache, and say what there is."""
         try:
             _fill_cache(cached)
-            return this_machine(self._resolved, require_controller(self._resolved.campaign))
+            return this_machine(self._resolved, require_controller(self._resolved.campaign.av))
         except Exception as error:  # noqa: BLE001 - see the class
             return fit_to_travel(error)
 

@@ -160,7 +160,7 @@ def replay_episode(
         require_libraries()
     else:
         require_world(campaign)
-    replay = partial(run_apart, campaign.av, _replay) if has_foreign_code(campaign) else _replay
+    replay = partial(run_apart, campaign.av, _replay) if has_foreign_code(campaign.av) else _replay
     again = replay(resolved, folder, episode, stored["episodes"], gui, fcd)
     compared = tuple(name for name in again if name in stored and stored[name].num_rows)
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
@@ -201,7 +201,7 @@ def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
     there = {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
     other = [f"{name} {there[name]} (here {here.get(name)})" for name in there if there[name] != here.get(name)]
     found = [f"The run was made with {', '.join(other)}; bits are promised for equal ones."] if other else []
-    if manifest.get("controller_sha256") != require_controller(campaign):
+    if manifest.get("controller_sha256") != require_controller(campaign.av):
         found.append("The controller's source file has been changed since the run.")
     elif campaign.av.model is None:
         same = "Versions, CPU and the controller's source file are the run's. " if not other else ""

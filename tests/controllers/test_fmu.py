@@ -30,7 +30,7 @@ def load(folder, text):
 
 
 def check(fmu, tmp_path, text):
-    require_controller(load(tmp_path, f"{{file: '{fmu}', {text}}}"))
+    require_controller(load(tmp_path, f"{{file: '{fmu}', {text}}}").av)
 
 
 @pytest.mark.parametrize(
