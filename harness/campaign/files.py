@@ -10,7 +10,6 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -22,7 +21,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import ModelName, default_surrogates
 from harness.campaign.problems import MOST_SHOWN, NAME_PATTERN, describe_found, did_you_mean, in_words
 from harness.campaign.sections import Section
-from harness.campaign.vehicle import AV_SOURCES, CONTROLLERS, AutomatedVehicle, with_another_driver
+from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_text, read_yaml, yaml_text
 from harness.errors import CampaignError
 
@@ -216,7 +215,7 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
 
     That is a Python class or function, ``my_av.py:MyClass`` or ``package.module:MyClass``; the path of an FMU; one of
     SUMO's car-following models, ``sumo:ACC``; a vehicle of a panel, ``PANEL.yaml:NAME``; or, without a colon, one of
-    the shipped panel, a built-in model, or an entry point of group ``harness.controllers``.
+    the shipped panel, or a built-in model.
     """
     place, colon, name = text.rpartition(":")
     if text.endswith(".fmu"):
@@ -228,10 +227,10 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     panel = load_panel(place or SHIPPED_PANEL).avs
     if name in panel:
         return panel[name].model_dump(exclude_unset=True)
-    models, installed = ((), ()) if colon else (get_args(ModelName), entry_points(group=CONTROLLERS).names)
-    if name in models or name in installed:
-        return {"model" if name in models else "controller": name}
-    known = sorted({*panel, *models, *installed})
+    models = () if colon else get_args(ModelName)
+    if name in models:
+        return {"model": name}
+    known = sorted({*panel, *models})
     files = [] if colon else [str(file) for file in Path().glob("*.y*ml")]
     found = f"no vehicle '{name}' in {place}" if colon else f"no {'' if option else 'campaign file, and no '}vehicle"
     expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(known)}"

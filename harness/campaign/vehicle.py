@@ -31,9 +31,7 @@ READS_NO_PARAMETERS = {
     "fmu": "Write them under av.fmu.start_values.",
 }
 """Sources of an AV beside which parameters would be lost, and where to write them."""
-CONTROLLERS = "harness.controllers"
-"""Group of entry points."""
-CONTROLLER_PATTERN = r"^(([A-Za-z_][A-Za-z0-9_.]*|.+\.py):[A-Za-z_][A-Za-z0-9_]*|[A-Za-z0-9][A-Za-z0-9_.-]*)$"
+CONTROLLER_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*|.+\.py):[A-Za-z_][A-Za-z0-9_]*$"
 
 
 def with_another_driver(data: dict[str, Any], source: str, value: Any) -> dict[str, Any]:
@@ -140,9 +138,9 @@ class AutomatedVehicle(Section):
     controller: str | None = Field(
         None,
         pattern=CONTROLLER_PATTERN,
-        examples=["my_av.py:MyClass", "my_package.my_module:MyClass", "an_entry_point"],
-        description="your own: 'file.py:Class', relative to the campaign file, 'package.module:Class', or the name of "
-        f"an entry point in group {CONTROLLERS}; instead of a class a function step(seen)",
+        examples=["my_av.py:MyClass", "my_package.my_module:MyClass"],
+        description="your own: 'file.py:Class', relative to the campaign file, or 'package.module:Class'; instead of a "
+        "class a function step(seen)",
     )
     sumo: dict[str, str | float] | None = Field(
         None, description="SUMO drives it: carFollowModel and any other vType attribute"

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from contextlib import closing
 from copy import deepcopy
 from functools import partial
-from importlib.metadata import entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from inspect import Parameter, Signature, isfunction, signature
 from multiprocessing.connection import Connection
@@ -18,7 +17,7 @@ from types import ModuleType
 from typing import Any, TypeVar, get_type_hints
 
 from harness.campaign.problems import did_you_mean
-from harness.campaign.vehicle import CONTROLLERS, AutomatedVehicle
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import (
     BatchHost,
     ControllerHost,
@@ -42,13 +41,11 @@ class AvEndedProcessError(HarnessError):
 
 
 def controller_class(name: str) -> Callable[..., Any]:
-    """The class, or function, that a name stands for: ``my_av.py:Class``, ``package.module:Class``, an entry point.
+    """The class, or function, that a name stands for: ``my_av.py:Class`` or ``package.module:Class``.
 
     The folder that the harness was started in is importable, as it is for a script, and so is that of a file. Where
-    there is no such module, class or entry point, a `CampaignError` says so.
+    there is no such module or class, a `CampaignError` says so.
     """
-    if ":" not in name:
-        return _from_entry_point(name)
     module_name, _, class_name = name.rpartition(":")
     is_file = module_name.endswith(".py")
     if (here := str(Path(module_name).parent.resolve() if is_file else Path.cwd())) not in sys.path:
@@ -83,15 +80,6 @@ def _of_file(file: Path) -> ModuleType:
             del sys.modules[name]
             raise
     return sys.modules[name]
-
-
-def _from_entry_point(name: str) -> Callable[..., Any]:
-    points = entry_points(group=CONTROLLERS)
-    if name not in points.names:
-        expected = f"an entry point of group {CONTROLLERS}: {', '.join(sorted(points.names)) or 'none is installed'}"
-        mend = did_you_mean(name, sorted(points.names)) or "Install what brings it, or write my_av.py:Class."
-        raise CampaignError("av.controller", name, expected, mend)
-    return points[name].load()  # type: ignore[no-any-return]
 
 
 def build_host(

@@ -80,21 +80,6 @@ def test_recipes_of_the_same_controller_are_the_same_vehicle_and_all_others_run(
         assert rows == per_vehicle
 
 
-def test_entry_points_are_found_by_name(folder, tmp_path, monkeypatch):
-    from harness.controllers.find import controller_class
-
-    (toml,) = (text for kind, text in BLOCKS if kind == "toml")
-    name, target = re.search(r'^([\w-]+) = "(.*)"$', toml, re.MULTILINE).groups()
-    (group,) = re.findall(r'entry-points\."(.*)"', toml)
-    info = tmp_path / "mine-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {target}\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.syspath_prepend(folder)
-    assert controller_class(name).__name__ == "Follows"
-
-
 @pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md"])
 def test_the_first_vehicle_of_a_new_user_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
