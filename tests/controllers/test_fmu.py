@@ -1,13 +1,16 @@
 """``av.fmu`` is checked against the FMU before anything runs; an instance per cell, a reset per episode."""
 
+import errno
 import re
 import sys
 import zipfile
 from contextlib import closing
+from unittest.mock import Mock
 
 import pytest
 
 from harness.campaign.files import load_campaign
+from harness.commands.printing import system_error
 from harness.controllers import EpisodeStart, Neighbour, Observation
 from harness.controllers.find import build_host, require_controller
 from harness.controllers.fmu import fmu_maker
@@ -49,6 +52,15 @@ def test_a_wrong_wiring_is_named_with_the_variables(fmu, tmp_path, text, where, 
     assert error.value.where == f"av.fmu.{where}"
     assert found in error.value.found
     assert "x (Real input), a (Real output)" in error.value.mend or "observation" in found
+
+
+def test_where_the_disk_is_full_nothing_half_unpacked_stays_and_the_fmu_is_not_blamed(fmu, tmp_path, monkeypatch):
+    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(zipfile.ZipFile, "extractall", Mock(side_effect=OSError(errno.ENOSPC, "No space left")))
+    with pytest.raises(OSError, match="No space left") as raised:
+        fmu_maker(load(tmp_path, f"{{file: '{fmu}', {WIRED}}}").av.fmu)
+    assert str(tmp_path) in system_error(raised.value).where
+    assert list((tmp_path / "fmu").iterdir()) == []
 
 
 @pytest.mark.parametrize(
