@@ -77,6 +77,7 @@ def test_the_answer_is_that_of_the_reference(tmp_path):
     """Fixed seeds on both sides: beyond 2 standard errors with a probability of 5 % once, and none after."""
     folder = tmp_path / "smoke"
     command = [Path(sys.executable).with_name("harness"), "run", "scenarios/smoke.yaml", "--out", folder]
+    command += ["--set=stop.rhw=0.05", "--set=testing.shells.first_tests=1400"]  # as precise as the reference deserves
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     estimates = json.loads((folder / "estimates.json").read_text(encoding="utf-8"))

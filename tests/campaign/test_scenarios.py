@@ -159,23 +159,23 @@ SHIPPED = {
     "overtaking_nade_epsilon_0.1": "9c126fcf2823adcd",
     "overtaking_nde": "71294e917364cdb2",
     "overtaking_recursive": "a43f69057d98143b",
-    "smoke": "e96a008c5e8b50b4",
+    "smoke": "5eabd80673e0bac0",
 }
-PANEL = "85f51781dfe16fec"
+PANEL = "6f6894f12ed359ea"
 CHANGED = [
     (
         ["testing.shells.stopping=sequential", "testing.shells.statements=null", "stop.estimator=null"],
-        "7af628145960e74a",
+        "995030cee532ef4e",
     ),
-    (["environment.cut_in_lead_s=0.5"], "849f9c8cd132d0f4"),
-    (["testing.shells.smallest_round=8"], "9effa1d477121757"),
-    (["av={controller: 'a:B', parameters: {x: 1}, before_cut_in: controller}"], "0b74ded34c4cb2ce"),
-    (["av={controller: 'a:B', warm_up_s: 0}"], "e554cf95f11fe057"),  # as before there was one
-    (["av={traci: {command: x}}"], "bd13597d5b96bc4b"),
-    (["av={sumo: {tau: 1}}"], "32f3238a2fdebd9c"),
-    (["surrogates={}", "accept.crash_rate_below=1e-7"], "8550aa94734883c2"),
-    (["testing.method=forced"], "03cae7d7dff5e59c"),
-    (["run.shard_size=7", "records.moments=all", "pool.library=ladder-1"], "a96e964afce39346"),
+    (["environment.cut_in_lead_s=0.5"], "977fb7a922c1cee6"),
+    (["testing.shells.smallest_round=8"], "5fcc39a05654096d"),
+    (["av={controller: 'a:B', parameters: {x: 1}, before_cut_in: controller}"], "035b3c181d4d0c0d"),
+    (["av={controller: 'a:B', warm_up_s: 0}"], "c703e9429d979de6"),  # as before there was one
+    (["av={traci: {command: x}}"], "79151783da6f1892"),
+    (["av={sumo: {tau: 1}}"], "edfd41f3400c149e"),
+    (["surrogates={}", "accept.crash_rate_below=1e-7"], "798404e8115d1e50"),
+    (["testing.method=forced"], "fb6c700764faed10"),
+    (["run.shard_size=7", "records.moments=all", "pool.library=ladder-1"], "d8d9d21fa956f40f"),
 ]
 
 
