@@ -20,6 +20,9 @@ from harness.records.folder import SEAL
 from tests.golden.campaigns import BASE, RUNS
 from tests.golden.record import TABLES, tables_of
 
+ROOT = Path(__file__).parents[1]
+SCENARIOS = ROOT / "scenarios"
+MIXTURE_FILE = SCENARIOS / "overtaking_mixture.yaml"
 MORE = {"mixture-seven": (*RUNS["mixture-sumo"], "stop.episodes=560")}
 """Further runs: of seven shards."""
 

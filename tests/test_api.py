@@ -15,9 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import harness
-from tests.stored_runs import estimates
+from tests.stored_runs import MIXTURE_FILE, ROOT, estimates
 
-MIXTURE_FILE = Path(__file__).parents[1] / "scenarios" / "overtaking_mixture.yaml"
 BUDGET = ("stop.episodes=3000", "stop.rhw=0.5", "stop.min_crashes=20", "run.shard_size=60")
 SMALL = ["world.engine=twin", "testing.method=forced", "av={model: fvdm}", *BUDGET]
 
@@ -69,7 +68,6 @@ def test_load_run_estimate_and_replay_in_a_few_lines(tmp_path):
 # -- README's first command: the smoke campaign against a committed reference --
 
 
-ROOT = Path(__file__).parent.parent
 REFERENCE = json.loads((ROOT / "tests/reference/default.json").read_text(encoding="utf-8"))
 
 

@@ -20,9 +20,8 @@ from harness.numbers import interval, words
 from harness.runner.stored import estimate_run
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
-from tests.stored_runs import copy_of, estimates, sets
+from tests.stored_runs import SCENARIOS, copy_of, estimates, sets
 
-SCENARIOS = Path(__file__).parents[1] / "scenarios"
 SMOKE = str(SCENARIOS / "smoke.yaml")
 
 CAMPAIGN = [str(BASE), *sets(*RUNS["shells-refuted"])]

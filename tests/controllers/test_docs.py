@@ -15,8 +15,8 @@ import pytest
 
 from harness.cli import main
 from tests.pool.conftest import SMALL_POOL
+from tests.stored_runs import ROOT
 
-ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/controllers.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 CAMPAIGN = """\

@@ -16,7 +16,7 @@ from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
 from harness.vocabulary import PASSED
 from tests.controllers.driving import LATERAL, drive, fmu_av, forced, make_fmu, motion
-from tests.worlds.running import ROOT
+from tests.stored_runs import ROOT
 
 FORMS = {
     "per vehicle": "av={controller: 'examples.idm:IDM'}",

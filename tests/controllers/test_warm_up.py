@@ -15,7 +15,7 @@ from harness.controllers.traci_style import TraciStyleController
 from harness.worlds.sumo import SumoWorld
 from tests.controllers.delay_line import Line
 from tests.controllers.driving import LATERAL, drive, fmu_av, make_fmu, motion
-from tests.worlds.running import ROOT
+from tests.stored_runs import ROOT
 
 HERE = "tests.controllers.test_warm_up"
 SHOWN = 300

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -17,8 +15,8 @@ from harness.traffic.laws import Environment, InitialStates
 from harness.traffic.loading import load_environment
 from harness.vehicles.drivers import Followers
 from tests.chains.seed import SEED
+from tests.stored_runs import MIXTURE_FILE
 
-MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 SMALL_POOL = ("pool.relative_error=0.03", "pool.cut_ins_per_shell=1500")
 
 

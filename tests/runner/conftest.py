@@ -12,8 +12,8 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.runner.run import RunResult, run_campaign
 from tests.in_process import one_process, without_page
+from tests.stored_runs import MIXTURE_FILE
 
-MIXTURE_FILE = Path(__file__).parents[2] / "scenarios" / "overtaking_mixture.yaml"
 SMALL = ("stop.episodes=1600", "stop.rhw=null", "run.shard_size=80", "records.trace_share=0.05")
 TWIN = ("world.engine=twin", "stop.episodes=400")
 

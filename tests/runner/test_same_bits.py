@@ -16,11 +16,10 @@ from harness.progress import Progress
 from tests.golden.campaigns import BASE, IN_BOTH_WORLDS
 from tests.in_process import run_here, run_with_workers, workers_alive
 from tests.runner import bad_workers
-from tests.stored_runs import MORE, golden, manifest, sets, shard_files, stored_table, unlike_columns
+from tests.stored_runs import MORE, ROOT, golden, manifest, sets, shard_files, stored_table, unlike_columns
 
 PATIENCE_S, POLL_S = 300.0, 0.01
 SEVEN = "mixture-seven"
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("name", IN_BOTH_WORLDS)

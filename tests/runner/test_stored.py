@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import xml.etree.ElementTree as ET
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -23,10 +22,10 @@ from harness.runner import stored
 from harness.runner.stored import estimate_run, replay_episode, stored_blocks
 from tests.golden.record import column_hash
 from tests.in_process import run_here
-from tests.stored_runs import copy_of, edit, estimates, golden, manifest, of_before, shard_files, stored_table
+from tests.stored_runs import ROOT, copy_of, edit, estimates, golden, manifest, of_before, shard_files, stored_table
 
 ESTIMATOR = {"shells-twin": "shells", "nde-twin": "nde"}
-RECORDS = (Path(__file__).parents[2] / "docs/records.md").read_text()
+RECORDS = (ROOT / "docs/records.md").read_text()
 LINES = "\n".join(re.findall(r"^```python\n(.*?)^```$", RECORDS, re.MULTILINE | re.DOTALL))
 
 

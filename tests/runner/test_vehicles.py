@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +14,8 @@ from harness.campaign.drivers import NeedBasedParameters
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.test_shells_runs import SHELLS
-from tests.stored_runs import stored_table, unlike_columns
+from tests.stored_runs import ROOT, stored_table, unlike_columns
 
-ROOT = Path(__file__).parents[2]
 FAILING = "av={controller: 'tests.runner.test_vehicles:RaisesBeforeContact'}"
 TRUTH = json.loads((ROOT / "tests/reference/default.json").read_text())["crash_rate"]
 BUSY = json.loads((ROOT / "docs/validation/nde_1e4.json").read_text())["crash_rate"]

@@ -18,8 +18,8 @@ from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
 from studies.chains.chain import CHAINS
 from studies.chains.sampler import blocks
+from tests.stored_runs import SCENARIOS
 
-SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
 STUDY = f"""
 format: case-study

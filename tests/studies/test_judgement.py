@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from studies.replication.populations import (
     ratio_to,
 )
 from studies.replication.shells import DrawnPool, PairedCampaign
+from tests.stored_runs import SCENARIOS
 
 
 def rows(rates, half: float) -> list[Row]:
@@ -96,7 +96,6 @@ def test_the_error_of_a_ratio_is_that_of_repeated_samples():
 # -- comparisons, repeated: intervals of the difference cover; one that assumes what is not so does not --
 
 
-SMOKE = Path(__file__).parents[2] / "scenarios/smoke.yaml"
 P = np.array([1e-7, 2e-7, 3e-6])
 BOTH, ONLY_A, ONLY_B = np.array([[0.5, 0.2, 0.0], [0.3, 0.1, 0.1], [0.0, 0.1, 0.0]])
 """Shares of each stratum."""
@@ -121,7 +120,9 @@ def covered(rows):
 
 def test_intervals_cover_at_the_stop_and_conditional_ones_do_not_where_vehicles_differ_outside():
     """Nine tenths of the difference lie beyond the boundary, which the conditional statement leaves out."""
-    campaign = load_campaign(SMOKE, ["world.engine=twin", "stop.rhw=0.5", "testing.shells.first_tests=12"])
+    campaign = load_campaign(
+        SCENARIOS / "smoke.yaml", ["world.engine=twin", "stop.rhw=0.5", "testing.shells.first_tests=12"]
+    )
     found = PairedCampaign(campaign, known_pool, seed=3).run(range(REPLICATIONS))
     free, inside = ([row for row in found if row.result == name] for name in (DIFFERENCE, CONDITIONAL_DIFFERENCE))
     assert len(free) == REPLICATIONS

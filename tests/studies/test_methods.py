@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -24,9 +23,9 @@ from studies.replication.run import validate
 from studies.replication.shells import FREE, ShellCampaign, limit_at, result_of
 from studies.replication.weighted import WeightedCampaign, chain_episodes
 from tests.golden.record import unlike
+from tests.stored_runs import ROOT
 from tests.studies.here import wrong_shell
 
-ROOT = Path(__file__).parents[2]
 CONFIDENCE = 0.9
 LARGEST_BIAS = 0.01
 FEW, MANY = 60, 300

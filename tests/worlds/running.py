@@ -15,8 +15,8 @@ from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.worlds import build_world
 from harness.worlds.twin import TwinWorld
+from tests.stored_runs import ROOT
 
-ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traci_client" / "idm_client.py"
 MISBEHAVING = Path(__file__).parent / "misbehaving_client.py"
 SMALL = ("testing.method=forced", "records={moments: none, traces: all}")

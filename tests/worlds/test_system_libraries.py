@@ -13,8 +13,9 @@ from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT, HarnessError
 from harness.worlds import system_libraries
 from harness.worlds.system_libraries import LIBRARIES, SystemLibrary
+from tests.stored_runs import SCENARIOS
 
-SMOKE = str(Path(__file__).parents[2] / "scenarios" / "smoke.yaml")
+SMOKE = str(SCENARIOS / "smoke.yaml")
 NOWHERE = SystemLibrary("libnowhere.so.7", "libnowhere7", "nowhere-libs", "nowhere")
 ALWAYS_THERE = ("ld-linux", "libc.", "libdl.", "libgcc_s.", "libm.", "libpthread.", "libresolv.", "librt.")
 LEAN = "--no-install-recommends"
