@@ -5,15 +5,17 @@ import re
 import sys
 import zipfile
 from contextlib import closing
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
 
 from harness.campaign.files import load_campaign
+from harness.campaign.vehicle import FmuController
 from harness.commands.printing import system_error
 from harness.controllers import EpisodeStart, Neighbour, Observation
 from harness.controllers.find import build_host, require_controller
-from harness.controllers.fmu import fmu_maker
+from harness.controllers.fmu import OBSERVATIONS, fmu_maker, wire
 from harness.errors import CampaignError
 from harness.resolved import resolve
 from tests.controllers.driving import make_fmu
@@ -52,6 +54,24 @@ def test_a_wrong_wiring_is_named_with_the_variables(fmu, tmp_path, text, where, 
     assert error.value.where == f"av.fmu.{where}"
     assert found in error.value.found
     assert "x (Real input), a (Real output)" in error.value.mend or "observation" in found
+
+
+def variables(**causalities):
+    """A description with these Real variables."""
+    listed = enumerate(causalities.items())
+    made = [SimpleNamespace(name=name, type="Real", causality=kind, valueReference=i) for i, (name, kind) in listed]
+    return SimpleNamespace(modelVariables=made)
+
+
+def test_inputs_that_are_named_as_observations_and_an_only_output_need_no_wiring():
+    own = FmuController(file="my.fmu")
+    found = wire(own, variables(gap_m="input", k="parameter", bv_speed_mps="input", a="output"))
+    assert (found.inputs, found.output) == ([0, 2], 3)
+    assert found.readings == [OBSERVATIONS["gap_m"], OBSERVATIONS["bv_speed_mps"]]
+    with pytest.raises(CampaignError, match=r"inputs gap_m, v;.*--set 'av.fmu.inputs="):
+        wire(own, variables(gap_m="input", v="input", a="output"))
+    with pytest.raises(CampaignError, match=r"av.fmu.output: found a, b;.*--set av.fmu.output=NAME"):
+        wire(own, variables(gap_m="input", a="output", b="output"))
 
 
 def test_where_the_disk_is_full_nothing_half_unpacked_stays_and_the_fmu_is_not_blamed(fmu, tmp_path, monkeypatch):
