@@ -116,7 +116,7 @@ class Campaign(Section):
             del environment["cut_in_lead_s"]
         if testing["shells"]["smallest_round"] == 1:
             del testing["shells"]["smallest_round"]
-        testing["shells"] |= ShellSettings.gone  # nor does what went
+        testing["shells"] |= {key: usual for key, (usual, *_) in ShellSettings.gone.items()}  # nor does what went
         unused = {"shadow_paths"} if not self.av.acts_before_cut_in else set()
         content = {
             "seed": self.seed,

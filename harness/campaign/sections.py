@@ -42,14 +42,14 @@ class Section(BaseModel):
     """A section of the campaign: unknown keys are errors, values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-    gone: ClassVar[Mapping[str, Any]] = {}
-    """Keys of earlier versions, which stored campaigns name, with the value that they had where nobody asked."""
+    gone: ClassVar[Mapping[str, Sequence[Any]]] = {}
+    """Keys of earlier versions, which stored campaigns name, and which values change nothing, the usual one first."""
 
     @model_validator(mode="wrap")
     @classmethod
     def _errors_in_words(cls, data: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
         if isinstance(data, dict) and not cls.gone.keys().isdisjoint(data):
-            data = {key: value for key, value in data.items() if key not in cls.gone or value != cls.gone[key]}
+            data = {key: value for key, value in data.items() if value not in cls.gone.get(key, ())}
         try:
             return validate(data)
         except ValidationError as error:
@@ -107,7 +107,7 @@ class EnvironmentSettings(Section):
 class ShellSettings(Section):
     """How tests are spread over the shells of the pool, and what is said about vehicles that keep to some of them."""
 
-    gone = {"stopping": "sequential", "boundary": None, "statements": None}
+    gone = {"stopping": ("sequential",), "boundary": (None,), "statements": (None,)}
 
     statement: str = Field(
         ASSUMPTION_FREE,
@@ -199,7 +199,7 @@ class Records(Section):
 class Stop(Section):
     """When the campaign is long enough."""
 
-    gone = {"estimator": None}
+    gone = {"estimator": (None, "nde", "nade", "mixture_cv", "shells")}
 
     episodes: Whole = Field(100_000, ge=1, le=10**10, description="most episodes to run")
     rhw: float | None = Field(

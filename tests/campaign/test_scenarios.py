@@ -164,7 +164,7 @@ SHIPPED = {
 PANEL = "6f6894f12ed359ea"
 CHANGED = [
     (
-        ["testing.shells.stopping=sequential", "testing.shells.statements=null", "stop.estimator=null"],
+        ["testing.shells.stopping=sequential", "testing.shells.statements=null", "stop.estimator=shells"],
         "995030cee532ef4e",
     ),
     (["environment.cut_in_lead_s=0.5"], "977fb7a922c1cee6"),
