@@ -26,13 +26,12 @@ from harness.worlds.sumo import SumoWorld
 ROOT = Path(__file__).parents[1]
 CELLS = 64
 FULL_LENGTH_STEPS = 200
-LISTENER = "{controller: 'harness.controllers.traci_style:StepListenerController', parameters: {listener: 'examples.idm_traci_style:Listener'}}"  # noqa: E501 - one campaign value
 FORMS = {
     "built in": ("{model: idm}", 1.0),
     "batch": ("{controller: 'examples.idm_batch:IDM'}", 1.2),
     "per vehicle": ("{controller: 'examples.idm:IDM'}", 4.0),
     "TraCI-style": ("{controller: 'examples.idm_traci_style:IDM'}", 6.0),
-    "step listener": (LISTENER, 6.0),
+    "step listener": ("{controller: 'examples.idm_traci_style:Listener'}", 6.0),
 }
 
 

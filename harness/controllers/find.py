@@ -28,6 +28,7 @@ from harness.controllers.hosts import (
     death_cause,
 )
 from harness.controllers.protocol import Observation
+from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.processes import CONSTRUCTOR, Apart, ForkServer, WorkerDeath, first_to_answer, tell
 
@@ -152,9 +153,7 @@ def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any],
         return partial(StepFunction, found), {first.name: None}
     _require_controller(made, name)
     if isinstance(found, type) and "traci" in takes and not _is_batch(found):
-        from harness.controllers.traci_style import StepListenerController  # noqa: PLC0415 - it looks up names here
-
-        return partial(StepListenerController, name), {"traci": None}
+        return partial(StepListenerController, found), {"traci": None}
     return found, {}
 
 

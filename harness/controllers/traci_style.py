@@ -14,7 +14,6 @@ from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
-from harness.controllers.find import controller_class
 from harness.controllers.protocol import EpisodeStart, Observation
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
@@ -32,7 +31,7 @@ _STEPS = "the harness itself starts, steps and ends the simulation"
 _WHY = {
     "setSpeedMode": "it has no effect here: what the AV is told it does exactly, as under speed mode 32",
     "setLaneChangeMode": "it has no effect here: the AV stays on its lane",
-    "addStepListener": "name the listener in the campaign: see StepListenerController",
+    "addStepListener": "name the listener in the campaign, as av.controller",
     "changeLane": "the AV stays on its lane; " + _WOULD_MOVE,
 }
 _REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")
@@ -331,16 +330,13 @@ class TraciStyleController:
 class StepListenerController(TraciStyleController):
     """Runs an object with the shape of ``traci.StepListener``: ``step(t)``, and ``cleanUp()`` if it has one.
 
-    ``listener`` (``package.module:Class``) is called for every episode, with the object that stands for ``traci`` and
-    the ``parameters``. As under TraCI it is removed when ``step`` returns something false, and the AV then follows its
+    ``listener``, its class, is called for every episode, with the object that stands for ``traci`` and the
+    ``parameters``. As under TraCI it is removed when ``step`` returns something false, and the AV then follows its
     last command.
     """
 
-    def __init__(self, listener: str, **parameters: Any) -> None:
-        self._make: Callable[..., Any] = controller_class(listener)
-        if not callable(getattr(self._make, "step", None)):
-            raise TypeError(f"the listener {listener} is no class with step(t)")
-        self._parameters = parameters
+    def __init__(self, listener: Callable[..., Any], **parameters: Any) -> None:
+        self._make, self._parameters = listener, parameters
         self._listener: Any = None
 
     def on_start(self, random: np.random.Generator) -> None:  # noqa: ARG002 - listeners know no randomness

@@ -22,8 +22,7 @@ FORMS = {
     "per vehicle": "av={controller: 'examples.idm:IDM'}",
     "batch": "av={controller: 'examples.idm_batch:IDM'}",
     "TraCI-style": "av={controller: 'examples.idm_traci_style:IDM'}",
-    "step listener": "av={controller: 'harness.controllers.traci_style:StepListenerController', "
-    "parameters: {listener: 'examples.idm_traci_style:Listener'}}",
+    "step listener": "av={controller: 'examples.idm_traci_style:Listener'}",
 }
 
 

@@ -149,7 +149,7 @@ class Twice:
 
 def test_a_step_listener_is_removed_when_it_says_so():
     told = []
-    with closing(StepListenerController(f"{__name__}:Twice", speed=19.0, told=told)) as controller:
+    with closing(StepListenerController(Twice, speed=19.0, told=told)) as controller:
         controller.start(start())
         assert [controller.step(seen(0.1 * i)) for i in range(3)] == pytest.approx([-10.0] * 3)
     assert Twice.log == [0.0, 0.1, "clean"]
