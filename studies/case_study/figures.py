@@ -64,12 +64,6 @@ def range_of(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return figure(found[0]["value"] if found else None, min(known, default=None), max(known, default=None))
 
 
-def quotient(above: float, found: dict[str, Any]) -> dict[str, Any]:
-    """A number over another, whose limits change places."""
-    value, high, low = (above / x if x else None for x in (found["value"], found["low"], found["high"]))
-    return figure(value, low, high)
-
-
 def ratio_of_means(above: ArrayLike, below: ArrayLike, confidence: float) -> dict[str, Any]:
     """Ratio of the means of paired repetitions, with the t interval of its logarithm, to the first order."""
     pairs = np.array([above, below], np.float64)

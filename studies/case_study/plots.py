@@ -84,9 +84,9 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
     axes.grid(visible=False, axis="x")
     axes.set_ylabel(f"tests for a relative half-width of {rhw:g}")
     caption = (
-        "Filled: here, with intervals (triangles: lower limits; grey, †: not converged). NADE's are by the spread of "
-        "repeated campaigns around the known rate, the others by what their intervals say. Hollow: the paper's, whose "
-        "share ε is not published."
+        "Filled: here, with intervals (triangles: lower limits; grey, †: not converged). NADE by ε are averages over "
+        "shuffles (RNoT), SCV truly is by repeated campaigns, the others by their intervals. Hollow: the paper's, with "
+        "an ε that is not published."
     )
     return Plot("tests", figure, "Number of tests by method, on a logarithmic axis. " + caption, caption)
 

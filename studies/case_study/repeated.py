@@ -25,7 +25,6 @@ from studies.case_study.figures import (
     is_settled,
     marked,
     mean_of,
-    quotient,
     range_of,
     ratio_of_means,
     ratio_of_variances,
@@ -51,7 +50,6 @@ def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
 
 
 SHOWN = ("claimed", "true", "rnot", "gain_true", "scv_claimed")
-KNOWN = ("within_claimed", "gain_strata", "gain_known", "gain_known_replicated")
 """Figures of each variant beside its claimed gain."""
 
 
@@ -76,19 +74,13 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
     figures["mean"] = marked(mean, settled=all(row["settled"] for row in rows))
     figures["minimum_at"] = _minimum_at({name: figures[name] for name in step.avs})
     if step.means:
-        figures |= {
-            key: range_of(sorted((row[key] for row in rows), key=lambda gain: -(gain["value"] or 0.0))) for key in KNOWN
-        }
+        figures["gain_known"] = range_of(
+            sorted((row["gain_known"] for row in rows), key=lambda each: -(each["value"] or 0.0))
+        )
     if step.reference:
-        best = min(rows, key=lambda row: float(row["true"]["value"] or math.inf))
-        plain = context.made[step.reference].result["figures"]["plain_tests"]["value"] or math.nan
-        numbers = {
-            "most_frequent_steps": [exactly(row["most_frequent_steps"]) for row in (best, *rows)],
-            "true_range": [row["true"] for row in (best, *rows)],
-            "rnot_range": [row["rnot"] for row in (best, *rows)],
-            "acceleration_range": [quotient(plain, row["true"]) for row in (best, *rows)],
-        }
-        figures |= {name: range_of(found) for name, found in numbers.items()}
+        best = min(rows, key=lambda row: float(row["rnot"]["value"] or math.inf))
+        figures["most_frequent_steps"] = range_of([exactly(row["most_frequent_steps"]) for row in (best, *rows)])
+        figures["rnot_range"] = range_of([row["rnot"] for row in (best, *rows)])
     return {"variants": rows, "figures": figures}
 
 
