@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -70,18 +70,23 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
     elif kind == "model_type":
         expected = f"a section with keys such as {', '.join(list(section.model_fields)[:4])}"
     elif last == "[key]":
-        found, expected, mend = f"the name {found}", _PATTERNS[context["pattern"]], "Choose another name."
+        found, expected, mend = f"the name {found}", _pattern_in_words(context), "Choose another name."
     elif kind == "literal_error":
         words = re.findall("'(.*?)'", context["expected"])
         expected, mend = f"one of {', '.join(words)}", did_you_mean(value, words) or mend
     elif kind == "string_pattern_mismatch":
         examples = " or ".join(map(str, (field and field.examples) or ()))
-        expected = f"text such as {examples}" if examples else _PATTERNS[context["pattern"]]
+        expected = f"text such as {examples}" if examples else _pattern_in_words(context)
     else:
         unit = next((f" ({unit})" for suffix, unit in _UNITS.items() if last.endswith(suffix)), "")
         expected = _KINDS.get(kind, details["msg"].removeprefix("Input should be ")) + unit
         expected += ", or null" if field and len(loc) == 1 and type(None) in get_args(field.annotation) else ""
     return {"key": key, "found": found, "expected": expected, "mend": mend}
+
+
+def _pattern_in_words(context: Mapping[str, Any]) -> str:
+    pattern = context["pattern"]
+    return _PATTERNS.get(pattern, f"text that matches {pattern}")
 
 
 def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:

@@ -92,37 +92,30 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
 
 
 def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw: float, confidence: float) -> Plot:
-    """Crash rate with its band, the first curve on the lower axis and the second on the upper; RHW of all."""
+    """Crash rate with its band, and RHW, against tests."""
     table = read_table(made[name].folder / CURVES)
-    top = reference = made[step.reference].result["figures"]["crash_rate"]["value"] or 0.0
-    figure, left, right = two_panels(3.6, ("", "tests"))
-    left.axhline(reference, **_DASHED)
-    for place, label in enumerate(step.of):
+    reference = made[step.reference].result["figures"]["crash_rate"]["value"] or 0.0
+    figure, left, right = two_panels(3.4, ("tests", "tests"))
+    for label in step.of:
         colour = next(colour for name, colour in _COLOURS.items() if name in label)
         rows = table.filter(pc.equal(table.column("step"), label))
         n, rate, half = (rows.column(column).to_numpy() for column in ("n", "crash_rate", "half_width"))
-        axes = left if place == 0 else left.twiny()
-        axes.fill_between(n, np.maximum(rate - half, 0.0), rate + half, color=colour, alpha=0.16, linewidth=0)
-        axes.plot(n, rate, color=colour, label=label)
-        axes.set_xlim(0.0, n[-1])
-        axes.xaxis.set_major_locator(MaxNLocator(4))
-        axes.set_xlabel(f"tests, {label}{scaled(axes.xaxis, n[-1])}", color=colour)
-        if place:
-            axes.grid(visible=False)
-            axes.spines["top"].set(visible=True, position=("outward", 34.0 * (place - 1)))
-        late = np.isfinite(half) & (n > n[-1] / 10)
-        top = max(top, float(np.max((rate + half)[late], initial=0.0)))
         known = (rate > 0.0) & np.isfinite(half)
-        if known.any():
-            right.plot(n[known], half[known] / rate[known], color=colour, label=label)
-    left.set_ylim(0.0, 1.1 * top or 1.0)
-    left.set_ylabel(f"crash rate per test{scaled(left.yaxis, 1.1 * top or 1.0)}")
-    right.set_xscale("log")
-    right.set_yscale("log")
+        left.fill_between(n, np.maximum(rate - half, 0.0), rate + half, color=colour, alpha=0.16, linewidth=0)
+        left.plot(n, rate, color=colour, label=label)
+        right.plot(n[known], half[known] / rate[known], color=colour, label=label)
+    left.axhline(reference, **_DASHED)
+    left.set_ylim(0.0, MOST_RATE * reference or 1.0)
     right.axhline(rhw, **_DASHED)
-    decades(right.xaxis, max(right.get_xlim()[0], 1.0), right.get_xlim()[1])
+    right.set_yscale("log")
     decades(right.yaxis, *right.get_ylim())
-    head(right, "relative half-width")
+    for axes, title in (
+        (left, f"crash rate per test{scaled(left.yaxis, MOST_RATE * reference or 1.0)}"),
+        (right, "RHW"),
+    ):
+        axes.set_xscale("log")
+        decades(axes.xaxis, max(axes.get_xlim()[0], 1.0), axes.get_xlim()[1])
+        head(axes, title)
     caption = (
         f"Left: crash rates with their {confidence:.0%} bands; dashed: that of {step.reference}. Right: relative "
         f"half-widths; dashed: {rhw:g}."
@@ -161,6 +154,8 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
     return Plot(name, figure, "By number of control steps. " + caption, caption)
 
 
+MOST_RATE = 3.0
+"""Times the known rate up to which rates are drawn."""
 LEAST_GAIN = 0.1
 """Least gain that is drawn; worse ones are on the axis."""
 _GAINS = (

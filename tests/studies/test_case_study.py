@@ -9,15 +9,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from harness.errors import HarnessError
 from harness.estimators.scv import Scv
 from studies.__main__ import main
 from studies.case_study import repeated, tested
-from studies.case_study.counted import spread
+from studies.case_study.counted import KnownMeans, spread
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
 from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
 from studies.chains.chain import CHAINS
-from studies.chains.sampler import blocks
+from studies.chains.sampler import blocks, with_optimal_function
 from tests.stored_runs import SCENARIOS
 
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
@@ -148,6 +149,14 @@ def test_the_theorems_hold_on_exact_chains(made):
     assert figures["scatter_estimated"]["value"] > 0.01
 
 
+def test_a_name_that_is_none_is_refused_in_words(tmp_path):
+    file = tmp_path / "study.yaml"
+    file.write_text(STUDY.replace("{same: []}", "{a.b: []}"))
+    with pytest.raises(HarnessError, match="settings") as refused:
+        load_study(file)
+    assert "text that matches ^[^.|]+$" in str(refused.value)
+
+
 def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
     for quick in (False, True):
         study = load_study(SHIPPED, quick=quick)
@@ -203,6 +212,19 @@ def test_the_spread_after_adjustment_is_what_algorithm_1_claims():
         z = found[found.control_steps == level].z.to_numpy()
         squares = np.sum((z - fit.intercept) ** 2) + (fit.n - len(z)) * fit.intercept**2
         assert squares == pytest.approx(fit.residual_squares, rel=1e-9, abs=1e-20)
+
+
+def test_known_means_gain_what_theorem_3_promises():
+    """In the theorem's world nothing is left of the variance of tests that the fit has not seen."""
+    world, rng, scv = with_optimal_function(), np.random.default_rng(1), Scv()
+    scv.add(world.block("step_mixture", world.maneuvers(2_000, rng)))
+    known = KnownMeans(scv)
+    for _ in range(5):
+        known.add(world.block("step_mixture", world.maneuvers(500, rng)))
+    row = known.row(0.9)
+    assert row["gain_known"]["value"] > 1e6
+    assert row["gain_known_replicated"]["value"] > 1e6
+    assert row["gain_strata"]["value"] == pytest.approx(1.0, rel=0.01)  # all tests have one control step
 
 
 def test_relative_variance_of_known_weights():
