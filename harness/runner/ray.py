@@ -34,13 +34,13 @@ from harness.runner.resume import cpu_name
 from harness.runner.workers import (
     CLOSING_S,
     LocalWorkers,
-    Request,
     Result,
     WorkerLostError,
     WorkerProcess,
     Workers,
 )
 from harness.sampling import source_of
+from harness.sampling.protocol import ShardRequest
 
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""
@@ -88,7 +88,7 @@ class OnMachine:
             return fit_to_travel(error)
 
     def run(
-        self, request: Request, fatal_episodes: Mapping[int, Death], baseline: Sequence[ray.ObjectRef[bytes]]
+        self, request: ShardRequest, fatal_episodes: Mapping[int, Death], baseline: Sequence[ray.ObjectRef[bytes]]
     ) -> Result | WorkerDeath | Exception:
         """Run a shard; tests may follow from ``baseline`` runs, which lie in the object store."""
         try:
@@ -126,7 +126,7 @@ class RayWorker:
     def __init__(self, actor: Any, pending: ray.ObjectRef[Any], workers: RayWorkers) -> None:
         self._actor, self.pending, self._workers = actor, pending, workers
 
-    def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
+    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
         """See `harness.runner.workers.WorkerProcess`: that it is dead shows in its answer."""
         self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.baseline)
         return True

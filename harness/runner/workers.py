@@ -46,7 +46,7 @@ from harness.records.folder import Repeated, encoded, read_table
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.sampling import prepare
-from harness.sampling.baseline import BaselineRequest, BaselineResult, as_recorded, run_baseline
+from harness.sampling.baseline import BaselineResult, as_recorded, run_baseline
 from harness.sampling.protocol import ShardRequest, Source
 from harness.vocabulary import FAILED
 from harness.worlds import build_world
@@ -91,10 +91,8 @@ class ShardResult:
     crc32: dict[str, int] = field(default_factory=dict)
 
 
-Request = ShardRequest | BaselineRequest
 Result = ShardResult | BaselineResult
-"""What a worker is asked for, and what it hands back."""
-_Request = TypeVar("_Request", bound=Request)
+"""What a worker hands back."""
 _Result = TypeVar("_Result", bound=Result)
 
 
@@ -105,7 +103,7 @@ def serve(connection: Connection, resolved: Path, baseline: Path, black_box: Pat
     """
     runner: ShardRunner | None = None
 
-    def run(request: Request, fatal_episodes: Mapping[int, Death]) -> Result:
+    def run(request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> Result:
         nonlocal runner
         if runner is None:
             runner = ShardRunner(pickle.loads(resolved.read_bytes()), baseline, black_box)  # noqa: S301 - our own
@@ -137,7 +135,7 @@ class ShardRunner:
         """Release the AV's controllers."""
         self._loop.close()
 
-    def run(self, request: Request, fatal_episodes: Mapping[int, Death] | None = None) -> Result:
+    def run(self, request: ShardRequest, fatal_episodes: Mapping[int, Death] | None = None) -> Result:
         """Run a shard; episodes in ``fatal_episodes`` fail before the call that ended a process.
 
         Raises `WorldDisagreementError`: the twin retraces an episode differently.
@@ -145,15 +143,13 @@ class ShardRunner:
         self._fatal_episodes.clear()  # a baseline run may have the number of a test
         self._fatal_episodes.update(fatal_episodes or {})
         source, paths = self._source, self._source.baseline_paths
-        if isinstance(request, ShardRequest):
-            if paths is not None and not self._begun:
-                self._begun = True
-                source.begin_after(as_recorded(read_table(self._baseline), source.resolved.environment))
-                self._loop = self._loop.beside(drawing=source.policy)
-            return self._tests(request)
-        if paths is None:
-            raise ValueError("this campaign has no baseline runs")
-        return run_baseline(self._loop, paths, source.resolved.environment, request)
+        if paths is not None and request.baseline:
+            return run_baseline(self._loop, paths, source.resolved.environment, request)
+        if paths is not None and not self._begun:
+            self._begun = True
+            source.begin_after(as_recorded(read_table(self._baseline), source.resolved.environment))
+            self._loop = self._loop.beside(drawing=source.policy)
+        return self._tests(request)
 
     def _tests(self, request: ShardRequest) -> ShardResult:
         campaign, shard = self._source.campaign, self._source.run(self._loop, request)
@@ -232,7 +228,7 @@ class WorkerLostError(HarnessError):
 class WorkerProcess(Apart):
     """A process that runs one shard after another: what any worker is, also one on another machine."""
 
-    def give(self, request: Request, fatal_episodes: Mapping[int, Death]) -> bool:
+    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
         """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
         try:
             self.connection.send((request, dict(fatal_episodes)))
@@ -249,7 +245,7 @@ class WorkerProcess(Apart):
 class _Job:
     """A shard that is wanted, with its result once there is one."""
 
-    request: Request
+    request: ShardRequest
     result: Result | None
     n_deaths: int = 0
     suspected: Call | None = None
@@ -289,7 +285,9 @@ class Workers:
             worker.wait(CLOSING_S)
         self._idle, self._busy = [], {}
 
-    def run(self, requests: Iterator[_Request], known: Callable[[_Request], _Result | None]) -> Iterator[_Result]:
+    def run(
+        self, requests: Iterator[ShardRequest], known: Callable[[ShardRequest], _Result | None]
+    ) -> Iterator[_Result]:
         """Results in the order of the requests; shards that are ``known`` are not run again.
 
         Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop, and

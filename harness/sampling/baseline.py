@@ -23,6 +23,7 @@ from harness.pool.vehicle_pool import BaselinePaths
 from harness.pool.walk import BaselineRuns, write_script
 from harness.records.folder import parquet, read_table
 from harness.records.schemas import baseline_table
+from harness.sampling.protocol import ShardRequest
 from harness.traffic.laws import Environment
 from harness.vocabulary import AV, FAILED, IntArray, RecordArray
 
@@ -35,36 +36,28 @@ _MEND = "Delete this file and run again with --resume: the same baseline runs ar
 
 
 @dataclass(frozen=True)
-class BaselineRequest:
-    """A fixed range of baseline runs."""
-
-    index: int
-    first_episode: int
-    n_episodes: int
-
-
-@dataclass(frozen=True)
 class BaselineResult:
     """A finished range: its table, as a file where it is not on disk yet, and the causes of failures."""
 
-    request: BaselineRequest
+    request: ShardRequest
     table: pa.Table
     parquet: bytes
     failures: Counter[str]
 
 
-def baseline_requests(n: int) -> Iterator[BaselineRequest]:
+def baseline_requests(n: int) -> Iterator[ShardRequest]:
     """All baseline runs of a campaign, in order."""
-    return (BaselineRequest(i, first, min(SHARD_RUNS, n - first)) for i, first in enumerate(range(0, n, SHARD_RUNS)))
+    firsts = enumerate(range(0, n, SHARD_RUNS))
+    return (ShardRequest(index, first, min(SHARD_RUNS, n - first), baseline=True) for index, first in firsts)
 
 
-def baseline_file(folder: Path, request: BaselineRequest) -> Path:
+def baseline_file(folder: Path, request: ShardRequest) -> Path:
     """Where a range of baseline runs is kept."""
     return folder / SHADOW / f"shard-{request.index:06d}.parquet"
 
 
 def run_baseline(
-    loop: EpisodeLoop, paths: BaselinePaths, environment: Environment, request: BaselineRequest
+    loop: EpisodeLoop, paths: BaselinePaths, environment: Environment, request: ShardRequest
 ) -> BaselineResult:
     """Drive the loop's vehicle along a range of paths."""
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
@@ -74,7 +67,7 @@ def run_baseline(
 
 
 def stored_baseline(
-    folder: Path, paths: BaselinePaths, listed: Sequence[int], request: BaselineRequest
+    folder: Path, paths: BaselinePaths, listed: Sequence[int], request: ShardRequest
 ) -> BaselineResult | None:
     """A range that an earlier run has finished, or None; a `RunFolderError` if it is damaged, or of other paths.
 

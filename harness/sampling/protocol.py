@@ -37,12 +37,13 @@ from harness.worlds import World
 
 @dataclass(frozen=True)
 class ShardRequest:
-    """A fixed range of episodes; ``draws`` says which cut-ins they are, where they are prescribed."""
+    """A fixed range of episodes, or of ``baseline`` runs; ``draws`` says which cut-ins they are, where that is so."""
 
     index: int
     first_episode: int
     n_episodes: int
     draws: tuple[Draw, ...] = ()
+    baseline: bool = False
 
 
 class Rounds:
