@@ -50,7 +50,7 @@ def test_check_prints_a_campaign_file(capsys, tmp_path):
     assert "#   most tests: 400,000" in output
     assert main(["check", SMOKE, "--json"]) == 0
     output = json.loads(capsys.readouterr().out)
-    assert (output["campaign"]["stop"]["rhw"], output["plan"]["most_tests"]) == (0.05, 400_000)
+    assert (output["campaign"]["stop"]["rhw"], output["plan"]["most_tests"]) == (0.3, 400_000)
 
 
 def test_run_prints_the_answer_and_where_more_is(folder, capsys):
