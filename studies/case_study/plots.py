@@ -134,13 +134,10 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
     counts = (("n", "tests", INK), ("columns", "control variates", GREY), ("rank", "rank", GREEN))
     for key, label, colour in counts:
         left.plot(steps, [max(row[key], 0.8) for row in shown], "o-", color=colour, label=label, markersize=3)
-    spreads = (
-        ("sd_before", "Y, NADE", BLUE),
-        ("sd_after", "Z, SCV", VERMILLION),
-        ("sd_corrected", "Z, corrected", INK),
-    )
-    for key, label, colour in spreads:
-        right.plot(steps, [row[key] or np.nan for row in shown], "o-", color=colour, label=label, markersize=3)
+    least = max(row["sd_before"] for row in shown) / 1e4  # beneath it is what rounding has left
+    for key, label, colour, width in (("sd_before", "Y, NADE", BLUE, 4.0), ("sd_after", "Z, SCV", VERMILLION, 1.4)):
+        spread = [row[key] if row[key] > least else np.nan for row in shown]
+        right.plot(steps, spread, "o-", color=colour, label=label, markersize=3, linewidth=width)
     for axes, title in ((left, "number in a stratum"), (right, "standard deviation of results")):
         if any(row["sd_before"] for row in shown) or axes is left:
             axes.set_yscale("log")
@@ -191,8 +188,9 @@ def growth_plot(name: str, looks: list[dict[str, Any]], rhw: float) -> Plot | No
         head(axes, title)
     caption = (
         f"Left: relative half-widths on growing parts of one run; dashed: {rhw:g}. Right: the gain that SCV claims; "
-        "what is left of it without what its fit explains by chance; and the gain between estimates of parts of the "
-        "run, which is 1 (dashed), as the estimates are NADE's."
+        "what is left of it without what its fit explains by chance (leave-one-out beyond the axis is on it; strata of "
+        "more than 4,096 tests take the mean leverage); and the gain between estimates of parts of the run, which is 1 "
+        "(dashed), as the estimates are NADE's."
     )
     return Plot(name, figure, caption, caption)
 
