@@ -236,25 +236,21 @@ def _together(fits: Sequence[StratumFit]) -> dict[str, Any]:
         "sd_before": float(np.sqrt((before + between) / max(n, 1))),
         "sd_after": float(np.sqrt((after + between) / max(n, 1))),
         "sd_corrected": float(np.sqrt((fair + between) / max(n, 1))),
-        "saturated": sum(fit.is_saturated for fit in fits),
     }
 
 
 def _figures(rows: list[dict[str, Any]], fits: list[tuple[int, StratumFit]]) -> dict[str, Any]:
     if not rows:
         return {}
-    last, most = rows[-1], max(((fit.n, level) for level, fit in fits if level > 0), default=(0, None))[1]
     total, late_total = (
         sum(fit.n * fit.intercept for level, fit in fits if level > k) for k in (-1, MAX_CONTROL_STEPS)
     )
-    gain, late = last["gain_claimed"], _together([fit for level, fit in fits if level >= 4])
+    late, settled = _together([fit for level, fit in fits if level >= 4]), rows[-1]["settled"]
     left = late["sd_after"] / late["sd_before"] if late["sd_before"] else None
     return {
-        "claimed_gain": marked(figure(None) if gain is None else exactly(gain), settled=last["settled"]),
         "rate_over_nade": exactly(1.0 + max(row["difference"] or 0.0 for row in rows)),
-        "sd_left_from_4": figure(None) if left is None else marked(exactly(left), settled=last["settled"]),
+        "sd_left_from_4": figure(None) if left is None else marked(exactly(left), settled=settled),
         "late_share": figure(late_total / total if total else None),
-        "most_frequent_stratum": figure(None) if most is None else exactly(most),
     }
 
 

@@ -49,7 +49,7 @@ def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
     return vehicles | {name: load_campaign(file, [*always, *more]) for name, more in settings.items()}
 
 
-SHOWN = ("claimed", "true", "rnot", "gain_true", "scv_claimed")
+SHOWN = ("true", "rnot", "gain_true", "scv_claimed")
 """Figures of each variant beside its claimed gain."""
 
 

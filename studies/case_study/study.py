@@ -94,7 +94,6 @@ class Variants(Section):
     epsilons: list[Probability] = Field(default_factory=list, description="values of testing.epsilon, a variant each")
     reference: StepName | None = Field(None, description="step with the crash rate of all, for tests by replication")
     shuffles: Whole = Field(0, ge=0, le=10_000, description="orderings of all tests of a variant, for their RNoT")
-    reported: dict[str, Positive] = Field(default_factory=dict, description="the paper's gains, by variant")
     means: Whole = Field(0, ge=0, le=100_000_000, description="other tests of each, whose means of columns are known")
 
 
