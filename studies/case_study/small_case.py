@@ -216,26 +216,24 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     settings = list(enumerate(product((False, True), step.thresholds, step.epsilons)))
     rows = context.by_workers(settings, partial(claims_of_setting, step, context.confidence))
     world = _world(step.lane_change_level)
-    nearest: dict[str, Any] = {}
     figures = {"nde": exactly(tests_for(1.0 / world.crash_rate - 1.0, step.rhw, context.confidence))}
     gains = [marked(row["gain_known"], settled=is_settled(row["nade_claimed"])) for row in rows]
     figures["gain_known"] = range_of(sorted(filter(is_settled, gains), key=lambda gain: -(gain["value"] or 0.0)))
     for name, wanted in step.reported.items():  # NADE's exact numbers, or what SCV claims: the nearest first
         found = [exactly(row["nade_exact"]) if name == "nade" else row["scv_claimed"] for row in rows]
-        known = [(one, row) for one, row in zip(found, rows, strict=True) if one["value"] and is_settled(one)]
-        known.sort(key=lambda each: abs(math.log(each[0]["value"] / wanted)))
-        figures[f"{name}_range"] = range_of([one for one, _ in known])
-        if known:
-            one, row = known[0]
-            nearest[name] = {name: one, **{key: row[key] for key in ("challenge", "threshold", "epsilon")}}
+        known = [one for one in found if one["value"] and is_settled(one)]
+        figures[f"{name}_range"] = range_of(sorted(known, key=partial(_apart, wanted)))
     return {
         "crash_rate": world.crash_rate,
         "rhw": step.rhw,
         "steps": len(world.p),
         "settings": rows,
-        "nearest": nearest,
         "figures": figures,
     }
+
+
+def _apart(wanted: float, found: dict[str, Any]) -> float:
+    return abs(math.log(found["value"] / wanted))
 
 
 def claims_of_setting(
