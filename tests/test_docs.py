@@ -1,5 +1,6 @@
 """What stands beside the code is true: commands, links, Python lines, generated tables, workflows, pins."""
 
+import json
 import re
 import runpy
 import shlex
@@ -8,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import click
+import matplotlib.pyplot as plt
 import pytest
 import yaml
 from packaging.requirements import Requirement
@@ -115,6 +117,20 @@ def test_python_lines_run(tmp_path, monkeypatch, capsys):
             script.write_text(text, encoding="utf-8")
             runpy.run_path(str(script), run_name="__main__")
             assert capsys.readouterr().out.strip(), script.name
+
+
+def test_the_notebook_runs(stored_run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(plt, "show", lambda: None)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs/smoke").symlink_to(stored_run("shells-twin"))
+    cells = json.loads((ROOT / "docs/first_look.ipynb").read_text(encoding="utf-8"))["cells"]
+    assert all(cell["outputs"] for cell in cells if cell["cell_type"] == "code")
+    known = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), known)
+    assert (tmp_path / f"test_{known['worst']}.html").stat().st_size > 10_000
 
 
 def test_generated_parts_are_current():
