@@ -70,6 +70,11 @@ def half_width(rhw: float | None) -> str:
     return f"> {WIDEST_RHW:g}" if rhw is not None and rhw > WIDEST_RHW else number(rhw)
 
 
+def ratio(value: float | None) -> str:
+    """A ratio of rates: ``0.84``, ``1.16``, ``138``."""
+    return number(value, 2 if value is not None and value < 1.0 else 3)
+
+
 def count(value: float | None) -> str:
     """A whole number with thousands separators."""
     return MISSING if value is None or math.isnan(value) else f"{value:,.0f}"
@@ -81,7 +86,10 @@ def tenths(value: float) -> str:
 
 
 def plain(value: float) -> str:
-    """A number as somebody would type it, with thousands separators: ``0.5``, ``100``, ``2,000,000``."""
+    """A number that somebody has chosen, with all its digits: ``0.5``, ``100``, ``2,000,000``, ``3 × 10⁻⁷``."""
+    if 0.0 < abs(value) < 1e-4:
+        power = exponent_of(value * (1.0 + 1e-12))
+        return f"{plain(float(f'{value / 10.0**power:.10g}'))} × {power_of_ten(power)}"
     return f"{value:,.10g}".replace("-", MINUS)
 
 

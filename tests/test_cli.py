@@ -17,11 +17,12 @@ from harness.cli import cli, main
 from harness.commands.campaigns import _run_folder
 from harness.commands.printing import in_folder, say
 from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooManyFailedError
+from harness.estimators.short_answer import lines
 from harness.numbers import interval, words
 from harness.runner.stored import estimate_run
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
-from tests.stored_runs import SCENARIOS, copy_of, estimates, sets
+from tests.stored_runs import SCENARIOS, copy_of, estimates, manifest, sets
 
 SMOKE = str(SCENARIOS / "smoke.yaml")
 
@@ -56,19 +57,24 @@ def test_check_prints_a_campaign_file(capsys, tmp_path):
 def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     """Also as JSON, with commands that name the folder as it was typed."""
     command = ["run", *CAMPAIGN, "--out", str(folder), "--workers", "1", "--resume"]
-    assert main(command) == 0
+    assert main([*command, "-v"]) == 0
     out, content = capsys.readouterr().out, in_folder(estimates(folder), folder)
     said = [f"Statement {name}: {sentence}" for name, sentence in content["boundary_statements"].items()]
     assert f"`harness replay '{folder}'" in said[0]
+    short = lines(content["answer"], manifest(folder)["wall_time_s"], folder / "report.html")
     assert out.splitlines() == [
         content["statement"],
         *said,
         *content["reference_statements"][1:],
         content["scope"],
         "Stopped after 240 tests: stop.episodes was all that was asked for.",
-        str(folder / "report.html"),
         str(folder / "estimates.json"),
+        "",
+        *short,
     ]
+    assert main(command) == 0
+    shorter = capsys.readouterr().out.splitlines()
+    assert (shorter[1:], len(shorter)) == (short[1:], 8)  # the first has the time that it took
     assert main([*command, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == content
 

@@ -20,6 +20,7 @@ from harness.campaign.drivers import Surrogate, default_surrogates
 from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import (
     Accept,
+    CrashSettings,
     EnvironmentSettings,
     PoolSettings,
     Records,
@@ -46,6 +47,7 @@ class Campaign(Section):
     seed: Whole = Field(1, ge=0, lt=2**63, description="every random number follows from it")
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
+    crash: CrashSettings = CrashSettings()
     surrogates: dict[SurrogateName, Surrogate] = Field(
         default_factory=default_surrogates, description="stand-ins for the unknown AV, by name"
     )
@@ -119,6 +121,7 @@ class Campaign(Section):
         testing["shells"] |= {key: usual for key, (usual, *_) in ShellSettings.gone.items()}  # nor does what went
         unused = {"shadow_paths"} if not self.av.acts_before_cut_in else set()
         content = {
+            **({"crash": self.crash.model_dump()} if self.crash != CrashSettings() else {}),
             "seed": self.seed,
             "environment": environment,
             "environment_parameters": environment_parameters,

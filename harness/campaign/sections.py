@@ -104,6 +104,14 @@ class EnvironmentSettings(Section):
     )
 
 
+class CrashSettings(Section):
+    """Which crashes count."""
+
+    counts_above_mps: float = Field(
+        0.0, ge=0.0, le=50.0, description="impact speed above which a crash counts, for all drivers alike; 0: every one"
+    )
+
+
 class ShellSettings(Section):
     """How tests are spread over the shells of the pool, and what is said about vehicles that keep to some of them."""
 

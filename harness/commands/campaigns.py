@@ -23,9 +23,18 @@ from harness.commands.options import (
     junit_option,
     quiet_option,
     set_option,
+    verbose_option,
     workers_option,
 )
-from harness.commands.printing import in_folder, print_json, print_plan, print_statements, print_table, say
+from harness.commands.printing import (
+    in_folder,
+    print_answer,
+    print_json,
+    print_plan,
+    print_statements,
+    print_table,
+    say,
+)
 from harness.numbers import leaves, words
 
 if TYPE_CHECKING:
@@ -93,6 +102,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
 )
 @junit_option
 @quiet_option
+@verbose_option
 @av_option
 @set_option
 @json_option
@@ -108,6 +118,7 @@ def run(
     accept: float | None,
     junit: Path | None,
     quiet: bool,
+    verbose: bool,
     av: str | None,
     overrides: Sequence[str],
     as_json: bool,
@@ -148,8 +159,10 @@ def run(
     if as_json:
         print_json(content)
     else:
-        print_statements(content)
-        say(result.ending, result.report, result.folder / "estimates.json")
+        if verbose:
+            print_statements(content)
+            say(result.ending, result.folder / "estimates.json", "")
+        print_answer(content, folder, result.report)
     ctx.exit(result.exit_code)
 
 

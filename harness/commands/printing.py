@@ -159,6 +159,14 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
         say(content["scope"])
 
 
+def print_answer(content: dict[str, Any], folder: Path, report: Path | None = None) -> None:
+    """Print the answer of a run in a few lines, with where its page is."""
+    from harness.estimators.short_answer import lines  # noqa: PLC0415 - keeps --help fast
+    from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
+
+    say(*lines(content["answer"], read_manifest(folder).get("wall_time_s"), report))
+
+
 def print_statements(content: dict[str, Any]) -> None:
     """Print the answer in a sentence, what else is stated under which assumption, and what all this is about."""
     decided = [decision["sentence"]] if (decision := content.get("decision")) else []

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, written_file
-from harness.commands.printing import in_folder, print_estimates, print_json, say
+from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, verbose_option, written_file
+from harness.commands.printing import in_folder, print_answer, print_estimates, print_json, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.vocabulary import ESTIMATORS
 
@@ -39,6 +39,7 @@ LATERAL = ("lead_steps", "onset_step", "onset_r2_m", "onset_ttc_s", "overlap_ttc
 )
 @click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
+@verbose_option
 @json_option
 @click.pass_context
 def estimate(
@@ -48,12 +49,13 @@ def estimate(
     estimators: Sequence[EstimatorName],
     confidence: float | None,
     write: bool,
+    verbose: bool,
     as_json: bool,
 ) -> None:
     """Estimate the crash rate again from the records in DIR, with any estimator.
 
-    Nothing is simulated in SUMO. An estimator that the records do not allow is shown with the reason; the exit code is
-    2 if they allow none of those asked for.
+    Nothing is simulated in SUMO. Estimators that are asked for, and with -v all, are shown in a table; one that the
+    records do not allow with the reason. The exit code is 2 if they allow none of those asked for.
     """
     from harness.runner.stored import estimate_run  # noqa: PLC0415 - keeps --help fast
 
@@ -64,8 +66,11 @@ def estimate(
         write_sealed(folder / "estimates.json", content)
     if as_json:
         print_json(in_folder(content, folder))
-    else:
+    elif verbose or estimators:
         print_estimates(in_folder(content, folder), estimators)
+    else:
+        page = folder / "report.html"
+        print_answer(content, folder, page if page.is_file() else None)
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.block import DANGER_TTC_S, Block
-from harness.estimators.estimate import Estimate, Estimates, Unavailable, finite_json
+from harness.estimators.estimate import Estimate, Number, Point, Unavailable, finite_json
 from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import PairedEstimate
+from harness.estimators.severity import Severity
+from harness.estimators.short_answer import ShortAnswer, short_answer
 from harness.estimators.stopping import Rule
 from harness.importance.functions import importance_names
-from harness.numbers import WIDEST_RHW, share
+from harness.numbers import WIDEST_RHW, interval, number, ratio, share
 from harness.records.folder import StoppedBy
 from harness.vocabulary import ESTIMATORS, RUN_FOLDER, EstimatorName
 
@@ -34,6 +37,33 @@ TOO_WIDE = (
     f" A relative half-width above {BIASED_RHW:g} is reached by chance: stopping at the first such interval makes "
     "rates too high on the mean. Ask for a smaller stop.rhw."
 )
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Content of ``estimates.json``, as it is written here and the page reads it; without a crash no severity."""
+
+    campaign: str
+    campaign_hash: str
+    lane_change_level: float
+    confidence: float
+    n_episodes: int
+    n_crashes: int
+    headline: str
+    distance_per_test_km: float | None
+    crash_rate_per_1e6_km: dict[str, Number] | None
+    estimates: dict[str, Estimate | Unavailable]
+    diagnostics: dict[str, Any]
+    convergence: tuple[Point, ...]
+    statement: str
+    statements: dict[str, str]
+    reference_statements: tuple[str, ...]
+    boundary_statements: dict[str, str]
+    scope: str
+    answer: ShortAnswer
+    severity: Severity | None = None
+    ending: str | None = None
+    decision: dict[str, Any] | None = None
 
 
 def estimate_blocks(
@@ -78,6 +108,8 @@ def estimate_blocks(
             reference_statements=tuple(reference_statements(best)),
             boundary_statements=boundary_statements(best),
             scope=SCOPE,
+            answer=short_answer(campaign, best, done.severity, manifest, distance_km),
+            severity=done.severity,
             ending=manifest.get("ending"),
             decision=manifest.get("decision"),
         )
@@ -123,25 +155,26 @@ def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km
         f"{estimate.n_episodes:,} overtaking tests at lane-change level {lane_change_level:g} "
         f"({estimate.n_crashes:,} sampled crashes)"
     )
-    level, per_km = f"{estimate.confidence:.0%}", ""
+    level, per_km = share(estimate.confidence), ""
     if estimate.n_crashes == 0:
         upper = estimate.upper_bound
         if distance_per_test_km:
-            per_km = f", or {upper * _PER_KM / distance_per_test_km:.3g} per 1e6 km of such driving"
-        text = f"No crash was sampled in {tests}: with {level} confidence the rate is below {upper:.3g} per test"
+            per_km = f", or {number(upper * _PER_KM / distance_per_test_km)} per million km of such driving"
+        text = f"No crash was sampled in {tests}: with {level} confidence the rate is below {number(upper)} per test"
     else:
         if distance_per_test_km:
             scaled = per_distance(estimate, distance_per_test_km)
             per_km = (
-                f"; that is {scaled['rate']:.3g} crashes per 1e6 km of such overtaking driving "
-                f"({scaled['ci_low']:.3g} to {scaled['ci_high']:.3g})"
+                f"; that is {number(scaled['rate'])} crashes per million km of such overtaking driving "
+                f"({interval(scaled['ci_low'], scaled['ci_high'])})"
             )
-        width = f", relative half-width {estimate.rhw:.1%}"
+        width = f", relative half-width {share(estimate.rhw)}"
         if estimate.rhw > WIDEST_RHW:
             width = ", still open upwards: far wider than the rate"
         text = (
-            f"The crash rate is {estimate.crash_rate:.3g} per test ({level} interval {estimate.ci_low:.3g} to "
-            f"{estimate.ci_high:.3g}{'' if estimate.cautions else width}), estimated from {tests}"
+            f"The crash rate is {number(estimate.crash_rate)} per test ({level} interval "
+            f"{interval(estimate.ci_low, estimate.ci_high)}{'' if estimate.cautions else width}), "
+            f"estimated from {tests}"
         )
     return warned(estimate.cautions, f"{text}{per_km}.")
 
@@ -152,13 +185,13 @@ def failed_statement(found: Mapping[str, Any]) -> str:
         return ""
     return (
         f" Of these tests {found['n_failed']:,} FAILED: they count as no crash in the rate and as crashes in the upper "
-        f"limit. Had they all crashed, the rate would be {found['crash_rate_if_failed_had_crashed']:.3g}."
+        f"limit. Had they all crashed, the rate would be {number(found['crash_rate_if_failed_had_crashed'])}."
     )
 
 
 def reference_statements(estimate: Estimate) -> list[str]:
     """How the vehicle compares with each reference driver, a sentence each; none unless drawn from shells."""
-    references, level = estimate.details.get("references", ()), f"{estimate.confidence:.0%}"
+    references, level = estimate.details.get("references", ()), share(estimate.confidence)
     return [_beside(found, level) for found in references if found["crash_rate"] > 0.0]
 
 
@@ -166,20 +199,20 @@ def _beside(found: Mapping[str, Any], level: str) -> str:
     who = f"{found['described']} ({found['reference']})"
     if found["ratio"] == 0.0:
         return (
-            f"In the same traffic this vehicle crashes less than {found['ratio_high']:.3g} times as often as {who} "
+            f"In the same traffic this vehicle crashes less than {ratio(found['ratio_high'])} times as often as {who} "
             f"would (upper end of the {level} interval): no crash was sampled."
         )
     low, high = found["preventable_low"], found["preventable_high"]
     return (
-        f"This vehicle crashes {found['ratio']:.2f} times as often as {who} would in the same traffic ({level} "
-        f"interval {found['ratio_low']:.2f} to {found['ratio_high']:.2f}); {share(found['preventable'])} of its "
+        f"This vehicle crashes {ratio(found['ratio'])} times as often as {who} would in the same traffic ({level} "
+        f"interval {ratio(found['ratio_low'])} to {ratio(found['ratio_high'])}); {share(found['preventable'])} of its "
         f"crashes such a driver would have avoided ({share(low)} to {share(high)})."
     )
 
 
 def boundary_statements(estimate: Estimate) -> dict[str, str]:
     """What holds for vehicles that crash only within a boundary, by statement; none unless drawn from shells."""
-    details, level = estimate.details, f"{estimate.confidence:.0%}"
+    details, level = estimate.details, share(estimate.confidence)
     return {found["name"]: _within(found, len(details["shells"]), level) for found in details.get("statements", ())}
 
 
@@ -193,9 +226,9 @@ def _within(found: Mapping[str, Any], n_shells: int, level: str) -> str:
     if math.isinf(found["rhw_from_pool"]):
         return "Under an assumption about where it crashes nothing more can be said: its crashes lie on too few paths."
     text = (
-        f"If this vehicle {found['assumes']}, its crash rate is {found['crash_rate']:.3g} per test ({level} interval "
-        f"{found['ci_low']:.3g} to {found['ci_high']:.3g}), estimated from {found['n_episodes']:,} tests "
-        f"({found['n_crashes']:,} sampled crashes).{failed_statement(found)}"
+        f"If this vehicle {found['assumes']}, its crash rate is {number(found['crash_rate'])} per test "
+        f"({level} interval {interval(found['ci_low'], found['ci_high'])}), estimated from "
+        f"{found['n_episodes']:,} tests ({found['n_crashes']:,} sampled crashes).{failed_statement(found)}"
     )
     return f"{text} {_outside(found, n_shells, level)}{_ahead(found)}"
 
@@ -209,7 +242,7 @@ def _outside(found: Mapping[str, Any], n_shells: int, level: str) -> str:
     counted = f", but {failed:,} of them FAILED and are counted as crashes here" if failed else ""
     return (
         f"There was no crash in {found['n_episodes_outside']:,} tests outside{counted}: with {level} confidence "
-        f"fewer than {found['upper_bound_outside']:.3g} crashes per test lie there."
+        f"fewer than {number(found['upper_bound_outside'])} crashes per test lie there."
     )
 
 
@@ -260,10 +293,12 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
 def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
     """Without an assumption: both rates, what lies between them, where only one of the two crashes, failed tests."""
     free, a, b = found.free, found.a, found.b
-    alone_a, alone_b = ("{value:.3g} ({ci_low:.3g} to {ci_high:.3g})".format(**free[of]) for of in ("only_a", "only_b"))
+    alone_a, alone_b = (
+        interval(free[of]["ci_low"], free[of]["ci_high"], free[of]["value"]) for of in ("only_a", "only_b")
+    )
     text = (
-        f"A ({name_a}) crashes {a.crash_rate:.3g} times per test ({a.ci_low:.3g} to {a.ci_high:.3g}), "
-        f"B ({name_b}) {b.crash_rate:.3g} times ({b.ci_low:.3g} to {b.ci_high:.3g}): {_apart(free, a.confidence)}, "
+        f"A ({name_a}) crashes {interval(a.ci_low, a.ci_high, a.crash_rate)} times per test, "
+        f"B ({name_b}) {interval(b.ci_low, b.ci_high, b.crash_rate)} times: {_apart(free, a.confidence)}, "
         f"from {free['n_pairs']:,} pairs of tests. Alone, where the other one does not, "
         f"A crashes {alone_a} times per test, B {alone_b}."
     )
@@ -301,8 +336,8 @@ def _apart(found: Mapping[str, Any], confidence: float) -> str:
         verdict = "A crashes more often"
     elif found["n_differing"] and high < 0.0:
         verdict = "A crashes less often"
-    apart = f"{verdict}, A - B = {found['difference']:.3g} ({confidence:.0%} interval {low:.3g} to {high:.3g})"
+    apart = f"{verdict}, A − B = {number(found['difference'])} ({share(confidence)} interval {interval(low, high)})"
     if not math.isfinite(found["ratio"]):
         return apart
-    most = f"{found['ratio_high']:.3g}" if math.isfinite(found["ratio_high"]) else "no limit"
-    return f"{apart}, A/B = {found['ratio']:.3g} ({found['ratio_low']:.3g} to {most})"
+    most = ratio(found["ratio_high"]) if math.isfinite(found["ratio_high"]) else "no limit"
+    return f"{apart}, A/B = {ratio(found['ratio'])} ({ratio(found['ratio_low'])} to {most})"

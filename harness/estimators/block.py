@@ -24,6 +24,7 @@ from harness.vocabulary import (
     FAILED,
     OUTCOMES,
     SAMPLING,
+    TIMEOUT,
     BoolArray,
     EstimatorName,
     FloatArray,
@@ -35,7 +36,9 @@ from harness.vocabulary import (
 
 MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
-EPISODE_COLUMNS = ("episode", "outcome", "cut_in_step", "n_control_steps", "log_weight", "log_p_cut_in", "log_q")
+EPISODE_COLUMNS = (
+    "episode", "outcome", "cut_in_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_cut_in", "log_q",
+)  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step", "min_ttc_s")
 DANGER_TTC_S = 4.0
 """A test in which the vehicle was ahead of a boundary counts where it also came closer to a collision than this (s).
@@ -62,13 +65,14 @@ class Drawn:
 
     ``alpha`` (M,) are mixture weights of the importance functions; ``weight_cap`` is the bound on Y = 1{crash}·weight
     that the design guarantees for every episode, seen or not, None if there is none; ``shells`` is what is known of the
-    strata, where tests are drawn from some.
+    strata, where tests are drawn from some. Crashes count with an impact above ``counts_above_mps``, all of them at 0.
     """
 
     method: Method
     alpha: FloatArray = field(default_factory=lambda: np.zeros(0))
     weight_cap: float | None = None
     shells: ShellDesign | None = None
+    counts_above_mps: float = 0.0
 
     @property
     def sampling(self) -> Sampling:
@@ -96,12 +100,13 @@ class Block:
         log p(x_c) - log q_sampled(x_c); exactly 0 without control.
     columns : mapping of str to array, a row for each episode
         What else the method records, also as attributes; those that it does not record are left out. ``cut_in`` (n,)
-        bool. ``log_q`` (n, M): per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot
-        draw the episode. ``n_control_steps`` (n,): stratum l of each episode. ``first_ratios`` (n, 9, J):
-        q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one. ``log_p_cut_in`` (n,):
-        log P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode alone. Of shells
-        ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C): its path's probability of a cut-in of each cell; and
-        ``ahead`` (n,) bool: whether the vehicle was ever ahead of the boundary that a statement checks.
+        bool. ``impact_mps`` (n,): closing speed at contact, NaN without a crash. ``log_q`` (n, M): per importance
+        function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode. ``n_control_steps``
+        (n,): stratum l of each episode. ``first_ratios`` (n, 9, J): q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine
+        control steps, 1 beyond the last one. ``log_p_cut_in`` (n,): log P(cut-in | path), where the method draws the
+        path ahead; it bounds Y of that episode alone. Of shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C):
+        its path's probability of a cut-in of each cell; and ``ahead`` (n,) bool: whether the vehicle was ever ahead of
+        the boundary that a statement checks.
     drawn : Drawn
     """
 
@@ -163,6 +168,10 @@ class Block:
         """The same episodes, had some of them ended otherwise, each with the weight that it has on record."""
         return replace(self, outcome=np.where(rows, np.int8(outcome), self.outcome)) if rows.any() else self
 
+    def harder_than(self, speed_mps: float) -> Block:
+        """The same episodes, where a crash counts only with an impact above this speed."""
+        return self.ending(self.crash & (self.impact_mps <= speed_mps), TIMEOUT)
+
     def failed_as_crashes(self) -> Block:
         """The same episodes had every failed one crashed, each with the weight that it has on record.
 
@@ -201,13 +210,14 @@ def block_from_tables(
     method: Method,
     alpha: Sequence[float],
     shells: ShellDesign | None = None,
+    counts_above_mps: float = 0.0,
 ) -> Block:
     """Block of one shard; rows that are missing, out of order, or contradict each other are a `RunFolderError`.
 
     ``episodes`` are rows of that table, consecutive and in index order, with `EPISODE_COLUMNS`; ``moments``, of the
     step mixture, are the control steps of the same episodes, sorted by episode and step, with `MOMENT_COLUMNS`.
     ``alpha`` (M,) are mixture weights in the order of ``log_q``. A campaign that draws from ``shells`` needs
-    `SHELL_COLUMNS`, too.
+    `SHELL_COLUMNS`, too. Crashes that are no harder than ``counts_above_mps`` count as none.
     """
     index = _integers(episodes, "episode")
     _require_consecutive(index)
@@ -218,6 +228,8 @@ def block_from_tables(
         "log_q": _nested(episodes, "log_q", len(alpha)),
         "n_control_steps": n_control_steps,
     }
+    if "impact_speed_mps" in episodes.column_names:
+        columns["impact_mps"] = np.asarray(episodes.column("impact_speed_mps").to_numpy(), dtype=np.float64)
     if moments is not None and SAMPLING[method].mixes_steps:
         columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     if np.all(_known(episodes, "log_p_cut_in") | failed):
@@ -229,8 +241,10 @@ def block_from_tables(
             # Comparing with a null, of a vehicle that never closed in, is false.
             danger = pc.fill_null(pc.less(episodes.column("min_ttc_s"), DANGER_TTC_S), fill_value=False).to_numpy()
             columns["ahead"] = _known(episodes, "ahead_step") & (danger | (outcome == CRASH) | failed)
-    drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), None if SAMPLING[method].controlled else 1.0, shells)
-    return Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
+    cap = None if SAMPLING[method].controlled else 1.0
+    drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), cap, shells, counts_above_mps)
+    block = Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
+    return block.harder_than(counts_above_mps) if counts_above_mps > 0.0 else block
 
 
 def _damaged(where: str, found: str, expected: str) -> RunFolderError:

@@ -99,31 +99,6 @@ class Point:
     n_crashes: int
 
 
-@dataclass(frozen=True)
-class Estimates:
-    """Content of ``estimates.json``, as `harness.estimators.answer` writes it and the page reads it."""
-
-    campaign: str
-    campaign_hash: str
-    lane_change_level: float
-    confidence: float
-    n_episodes: int
-    n_crashes: int
-    headline: str
-    distance_per_test_km: float | None
-    crash_rate_per_1e6_km: dict[str, Number] | None
-    estimates: dict[str, Estimate | Unavailable]
-    diagnostics: dict[str, Any]
-    convergence: tuple[Point, ...]
-    statement: str
-    statements: dict[str, str]
-    reference_statements: tuple[str, ...]
-    boundary_statements: dict[str, str]
-    scope: str
-    ending: str | None = None
-    decision: dict[str, Any] | None = None
-
-
 def finite_json(content: Any) -> dict[str, Any]:
     """JSON content of a dataclass or mapping: tuples as lists, non-finite numbers, which JSON cannot write, as null."""
     plain: dict[str, Any] = from_json(to_json(content, inf_nan_mode="null"))

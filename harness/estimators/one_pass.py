@@ -14,6 +14,7 @@ import numpy as np
 from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Point, Unavailable
 from harness.estimators.scv import MixtureCv, Scv
+from harness.estimators.severity import Impacts, Severity
 from harness.estimators.shells import Shells
 from harness.estimators.weighted import Moments, Nade, Nde
 from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, EstimatorName, Sampling
@@ -96,7 +97,7 @@ class PassResult:
     """What one pass over a campaign's blocks gives.
 
     ``headline`` is the method's own estimator, asked for or not; ``convergence`` its estimate on growing prefixes, for
-    plots: block boundaries at least 1 % apart.
+    plots: block boundaries at least 1 % apart; ``severity`` is how hard the crashes of that estimate are.
     """
 
     estimates: dict[EstimatorName, Estimate | Unavailable]
@@ -104,6 +105,7 @@ class PassResult:
     headline_estimate: Estimate
     diagnostics: Diagnostics
     convergence: list[Point]
+    severity: Severity | None
 
 
 def one_pass(
@@ -114,6 +116,7 @@ def one_pass(
     Blocks are contiguous and in index order, from episode 0; a gap, or no episode at all, is a `ValueError`.
     """
     own: EstimatorName | None = None
+    impacts: Impacts | None = None
     states: dict[EstimatorName, FailureBounds] = {}
     refusals: dict[EstimatorName, str | None] = {}
     diagnostics, convergence, n = Diagnostics(), list[Point](), 0
@@ -124,10 +127,15 @@ def one_pass(
             own = block.drawn.sampling.headline
             refusals = {name: block.refusal(name) for name in (own, *names)}
             states = {name: accumulator(name) for name, reason in refusals.items() if reason is None}
+            if "impact_mps" in block.columns:
+                empty = Shells if own == "shells" else partial(accumulator, own)
+                impacts = Impacts(empty, block.drawn.counts_above_mps)
         n += len(block)
         diagnostics.add(block)
         for state in states.values():
             state.add(block)
+        if impacts is not None:
+            impacts.add(block)
         if not convergence or n >= convergence[-1].n * SPACING:
             convergence.append(_point(states[own].result(confidence)))
     if own is None:
@@ -136,7 +144,8 @@ def one_pass(
     if convergence[-1].n != n:
         convergence.append(_point(results[own]))
     estimates = {name: results.get(name) or Unavailable(str(refusals[name])) for name in names}
-    return PassResult(estimates, own, results[own], diagnostics, convergence)
+    severity = None if impacts is None else impacts.result(confidence)
+    return PassResult(estimates, own, results[own], diagnostics, convergence, severity)
 
 
 def _point(of: Estimate) -> Point:

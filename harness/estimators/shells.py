@@ -113,6 +113,16 @@ class Within:
 
 
 @dataclass(frozen=True)
+class Unavoidable:
+    """The share of a rate, with limits, on whose cut-ins the most careful driver of the library crashes, too."""
+
+    driver: str
+    share: float
+    share_low: float
+    share_high: float
+
+
+@dataclass(frozen=True)
 class ShellDetails:
     """``details`` of the estimate: shells from conservative to aggressive, and the pool that they come from."""
 
@@ -228,6 +238,19 @@ class Shells:
         tally, p = self.tally.part(slice(0, n_strata)), self._design.p[:n_strata]
         of_tests = p * p * tally.share * (1.0 - tally.share) / tally.at_least_one
         return math.sqrt(float(of_tests.sum()) + pool_variance(p, tally, self._design.n_paths))
+
+    def weight_of_a_crash(self) -> FloatArray:
+        """What a crash in each stratum adds to the rate, p_s/n_s, shape (S,)."""
+        return np.asarray(self._design.p / self.tally.at_least_one)
+
+    def unavoidable(self, level: Level) -> Unavoidable | None:
+        """See there; None without a crash, and where that driver crashes nowhere."""
+        design = self._design
+        if not design.n_inside or not self.tally.totals[1]:
+            return None
+        avoids = np.asarray(design.cell_stratum) > 0
+        share, low, high = preventable_share(design.cell_p, self._cells, avoids, design.n_paths, level)
+        return Unavoidable(design.strata[0], 1.0 - share, 1.0 - high, 1.0 - low)
 
     def limits_of(self, statement: str, level: Level) -> RateLimits:
         """Rate and limits of a statement, or of all strata."""

@@ -29,6 +29,7 @@ from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import MarginDecision, PairCounts
 from harness.estimators.shells import Shells
+from harness.numbers import number, plain
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import SAMPLING, EstimatorName, Method
 
@@ -102,11 +103,11 @@ class Decision:
     def sentence(self) -> str:
         """The verdict in words, and which limits were asked before."""
         given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
-        limit, before = f"{self.crash_rate_below:.3g}", self.asked_before
-        side = f"below {limit} per test (upper limit {self.high:.3g})"
+        limit, before = plain(self.crash_rate_below), self.asked_before
+        side = f"below {limit} per test (upper limit {number(self.high)})"
         if self.verdict == "rejected":
-            side = f"above {limit} per test (lower limit {self.low:.3g})"
-        text = f"{self.verdict.upper()}: with confidence {self.confidence:.3g} the crash rate{given} is {side}."
+            side = f"above {limit} per test (lower limit {number(self.low)})"
+        text = f"{self.verdict.upper()}: with confidence {plain(self.confidence)} the crash rate{given} is {side}."
         if self.verdict == "undecided" and self.contradicted:
             text = (
                 f"UNDECIDED: whether the crash rate is below {limit} per test is not known: the vehicle does not do "
@@ -114,12 +115,12 @@ class Decision:
                 "folder."
             )
         elif self.verdict == "undecided":
-            between = f"it may be {self.low:.3g} as well as {self.high:.3g}"
+            between = f"it may be {number(self.low)} as well as {number(self.high)}"
             text = f"UNDECIDED: whether the crash rate{given} is below {limit} per test is not known; {between}."
         if not before:
             return text
         place = ("second", "third")[len(before) - 1] if len(before) < 3 else f"{len(before) + 1}th"
-        limits = ", ".join(f"{limit:.3g}" for limit in before)
+        limits = ", ".join(map(plain, before))
         return f"{text} This is the {place} limit asked of these tests (before: {limits})."
 
     def to_json(self) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import numpy as np
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate
 from harness.estimators.limits import capped_mean_upper, clopper_pearson, skewed_distances
+from harness.numbers import number
 from harness.vocabulary import FloatArray
 
 FEW_CRASHES = 50
@@ -28,7 +29,7 @@ OVERTURNS = 1.0
 """One more crash of the largest known weight, over all those seen, above which an interval is not to be trusted: a
 single test could double the rate. Default IDM under forced cut-ins, nominal 0.90: where nearly all campaigns are above
 (500 and 2,000 tests) intervals cover 0.73 and 0.87, where nearly all are below (25,000) 0.91 (docs/estimators.md)."""
-UNBOUNDED = "the weights of these tests are unbounded: the true rate may lie far above this interval"
+UNBOUNDED = "the true rate may lie far above this interval: the weights of these tests are unbounded"
 
 
 @dataclass(frozen=True)
@@ -163,15 +164,14 @@ class Nade:
         found = []
         if math.isfinite(self._design_cap) and self._largest_y > self._design_cap * (1.0 + 1e-9):
             found.append(
-                f"a crash weighs {self._largest_y:.6g}, more than the cap {self._design_cap:.6g} that the design "
-                "guarantees: the records contradict the campaign"
+                f"the records contradict the campaign: a crash weighs {self._largest_y:.6g}, more than the design's "
+                f"{self._design_cap:.6g}"
             )
         if not math.isfinite(self.known_cap()):
             found.append(UNBOUNDED)
         elif self.n_crashes and (times := self.known_cap() / self.y.total) > OVERTURNS:
             found.append(
-                f"one more crash of the largest possible weight would add {times:.3g} times this rate: the true rate "
-                "may lie far above this interval"
+                f"the true rate may lie far above this interval: one more crash might add {number(times)} times it"
             )
         return found
 

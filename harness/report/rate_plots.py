@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axes._base import _AxesBase
 
-from harness.estimators.estimate import Estimate, Estimates
+from harness.estimators.answer import Estimates
+from harness.estimators.estimate import Estimate
 from harness.numbers import count, exponent_of, interval, number, plain, share
 from harness.report.style import (
     BLUE,

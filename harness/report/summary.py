@@ -21,7 +21,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
-from harness.estimators.estimate import Estimate, Estimates, Unavailable
+from harness.estimators.answer import Estimates
+from harness.estimators.estimate import Estimate, Unavailable
 from harness.estimators.shells import ShellDetails, Within
 from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_shards, stored_columns

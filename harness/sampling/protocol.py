@@ -195,5 +195,10 @@ class Source:
 def block_of(campaign: Campaign, episodes: pa.Table, moments: pa.Table | None, design: ShellDesign | None) -> Block:
     """What estimators read of the tables of a campaign's shard."""
     return block_from_tables(
-        episodes, moments, method=campaign.testing.method, alpha=mixture_weights(campaign), shells=design
+        episodes,
+        moments,
+        method=campaign.testing.method,
+        alpha=mixture_weights(campaign),
+        shells=design,
+        counts_above_mps=campaign.crash.counts_above_mps,
     )

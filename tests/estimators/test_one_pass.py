@@ -10,6 +10,7 @@ from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import Block, joined
 from harness.estimators.estimate import Unavailable, finite_json
 from harness.estimators.one_pass import ACCUMULATORS, Diagnostics, accumulator, one_pass
+from harness.numbers import number
 from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, FAILED, SAMPLING, TIMEOUT
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
@@ -40,14 +41,14 @@ def test_rates_are_per_test_and_per_distance_where_that_is_known():
     assert known["distance_per_test_km"] == 0.4
     assert known["crash_rate_per_1e6_km"]["rate"] == pytest.approx(known["estimates"]["nade"]["crash_rate"] / 0.4 * 1e6)
     assert "lane-change level 3 " in known["statement"]
-    assert "per 1e6 km" in known["statement"]
+    assert "per million km" in known["statement"]
     assert set(known["statements"]) == set(known["estimates"])
     assert known["estimates"]["nde"]["reason"].rstrip(".") in known["statements"]["nde"]
 
 
 def test_unbounded_weights_lead_the_sentence_and_claim_no_precision():
     content = answered(drawn("step_mixture"))
-    assert content["statement"].startswith("WARNING: the weights of these tests are unbounded: ")
+    assert content["statement"].startswith("WARNING: the true rate may lie far above this interval: the weights")
     for name, n_cautions in (("nade", 1), ("scv", 2)):
         found = content["estimates"][name]
         assert "half-width" not in content["statements"][name]
@@ -60,7 +61,8 @@ def test_one_crash_that_could_double_the_rate_leads_the_sentence(n, doubts):
     """Three tests in a hundred crash, with weight 0.001; the largest weight, 0.1, counts as much as 100 of them."""
     some = block([k % 100 < 3 for k in range(n)], [-6.9] * n, method="forced", log_p_cut_in=np.full(n, np.log(0.1)))
     said = answered([some])["statement"]
-    assert said.startswith("WARNING: one more crash of the largest possible weight would add 1.65 times") == doubts
+    assert said.startswith("WARNING: the true rate may lie far above this interval: one more crash") == doubts
+    assert ("might add 1.65 times it." in said) == doubts
     assert ("relative half-width" in said) != doubts
 
 

@@ -13,6 +13,7 @@ from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
 from harness.estimators.tally import FEWEST_PATHS, CrashPaths, Tally, combined, empty_tally, pool_variance
+from harness.numbers import interval
 from harness.strata import Statement
 from tests.estimators.small_blocks import EXACT, SHELLS, in_shells, tally
 
@@ -123,9 +124,9 @@ def test_a_half_width_far_wider_than_the_rate_is_no_number():
     estimate = shells_estimate((0, 10, 0, 0), (1, 0, 0, 20))
     assert estimate.rhw > 10.0
     text = statement(estimate, 1.0, None)
-    assert f"to {estimate.ci_high:.3g}, still open upwards: far wider than the rate)" in text
+    assert f"{interval(estimate.ci_low, estimate.ci_high)}, still open upwards: far wider than the rate)" in text
     assert "half-width" not in text
-    assert "relative half-width 50.0%)" in statement(replace(estimate, rhw=0.5), 1.0, None)
+    assert "relative half-width 50 %)" in statement(replace(estimate, rhw=0.5), 1.0, None)
 
 
 def test_a_crash_outside_refutes_the_assumption():

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import harness.report
-from harness.estimators.estimate import Estimate, Estimates, Unavailable
+from harness.estimators.answer import Estimates
+from harness.estimators.estimate import Estimate, Unavailable
 from harness.numbers import number
 from harness.report import crashes
 from harness.report.crashes import CANDIDATES, crash_gallery, worst_crashes

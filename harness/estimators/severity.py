@@ -1,0 +1,110 @@
+"""How hard a vehicle crashes: the rate of crashes above each impact speed, from the same tests.
+
+The impact speed is the closing speed at contact, v_AV - v_BV. The rate above a speed is that of the method's own
+estimator with only the harder crashes as crashes, so that its limits promise what those of the rate do, at each speed
+for itself. A failed test may have been a crash of any speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.estimators.block import Block
+from harness.estimators.estimate import Accumulator, Number
+from harness.estimators.likelihood import Level
+from harness.estimators.shells import Shells, Unavoidable
+from harness.strata import ASSUMPTION_FREE
+from harness.vocabulary import FloatArray
+
+SPEEDS_MPS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0)
+"""At which the rate is asked; at 0, or at what the campaign counts from, all crashes count."""
+TOUCH_MPS, HARD_MPS = 1.0, 5.0
+"""Below the first a crash is a touch at walking pace; shares of the rate are told below it and above the second."""
+
+
+@dataclass(frozen=True)
+class Exceedance:
+    """Rate per test of crashes with an impact above a speed, its interval and one-sided upper bound."""
+
+    above_mps: float
+    crash_rate: float
+    ci_low: Number
+    ci_high: Number
+    upper_bound: Number
+    n_crashes: int
+
+
+@dataclass(frozen=True)
+class Severity:
+    """Impact speeds of the crashes, each counted by what it adds to the rate; nothing of them without a crash.
+
+    ``median_mps`` and ``p95_mps`` are quantiles of the impact speed (m/s), ``share_below_1_mps`` and
+    ``share_above_5_mps`` shares of the rate; ``exceedance`` has a row for each of `SPEEDS_MPS` above what is counted,
+    and ``unavoidable`` what not even the most careful driver of the library avoids, of shells.
+    """
+
+    median_mps: float
+    p95_mps: float
+    share_below_1_mps: float
+    share_above_5_mps: float
+    exceedance: tuple[Exceedance, ...]
+    unavoidable: Unavoidable | None
+
+
+class Impacts:
+    """Running state: an accumulator for each speed, and the impact speed of each crash with its weight.
+
+    ``empty`` makes an estimator without tests, ``counts_above_mps`` is what the campaign counts.
+    """
+
+    def __init__(self, empty: Callable[[], Accumulator], counts_above_mps: float = 0.0) -> None:
+        speeds = [counts_above_mps, *(speed for speed in SPEEDS_MPS if speed > counts_above_mps)]
+        self._above = {speed: empty() for speed in speeds}
+        self._first = counts_above_mps
+        self._crashes: list[tuple[FloatArray, FloatArray]] = []
+
+    def add(self, block: Block) -> None:
+        """Add the episodes of one block."""
+        crash = block.crash
+        weight = block.stratum[crash] if block.drawn.shells is not None else np.exp(block.log_weight[crash])
+        self._crashes.append((block.impact_mps[crash], np.asarray(weight, np.float64)))
+        for speed, state in self._above.items():
+            state.add(block if speed == self._first else block.harder_than(speed))
+
+    def result(self, confidence: float) -> Severity | None:
+        """Of the episodes so far; None without a crash."""
+        impact, weight = (np.concatenate(column) for column in zip(*self._crashes, strict=True))
+        if not impact.size:
+            return None
+        every, unavoidable = self._above[self._first], None
+        if isinstance(every, Shells):
+            weight = every.weight_of_a_crash()[weight.astype(np.int64)]
+            unavoidable = every.unavoidable(Level.two_sided(confidence))
+        if not weight.any():  # too small for a number
+            return None
+        total, median, high = float(weight.sum()), *weighted_quantiles(impact, weight, (0.5, 0.95))
+        below, above = (float(weight[rows].sum()) / total for rows in (impact <= TOUCH_MPS, impact > HARD_MPS))
+        rows = tuple(_exceedance(speed, state, confidence) for speed, state in self._above.items())
+        return Severity(median, high, below, above, rows, unavoidable)
+
+
+def _exceedance(speed: float, state: Accumulator, confidence: float) -> Exceedance:
+    if not isinstance(state, Shells):
+        of = state.result(confidence)
+        return Exceedance(speed, of.crash_rate, of.ci_low, of.ci_high, of.upper_bound, of.n_crashes)
+    n, n_crashes, _ = state.tally.totals
+    limits = state.limits_of(ASSUMPTION_FREE, Level.two_sided(confidence))
+    bound = state.limits_of(ASSUMPTION_FREE, Level.of_bound(confidence, n)).high
+    return Exceedance(speed, limits.rate, limits.low, limits.high, bound, n_crashes)
+
+
+def weighted_quantiles(values: FloatArray, weights: FloatArray, quantiles: tuple[float, ...]) -> list[float]:
+    """Values up to which these shares of the weight lie; NaN without weight."""
+    if not weights.any():
+        return [math.nan] * len(quantiles)
+    found: list[float] = np.quantile(values, quantiles, method="inverted_cdf", weights=weights).tolist()
+    return found

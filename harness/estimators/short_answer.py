@@ -1,0 +1,239 @@
+"""The answer at a glance: at most nine lines for a terminal, and the same rows for the first screen of the page."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from harness.campaign.campaign import Campaign
+from harness.campaign.vehicle import AutomatedVehicle
+from harness.estimators.estimate import Estimate
+from harness.estimators.severity import HARD_MPS, TOUCH_MPS, Severity
+from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, ratio, share, tenths, words
+from harness.strata import ASSUMPTION_FREE
+
+WIDTH, LINES = 100, 9
+MOST_WARNINGS = 3
+_BRAKES_HARDEST = "brakes-8"
+ENDED = {
+    "rhw": "precision reached",
+    "accept": "decision reached",
+    "two_phase": "all tests of the second phase done",
+    "episodes": "budget spent",
+    "pool": "no cut-in of the pool is left",
+    "contradicted": "vehicle does not do what the statement assumes",
+    "pool_error": "the pool’s own error is too wide",
+}
+"""Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the answer: what, how much, its interval, a remark; ``key`` tells the page which it is."""
+
+    key: str
+    what: str
+    value: str
+    interval: str = ""
+    remark: str = ""
+
+
+@dataclass(frozen=True)
+class ShortAnswer:
+    """What is shown first of a run: vehicle and tests, rows, what changes their meaning, and how far they go.
+
+    ``parameters`` are those of the vehicle that are not defaults, as pairs of a name and a value.
+    """
+
+    vehicle: str
+    parameters: tuple[tuple[str, str], ...]
+    tests: str
+    rows: tuple[Row, ...]
+    warnings: tuple[str, ...]
+    scope: str
+
+
+def short_answer(
+    campaign: Campaign,
+    best: Estimate,
+    severity: Severity | None,
+    manifest: Mapping[str, Any],
+    distance_km: float | None,
+) -> ShortAnswer:
+    """The answer by a campaign's own estimate ``best``; ``distance_km`` is the mean of a test, if it is known."""
+    vehicle, parameters = vehicle_words(campaign.av)
+    engine = "SUMO" if campaign.world.engine == "sumo" else "SUMO’s twin"
+    return ShortAnswer(
+        vehicle=vehicle,
+        parameters=tuple(parameters),
+        tests=f"{count(best.n_episodes)} tests in {engine}",
+        rows=tuple(_rows(campaign, best, severity, manifest.get("decision"), distance_km)),
+        warnings=tuple(_warnings(campaign, best, severity, manifest)),
+        scope=_scope(campaign, best, manifest.get("stopped_by")),
+    )
+
+
+def vehicle_words(av: AutomatedVehicle) -> tuple[str, list[tuple[str, str]]]:
+    """Who drives the vehicle, and its parameters that are not defaults."""
+    given = dict[str, Any]()
+    for section, key in ((av.parameters, ""), (av.reaction, "reaction")):
+        if isinstance(section, BaseModel):
+            usual = type(section)().model_dump()
+            changed = {name: value for name, value in section.model_dump().items() if value != usual[name]}
+        else:
+            changed = dict(section)
+        given |= {key: changed} if key and changed else changed
+    name = av.model or av.controller or ""
+    if av.sumo is not None:
+        given |= av.sumo
+        name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
+    elif av.traci is not None:
+        name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
+    elif av.fmu is not None:
+        given |= av.fmu.start_values
+        name = Path(av.fmu.file).name
+    return name, [(path, plain(value) if isinstance(value, float) else words(value)) for path, value in leaves(given)]
+
+
+def _rows(
+    campaign: Campaign,
+    best: Estimate,
+    severity: Severity | None,
+    decision: Mapping[str, Any] | None,
+    distance_km: float | None,
+) -> Iterator[Row]:
+    if decision is not None:
+        yield _decided(decision)
+    from_mps = campaign.crash.counts_above_mps
+    counted = f"crash rate > {plain(from_mps)} m/s" if from_mps else "crash rate"
+    shown, ends = best.crash_rate, interval(best.ci_low, best.ci_high)
+    value = f"{number(shown)} per test"
+    if not best.n_crashes:
+        shown, ends, value = best.upper_bound, "no crash seen", f"< {number(best.upper_bound)} per test"
+    per_km = "" if not distance_km else f"{number(shown * 1e6 / distance_km)} per million km"
+    yield Row("rate", counted, value, ends, per_km)
+    for each in best.details.get("references", ())[:1]:
+        if each["crash_rate"] > 0.0:
+            yield _beside(each)
+    if severity is not None:
+        below, above = share(severity.share_below_1_mps), share(severity.share_above_5_mps)
+        value = f"median {tenths(severity.median_mps)} m/s"
+        yield Row(
+            "impact", "impact", value, f"{below} below {plain(TOUCH_MPS)} m/s", f"{above} above {plain(HARD_MPS)} m/s"
+        )
+        if (of := severity.unavoidable) is not None:
+            hardest = of.driver == _BRAKES_HARDEST
+            why = "not even 8 m/s² avoids it" if hardest else f"{of.driver} crashes there, too"
+            ends = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}"
+            yield Row("unavoidable", "unavoidable", f"{share(of.share)} of the rate", ends, why)
+    asked = campaign.testing.shells.statement
+    statements = best.details.get("statements", ())
+    chosen = [each for each in statements if each["name"] == asked] or statements
+    for each in chosen[:1]:
+        yield _within(each)
+
+
+def _decided(decision: Mapping[str, Any]) -> Row:
+    limit, verdict = plain(decision["crash_rate_below"]), decision["verdict"]
+    value = {"accepted": f"below {limit} per test", "rejected": f"above {limit} per test"}.get(
+        verdict, f"limit {limit} per test"
+    )
+    ends = {
+        "accepted": f"upper limit {number(decision['high'])}",
+        "rejected": f"lower limit {number(decision['low'])}",
+    }.get(verdict, f"it may be {interval(decision['low'], decision['high'])}")
+    given = "" if decision["statement"] == ASSUMPTION_FREE else f", given {decision['statement']}"
+    return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
+
+
+def _beside(found: Mapping[str, Any]) -> Row:
+    low, high = found["ratio_low"], found["ratio_high"]
+    who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
+    if not found["ratio"]:
+        return Row("ratio", "× competent driver", f"< {ratio(high)}", "no crash seen", who)
+    apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
+    return Row(
+        "ratio", "× competent driver", f"{ratio(found['ratio'])} ({apart})", f"{ratio(low)} to {ratio(high)}", who
+    )
+
+
+def _within(found: Mapping[str, Any]) -> Row:
+    name, n, outside = found["name"], found["n_crashes_outside"], count(found["n_episodes_outside"])
+    what = f"keeping to {name}"
+    if found["refuted"]:
+        return Row("within", what, "REFUTED", "", f"{count(n)} crashes in {outside} tests beyond")
+    beyond = f"no crash in {outside} tests beyond" if found["n_episodes_outside"] else "nothing was tested beyond"
+    if found["n_ahead"]:
+        beyond = f"NOT KEPT TO in {count(found['n_ahead'])} of {count(found['n_checked'])} tests"
+    if not found["n_crashes"]:
+        return Row("within", what, f"< {number(found['ci_high'])}", "", beyond)
+    return Row("within", what, number(found["crash_rate"]), interval(found["ci_low"], found["ci_high"]), beyond)
+
+
+def _warnings(
+    campaign: Campaign, best: Estimate, severity: Severity | None, manifest: Mapping[str, Any]
+) -> Iterator[str]:
+    """What changes the meaning of the rows, a line each."""
+    yield from best.cautions
+    repeated = manifest.get("repeated") or {}
+    if n := len(repeated.get("differing", ())):
+        yield f"NOT REPRODUCIBLE: {count(n)} of {count(repeated['n_episodes'])} tests that ran twice came out otherwise"
+    if n := best.details["n_failed"]:
+        had = number(best.details["crash_rate_if_failed_had_crashed"])
+        yield f"{count(n)} of {count(best.n_episodes)} tests FAILED; had they all crashed, the rate would be {had}"
+    if severity is not None and severity.share_below_1_mps > 0.5:
+        yield f"{share(severity.share_below_1_mps)} of this rate are touches below {plain(TOUCH_MPS)} m/s"
+    decision = manifest.get("decision")
+    if decision is not None and decision["contradicted"]:
+        yield f"the vehicle does not do what statement {decision['statement']} assumes: ask without it"
+    if decision is not None and (before := decision["asked_before"]):
+        yield f"these tests were asked about {len(before)} other limits before: {', '.join(map(plain, before))}"
+    if (level := campaign.environment.lane_change_level) != 1.0:
+        yield f"lane-change level {plain(level)}: never compare with rates of other levels"
+
+
+def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None) -> str:
+    ended, target = ENDED.get(stopped_by or "", "interrupted"), campaign.stop.rhw
+    if campaign.accept is None and target is not None and stopped_by not in ("rhw", "two_phase"):
+        asked = best.precision
+        for each in best.details.get("statements", ()):
+            asked = each["rhw"] if each["name"] == campaign.testing.shells.statement else asked
+        reached = f"± {share(asked)}" if asked <= WIDEST_RHW else "with next to nothing known"
+        ended += f" {reached}, asked: ± {share(target)}"
+    elif stopped_by == "episodes" and campaign.accept is None:
+        ended = "all tests done"
+    return f"sampling error in this simulated traffic only ({share(best.confidence)}); ended by: {ended}"
+
+
+def lines(answer: Mapping[str, Any], took_s: float | None, report: Path | None = None) -> list[str]:
+    """An answer (``answer`` in ``estimates.json``) for a terminal: at most `LINES` lines of `WIDTH` columns.
+
+    Where there is much to warn of the last rows give way: all of it is on the page.
+    """
+    warnings = [f"! {text}" for text in answer["warnings"]]
+    if len(warnings) > MOST_WARNINGS:
+        warnings[MOST_WARNINGS - 1 :] = [f"! {count(len(warnings) - MOST_WARNINGS + 1)} more warnings: see the report"]
+    ends = [answer["scope"], *([] if report is None else [f"report  {report}"])]
+    rows = answer["rows"][: LINES - 1 - len(warnings) - len(ends)]
+    parameters = ", ".join(f"{name} {value}" for name, value in answer["parameters"])
+    head = [answer["vehicle"], answer["tests"], *([] if took_s is None else [duration(took_s)])]
+    if parameters:
+        room = WIDTH - len(" · ".join(head)) - 3
+        head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
+    keys = "what", "value", "interval"
+    widths = [max(len(row[key]) for row in rows) for key in keys]
+    table = [
+        "  ".join([*(row[key].ljust(width) for key, width in zip(keys, widths, strict=True)), row["remark"]])
+        for row in rows
+    ]
+    shown = [*table, *warnings, ends[0]]
+    return [" · ".join(head), *_cut(f"  {line.rstrip()}" for line in shown), *(f"  {line}" for line in ends[1:])]
+
+
+def _cut(texts: Iterable[str]) -> Iterator[str]:
+    return (text if len(text) <= WIDTH else f"{text[: WIDTH - 2]} …" for text in texts)

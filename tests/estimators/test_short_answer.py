@@ -1,0 +1,103 @@
+"""The answer at a glance of every kind of run: short, and with what changes its meaning."""
+
+import json
+import re
+
+import pytest
+
+from harness.campaign.files import load_campaign
+from harness.estimators.answer import estimate_blocks
+from harness.estimators.short_answer import LINES, WIDTH, lines, vehicle_words
+from harness.records.folder import read_manifest
+from harness.runner.stored import stored_blocks
+from tests.golden.campaigns import BASE, RUNS
+from tests.stored_runs import estimates, golden
+
+SAID = {
+    "nde-twin": ["lane-change level 3,000,000: never compare", "impact "],
+    "step-immediate-twin": ["the true rate may lie far above this interval: the weights of these tests are unb"],
+    "forced-failing-twin": [" of 240 tests FAILED; had they all crashed, the rate would be "],
+    "shells-twin": [
+        "× competent driver  ",
+        "r157-cc of UN R157",
+        "not even 8 m/s² avoids it",
+        "keeping to library ",
+    ],
+    "shells-accepted": ["ACCEPTED ", "below 4 × 10⁻⁷ per test", "confidence 0.95", "ended by: decision reached"],
+    "shells-refuted": ["138 (crashes more)", "103 crashes in 120 tests beyond", "ended by: all tests done"],
+    "shells-need-based": ["need-based · ", "keeping to need-based "],
+    "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin"],
+    "forced-inattentive": ["fvdm (reaction.delay_s 0.2, "],
+    "forced-krauss": ["SUMO’s Krauss · 240 tests in SUMO"],
+    "shells-lateral-twin": ["idm · 240 tests"],
+}
+
+
+def shown(folder):
+    return lines(estimates(folder)["answer"], 3.21, folder / "report.html")
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_it_is_short_and_says_what_changes_the_meaning(name, stored_run):
+    text = shown(stored_run(name))
+    assert len(text) <= LINES
+    assert max(map(len, text[:-1])) <= WIDTH
+    assert " · 3.2 s" in text[0]
+    assert text[-1] == f"  report  {stored_run(name)}/report.html"
+    assert text[-2].startswith("  sampling error in this simulated traffic only (90 %)")
+    assert [each for each in SAID.get(name, ()) if each not in "\n".join(text)] == []
+
+
+def answered(stored_run, name="shells-twin", **manifest):
+    folder = stored_run(name)
+    known = {**read_manifest(folder), **manifest}
+    return estimate_blocks(stored_blocks(folder, moments=False), golden(name, "stop.rhw=0.1"), known)["answer"]
+
+
+def test_a_vehicle_that_is_not_reproducible_and_a_precision_that_was_not_reached(stored_run):
+    answer = answered(stored_run, repeated={"n_episodes": 16, "differing": [3, 4, 5]})
+    assert answer["warnings"] == ["NOT REPRODUCIBLE: 3 of 16 tests that ran twice came out otherwise"]
+    assert re.search(r"ended by: budget spent ± \d+ %, asked: ± 10 %$", answer["scope"])
+
+
+def test_a_limit_that_is_rejected_or_open_and_was_not_the_first(stored_run):
+    decision = json.loads(json.dumps(read_manifest(stored_run("shells-accepted"))["decision"]))
+    for verdict, value in (("rejected", "above 4 × 10⁻⁷ per test"), ("undecided", "limit 4 × 10⁻⁷ per test")):
+        asked = {**decision, "verdict": verdict, "asked_before": [1e-7, 2e-7], "contradicted": True}
+        answer = answered(stored_run, decision=asked)
+        assert (answer["rows"][0]["what"], answer["rows"][0]["value"]) == (verdict.upper(), value)
+        assert "these tests were asked about 2 other limits before: 1 × 10⁻⁷, 2 × 10⁻⁷" in answer["warnings"]
+        assert len(lines(answer, 1.0)) <= LINES
+
+
+def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
+    """Of the same tests had none crashed: above 50 m/s none did."""
+    folder, campaign = stored_run("shells-twin"), golden("shells-twin", "crash.counts_above_mps=50")
+    blocks = [block.harder_than(50.0) for block in stored_blocks(folder, moments=False)]
+    content = estimate_blocks(blocks, campaign, read_manifest(folder))
+    rows = {row["key"]: row for row in content["answer"]["rows"]}
+    assert set(rows) == {"rate", "ratio", "within"}
+    assert (rows["rate"]["what"], rows["rate"]["interval"]) == ("crash rate > 50 m/s", "no crash seen")
+    assert rows["rate"]["value"].startswith("< ")
+    assert content["severity"] is None
+
+
+def test_much_to_warn_of_leaves_room_for_the_rate(stored_run):
+    answer = {**answered(stored_run), "warnings": ["a" * 120, "b", "c", "d", "e"]}
+    text = lines(answer, None)
+    assert len(text) <= LINES
+    assert text[1].startswith("  crash rate ")
+    assert text[-2].strip() == "! 3 more warnings: see the report"
+    assert max(map(len, text)) == WIDTH
+
+
+def test_vehicles_are_named_with_what_is_not_a_default():
+    for av, name, parameters in (
+        ("av={controller: 'm:C', parameters: {hard: 8, soft: {a: 1}}}", "m:C", [("hard", "8"), ("soft.a", "1")]),
+        ("av={fmu: {file: x/brake.fmu, inputs: {s: speed_mps}, output: a}}", "brake.fmu", []),
+        ("av={traci: {command: './my_av --port {port}'}}", "TraCI client my_av", []),
+        ("av={sumo: {tau: 1}}", "SUMO’s Krauss", [("tau", "1")]),
+        ("av.parameters.min_acceleration_mps2=-8", "idm", [("min_acceleration_mps2", "−8")]),
+    ):
+        campaign = load_campaign(BASE, ["testing.method=forced", av], check_files=False)
+        assert vehicle_words(campaign.av) == (name, parameters)
