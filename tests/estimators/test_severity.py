@@ -1,0 +1,150 @@
+"""How hard it crashes: against records taken apart by hand, and bands that hold, by replication.
+
+``python -m tests.estimators.test_severity`` prints how often they do for all `VEHICLES`, from 500 campaigns each.
+"""
+
+import sys
+
+import numpy as np
+import pytest
+
+from harness.compiled import unboxed
+from harness.episode.path import empty_trajectory
+from harness.estimators.block import Block, Drawn, joined
+from harness.estimators.one_pass import one_pass
+from harness.estimators.severity import SPEEDS_MPS, Impacts
+from harness.estimators.shells import Shells as SeenShells
+from harness.pool.replay import RETRACED_DTYPE, StoredPaths, retrace
+from harness.pool.walk import Script
+from harness.resolved import resolve
+from harness.runner.prepare import prepare
+from harness.runner.stored import stored_blocks
+from harness.sampling.shells import ShellRounds, Shells
+from harness.vocabulary import CRASH, FAILED, SAMPLING, TIMEOUT
+from tests.stored_runs import estimates, golden, stored_table
+
+
+@pytest.mark.parametrize("name", ["nde-twin", "step-recursive-twin", "mixture-twin", "shells-twin", "shells-sumo"])
+def test_it_is_the_rate_of_harder_crashes_by_the_same_estimator(name, stored_run):
+    folder, own = stored_run(name), SAMPLING[golden(name).testing.method].headline
+    content, rows = estimates(folder), stored_table(folder, "episodes").to_pandas()
+    crashes = rows[rows.outcome == "crash"]
+    found = {row["above_mps"]: row for row in content["severity"]["exceedance"]}
+    assert tuple(found) == SPEEDS_MPS
+    for above in (0.0, 2.0, 5.0, 20.0):
+        harder = [block.harder_than(above) for block in stored_blocks(folder, moments=False)]
+        alone = one_pass(harder, [own]).headline_estimate
+        n = int((crashes.impact_speed_mps > above).sum())
+        assert (found[above]["n_crashes"], alone.n_crashes) == (n, n)
+        for key in ("crash_rate", "ci_low", "ci_high", "upper_bound"):
+            assert found[above][key] == pytest.approx(getattr(alone, key), rel=1e-9, abs=1e-30)
+    weight = np.exp(crashes.log_weight.to_numpy())
+    if own == "shells":
+        weight /= rows.groupby("component").size()[crashes.component].to_numpy()
+    order = np.argsort(crashes.impact_speed_mps.to_numpy())
+    impact, share = crashes.impact_speed_mps.to_numpy()[order], np.cumsum(weight[order]) / weight.sum()
+    severity = content["severity"]
+    assert severity["median_mps"] == impact[np.searchsorted(share, 0.5)]
+    assert severity["share_below_1_mps"] == pytest.approx(weight[crashes.impact_speed_mps <= 1.0].sum() / weight.sum())
+    assert severity["share_above_5_mps"] == pytest.approx(weight[crashes.impact_speed_mps > 5.0].sum() / weight.sum())
+
+
+def test_what_nobody_avoids_is_what_the_most_careful_driver_crashes_on(stored_run):
+    folder = stored_run("shells-twin")
+    rows, design = stored_table(folder, "episodes").to_pandas(), Shells.stored_design(folder)
+    by_cell = design.cell_p * (rows.outcome == "crash").groupby(rows.cell).mean().reindex(range(design.cell_p.size))
+    found = estimates(folder)["severity"]["unavoidable"]
+    assert found["driver"] == design.strata[0] == "brakes-8"
+    assert found["share"] == pytest.approx(by_cell[np.array(design.cell_stratum) == 0].sum() / by_cell.sum())
+    assert 0.0 < found["share_low"] < found["share"] < found["share_high"] < 1.0
+
+
+@pytest.mark.parametrize("method", ["nde", "shells"])
+def test_a_failed_test_may_have_been_a_crash_of_any_speed(method, stored_run):
+    block = joined(list(stored_blocks(stored_run(f"{method}-twin"), moments=False)))
+    hardest = {n: one_pass([block.ending(np.arange(len(block)) < n, FAILED)]).severity.exceedance[-1] for n in (0, 5)}
+    assert hardest[5].ci_high > hardest[0].ci_high
+
+
+# -- replication: every cut-in that a pool keeps is driven once; campaigns draw from them, and the truth is known --
+
+VEHICLES = {
+    "idm": "av.parameters.min_acceleration_mps2=-4",
+    "brakes-8": "av.parameters.min_acceleration_mps2=-8",
+    "late": "av.reaction.delay_s=0.6",
+    "fvdm": "av={model: fvdm}",
+    "need-based": "av.model=need-based",
+    "touches": "av.reaction.delay_s=0.6",
+}
+ABOVE_MPS = (0.0, 1.0, 3.0, 5.0, 10.0)
+
+
+@pytest.fixture(scope="module")
+def source():
+    return prepare(resolve(golden("shells-twin")))
+
+
+def driven(source, name):
+    """Whether the vehicle crashes on each cut-in of the pool, and how hard; one only touches but for one in fifty."""
+    campaign = golden("shells-twin", VEHICLES[name])
+    cut_ins = source.prescribed._cut_ins
+    n, environment = cut_ins.step.size, source.resolved.environment
+    script = Script(cut_ins.lv, cut_ins.bv, cut_ins.n_lv, cut_ins.n_bv, cut_ins.lead)
+    stored = StoredPaths(1, np.arange(n), cut_ins.state, np.full(n, 200), cut_ins.step, script)
+    twin, scratch = np.zeros(n, RETRACED_DTYPE), empty_trajectory(environment)
+    retrace(unboxed(stored), unboxed(environment), resolve(campaign).av, unboxed(scratch), twin)
+    impact = twin["impact"]
+    if name == "touches":
+        impact = np.where(np.arange(n) % 50 > 0, 0.05 * impact, impact)
+    return twin["outcome"] == CRASH, impact
+
+
+def campaign_of(source, crashed, impact, rows, rng):
+    """One campaign to its own precision, its tests drawn from the cut-ins of each stratum with replacement."""
+    campaign = golden("shells-twin", "stop.rhw=0.4", "stop.episodes=20000", "testing.shells.first_tests=20")
+    design = source.design.without_references()
+    rounds, sums = ShellRounds(campaign, design, np.full(design.p.size, 20_000)), Impacts(SeenShells)
+    while (added := rounds.next_round()).any():
+        stratum = np.repeat(np.arange(added.size), added)
+        chosen = np.concatenate([rng.choice(rows[s], k) for s, k in enumerate(added.tolist()) if k])
+        n, crash = stratum.size, crashed[chosen]
+        columns = {
+            "cut_in": np.ones(n, bool), "stratum": stratum, "cell": stratum, "impact_mps": impact[chosen],
+            "cell_mass": np.zeros((n, design.p.size)),
+        }  # fmt: skip
+        outcome = np.where(crash, CRASH, TIMEOUT).astype(np.int8)
+        block = Block(int(rounds.tally.tests.sum()), outcome, np.zeros(n), columns, Drawn("shells", shells=design))
+        sums.add(block)
+        if rounds.enough(block):
+            break
+    return {row.above_mps: row for row in sums.result(0.9).exceedance}
+
+
+def held(source, name, n_campaigns):
+    """Shares of campaigns whose band (first row) and one-sided bound hold at each speed."""
+    crashed, impact = driven(source, name)
+    rows = [source.prescribed._order[s] for s in range(source.design.p.size)]
+
+    def rate(above):
+        return sum(
+            p * np.mean(crashed[cut_ins] & ((impact[cut_ins] > above) | (above == 0.0)))
+            for p, cut_ins in zip(source.design.p, rows, strict=True)
+        )
+
+    truth, rng, found = {above: rate(above) for above in ABOVE_MPS}, np.random.default_rng(20), []
+    for _ in range(n_campaigns):
+        of = campaign_of(source, crashed, impact, rows, rng)
+        found.append([(of[v].ci_low <= truth[v] <= of[v].ci_high, truth[v] <= of[v].upper_bound) for v in ABOVE_MPS])
+    return np.mean(found, axis=0).T
+
+
+@pytest.mark.parametrize("name", ["idm", "touches"])
+def test_bands_and_bounds_hold_at_each_speed(name, source):
+    """At 90 %, where each campaign stops by its own rate; the pool's own error is not in it."""
+    assert np.all(held(source, name, 60) >= 0.9 - 2.0 * np.sqrt(0.09 / 60))
+
+
+if __name__ == "__main__":
+    pool = prepare(resolve(golden("shells-twin")))
+    for name in VEHICLES:
+        sys.stdout.write(f"{name} {ABOVE_MPS} {held(pool, name, 500).round(3).tolist()}\n")
