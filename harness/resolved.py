@@ -42,7 +42,7 @@ class Resolved:
 
         Raises `CampaignError`: the library's file is missing or wrong.
         """
-        return load_library(self.campaign.pool.library)
+        return load_library(self.campaign.pool.library).counting_above(self.campaign.crash.counts_above_mps)
 
 
 def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:

@@ -275,7 +275,10 @@ def never_reaches(driver: Record, speed: float, ahead: float, slowest: float, st
 
 @compiled_inline
 def who_crashes(followers: Followers, cut: int, lead: int, environment: Environment, path: Trajectory) -> int:
-    """One bit for each attentive driver that runs into BV; see `follow`."""
+    """One bit for each attentive driver that runs into BV hard enough to count; see `follow`.
+
+    Of those that enclose others every crash counts: who stays behind them may be the harder for crashing later.
+    """
     drivers, envelope, until = followers.drivers, followers.envelope, environment.numbers.max_steps
     found = n = 0
     if envelope >= 0:
@@ -292,8 +295,11 @@ def who_crashes(followers: Followers, cut: int, lead: int, environment: Environm
             n += 1
     follow(n, drivers, cut, lead, until, path)
     for i in range(n):
-        if path.follower[i].end >= 0:
-            found |= 1 << path.follower[i].driver
+        one = path.follower[i]
+        if one.end >= 0:
+            counts = followers.counts_above_mps == 0.0 or one.encloses
+            if counts or one.v - path.v_after[one.end] > followers.counts_above_mps:
+                found |= 1 << one.driver
     return found
 
 

@@ -16,7 +16,7 @@ from harness.estimators.severity import Severity
 from harness.estimators.short_answer import ShortAnswer, short_answer
 from harness.estimators.stopping import Rule
 from harness.importance.functions import importance_names
-from harness.numbers import WIDEST_RHW, interval, number, ratio, share
+from harness.numbers import WIDEST_RHW, interval, number, plain, ratio, share
 from harness.records.folder import StoppedBy
 from harness.vocabulary import ESTIMATORS, RUN_FOLDER, EstimatorName
 
@@ -88,7 +88,8 @@ def estimate_blocks(
     distance_km = None if distance_m is None else distance_m / 1000.0
     retraced = manifest.get("retraced") or {"reason": "the run did not retrace its episodes"}
     repeated = manifest.get("repeated")
-    statements: dict[str, str] = {name: _answer(of, repeated, level, distance_km) for name, of in estimates.items()}
+    about = level, distance_km, campaign.crash.counts_above_mps
+    statements: dict[str, str] = {name: _answer(of, repeated, *about) for name, of in estimates.items()}
     return finite_json(
         Estimates(
             campaign=campaign.name,
@@ -117,7 +118,11 @@ def estimate_blocks(
 
 
 def _answer(
-    found: Estimate | Unavailable, repeated: Mapping[str, Any] | None, level: float, distance_km: float | None
+    found: Estimate | Unavailable,
+    repeated: Mapping[str, Any] | None,
+    level: float,
+    distance_km: float | None,
+    counts_above_mps: float,
 ) -> str:
     """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot.
 
@@ -125,7 +130,7 @@ def _answer(
     """
     if isinstance(found, Unavailable):
         return f"No crash rate from these records: {found.reason.rstrip('.')}."
-    text = " ".join([*reference_statements(found)[:1], statement(found, level, distance_km)])
+    text = " ".join([*reference_statements(found)[:1], statement(found, level, distance_km, counts_above_mps)])
     text += failed_statement(found.details)
     if repeated is None or not (n := repeated["n_episodes"]):
         return text
@@ -149,13 +154,17 @@ def per_distance(estimate: Estimate, distance_per_test_km: float) -> dict[str, f
     return {"rate": estimate.crash_rate * scale, "ci_low": estimate.ci_low * scale, "ci_high": estimate.ci_high * scale}
 
 
-def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None) -> str:
+def statement(
+    estimate: Estimate, lane_change_level: float, distance_per_test_km: float | None, counts_above_mps: float = 0.0
+) -> str:
     """Why the interval may be wrong, if it may; then rate, interval, number of tests and level, in words."""
     tests = (
-        f"{estimate.n_episodes:,} overtaking tests at lane-change level {lane_change_level:g} "
+        f"{estimate.n_episodes:,} overtaking tests at lane-change level {plain(lane_change_level)} "
         f"({estimate.n_crashes:,} sampled crashes)"
     )
-    level, per_km = share(estimate.confidence), ""
+    level, per_km, what = share(estimate.confidence), "", "The crash rate"
+    if counts_above_mps:
+        what = f"The rate of crashes above {plain(counts_above_mps)} m/s"
     if estimate.n_crashes == 0:
         upper = estimate.upper_bound
         if distance_per_test_km:
@@ -164,15 +173,13 @@ def statement(estimate: Estimate, lane_change_level: float, distance_per_test_km
     else:
         if distance_per_test_km:
             scaled = per_distance(estimate, distance_per_test_km)
-            per_km = (
-                f"; that is {number(scaled['rate'])} crashes per million km of such overtaking driving "
-                f"({interval(scaled['ci_low'], scaled['ci_high'])})"
-            )
+            per_million_km = interval(scaled["ci_low"], scaled["ci_high"], scaled["rate"])
+            per_km = f"; that is {per_million_km} crashes per million km of such overtaking driving"
         width = f", relative half-width {share(estimate.rhw)}"
         if estimate.rhw > WIDEST_RHW:
             width = ", still open upwards: far wider than the rate"
         text = (
-            f"The crash rate is {number(estimate.crash_rate)} per test ({level} interval "
+            f"{what} is {number(estimate.crash_rate)} per test ({level} interval "
             f"{interval(estimate.ci_low, estimate.ci_high)}{'' if estimate.cautions else width}), "
             f"estimated from {tests}"
         )

@@ -23,7 +23,6 @@ _BRAKES_HARDEST = "brakes-8"
 ENDED = {
     "rhw": "precision reached",
     "accept": "decision reached",
-    "two_phase": "all tests of the second phase done",
     "episodes": "budget spent",
     "pool": "no cut-in of the pool is left",
     "contradicted": "vehicle does not do what the statement assumes",
@@ -199,7 +198,7 @@ def _warnings(
 
 def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None) -> str:
     ended, target = ENDED.get(stopped_by or "", "interrupted"), campaign.stop.rhw
-    if campaign.accept is None and target is not None and stopped_by not in ("rhw", "two_phase"):
+    if campaign.accept is None and target is not None and stopped_by != "rhw":
         asked = best.precision
         for each in best.details.get("statements", ()):
             asked = each["rhw"] if each["name"] == campaign.testing.shells.statement else asked

@@ -53,6 +53,7 @@ def campaign_pool_key(resolved: Resolved) -> str:
         [(name, model.model_dump()) for name, model in library.references.items()],
         [sorted(boundaries), library.boundary, library.envelope],
         resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths"}),
+        resolved.campaign.crash.counts_above_mps,
     ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 

@@ -63,11 +63,12 @@ class Followers(NamedTuple):
     """Drivers (D,) to be put in the AV's place: at most `MOST_FOLLOWERS`, without inattention.
 
     ``envelope`` is the place of the one that crashes wherever another one does: where it does not, nobody else is
-    asked; -1 for none.
+    asked; -1 for none. Crashes count with an impact above ``counts_above_mps``, all of them at 0.
     """
 
     drivers: RecordArray
     envelope: int = -1
+    counts_above_mps: float = 0.0
 
 
 def driver_records(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from harness.campaign.drivers import Driver, Reference, Reflexes
 from harness.campaign.files import read_model, shipped_or_own
@@ -78,10 +78,18 @@ class Library(Section):
         default_factory=dict, description="drivers that the vehicle is compared with; no shell is made of them"
     )
 
+    _counts_above_mps: float = PrivateAttr(0.0)
+
+    def counting_above(self, speed_mps: float) -> Library:
+        """The library of a campaign in which drivers crash with an impact above a speed alone, as its vehicle."""
+        other = self.model_copy()
+        other._counts_above_mps = speed_mps
+        return other
+
     def followers(self, see_onset: bool) -> Followers:
         """The surrogates and then the references as kernels read them, in the order of the file, D + R of them."""
         drivers = library_records([*self.surrogates.values(), *self.references.values()], see_onset)
-        return Followers(drivers, list(self.surrogates).index(self.envelope))
+        return Followers(drivers, list(self.surrogates).index(self.envelope), self._counts_above_mps)
 
     @property
     def n_drivers(self) -> int:

@@ -14,13 +14,15 @@ from harness.estimators.block import Block, Drawn, joined
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import SPEEDS_MPS, Impacts
 from harness.estimators.shells import Shells as SeenShells
+from harness.pool.build import campaign_pool
 from harness.pool.replay import RETRACED_DTYPE, StoredPaths, retrace
 from harness.pool.walk import Script
 from harness.resolved import resolve
-from harness.runner.prepare import prepare
 from harness.runner.stored import stored_blocks
+from harness.sampling import prepare
 from harness.sampling.shells import ShellRounds, Shells
 from harness.vocabulary import CRASH, FAILED, SAMPLING, TIMEOUT
+from tests.in_process import run_here
 from tests.stored_runs import estimates, golden, stored_table
 
 
@@ -118,6 +120,41 @@ def campaign_of(source, crashed, impact, rows, rng):
         if rounds.enough(block):
             break
     return {row.above_mps: row for row in sums.result(0.9).exceedance}
+
+
+@pytest.fixture(scope="module")
+def harder():
+    """Where only crashes above 5 m/s count."""
+    return prepare(resolve(golden("shells-twin", "crash.counts_above_mps=5")))
+
+
+def test_drivers_of_the_pool_are_judged_by_the_speed_that_counts(harder, source):
+    """But those that enclose others: of them every crash counts."""
+    crashed, impact = driven(harder, "brakes-8")
+    counts = crashed & (impact > 5.0)
+    resolved = resolve(golden("shells-twin", "crash.counts_above_mps=5"))
+    pool, before = campaign_pool(resolved), campaign_pool(resolve(golden("shells-twin")))
+    place = {name: pool.names.index(name) for name in ("brakes-8", "brakes-3-when-needed")}
+    assert 0 < counts.sum() < crashed.sum()
+    assert np.array_equal(pool.cut_ins.crashes[:, place["brakes-8"]], counts)
+    mu = {name: (pool.mu[of], before.mu[before.names.index(name)]) for name, of in place.items()}
+    assert mu["brakes-8"][0] < 0.7 * mu["brakes-8"][1]
+    assert mu["brakes-3-when-needed"][0] == pytest.approx(mu["brakes-3-when-needed"][1], rel=0.2)
+    assert np.all(pool.reference_rate < 0.8 * before.reference_rate)
+
+
+def test_a_campaign_that_counts_harder_crashes_alone_agrees_with_the_severity_of_all(tmp_path, stored_run):
+    """In rate, ratio, statements and stop rule, with the same limits at 5 m/s and no row below."""
+    run_here(golden("shells-twin", "crash.counts_above_mps=5"), tmp_path / "run")
+    found, of_all = estimates(tmp_path / "run"), estimates(stored_run("shells-twin"))
+    rows = stored_table(tmp_path / "run", "episodes").to_pandas()
+    assert found["n_crashes"] == (rows.impact_speed_mps > 5.0).sum() < (rows.outcome == "crash").sum()
+    first, same = found["severity"]["exceedance"][0], found["estimates"]["shells"]
+    assert (first["above_mps"], first["crash_rate"], first["ci_high"]) == (5.0, same["crash_rate"], same["ci_high"])
+    [at_5] = [row for row in of_all["severity"]["exceedance"] if row["above_mps"] == 5.0]
+    assert same["ci_low"] < at_5["ci_high"]
+    assert at_5["ci_low"] < same["ci_high"]
+    assert found["answer"]["rows"][0]["what"] == "crash rate > 5 m/s"
 
 
 def held(source, name, n_campaigns):
