@@ -167,6 +167,7 @@ CHANGED = [
         ["testing.shells.stopping=sequential", "testing.shells.statements=null", "stop.estimator=shells"],
         "995030cee532ef4e",
     ),
+    (["crash.counts_above_mps=5"], "efd7a5bd64c441f6"),
     (["environment.cut_in_lead_s=0.5"], "977fb7a922c1cee6"),
     (["testing.shells.smallest_round=8"], "5fcc39a05654096d"),
     (["av={controller: 'a:B', parameters: {x: 1}, before_cut_in: controller}"], "035b3c181d4d0c0d"),

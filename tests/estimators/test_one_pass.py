@@ -10,7 +10,6 @@ from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import Block, joined
 from harness.estimators.estimate import Unavailable, finite_json
 from harness.estimators.one_pass import ACCUMULATORS, Diagnostics, accumulator, one_pass
-from harness.numbers import number
 from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, FAILED, SAMPLING, TIMEOUT
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks

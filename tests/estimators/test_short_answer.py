@@ -94,6 +94,7 @@ def test_much_to_warn_of_leaves_room_for_the_rate(stored_run):
 def test_vehicles_are_named_with_what_is_not_a_default():
     for av, name, parameters in (
         ("av={controller: 'm:C', parameters: {hard: 8, soft: {a: 1}}}", "m:C", [("hard", "8"), ("soft.a", "1")]),
+        ("av.controller=my_av.py:MyAV", "my_av.py:MyAV", []),
         ("av={fmu: {file: x/brake.fmu, inputs: {s: speed_mps}, output: a}}", "brake.fmu", []),
         ("av={traci: {command: './my_av --port {port}'}}", "TraCI client my_av", []),
         ("av={sumo: {tau: 1}}", "SUMO’s Krauss", [("tau", "1")]),
