@@ -76,7 +76,15 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
         is_limit = found["high"] is None and found["low"] is not None
         axes.errorbar(place, value, yerr=ends, fmt="^" if is_limit else "o", color=colour, capsize=4.0, markersize=7)
         words = ("> " if is_limit else "") + tick_label(float(f"{value:.2g}")) + (" †" if colour == GREY else "")
-        note(axes, words, (place, found["high"] or value), (0, 7), ha="center", color=INK, fontsize=8)
+        note(
+            axes,
+            words,
+            (place, found["high"] or value),
+            (0, -18 if is_limit else 7),
+            ha="center",
+            color=INK,
+            fontsize=8,
+        )
     low, high = axes.get_ylim()
     axes.set_ylim(low / 2.0, high * 4.0)
     decades(axes.yaxis, *axes.get_ylim())
