@@ -289,17 +289,17 @@ def decisions_table() -> str:
     budgets = [*content["experiment"]["budgets"], content["experiment"]["campaign"]["stop"]["episodes"]]
     rows = []
     for subject, of in _by_result(content["judgements"]).items():
-        wrong = (_wrong(of, budget, by) for by in ("", FORMER) for budget in budgets)
+        wrong = [*(_wrong(of, budget) for budget in budgets), _wrong(of, budgets[-1], FORMER)]
         ways = ("2 x rate, rejected", "0.5 x rate, accepted")
         at_last = [of[f"limit {way} within {budgets[-1]:,} tests"] for way in ways]
         tests = (f"{one['tests_median']:,.0f}" if one["reached"] > 0.5 else "undecided" for one in at_last)
         rows.append((f"`{subject}`", f"{at_last[0]['truth']:.2g}", *wrong, *tests))
     words = [f"≤ {budget:,} tests" for budget in budgets]
-    head = ("vehicle", "crash rate", *words, *(f"former, {each}" for each in words), "at twice the rate", "at half")
+    head = ("vehicle", "crash rate", *words, f"former, {words[-1]}", "tests at twice the rate", "at half")
     return _table(head, rows) + f"\n{at_last[0]['replications']} campaigns each: {_command('gate')}\n"
 
 
-def _wrong(of: dict[str, dict[str, Any]], budget: int, by: str) -> str:
+def _wrong(of: dict[str, dict[str, Any]], budget: int, by: str = "") -> str:
     verdicts = [of[f"limit 1 x rate, {verdict} within {budget:,} tests{by}"] for verdict in ("accepted", "rejected")]
     return " / ".join(f"{100.0 * (1.0 - one['coverage']):.1f}" for one in verdicts)
 

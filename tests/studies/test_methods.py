@@ -17,7 +17,7 @@ from harness.strata import LIBRARY_STATEMENT
 from studies.chains.chain import CHAINS, REPLAYED
 from studies.chains.shells import ChainShells
 from studies.replication.experiment import Experiment, load_experiment
-from studies.replication.judgement import Judgement, Row, Subject, corrected, judge
+from studies.replication.judgement import FORMER, Judgement, Row, Subject, corrected, judge
 from studies.replication.populations import Known, preventable_by, ratio_to
 from studies.replication.run import validate
 from studies.replication.shells import FREE, ShellCampaign, limit_at, result_of
@@ -137,6 +137,20 @@ def test_the_committed_panel_meets_what_shells_promise():
     assert {ratio_to("r157-cc"), preventable_by("r157-cc")} < {result for _, result in found}
     assert not found["SM-II", CONDITIONAL]["assumption_met"]
     assert found["SM-II", FREE]["alarm"] == found["never-brakes", FREE]["alarm"] == 1.0
+
+
+def test_the_committed_gate_errs_as_rarely_as_it_says():
+    content, shipped = committed("gate")
+    found = {(one["subject"], one["result"]): one for one in content["judgements"]}
+    assert {subject for subject, _ in found} == {*shipped.avs, *shipped.adversaries}
+    for (_, result), one in found.items():
+        assert one["replications"] >= 500
+        assert one["coverage"] >= 0.95 or FORMER in result
+    for subject in ("idm", "brakes-8", "late-600ms", "inattentive", "SM-II"):
+        assert found[subject, f"limit 1 x rate, rejected within 400,000 tests{FORMER}"]["p_value_holm"] < 1e-20
+    needed = {subject: found[subject, "limit 2 x rate, rejected within 400,000 tests"] for subject in shipped.avs}
+    assert needed["idm"]["tests_median"] <= 950
+    assert needed["brakes-8"]["tests_median"] <= 1650
 
 
 @pytest.mark.slow
