@@ -258,10 +258,7 @@ CURVES = "curves.parquet"
 
 
 def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
-    """Curves as Parquet; how many tests each needed in the order in which it was tested; rates over the reference's.
-
-    Where the rate is farther below the reference's than the half-width asked for, more tests are needed than were made.
-    """
+    """Curves as Parquet; how many tests each needed in the order in which it was tested; rates over the reference's."""
     procedure = Procedure(context.rhw, context.confidence)
     tables, figures = list[pa.Table](), dict[str, Any]()
     reference = context.made[step.reference].result["figures"]["crash_rate"]
@@ -278,10 +275,8 @@ def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
             "rhw": exactly(rhw[-1]) if np.isfinite(rhw[-1]) else figure(None),
             "over_reference": ratio(context.made[name].result["figures"]["crash_rate"], reference),
         }
-        too_few = found["over_reference"]["high"] is not None and found["over_reference"]["high"] < 1.0 - context.rhw
         is_in = settled(context.made[name])
         figures |= {f"{name}.{key}": marked(each, settled=is_in) for key, each in found.items()}
-        figures[f"{name}.needs"] = figure(None, tests.n) if too_few else figures[f"{name}.settled"]
     write_table(context.folder / CURVES, pa.concat_tables(tables))
     return {"figures": figures}
 
