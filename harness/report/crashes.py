@@ -10,12 +10,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.errors import CampaignError
+from harness.estimators.severity import weighted_quantiles
 from harness.numbers import tenths
 from harness.pool.replay import LEAD, PATH_COLUMNS
 from harness.records.reader import read_traces, stored_columns
 from harness.report.player import OTHERS, TRACE_COLUMNS, UNKNOWN, Scene, Scenes
 from harness.report.summary import RunFolder, RunSummary
-from harness.report.test_plots import weighted_quantile
+from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment, load_parameters
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
@@ -56,13 +57,15 @@ def worst_crashes(key: FloatArray, episode: FloatArray, among: BoolArray) -> lis
     return [int(place) for place in order[among[order]][:CANDIDATES]]
 
 
-def crash_gallery(run: RunFolder, summary: RunSummary) -> tuple[list[GalleryRow], list[Scene]]:
+def crash_gallery(
+    run: RunFolder, summary: RunSummary, environment: Environment | None
+) -> tuple[list[GalleryRow], list[Scene]]:
     """Crashes that the reference driver avoids, the hardest impacts, typical ones, those of the largest weights.
 
     Of shells the outermost in place of the latter. Crashes that nobody avoids are left out, unless there are no others.
     Traced crashes go first where some of the worst have no trace: a scene is worth more than a rank.
     """
-    crashes, scenes = summary.crashes, _scenes(run)
+    crashes, scenes = summary.crashes, Scenes(run.campaign, environment)
     episode = crashes["episode"]
     ends = _ends(run, scenes, episode, crashes["impact_speed_mps"])
     avoided = (ends < 0) & (ends != UNKNOWN)
@@ -96,7 +99,7 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
     """Places of crashes by what they are shown for; who ``avoided`` (n, D) them, and if ``someone`` (n,) may have."""
     crashes, among = summary.crashes, someone if someone.any() else ~someone
     episode, impact, weight = (crashes[name] for name in ("episode", "impact_speed_mps", "weight"))
-    keys = {"impact": impact, "typical": -np.abs(impact - weighted_quantile(impact, weight, 0.5))}
+    keys = {"impact": impact, "typical": -np.abs(impact - weighted_quantiles(impact, weight, (0.5,))[0])}
     if summary.from_shells:
         keys["outermost"] = crashes["component"]
     elif not summary.all_weights_one:
@@ -105,15 +108,15 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
     return first | {name: worst_crashes(key, episode, among) for name, key in keys.items()}
 
 
-def _scenes(run: RunFolder) -> Scenes:
-    """Of the run's traffic, where its parameters are still what they were; else others cannot be driven."""
+def environment_of(run: RunFolder) -> Environment | None:
+    """The run's traffic, where its parameters are still what they were; else others cannot be driven."""
     settings = run.campaign.environment
     try:
         parameters = load_parameters(settings)
     except CampaignError:
-        return Scenes(run.campaign, None)
+        return None
     known = run.campaign.content_hash(parameters.content_hash()) == run.manifest["campaign_hash"]
-    return Scenes(run.campaign, load_environment(settings, parameters) if known else None)
+    return load_environment(settings, parameters) if known else None
 
 
 def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArray) -> IntArray:

@@ -22,21 +22,22 @@ from harness.estimators.shells import ShellDetails, Within
 from harness.numbers import MISSING, count, exponent_of, half_width, leaves, number, power_of_ten, share, words
 from harness.records.folder import write_bytes
 from harness.records.reader import table_sizes
-from harness.report.crashes import crash_gallery
+from harness.report.crashes import crash_gallery, environment_of
 from harness.report.player import templates
-from harness.report.rate_plots import answer_plot, convergence_plot, rate_exponent, shells_plot
-from harness.report.style import RC, Plot, inline_svg, png, svg
+from harness.report.rate_plots import convergence_plot, rate_exponent, severity_plot, shells_plot
+from harness.report.style import RC, Plot, inline_svg, svg
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
-from harness.report.test_plots import crash_time_plot, cut_in_plot, impact_speed_plot, strata_plot, weight_plot
+from harness.report.test_plots import weight_plot, where_plot
+from harness.traffic.laws import Environment
 from harness.vocabulary import OUTCOMES, RUN_FOLDER
 
 PLOT_NAMES = re.compile(
-    r"(answer|shells|convergence|weights|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
+    r"(severity|where|shells|convergence|weights|answer|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
 )
 
 
 def write_report(folder: str | Path) -> Path:
-    """Write ``report.html`` and ``plots/`` (PNG and SVG) into a run folder, and return the page.
+    """Write ``report.html`` and ``plots/`` (SVG) into a run folder, and return the page.
 
     The page is self-contained: it can be mailed, archived and opened offline. The same folder gives the same bytes if
     it is reached from the working directory by the same relative path, by which the commands on the page name it;
@@ -47,10 +48,10 @@ def write_report(folder: str | Path) -> Path:
     """
     folder = Path(folder)
     run = read_run_folder(folder)
-    sizes, summary = table_sizes(folder), summarise(run)
+    sizes, summary, traffic = table_sizes(folder), summarise(run), environment_of(run)
     with matplotlib.style.context(["default", RC]):
-        files, figures = _rendered(_plots(run, summary))
-    gallery, scenes = crash_gallery(run, summary)
+        files, figures = _rendered(_plots(run, summary, traffic))
+    gallery, scenes = crash_gallery(run, summary, traffic)
     environment = templates()
     environment.filters.update(getmembers(numbers, isfunction), verdict=verdict, sentence=sentence)
     page = environment.get_template("report.html.j2").render(
@@ -76,16 +77,13 @@ def write_report(folder: str | Path) -> Path:
     return folder / "report.html"
 
 
-def _plots(run: RunFolder, summary: RunSummary) -> list[Plot]:
-    # Within a shell all tests weigh the same and there is one control step, the cut-in: nothing to draw of either.
-    drawn_by = [weight_plot(summary), strata_plot(summary)] if run.shells is None else [shells_plot(run.shells)]
+def _plots(run: RunFolder, summary: RunSummary, traffic: Environment | None) -> list[Plot]:
     plots = [
-        answer_plot(run.estimates, run.shells),
+        severity_plot(run.estimates),
+        where_plot(summary, traffic),
+        # Within a shell all tests weigh the same: there is nothing to draw of weights.
+        weight_plot(summary) if run.shells is None else shells_plot(run.shells),
         convergence_plot(run.estimates, run.target_rhw, of_statement=run.asked_statement),
-        *drawn_by,
-        cut_in_plot(summary),
-        impact_speed_plot(summary),
-        crash_time_plot(summary),
     ]
     return [plot for plot in plots if plot is not None]
 
@@ -94,8 +92,7 @@ def _rendered(plots: list[Plot]) -> tuple[dict[str, bytes], dict[str, dict[str, 
     """Files by name, and by plot what the template needs: markup that is ours, and texts that it escapes."""
     files, figures = {}, {}
     for plot in plots:
-        drawing = svg(plot)
-        files[f"{plot.name}.svg"], files[f"{plot.name}.png"] = drawing, png(plot)
+        files[f"{plot.name}.svg"] = drawing = svg(plot)
         # The SVG is matplotlib's own output, in which every text is escaped: the one place that is not autoescaped.
         markup = Markup(inline_svg(drawing))  # noqa: S704
         figures[plot.name] = {"markup": markup, "alt": plot.alt, "caption": plot.caption}

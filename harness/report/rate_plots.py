@@ -1,14 +1,13 @@
-"""The rate drawn: by estimator, as tests came in, and (of shells) where it comes from."""
+"""The rate drawn: above each impact speed, as tests came in, and (of shells) where it comes from."""
 
 from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axes._base import _AxesBase
 
 from harness.estimators.answer import Estimates
 from harness.estimators.estimate import Estimate
-from harness.numbers import count, exponent_of, interval, number, plain, share
+from harness.numbers import count, exponent_of, number, plain, share
 from harness.report.style import (
     BLUE,
     FULL_WIDTH_IN,
@@ -17,7 +16,6 @@ from harness.report.style import (
     VERMILLION,
     Plot,
     Row,
-    decades,
     head,
     interval_bars,
     log_axis,
@@ -29,7 +27,6 @@ from harness.report.style import (
 from harness.report.summary import ShownShells
 from harness.vocabulary import FloatArray
 
-LOG_AXIS_RATIO = 30.0
 POOL = "pool’s own error"
 VISIBLE = 0.005
 """Smallest share of an axis that a bar must have to show a colour."""
@@ -46,94 +43,39 @@ IN_ROUNDS = (
 )
 
 
-def answer_plot(estimates: Estimates, shells: ShownShells | None) -> Plot | None:
-    """Draw the intervals of all estimators that have one, the headline first; None when there is none.
-
-    Of a shells run also those of the statements about a boundary, unless its tests have refuted them.
-    """
-    rows = _intervals(estimates)
-    for each in () if shells is None else shells.statements:
-        if not each.refuted:
-            rows.append(_row(f"given {each.name}", each.crash_rate, each.ci_low, each.ci_high))
-    if not rows:
-        return None
-    figure = new_figure(FULL_WIDTH_IN, 1.15 + 0.34 * len(rows))
-    axes = figure.subplots()
-    on_log = _set_scale(axes, rows)
-    interval_bars(axes, rows)
-    unit = _labelled(axes, axes.get_xlim(), on_log=on_log)
-    axes.set_xlabel(f"crash rate per test{unit} (lane-change level {plain(estimates.lane_change_level)})")
-    if estimates.distance_per_test_km:
-        _add_distance_axis(axes, 1e6 / estimates.distance_per_test_km, on_log=on_log)
-    name, rate, _, *ends, _ = rows[0]
-    alt = f"Crash rate per test by estimator. {name}: {number(rate)}, interval {interval(*ends)}."
-    return Plot("answer", figure, alt, _answer_caption(estimates, rows, on_log=on_log, of_shells=shells is not None))
-
-
 def rate_exponent(estimates: Estimates) -> int:
     """Power of ten in which the rates of this run are best written."""
-    rows = _intervals(estimates)
-    return exponent_of(rows[0].value or rows[0].high or 0.0) if rows else 0
+    found = estimates.estimates[estimates.headline]
+    return exponent_of(found.crash_rate or found.ci_high) if isinstance(found, Estimate) else 0
 
 
-def _intervals(estimates: Estimates) -> list[Row]:
-    found = sorted(estimates.estimates.items(), key=lambda item: item[0] != estimates.headline)
-    return [
-        _row(name, e.crash_rate, e.ci_low, e.ci_high, BLUE if name == estimates.headline else GREY)
-        for name, e in found
-        if isinstance(e, Estimate) and e.ci_low <= e.ci_high
-    ]
-
-
-def _row(name: str, rate: float, low: float, high: float, colour: str = GREY) -> Row:
-    return Row(name, rate, colour, low, high, interval(low, high, rate) if rate > 0.0 else f"0 (to {number(high)})")
-
-
-def _set_scale(axes: Axes, rows: list[Row]) -> bool:
-    """Logarithmic when estimators differ by orders of magnitude, else linear; returns whether logarithmic.
-
-    Lower ends do not decide: one that touches zero would stretch a logarithmic axis without end.
-    """
-    low, high = min(row.low or 0.0 for row in rows), max(row.high or 0.0 for row in rows)
-    rates = [row.value for row in rows if row.value > 0.0]
-    if rates and high / min(rates) > LOG_AXIS_RATIO:
-        axes.set_xscale("log")
-        axes.set_xlim(min(rates) / 5.0, high * 2.0)
-        return True
-    margin = 0.12 * max(high - low, 1e-300)
-    axes.set_xlim(max(low - margin, 0.0), high + margin)
-    return False
-
-
-def _add_distance_axis(axes: Axes, factor: float, *, on_log: bool) -> None:
-    """Second scale on top, per 1e6 km: the same interval in the unit that safety cases use."""
-    top = axes.secondary_xaxis("top", functions=(lambda x: np.multiply(x, factor), lambda x: np.divide(x, factor)))
-    low, high = (factor * end for end in axes.get_xlim())
-    top.set_xlabel(f"crashes per 10⁶ km of such overtaking driving{_labelled(top, (low, high), on_log=on_log)}")
-    top.spines["top"].set_visible(True)
-
-
-def _labelled(axes: _AxesBase, ends: tuple[float, float], *, on_log: bool) -> str:
-    if not on_log:
-        return scaled(axes.xaxis, ends[1])
-    decades(axes.xaxis, *ends)
-    return ""
-
-
-def _answer_caption(estimates: Estimates, rows: list[Row], *, on_log: bool, of_shells: bool) -> str:
-    level = f"{100.0 * estimates.confidence:g} %"
-    text = f"Point and {level} interval of each estimator, from the same tests; the headline ({rows[0].name}) in blue."
-    if on_log:
-        text += " The axis is logarithmic because they differ by orders of magnitude."
-    if rows[0].value == 0.0:
-        return text + " No crash was sampled: the interval reaches from zero to the upper bound."
-    if len(rows) == 1:
-        return text
-    if of_shells:
-        return text + " The others hold for vehicles that keep to what the statement assumes."
-    return text + (
-        " Estimators that use the same tests are not independent: agreement among them is expected, not evidence."
-    )
+def severity_plot(estimates: Estimates) -> Plot | None:
+    """Draw the rate of crashes above each impact speed with its band; None without a crash."""
+    severity = estimates.severity
+    if severity is None:
+        return None
+    rows = [(row.above_mps, row.crash_rate, row.ci_low, row.ci_high) for row in severity.exceedance]
+    above, rate, low, high = np.array(rows, np.float64).T
+    seen = rate > 0.0
+    shown = slice(0, min(int(seen.sum()) + 1, rate.size))
+    figure = new_figure(FULL_WIDTH_IN, 2.9)
+    axes, confidence = figure.subplots(), share(estimates.confidence)
+    bottom = 0.3 * float(rate[seen].min())
+    axes.fill_between(
+        above[shown], np.maximum(low[shown], bottom), high[shown], color=BLUE, alpha=0.16, linewidth=0,
+        label=f"{confidence} band, at each speed",
+    )  # fmt: skip
+    axes.plot(above[seen], rate[seen], color=BLUE, marker="o", markersize=4, label="rate of harder crashes")
+    axes.axvline(severity.median_mps, color=MUTED, linewidth=0.9, linestyle=(0, (4, 3)), label="median impact")
+    log_axis(axes.yaxis, bottom, 2.0 * float(high[shown].max()))
+    axes.set_xlim(0.0, float(above[shown][-1]))
+    axes.set_xlabel("impact speed (closing speed at contact) above which crashes count, m/s")
+    axes.set_ylabel("crashes per test")
+    head(axes, "How hard it crashes")
+    half = f"{severity.median_mps:.1f} m/s ({3.6 * severity.median_mps:.0f} km/h)"
+    most = f"{severity.p95_mps:.1f} m/s ({3.6 * severity.p95_mps:.0f} km/h)"
+    text = f"Half of the crashes are below {half}, 95 % below {most}, as they would happen in this traffic."
+    return Plot("severity", figure, f"Rate of crashes above each impact speed. {text}", text)
 
 
 def convergence_plot(estimates: Estimates, target_rhw: float | None, *, of_statement: str | None = None) -> Plot | None:

@@ -1,41 +1,44 @@
-"""What tests were like: weights, control steps before a crash, cut-ins, how hard and how soon the AV crashes."""
+"""What tests were like: which cut-ins crash, beside what others avoid, and how tests weigh."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch, PathPatch
+from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 
-from harness.numbers import count, number, power_of_ten, share
+from harness.compiled import unboxed
+from harness.episode.path import empty_trajectory
+from harness.numbers import count, power_of_ten, share
+from harness.pool.replay import StoredPaths, drive_others
+from harness.pool.walk import Script
+from harness.report.player import OTHERS
 from harness.report.style import (
-    BLUES,
+    BLUE,
     FULL_WIDTH_IN,
     GREY,
-    MUTED,
+    GRID,
+    INK,
     REDS,
     VERMILLION,
     Plot,
     head,
     log_axis,
     new_figure,
-    only_horizontal_grid,
-    two_panels,
 )
 from harness.report.summary import RunSummary
-from harness.vocabulary import CRASH, FAILED, FloatArray, IntArray
+from harness.traffic.laws import Environment
+from harness.vehicles.library import library_records
+from harness.vocabulary import CRASH, CUT_IN, FAILED, FloatArray, IntArray, states_from
 
-WEIGHT_BINS, STRATUM_BINS, CRASH_BINS = 70, 40, 36
-R2DOT_MPS, R2_M = np.arange(-30.0, 20.5, 0.5), np.arange(0.0, 152.5, 2.5)
-"""Edges of the cells of maps; a cut-in beyond them is counted in the outermost cell."""
-LEVELS_PER_DECADE = 2
-"""Each colour step is a factor √10, so that six colours span three decades below the fullest cell."""
-TTC_LINES_S = (1.0, 2.0, 4.0, 8.0)
+WEIGHT_BINS, CELLS = 70, 36
+SHARES = {0.0: GRID, 0.25: REDS[0], 0.5: REDS[1], 0.75: REDS[3], 1.0: REDS[5]}
+"""Up to which share of cut-ins that crash a cell of the map has a colour."""
+KEEPS_SPEED = 20
+"""Index of the maneuver 0 m/s²."""
 
 
 class Bins(NamedTuple):
@@ -60,13 +63,6 @@ def edges_for(values: FloatArray, width: float, most: int) -> FloatArray:
     # A value such as 0.3 on bins of 0.1 must not fall below its edge by rounding.
     first, last = (math.floor(end / width + 1e-9) for end in ends)
     return width * np.asarray(MaxNLocator(most, steps=[1, 2, 5, 10], integer=True).tick_values(first, last + 1))
-
-
-def weighted_quantile(values: FloatArray, weights: FloatArray, quantile: float) -> float:
-    """Value up to which this share of the weight lies; NaN without weight."""
-    if not weights.any():
-        return math.nan
-    return float(np.quantile(values, quantile, method="inverted_cdf", weights=weights))
 
 
 def _percent(values: FloatArray) -> FloatArray:
@@ -121,194 +117,73 @@ def _weight_caption(crashed: Bins) -> str:
     )
 
 
-def strata_plot(summary: RunSummary) -> Plot | None:
-    """Draw sampled crashes and share of the estimate per number of control steps; None unless there are several."""
-    crashes = summary.crashes
-    steps = crashes["n_control_steps"]
-    if np.unique(steps).size < 2:
-        return None
-    bins = binned(steps, crashes["weight"], edges_for(steps, 1.0, STRATUM_BINS))
-    labels = ("control steps in the test",) * 2
-    figure, sampled, weighted = two_panels(2.9, labels, sharex=True)
-    width = float(bins.edges[1] - bins.edges[0])
-    for axes, heights, colour, title, label in (
-        (sampled, bins.counts, GREY, "Sampled crashes", "crashes"),
-        (weighted, bins.shares, VERMILLION, "Share of the estimate", "share, %"),
-    ):
-        axes.bar(bins.edges[:-1] - 0.5 + 0.5 * width, heights, width=0.86 * width, color=colour)
-        axes.set_title(title)
-        axes.set_ylabel(label)
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=9, integer=True, steps=[1, 2, 5, 10]))
-        only_horizontal_grid(axes)
-    sampled.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True, steps=[1, 2, 5, 10]))
-    top = int(np.argmax(bins.shares))
-    first, last = round(bins.edges[top]), round(bins.edges[top + 1]) - 1
-    where, most = f"{first}" if first == last else f"{first} to {last}", share(bins.shares[top] / 100.0)
-    alt = f"Bars of crashes by number of control steps; {where} control steps carry most, {most}."
-    caption = (
-        "Left, how many crashes were sampled after how many control steps; right, how much of the crash rate they "
-        f"stand for. Most comes from {where} control steps ({most}). A stratum that is high on "
-        "the right but low on the left is where more tests would help most."
-    )
-    return Plot("strata", figure, alt, caption)
+def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | None:
+    """Map of the share of cut-ins that crash, over gap and closing speed, and what others avoid; None without any.
 
-
-def impact_speed_plot(summary: RunSummary) -> Plot | None:
-    """Histogram of impact speeds, weighted and sampled; None without crashes."""
-    if summary.n_crashes == 0:
-        return None
-    figure = new_figure(FULL_WIDTH_IN, 2.9)
-    axes, crashes = figure.subplots(), summary.crashes
-    axes.set_xlabel("impact speed v_AV − v_BV, m/s")
-    _draw_crashes(axes, summary, crashes["impact_speed_mps"], "")
-    median, high = (weighted_quantile(crashes["impact_speed_mps"], crashes["weight"], q) for q in (0.5, 0.95))
-    text = "no crash has a weight above zero"
-    if not math.isnan(median):
-        text = (
-            f"weighted to naturalistic driving, half of the crashes are below {median:.1f} m/s "
-            f"({3.6 * median:.0f} km/h) and 95 % below {high:.1f} m/s ({3.6 * high:.0f} km/h)"
-        )
-    caption = f"{_crash_legend(summary)} Here, {text}."
-    return Plot("impact_speed", figure, f"Histogram of impact speeds; {text}.", caption)
-
-
-def crash_time_plot(summary: RunSummary) -> Plot | None:
-    """Histograms of the time from cut-in to crash and of the time of the crash; None without crashes."""
-    if summary.n_crashes == 0:
-        return None
-    crashes = summary.crashes
-    figure, left, right = two_panels(2.9, ("from cut-in to crash, s", "from start of the test, s"))
-    _draw_crashes(left, summary, crashes["response_s"], "Time to crash after the cut-in")
-    _draw_crashes(right, summary, crashes["crash_time_s"], "Time of the crash in the test")
-    median_s = weighted_quantile(crashes["response_s"], crashes["weight"], 0.5)
-    median = "" if math.isnan(median_s) else f" (weighted median {median_s:.1f} s)"
-    caption = (
-        f"{_crash_legend(summary)} Left, the time that the AV had between the "
-        f"cut-in and the crash{median}: short times leave no controller a chance, long ones point to its braking. "
-        "Right, when crashes come: a pile-up at the end of the test would mean that its length cuts crashes off."
-    )
-    return Plot("crash_time", figure, f"Histograms of time to crash for {count(summary.n_crashes)} crashes.", caption)
-
-
-def _draw_crashes(axes: Axes, summary: RunSummary, values: FloatArray, title: str) -> None:
-    bins = binned(values, summary.crashes["weight"], edges_for(values[np.isfinite(values)], 0.1, CRASH_BINS))
-    axes.stairs(
-        bins.shares, bins.edges, fill=True, color=VERMILLION, alpha=0.85,
-        label=None if summary.all_weights_one else "weighted (share of the rate)",
-    )  # fmt: skip
-    if not summary.all_weights_one:
-        axes.stairs(_percent(bins.counts), bins.edges, color=GREY, linewidth=1.4, label="as sampled")
-    axes.set_xlim(float(bins.edges[0]), float(bins.edges[-1]))
-    axes.set_ylim(bottom=0.0)
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_ylabel("share of crashes, %")
-    only_horizontal_grid(axes)
-    head(axes, title)
-
-
-def _crash_legend(summary: RunSummary) -> str:
-    if summary.all_weights_one:
-        return "Share of crashes; tests are naturalistic driving itself, all with weight 1."
-    return "Filled: share of the crash rate; outline: crashes as sampled."
-
-
-def cut_in_plot(summary: RunSummary) -> Plot | None:
-    """Maps of (R2, R2dot) at the cut-in, as sampled and as weighted; None when BV never cut in."""
+    ``environment`` is that in which others can be driven, None where that is not known any more.
+    """
     rows = summary.rows
     cut_in = np.isfinite(rows["cut_in_r2_m"]) & np.isfinite(rows["cut_in_r2dot_mps"]) & (rows["outcome"] != FAILED)
-    crash = cut_in & (rows["outcome"] == CRASH)
     if not cut_in.any():
         return None
-    maps = []
-    for which, ramp, title in ((cut_in, BLUES, "Cut-ins"), (crash, REDS, "Cut-ins that crash")):
-        r2dot_mps, r2_m = (
-            np.clip(rows["cut_in_r2dot_mps"][which], -30.0, 19.9),
-            np.clip(rows["cut_in_r2_m"][which], 0.0, 149.9),
+    gap, closing = rows["cut_in_r2_m"][cut_in], np.maximum(-rows["cut_in_r2dot_mps"][cut_in], 0.0)
+    weight, crash = rows["weight"][cut_in], rows["outcome"][cut_in] == CRASH
+    of = crash if crash.any() else np.ones_like(crash)
+    far, fast = 1.4 * float(np.quantile(gap[of], 0.98)) + 1.0, 1.15 * float(np.quantile(closing[of], 0.98)) + 1.0
+    edges = np.linspace(0.0, far, CELLS + 1), np.linspace(0.0, fast, CELLS // 2 + 1)
+    every, crashed = (np.histogram2d(gap, closing, edges, weights=w)[0].T for w in (weight, weight * crash))
+    shares = np.divide(crashed, every, out=np.full_like(every, -1.0), where=every > 0.0)
+    figure = new_figure(FULL_WIDTH_IN, 3.5)
+    axes = figure.subplots()
+    for low, (high, colour) in zip((-0.5, *SHARES), SHARES.items(), strict=False):
+        if (here := (shares > low) & (shares <= high)).any():
+            rows_here, columns_here = np.nonzero(here)
+            cells, label = _cells_path(rows_here, columns_here, *edges[::-1]), f"≤ {share(high)}" if high else "none"
+            axes.add_patch(PathPatch(cells, facecolor=colour, edgecolor="none", label=label))
+    known = environment is not None and not environment.lateral.present
+    lines = limits_of_others(environment, summary, fast) if environment is not None and known else {}
+    for (name, (speeds, gaps)), colour, style in zip(lines.items(), (INK, BLUE), ("-", (0, (4, 2))), strict=False):
+        axes.plot(gaps, speeds, color=colour, linestyle=style, label=f"{name}’s limit")
+    axes.set(xlim=(0.0, far), ylim=(0.0, fast), xlabel="gap at the cut-in, m", ylabel="closing speed, m/s")
+    head(axes, "Share of cut-ins that crash")
+    text = f"Each of {count(cut_in.sum())} cut-ins by its gap and closing speed; {count(crash.sum())} of them crashed."
+    if lines:
+        text += (
+            " Left of its line the competent driver (r157-cc), or the best of brakes (8 m/s² at once), crashes in the "
+            "vehicle’s place, too, if the car that cuts in keeps its speed."
         )
-        edges = [R2DOT_MPS - 1e-9, R2_M - 1e-9]
-        sampled, _, _ = np.histogram2d(r2dot_mps, r2_m, bins=edges)
-        weighted, _, _ = np.histogram2d(r2dot_mps, r2_m, bins=edges, weights=rows["weight"][which])
-        if summary.all_weights_one:
-            maps.append((sampled, ramp, title))
-        elif which is cut_in or crash.any():
-            maps += [(sampled, ramp, f"{title}, sampled"), (weighted, ramp, f"{title}, weighted")]
-    used = tuple(slice(int(i.min()), int(i.max()) + 2) for i in np.nonzero(maps[0][0]))
-    cells = tuple(slice(of.start, of.stop - 1) for of in used)
-    figure = new_figure(FULL_WIDTH_IN, 1.5 * len(maps) + 0.4)
-    panels = figure.subplots(len(maps) // 2, 2, sharex=True, sharey=True, squeeze=False)
-    for axes, (values, ramp, title) in zip(panels.flat, maps, strict=True):
-        _draw_map(axes, values[cells], R2DOT_MPS[used[0]], R2_M[used[1]], ramp)
-        axes.set_title(title)
-    for axes in panels[:, 0]:
-        axes.set_ylabel("R2dot at the cut-in, m/s")
-    for axes in panels[-1]:
-        axes.set_xlabel("R2 at the cut-in, m")
-    _add_key(figure, [ramp for ramp in (BLUES, REDS) if any(shown is ramp for _, shown, _ in maps)])
-    alt = (
-        f"Maps of gap R2 against its rate R2dot at the cut-in: {count(cut_in.sum())} cut-ins, {count(crash.sum())} of "
-        f"them crashed. Panels: {', '.join(title for _, _, title in maps)}."
-    )
-    return Plot("cut_ins", figure, alt, _cut_in_caption(summary, float(rows["weight"][cut_in].sum())))
+    return Plot("where", figure, text, text)
 
 
-def _draw_map(axes: Axes, values: FloatArray, r2dot_mps: FloatArray, r2_m: FloatArray, ramp: tuple[str, ...]) -> None:
-    """Fill the cells of each level as one path: small files, no seams, and colours that can follow the page."""
-    top = float(values.max(initial=0.0)) or 1.0
-    with np.errstate(divide="ignore"):
-        below = np.floor(-np.log10(values / top) * LEVELS_PER_DECADE)
-    level = np.where(values > 0.0, np.maximum(len(ramp) - 1 - below, 0), -1.0)
-    for index, colour in enumerate(ramp):
-        rows, columns = np.nonzero(level == index)
-        if rows.size:
-            axes.add_patch(PathPatch(_cells_path(rows, columns, r2dot_mps, r2_m), facecolor=colour, edgecolor="none"))
-    axes.set_xlim(float(r2_m[0]), float(r2_m[-1]))
-    axes.set_ylim(float(r2dot_mps[0]), float(r2dot_mps[-1]))
-    r2, r2dot = np.meshgrid(np.linspace(*axes.get_xlim(), 200), np.linspace(*axes.get_ylim(), 200))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ttc_s = np.where(r2dot < 0.0, -r2 / r2dot, np.inf)
-    style: dict[str, Any] = {"colors": MUTED, "linewidths": 0.8, "linestyles": "dashed"}
-    lines = axes.contour(r2, r2dot, np.minimum(ttc_s, 2.0 * TTC_LINES_S[-1]), levels=TTC_LINES_S, **style)
-    axes.clabel(lines, fmt="%g s", fontsize=8)
+def limits_of_others(
+    environment: Environment, summary: RunSummary, fastest_mps: float
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Closing speeds (m/s), and the smallest gap (m) at which each of `OTHERS` avoids a crash, BV keeping its speed."""
+    speeds, gaps = np.linspace(0.5, fastest_mps, 40), np.linspace(0.25, 60.0, 240)
+    speed, gap = (each.ravel() for each in np.meshgrid(speeds, gaps, indexing="ij"))
+    n, draws = speed.size, int(environment.numbers["max_steps"] // environment.numbers["hold_steps"]) + 1
+    v_bv = np.full(n, float(np.median(summary.rows["v_bv_mps"])))
+    state = states_from((v_bv, np.full(n, 200.0), np.zeros(n), gap, -speed))
+    maneuvers = np.full((n, draws + 1), KEEPS_SPEED, np.int8)
+    bv = maneuvers.copy()
+    bv[:, 1] = CUT_IN
+    used, none = np.full(n, draws), np.zeros(n, np.int64)
+    script = Script(maneuvers, bv, used, used + 1, none)
+    stored = StoredPaths(0, none, state, none, none, script)
+    end, start = np.zeros((n, len(OTHERS)), np.int64), np.full((n, 2), np.nan)
+    drivers = library_records([driver for _, driver in OTHERS.values()], see_onset=False)
+    path = unboxed(empty_trajectory(environment))
+    drive_others(unboxed(stored), start, unboxed(environment), drivers, path, end, np.zeros((0, 0, 0)))
+    crashes = (end >= 0).reshape(speeds.size, gaps.size, len(OTHERS))
+    last = np.where(crashes.any(1), gaps[gaps.size - 1 - np.argmax(crashes[:, ::-1], axis=1)], 0.0)
+    return {name: (speeds, last[:, d]) for d, name in enumerate(OTHERS)}
 
 
-def _cells_path(rows: IntArray, columns: IntArray, r2dot_mps: FloatArray, r2_m: FloatArray) -> Path:
+def _cells_path(rows: IntArray, columns: IntArray, y: FloatArray, x: FloatArray) -> Path:
     """One compound path of all cells, neighbours in a row merged into one rectangle."""
     starts = np.flatnonzero(np.r_[True, (np.diff(rows) != 0) | (np.diff(columns) != 1)])
     ends = np.r_[starts[1:], rows.size] - 1
-    left, right = r2_m[columns[starts]], r2_m[columns[ends] + 1]
-    low, high = r2dot_mps[rows[starts]], r2dot_mps[rows[starts] + 1]
+    left, right = x[columns[starts]], x[columns[ends] + 1]
+    low, high = y[rows[starts]], y[rows[starts] + 1]
     corners = np.array([[left, low], [right, low], [right, high], [left, high]])
     return Path.make_compound_path_from_polys(corners.transpose(2, 0, 1))
-
-
-def _add_key(figure: Figure, ramps: list[tuple[str, ...]]) -> None:
-    """Add one legend row per colour ramp, with the labels in the last."""
-    n = len(BLUES)
-    labels = ["less", *(f"over 1/{10 ** ((n - level) / LEVELS_PER_DECADE):.0f}" for level in range(1, n))]
-    # Legends fill column by column.
-    patches = [
-        Patch(facecolor=ramp[level], edgecolor="none", label=labels[level] if ramp is ramps[-1] else " ")
-        for level in range(n)
-        for ramp in ramps
-    ]
-    title = "cell, relative to the fullest cell of its map"
-    style = {"fontsize": 8, "title_fontsize": 8, "labelcolor": MUTED, "handlelength": 1.8, "columnspacing": 1.2}
-    figure.legend(handles=patches, loc="outside lower center", title=title, ncols=n, **style)
-
-
-def _cut_in_caption(summary: RunSummary, weight: float) -> str:
-    per_test = number(summary.per_test(weight))
-    text = "Gap R2 and its rate R2dot (BV minus AV) when BV cuts in. "
-    if summary.all_weights_one:
-        text += f"Tests are naturalistic driving itself; there are {per_test} cut-ins per test."
-    else:
-        weighted, of_shells = "weighted by their likelihood ratio", "with each shell counted by its probability"
-        how = of_shells if summary.from_shells else weighted
-        text += (
-            f"Left, where the tests went; right, the same cut-ins {how}, as they occur in naturalistic driving "
-            f"({per_test} per test)."
-        )
-    text += " Dashed lines: equal time to collision. Colours step by a factor √10 below each map's fullest cell."
-    if not summary.n_crashes:
-        return text + " None of them crashed."
-    return text if summary.all_weights_one else text + " The lower right map is where the crash rate comes from."

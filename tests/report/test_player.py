@@ -130,7 +130,7 @@ def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_n
     for rank, end in who.items():
         ends[by_rank[rank]] = end
     monkeypatch.setattr(crashes, "_ends", lambda *_: ends)
-    rows, scenes = crashes.crash_gallery(run, summary)
+    rows, scenes = crashes.crash_gallery(run, summary, crashes.environment_of(run))
     assert [row.reason.split(", ")[0] for row in rows][: len(leads)] == [lead.split(", ")[0] for lead in leads]
     shown = [row.crash.episode for row in rows]
     allowed = [int(summary.crashes["episode"][by_rank[rank]]) for rank in who or range(impact.size)]
@@ -146,7 +146,7 @@ def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_n
 def test_a_report_shows_crashes_with_those_who_avoid_them(stored_run, tmp_path):
     folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
     scenes = scenes_in(write_report(folder).read_text(encoding="utf-8"))
-    rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run))
+    rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run), crashes.environment_of(run))
     assert [row.crash.episode for row in rows if row.scene is not None] == [scene["episode"] for scene in scenes]
     for row, scene in zip(rows, scenes, strict=True):
         avoids = [ghost["name"] for ghost in scene["ghosts"] if ghost["crash"] is None]
@@ -162,7 +162,7 @@ def test_without_the_runs_traffic_its_vehicles_are_played_alone(stored_run, tmp_
     scenes = scenes_in(write_report(folder).read_text(encoding="utf-8"))
     assert scenes
     assert not any(scene["ghosts"] for scene in scenes)
-    rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run))
+    rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run), crashes.environment_of(run))
     assert {row.avoided_by for row in rows} == {"–"}
 
 

@@ -14,16 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import harness.report
-from harness.estimators.answer import Estimates
-from harness.estimators.estimate import Estimate, Unavailable
+from harness.estimators.severity import weighted_quantiles
 from harness.numbers import number
 from harness.report import crashes
-from harness.report.crashes import CANDIDATES, crash_gallery, worst_crashes
+from harness.report.crashes import CANDIDATES, crash_gallery, environment_of, worst_crashes
 from harness.report.player import UNKNOWN
-from harness.report.rate_plots import POOL, answer_plot, shells_plot
+from harness.report.rate_plots import POOL, severity_plot, shells_plot
 from harness.report.style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg
 from harness.report.summary import read_run_folder, summarise
-from harness.report.test_plots import binned, edges_for, weighted_quantile
+from harness.report.test_plots import binned, edges_for, limits_of_others, where_plot
 from harness.vocabulary import CRASH, OUTCOMES
 from tests.report.test_page import edit
 
@@ -53,48 +52,38 @@ def test_inline_svg_is_themed_text_without_names_or_namespaces():
         assert absent not in markup
 
 
-def estimates(**rates: tuple[float, float, float] | None) -> Estimates:
-    rest = 1.0, 0.9, 0.1, 9, 9, 9.0, 0.1, "m"
-    found = {
-        name: Unavailable("why") if rate is None else Estimate(rate[0], 0.0, *rate[1:], *rest)
-        for name, rate in rates.items()
-    }
-    return Estimates("c", "h", 1.0, 0.9, 9, 9, next(iter(rates)), 0.3, None, found, {}, (), "s", {}, (), {}, "")
+@pytest.mark.parametrize("name", ["shells", "weighted", "nde"])
+def test_severity_is_drawn_as_it_was_estimated(name, runs):
+    rows = [row for row in runs[name].estimates.severity.exceedance if row.crash_rate > 0.0]
+    axes = severity_plot(runs[name].estimates).figure.axes[0]
+    assert axes.lines[0].get_xydata().tolist() == [[row.above_mps, row.crash_rate] for row in rows]
+    band = axes.collections[0].get_paths()[0].vertices
+    assert {row.ci_high for row in rows} <= set(band[:, 1])
+    assert severity_plot(runs["no_crash"].estimates) is None
 
 
-@pytest.mark.parametrize(
-    ("rates", "scale"),
-    [
-        ({"nade": (1.0e-7, 0.9e-7, 1.1e-7)}, "linear"),
-        ({"nade": (1.0e-8, 1.0e-12, 2.0e-8)}, "linear"),
-        ({"nde": (0.0, 0.0, 3.0e-4)}, "linear"),
-        ({"nade": (1.0e-7, 0.9e-7, 1.1e-7), "nde": (0.0, 0.0, 1e-4)}, "log"),
-        ({"nade": (1.0e-7, 0.9e-7, 1.1e-7), "other": (1.0e-4, 0.0, 2e-4)}, "log"),
-    ],
-)
-def test_axis_is_logarithmic_only_where_estimators_differ_by_orders_of_magnitude(rates, scale):
-    plot = answer_plot(estimates(**rates), None)
-    axes = plot.figure.axes[0]
-    plot.figure.draw_without_rendering()
-    assert axes.get_xscale() == scale
-    low, high = axes.get_xlim()
-    for rate, _, end in rates.values():
-        assert end <= high
-        assert rate >= low or rate == 0.0
+def test_others_avoid_a_crash_from_the_gap_on_that_their_brakes_need(runs):
+    """No less than v²/2b and 0.1 s, no more than half a metre and half a second above; a delay of 0.47 s needs more."""
+    run = runs["shells"]
+    lines = limits_of_others(environment_of(run), summarise(run), 12.0)
+    (speeds, at_once), (_, competent) = lines["brakes-8"], lines["r157-cc"]
+    needed = speeds**2 / 16.0
+    assert np.all((at_once > needed - 0.3) & (at_once < needed + 0.5 * speeds + 0.5))
+    assert np.all(np.diff(competent) >= 0.0)
+    assert np.all(competent[speeds > 3.0] > at_once[speeds > 3.0])
 
 
-def test_intervals_are_drawn_where_they_are_with_the_headline_first():
-    plot = answer_plot(estimates(cv=(2.0e-7, 1.5e-7, 2.5e-7), nade=(2.1e-7, 1.0e-7, 3.0e-7), scv=None), None)
-    axes = plot.figure.axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["cv", "nade"]
-    (first,) = axes.containers[0].lines[2]
-    assert first.get_segments()[0][:, 0] == pytest.approx([1.5e-7, 2.5e-7])
-    assert "2.00 (1.50 to 2.50) × 10⁻⁷" in [text.get_text() for text in axes.texts]
-    assert answer_plot(estimates(scv=None), None) is None
+def test_the_map_has_a_colour_for_every_cut_in(runs):
+    axes = where_plot(summarise(runs["shells"]), None).figure.axes[0]
+    assert axes.patches
+    assert not axes.lines
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels[0] == "none"
+    assert set(labels) <= {"none", "≤ 25 %", "≤ 50 %", "≤ 75 %", "≤ 100 %"}
 
 
 def test_the_plot_shows_contributions_and_half_widths(runs):
-    """The latter are what is not known, that of the pool included; a refuted statement has no interval."""
+    """The latter are what is not known, that of the pool included."""
     found = runs["shells"].shells
     rates, widths = shells_plot(found).figure.axes
     assert [label.get_text() for label in rates.get_yticklabels()] == [*(s.shell for s in found.shells), POOL]
@@ -102,9 +91,6 @@ def test_the_plot_shows_contributions_and_half_widths(runs):
     half_widths = [*(s.half_width for s in found.shells), found.pool_half_width]
     assert [bar.get_width() for bar in widths.patches] == half_widths
     assert sum(map(found.share_of_uncertainty, half_widths)) == pytest.approx(1.0)
-    for name, rows in (("shells", ["shells", "given library", "given need-based"]), ("shells_refuted", ["shells"])):
-        axes = answer_plot(runs[name].estimates, runs[name].shells).figure.axes[0]
-        assert [label.get_text() for label in axes.get_yticklabels()] == rows
 
 
 def test_a_shell_without_tests_is_said_so_and_runs_out_of_the_plot(runs):
@@ -169,7 +155,7 @@ def test_gallery_prefers_traced_crashes_where_few_are_traced(run_folder, summary
     for path in sorted((run_folder / "traces").iterdir()):
         traces = pq.read_table(path)
         pq.write_table(traces.filter(np.asarray(traces.column("episode")) == tenth), path)
-    rows, scenes = crash_gallery(read_run_folder(run_folder), summary)
+    rows, scenes = crash_gallery(read_run_folder(run_folder), summary, None)
     shown = [(row.crash.episode, row.reason.split(", ")[0], row.scene) for row in rows if row.scene is not None]
     assert shown == [(tenth, "impact no. 10", 0)]
     assert [scene["episode"] for scene in scenes] == [tenth]
@@ -189,9 +175,8 @@ def test_values_on_an_edge_and_weighted_quantiles():
     tenths = 0.1 * np.arange(10)  # of which 0.3 is a little less than its edge
     assert binned(tenths, tenths, 0.1 * np.arange(11)).counts.tolist() == [1.0] * 10
     values, weights = np.array([9.0, 1.0, 2.0]), np.array([8.0, 1.0, 1.0])
-    assert weighted_quantile(values, weights, 0.5) == 9.0
-    assert weighted_quantile(values, weights, 0.15) == 2.0
-    assert math.isnan(weighted_quantile(values, 0.0 * weights, 0.5))
+    assert weighted_quantiles(values, weights, (0.5, 0.15)) == [9.0, 2.0]
+    assert math.isnan(weighted_quantiles(values, 0.0 * weights, (0.5,))[0])
 
 
 @pytest.mark.parametrize("name", ["shells", "shells_refuted"])
