@@ -153,6 +153,14 @@ def test_the_committed_gate_errs_as_rarely_as_it_says():
     assert needed["brakes-8"]["tests_median"] <= 1650
 
 
+def test_committed_bounds_hold_after_stopping_and_one_of_the_former_ones_does_not():
+    content, _ = committed("shells_bounds")
+    bounds = [one for one in content["judgements"] if "upper bound" in one["result"]]
+    failed = {one["subject"] for one in bounds if one["coverage_too_low"]}
+    assert failed == {"full-throttle"} == {one["subject"] for one in bounds if one["coverage"] < 0.8}
+    assert not any(one["coverage_too_low"] for one in bounds if FORMER not in one["result"])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMITTED)
 def test_committed_experiments_are_what_the_command_gives(name, tmp_path):
