@@ -330,6 +330,8 @@ def coverage_table() -> str:
         for value, file in zip(values, varied_files(name), strict=True):
             lowest = dict.fromkeys(kinds, math.inf)
             for one in filter(_is_judged, _result(file)["judgements"]):
+                if "upper bound" in one["result"]:
+                    continue  # has a table of its own
                 lowest[_kind(one)] = min(one["coverage"], lowest[_kind(one)])
             variant = "" if value == values[0] else f", {key.rpartition('.')[2]} {value}"
             cells = (f"{coverage:.3f}" if coverage < math.inf else "–" for coverage in lowest.values())
