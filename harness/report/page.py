@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import re
 from inspect import getmembers, isfunction
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib.style
 from markupsafe import Markup
@@ -16,15 +15,14 @@ from harness import numbers
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import written_out
 from harness.errors import printable
-from harness.estimators.answer import MENDS
 from harness.estimators.estimate import Estimate
 from harness.estimators.shells import ShellDetails, Within
-from harness.numbers import MISSING, count, exponent_of, half_width, leaves, number, power_of_ten, share, words
+from harness.numbers import count, leaves, words
 from harness.records.folder import write_bytes
 from harness.records.reader import table_sizes
 from harness.report.crashes import crash_gallery, environment_of
 from harness.report.player import templates
-from harness.report.rate_plots import convergence_plot, rate_exponent, severity_plot, shells_plot
+from harness.report.rate_plots import convergence_plot, severity_plot, shells_plot
 from harness.report.style import RC, Plot, inline_svg, svg
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
 from harness.report.test_plots import weight_plot, where_plot
@@ -63,7 +61,6 @@ def write_report(folder: str | Path) -> Path:
         figures=figures,
         lateral=lateral_facts(run),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
-        unit=RateUnit(rate_exponent(run.estimates)),
         outcomes=outcome_rows(summary),
         notes=run_notes(run, summary),
         diagnostics=diagnostics(run),
@@ -108,57 +105,14 @@ def _write_plots(folder: Path, files: dict[str, bytes]) -> None:
             old.unlink()
 
 
-class RateUnit(NamedTuple):
-    """The power of ten in which a table writes its rates."""
-
-    exponent: int
-
-    @property
-    def text(self) -> str:
-        """`` × 10⁻⁷``, to follow the unit in the head of a column."""
-        return f" × {power_of_ten(self.exponent)}" if self.exponent else ""
-
-    def digits(self, rate: float, digits: int) -> str:
-        """A rate with so many significant digits."""
-        return number(rate, digits, exponent=self.exponent)
-
-    def rate(self, rate: float | None) -> str:
-        """A rate, by its own power of ten where this one would show no digit of it or too many."""
-        if not rate or 1e-2 <= rate / 10.0**self.exponent < 1e4:
-            return number(rate, exponent=self.exponent)
-        return number(rate) if exponent_of(rate) or not self.exponent else f"{number(rate)} × 10⁰"
-
-    def ends(self, low: float | None, high: float | None) -> str:
-        """Both ends of an interval, with the decimals that the upper one needs."""
-        if low is None or high is None:
-            return MISSING
-        if not high or 1e-2 <= high / 10.0**self.exponent < 1e4:
-            return " to ".join(number(end, exponent=self.exponent, like=high) for end in (low, high))
-        return f"{self.rate(low)} to {self.rate(high)}"
-
-
 def run_notes(run: RunFolder, summary: RunSummary) -> list[str]:
-    """Return what the reader must know about this run as a whole."""
+    """What else the reader should know about this run as a whole, beside the answer's own warnings."""
     notes = list(run.headline.warnings)
     n_tests, n_estimated = summary.n_episodes, run.estimates.n_episodes
     if n_estimated not in (n_tests, n_tests - summary.n_failed):
         notes.append(
             f"The estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}: run "
             f"harness estimate {run.typed} --write."
-        )
-    target, rhw = run.target_rhw, run.headline.rhw
-    if run.asked_statement and run.shells is not None:
-        rhw = next(each.rhw for each in run.shells.statements if each.name == run.asked_statement)
-    if target is not None and not rhw <= target:
-        reached = "it is not known" if math.isnan(rhw) else f"it is {half_width(rhw)}"
-        mend = MENDS.get(run.manifest.get("stopped_by") or "")
-        why = f" ({mend})" if mend else ""
-        notes.append(f"The asked relative half-width of {target:g} was not reached: {reached}{why}.")
-    if summary.n_failed:
-        notes.append(
-            f"{count(summary.n_failed)} of {count(n_tests)} tests failed ({share(summary.n_failed / n_tests)}). They "
-            "are kept as rows and listed under Outcomes; a crash rate over the others is biased if failing and "
-            "crashing go together."
         )
     return notes
 

@@ -197,9 +197,10 @@ def _ending(track: Scene, bv: Scene, scene: Scene) -> str:
         places = range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
         return f"avoids it, {tenths(min(_gap(track, bv, place) for place in places))} m at the closest"
     v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
-    side = ", from the side" if scene["onset"] < cut and crash == cut + 1 else ""
+    from_the_side = scene["onset"] < cut and crash == cut + 1
+    who = "BV strikes it from the side" if from_the_side else "strikes BV from behind"
     impact = tenths(_closing(track, bv, crash - first))
-    return f"crashes at {_when(crash, cut)}: {v} m/s into BV at {v_bv} m/s, impact {impact} m/s{side}"
+    return f"crashes at {_when(crash, cut)}: {who}, {v} m/s into {v_bv} m/s, impact {impact} m/s"
 
 
 def _gap(track: Scene, bv: Scene, place: int) -> float:

@@ -6,8 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from harness.estimators.answer import Estimates
-from harness.estimators.estimate import Estimate
-from harness.numbers import count, exponent_of, number, plain, share
+from harness.numbers import count, number, plain, share
 from harness.report.style import (
     BLUE,
     FULL_WIDTH_IN,
@@ -28,25 +27,15 @@ from harness.report.summary import ShownShells
 from harness.vocabulary import FloatArray
 
 POOL = "pool’s own error"
-VISIBLE = 0.005
-"""Smallest share of an axis that a bar must have to show a colour."""
 WEIGHTED = (
-    "Left, the band should narrow around a level line: a rate that still climbs, or drops between jumps, has not "
-    "settled. Right, RHW should fall along the dotted line; each jump upwards is a crash with a large weight, and "
-    "many late jumps mean that the interval cannot be trusted yet."
+    "Left, the band should narrow around a level line. Right, RHW should fall along the dotted line; each jump upwards "
+    "is a crash with a large weight, and many late jumps mean that the interval cannot be trusted yet."
 )
 IN_ROUNDS = (
-    "Tests come in rounds, first inside the narrowest boundary. A shell without tests counts as free of crashes in "
-    "the estimate (line) and as anything in the interval (band), which is why the band begins wide and one-sided, and "
-    "why the line may jump when a shell is first tested. Right, RHW falls faster than the dotted line while what "
-    "remains is to see no crash outside, and along it where crashes must be counted."
+    "Tests come in rounds, first inside the narrowest boundary. A shell without tests counts as free of crashes in the "
+    "line and as anything in the band, which begins wide and one-sided. Right, RHW falls faster than the dotted line "
+    "while what remains is to see no crash outside."
 )
-
-
-def rate_exponent(estimates: Estimates) -> int:
-    """Power of ten in which the rates of this run are best written."""
-    found = estimates.estimates[estimates.headline]
-    return exponent_of(found.crash_rate or found.ci_high) if isinstance(found, Estimate) else 0
 
 
 def severity_plot(estimates: Estimates) -> Plot | None:
@@ -79,19 +68,17 @@ def severity_plot(estimates: Estimates) -> Plot | None:
 
 
 def convergence_plot(estimates: Estimates, target_rhw: float | None, *, of_statement: str | None = None) -> Plot | None:
-    """Rate with its band, and RHW with its target, against tests; None without convergence records.
+    """Rate with its band, and RHW with its target, against tests; None without a crash, or a course to draw.
 
     ``of_statement``: the target is one for a statement of a shells run about a boundary, which convergence does not
     record.
     """
     points = sorted(estimates.convergence, key=lambda point: point.n)
-    if len(points) < 2:
+    if len(points) < 2 or not points[-1].crash_rate:
         return None
     columns = [(each.n, each.crash_rate, each.ci_low, each.ci_high, each.rhw) for each in points]
     n, rate, low, high, rhw = np.array(columns, np.float64).T
     confidence, level = share(estimates.confidence), plain(estimates.lane_change_level)
-    if not np.any(rate > 0.0):
-        return _plot_without_crash(n, high, confidence, level)
     figure, left, right = two_panels(3.5, ("tests", "tests"), sharex=True)
     for axes in (left, right):
         log_axis(axes.xaxis, n[0], n[-1])
@@ -111,26 +98,6 @@ def convergence_plot(estimates: Estimates, target_rhw: float | None, *, of_state
         caption += " No RHW was asked for."
     elif of_statement:
         caption += f" The RHW that was asked for is that of the statement {of_statement}, not of the rate drawn here."
-    return Plot("convergence", figure, alt, caption)
-
-
-def _plot_without_crash(n: FloatArray, high: FloatArray, confidence: str, level: str) -> Plot:
-    """Draw only the upper end of the interval: without a crash it is all that changes, and RHW is not defined."""
-    figure = new_figure(FULL_WIDTH_IN, 2.9)
-    axes = figure.subplots()
-    log_axis(axes.xaxis, n[0], n[-1])
-    axes.plot(n, high, color=BLUE)
-    known = high[np.isfinite(high) & (high > 0.0)]
-    if known.size:
-        log_axis(axes.yaxis, float(known.min()) / 1.6, float(known.max()) * 1.6)
-    axes.set_xlabel("tests")
-    axes.set_ylabel(f"crash rate per test (level {level})")
-    axes.set_title(f"Upper end of the {confidence} interval")
-    alt = f"Upper end of the {confidence} interval against tests, ending at {number(high[-1])}; no crash was sampled."
-    caption = (
-        "No crash was sampled: the estimate stays at zero and only the upper end of its interval falls as tests come "
-        "in. The relative half-width is not defined without a crash."
-    )
     return Plot("convergence", figure, alt, caption)
 
 
@@ -201,21 +168,10 @@ def shells_plot(found: ShownShells) -> Plot:
     )
     caption = (
         "From careful (top) to careless. Left: what each shell adds to the crash rate, with its "
-        f"limits{_colours(found, limit)}. {source} Right: probability × half-width of the crash share, with its share "
-        f"of the sum of squares, which is what makes the interval. {open_question}"
+        f"limits (orange outside every boundary). {source} Right: probability × half-width of the crash share, and its "
+        f"share of the sum of squares, which is what makes the interval. {open_question}"
     )
     return Plot("shells", figure, alt, caption)
-
-
-def _colours(found: ShownShells, limit: float) -> str:
-    """Name the colours that can be seen, none where all bars have one because there is no outside."""
-    seen = {shell.inside for shell in found.shells if shell.contribution > VISIBLE * limit}
-    if not found.has_outside or not seen:
-        return ""
-    if seen == {True, False}:
-        return "; blue inside the widest boundary, orange outside"
-    inside = "; all that can be seen (blue) lies inside the widest boundary"
-    return inside if True in seen else "; all lies outside (orange)"
 
 
 def _source(found: ShownShells) -> str:

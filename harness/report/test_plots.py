@@ -111,9 +111,8 @@ def _weight_caption(crashed: Bins) -> str:
     last = np.flatnonzero(crashed.counts)[-1]
     return (
         "Sound sampling has the two panels overlap: the weights that carry the estimate (below) are also the ones that "
-        "crashes often have (above, orange). A contribution far to the right of the bulk of crashes rests on few "
-        f"tests. Here the rightmost bin with a crash holds {count(crashed.counts[last])} of "
-        f"{count(crashed.counts.sum())} crashes and {share(crashed.shares[last] / 100.0)} of the estimate."
+        f"crashes often have (above, orange). Here the rightmost bin with a crash holds {count(crashed.counts[last])} "
+        f"of {count(crashed.counts.sum())} crashes and {share(crashed.shares[last] / 100.0)} of the estimate."
     )
 
 

@@ -14,7 +14,6 @@ import pyarrow.parquet as pq
 import pytest
 from junitparser import JUnitXml
 
-from harness.campaign.sections import Accept
 from harness.errors import RunFolderError
 from harness.report.junit import Case, outcome_of, statement_cases, write_junit
 from harness.report.page import run_notes, verdict, write_report
@@ -62,28 +61,16 @@ def test_the_page_is_self_contained_with_plots_and_words_that_make_sense(reports
     plots, words = SEEN[name]
     assert [each for each in words if each not in page.words] == []
     stems = {path.stem for path in (folder / "plots").iterdir()}
-    assert stems == {"where", "convergence"} | plots
+    assert stems == {"where"} | plots | ({"convergence"} if name != "no_crash" else set())
     for stem in stems:
         ElementTree.parse(folder / "plots" / f"{stem}.svg")
         assert f"plot-{stem}" in page.ids
 
 
-def test_notes_say_what_was_not_reached_and_what_is_stale(run_folder):
-    estimates = edit(run_folder / "estimates.json", n_episodes=2_000)["estimates"]
-    estimates["mixture_cv"]["rhw"] = 0.7
-    edit(run_folder / "estimates.json", estimates=estimates)
-    edit(run_folder / "manifest.json", stopped_by="episodes")
+def test_notes_say_what_is_stale(run_folder):
+    edit(run_folder / "estimates.json", n_episodes=2_000)
     run = read_run_folder(run_folder)
-    notes = "\n".join(run_notes(run, summarise(run)))
-    assert "asked relative half-width of 0.1 was not reached: it is 0.700 (stop.episodes was spent; raise" in notes
-    assert "cover 2,000 tests but the records hold 3,000" in notes
-
-
-def test_a_gate_is_not_blamed_for_a_width_that_it_does_not_look_at(runs):
-    run = runs["shells"]
-    notes = run_notes(run, summarise(run))
-    gate = replace(run, campaign=run.campaign.replaced(("accept",), Accept(crash_rate_below=1e-6)))
-    assert run_notes(gate, summarise(run)) == [note for note in notes if "half-width" not in note] != notes
+    assert "cover 2,000 tests but the records hold 3,000" in "\n".join(run_notes(run, summarise(run)))
 
 
 def test_a_statement_that_a_vehicle_does_not_keep_to_is_said_so_and_sooner_that_it_is_refuted(runs):
