@@ -101,7 +101,7 @@ class Theorems(Section):
     """The paper's three theorems on small chains, by enumeration of all episodes."""
 
     kind: Literal["theorems"]
-    draws: Whole = Field(200, ge=2, le=100_000, description="repetitions for Theorem 3's picture")
+    draws: Whole = Field(200, ge=2, le=100_000, description="repetitions of Theorem 3's estimates")
     tests: Whole = Field(2_000, ge=10, description="tests of each repetition")
 
 
