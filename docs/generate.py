@@ -33,7 +33,7 @@ FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 SCHEMAS = {
-    "episodes": episodes_schema(4, 3, 2, takes_time=True),
+    "episodes": episodes_schema(4, 3, 2, acts=True, takes_time=True),
     "moments": moments_schema(3),
     "traces": traces_schema(takes_time=True),
     "shadow": baseline_schema(),

@@ -93,6 +93,49 @@ class PartlyYields(Holds):
         return np.where((gap > 0.0) & (gap < self._within), -self._deceleration, 0.0)
 
 
+class Careful(Holds):
+    """Makes room: slows down to a little above BV's speed while that is near, and brakes hard after the cut-in.
+
+    What it does comes by a dead time late.
+    """
+
+    braking_mps2 = 6.0
+
+    def __init__(self, deceleration_mps2: float = 1.5, dead_time_s: float = 0.0) -> None:
+        self._deceleration, self._steps = deceleration_mps2, round(dead_time_s / 0.1)
+        self._waiting = np.zeros((0, self._steps))
+
+    def start_batch(self, cells: Any, episodes: Any, random: Any) -> None:
+        """Nothing is on its way yet."""
+        self._waiting = _with_room(self._waiting, cells)
+        self._waiting[cells] = 0.0
+
+    def step_batch(self, seen: Any) -> Any:
+        """Accelerations (m/s²)."""
+        asked = np.column_stack([self._waiting[seen.cell], super().step_batch(seen)])
+        self._waiting[seen.cell] = asked[:, 1:]
+        return asked[:, 0]
+
+    def before(self, seen: Any) -> Any:
+        """What it does until the cut-in (m/s²)."""
+        gap = seen.bv_position_m - _LENGTH_M - seen.position_m
+        near = (gap > -10.0) & (gap < 40.0) & (seen.speed_mps > seen.bv_speed_mps + 3.0)
+        return np.where(near, -self._deceleration, 0.0)
+
+
+class Yields(Holds):
+    """Follows BV by the intelligent driver model while that is still on the other lane, braking gently."""
+
+    def __init__(self, deceleration_mps2: float = 1.0) -> None:
+        self._deceleration = deceleration_mps2
+
+    def before(self, seen: Any) -> Any:
+        """What it does until the cut-in (m/s²)."""
+        gap = seen.bv_position_m - _LENGTH_M - seen.position_m
+        behind = seen._replace(gap_m=np.maximum(gap, 0.1), lead_speed_mps=seen.bv_speed_mps)
+        return np.where(gap > 0.0, np.maximum(IDM.step_batch(self, behind), -self._deceleration), 0.0)
+
+
 def _with_room(values: Any, cells: Any) -> Any:
     """The array, with rows for cells of these numbers."""
     missing = int(np.max(cells, initial=-1)) + 1 - len(values)

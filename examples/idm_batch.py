@@ -9,6 +9,9 @@ import numpy as np
 class IDM:
     """All AVs of a worker at once."""
 
+    braking_mps2 = 4.0
+    """Hardest braking."""
+
     def start_batch(self, cells: Any, episodes: Any, random: Any) -> None:
         """Nothing to forget."""
 
@@ -19,7 +22,7 @@ class IDM:
         desired = 2.0 + np.fmax(0.0, speed * 1.0 + closing)  # fmax: no speed (NaN) where nobody is ahead
         ratio = speed / 40.0
         squared, close = ratio * ratio, desired / gap
-        return np.minimum(np.maximum(2.0 * (1.0 - squared * squared - close * close), -4.0), 2.0)
+        return np.minimum(np.maximum(2.0 * (1.0 - squared * squared - close * close), -self.braking_mps2), 2.0)
 
     def close(self) -> None:
         """Nothing to release."""

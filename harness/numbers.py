@@ -93,6 +93,12 @@ def plain(value: float) -> str:
     return f"{value:,.10g}".replace("-", MINUS)
 
 
+def two_digits_up(value: float) -> int:
+    """The next number of two digits and zeros that is no smaller."""
+    unit = 10.0 ** max(math.floor(math.log10(max(value, 1.0))) - 1, 0)
+    return round(math.ceil(value / unit - 1e-9) * unit)
+
+
 def duration(seconds: float | None) -> str:
     """``1 h 02 min``, ``3 min 20 s`` or ``12.3 s``."""
     if seconds is None:

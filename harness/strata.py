@@ -86,6 +86,8 @@ class ShellDesign:
         Cut-ins that the pool has kept of each; empty if that is no limit.
     shadow_runs : bool
         Whether the pool's paths are the few that the vehicle has walked itself.
+    candidates : int
+        Of how many paths these were chosen; 0 in runs of earlier days, whose tests do not say which runs they repeat.
     """
 
     pool: str
@@ -102,6 +104,7 @@ class ShellDesign:
     reference_square: Numbers = field(default_factory=lambda: np.zeros(0))
     available: tuple[int, ...] = ()
     shadow_runs: bool = False
+    candidates: int = 0
 
     @cached_property
     def p(self) -> FloatArray:
@@ -111,6 +114,11 @@ class ShellDesign:
     def n_within(self, statement: str) -> int:
         """Strata up to the boundary of a statement; all where it has none."""
         return next((each.n_inside for each in self.statements if each.name == statement), len(self.strata))
+
+    @property
+    def n_independent(self) -> float:
+        """Paths that would err as the pool's do; fewer where they were chosen from a finite number, which errs too."""
+        return self.n_paths / (1.0 + self.n_paths / self.candidates) if self.candidates else self.n_paths
 
     @property
     def n_inside(self) -> int:

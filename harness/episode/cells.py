@@ -182,12 +182,15 @@ class PrescribedCutIns(NamedTuple):
     """Which cut-ins of a pool tests prescribe, and what the error of the pool is told by.
 
     ``row`` (n,) is the row in the pool, ``cell`` (n,) the cell of the campaign's design, ``cell_mass`` (n, C) the
-    path's probability of a cut-in of each cell.
+    path's probability of a cut-in of each cell. Of vehicles that act before the cut-in ``shadow`` (n,) is the baseline
+    run, and ``mass`` (n,) the probability of the cut-in itself; else empty.
     """
 
     row: IntArray
     cell: IntArray
     cell_mass: FloatArray
+    shadow: IntArray
+    mass: FloatArray
 
 
 def drawn_traffic() -> PrescribedTraffic:

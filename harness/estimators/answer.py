@@ -14,9 +14,9 @@ from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import PairedEstimate
 from harness.estimators.severity import Severity
 from harness.estimators.short_answer import ShortAnswer, short_answer
-from harness.estimators.stopping import Rule
+from harness.estimators.stopping import Look, Rule
 from harness.importance.functions import importance_names
-from harness.numbers import WIDEST_RHW, interval, number, plain, ratio, share
+from harness.numbers import WIDEST_RHW, interval, number, plain, ratio, share, two_digits_up
 from harness.records.folder import StoppedBy
 from harness.vocabulary import ESTIMATORS, RUN_FOLDER, EstimatorName
 
@@ -291,10 +291,37 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
         why = f"the last condition to be met was {unmet}" if unmet else "every condition was met at the first look"
     elif campaign.stop.rhw is not None or look.decision is not None:
         after, why = f"{after} without {unmet}", MENDS[stopped_by]
+        if campaign.has_baseline_runs and stopped_by in ("episodes", "pool_error"):
+            why = _runs_or_tests(look, campaign, n_episodes) or why
     else:
         why = "stop.episodes was all that was asked for" if stopped_by == "episodes" else MENDS[stopped_by]
     wide = stopped_by == "rhw" and campaign.sampling.strata and (campaign.stop.rhw or 0.0) > BIASED_RHW
     return stopped_by, f"{after}: {why}." + (TOO_WIDE if wide else "")
+
+
+def _runs_or_tests(look: Look, campaign: Campaign, n_tests: int) -> str | None:
+    """Which of baseline runs and tests are too few for the precision that is asked, and how many of both it may take.
+
+    The squares of what both leave add up, and each falls as one over their number.
+    """
+    target, n_runs = campaign.stop.rhw or 0.0, campaign.pool.shadow_paths
+    of_runs, of_tests = look.rhw_from_pool**2, look.rhw**2 - look.rhw_from_pool**2
+    if not (target and 0.0 < of_runs < math.inf and 0.0 < of_tests < math.inf):
+        return None
+    found = (
+        f"{n_runs:,} baseline runs alone leave ±{share(look.rhw_from_pool)} of the rate, {n_tests:,} tests alone "
+        f"±{share(math.sqrt(of_tests))}"
+    )
+    if of_runs <= target**2 / 2.0:
+        more = two_digits_up(n_tests * of_tests / (target**2 - of_runs))
+        return f"{found}: tests dominate; raise stop.episodes to about {more:,} and go on with --resume"
+    runs, tests = (
+        two_digits_up(n * square * 2.0 / target**2) for n, square in ((n_runs, of_runs), (n_tests, of_tests))
+    )
+    what = "baseline runs are too few" if of_tests <= target**2 / 2.0 else "both are too few"
+    return (
+        f"{found}: {what}; pool.shadow_paths of about {runs:,} and {tests:,} tests are expected to do, in a new folder"
+    )
 
 
 def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:

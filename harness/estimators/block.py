@@ -40,6 +40,8 @@ EPISODE_COLUMNS = (
     "episode", "outcome", "cut_in_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_cut_in", "log_q",
 )  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step", "min_ttc_s")
+BASELINE_COLUMNS = ("shadow", "cut_in_mass")
+"""Of vehicles that act before the cut-in, where `ShellDesign.candidates` says that they are on record."""
 DANGER_TTC_S = 4.0
 """A test in which the vehicle was ahead of a boundary counts where it also came closer to a collision than this (s).
 
@@ -105,8 +107,9 @@ class Block:
         (n,): stratum l of each episode. ``first_ratios`` (n, 9, J): q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine
         control steps, 1 beyond the last one. ``log_p_cut_in`` (n,): log P(cut-in | path), where the method draws the
         path ahead; it bounds Y of that episode alone. Of shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C):
-        its path's probability of a cut-in of each cell; and ``ahead`` (n,) bool: whether the vehicle was ever ahead of
-        the boundary that a statement checks.
+        its path's probability of a cut-in of each cell; ``ahead`` (n,) bool: whether the vehicle was ever ahead of the
+        boundary that a statement checks; and `BASELINE_COLUMNS`, with ``step`` (n,) of the cut-in, below 0 where a
+        failed test has come to none.
     drawn : Drawn
     """
 
@@ -237,6 +240,10 @@ def block_from_tables(
     if shells is not None:
         columns["stratum"], columns["cell"] = _integers(episodes, "component"), _integers(episodes, "cell")
         columns["cell_mass"] = _nested(episodes, "cell_mass", len(shells.cell_stratum))
+        if shells.candidates:
+            columns |= {name: episodes.column(name).to_numpy() for name in BASELINE_COLUMNS}
+            step = pc.fill_null(episodes.column("cut_in_step"), -1).to_numpy()
+            columns["step"] = np.where(columns["cut_in"], step, -1 - index).astype(np.int64)
         if shells.checked is not None:
             # Comparing with a null, of a vehicle that never closed in, is false.
             danger = pc.fill_null(pc.less(episodes.column("min_ttc_s"), DANGER_TTC_S), fill_value=False).to_numpy()

@@ -8,7 +8,7 @@ Beside reference drivers in the same traffic, ratio x = μ/μ_R and preventable 
 docs/estimators.md; each limit is a root of `harness.estimators.likelihood.ratio_limits`. Of the pool's part of their
 variance:
 
-- with X and R a path's probabilities that the vehicle and the reference crash, `mean_square` bounds E[X²], the pool
+- with X and R a path's probabilities that the vehicle and the reference crash, `crash_square` is E[X²], the pool
   knows E[R²], and E[XR] follows from the crashed tests: one of stratum s is a draw in proportion to X there, so that
   Σ p_s/n_s times the sum of R over them has that mean;
 - paths may carry preventable and unavoidable crashes, of rates P and U, which makes the contrast's variance smaller;
@@ -31,16 +31,20 @@ from harness.estimators.likelihood import CRASH, Level, ratio_limits
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.tally import (
     FEWEST_PATHS,
-    CrashPaths,
+    ROOM,
+    CrashedTests,
+    OnRuns,
     RateLimits,
     Tally,
     combined,
+    crash_square,
     empty_tally,
-    mean_square,
+    paths_that_count,
     pool_variance,
 )
+from harness.numbers import share, two_digits_up
 from harness.strata import ShellDesign
-from harness.vocabulary import BoolArray, FloatArray, IntArray
+from harness.vocabulary import BoolArray, FloatArray
 
 MOST_NAMED = 10
 """Tests that are named of those that refute a statement, or show that its reason fails."""
@@ -147,7 +151,7 @@ class Shells:
     def __init__(self) -> None:
         self.tally = self._cells = empty_tally(0)
         self._known: dict[tuple[int, Level], RateLimits] = {}  # of so many first strata
-        self._paths = CrashPaths()
+        self._on_runs: list[CrashedTests] = []
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
         self._n_checked = self._n_ahead = 0
         self._ahead_in: list[int] = []
@@ -159,17 +163,20 @@ class Shells:
         shells.count(design.without_references(), tally)
         return shells
 
-    def count(self, design: ShellDesign, cells: Tally, paths: tuple[FloatArray, IntArray] | None = None) -> None:
-        """Count tests by cell of the design; ``paths`` of crashed ones see `CrashPaths`."""
+    def count(self, design: ShellDesign, cells: Tally, on_runs: CrashedTests | None = None) -> None:
+        """Count tests by cell of the design."""
         self._design = design
         known = self._cells if self._cells.tests.size else empty_tally(cells.tests.size)
         self._cells = known.plus(cells)
-        if paths is not None:
-            self._paths.add(*paths)
+        self._on_runs += [] if on_runs is None else [on_runs]
         self._join()
 
     def _join(self) -> None:
-        self.tally = self._cells.joined(self._design.joined)
+        design = self._design
+        if self._on_runs:
+            tests = CrashedTests(*map(np.concatenate, zip(*self._on_runs, strict=True)))
+            self._cells = self._cells._replace(runs=OnRuns.of(design.n_paths, design.cell_p.size, tests))
+        self.tally = self._cells.joined(design.joined)
         self._known.clear()
 
     def add(self, block: Block) -> None:
@@ -187,8 +194,10 @@ class Shells:
         ):
             np.add.at(counts, cell[rows], 1)
             np.add.at(sums, cell[rows], block.cell_mass[rows])
-        if design.shadow_runs:
-            self._paths.add(block.cell_mass[crash], np.eye(design.p.size, dtype=np.int64)[stratum[crash]])
+        if design.candidates:
+            rows = crash | block.failed
+            place = cell[rows] + design.cell_p.size * block.failed[rows]
+            self._on_runs.append(CrashedTests(block.shadow[rows], block.step[rows], block.cut_in_mass[rows], place))
         for s in np.unique(stratum[crash]).tolist():
             _name(self._crashed.setdefault(s, []), block, crash & (stratum == s))
         if design.checked is not None and "ahead" in block.columns:
@@ -218,7 +227,7 @@ class Shells:
             largest_weight_share=float(np.max(y[tally.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
             method="crashes within shells of known probability; likelihood-ratio limits of their weighted sum; upper "
             "bound: the same, as an interval's upper limit",
-            warnings=(*cautions, *self._warnings(tally)),
+            warnings=(*cautions, *self._warnings(tally, confidence)),
             cautions=cautions,
             details=asdict(
                 ShellDetails(
@@ -237,7 +246,7 @@ class Shells:
         """Of the rate of the first strata, all by default, with the pool's own error."""
         tally, p = self.tally.part(slice(0, n_strata)), self._design.p[:n_strata]
         of_tests = p * p * tally.share * (1.0 - tally.share) / tally.at_least_one
-        return math.sqrt(float(of_tests.sum()) + pool_variance(p, tally, self._design.n_paths))
+        return math.sqrt(float(of_tests.sum()) + pool_variance(p, tally, self._design.n_independent))
 
     def weight_of_a_crash(self) -> FloatArray:
         """What a crash in each stratum adds to the rate, p_s/n_s, shape (S,)."""
@@ -266,24 +275,20 @@ class Shells:
         """Of the first strata; anything is possible where crashes lie on too few paths."""
         if (n_strata, level) not in self._known:
             p, tally = self._design.p[:n_strata], self.tally.part(slice(0, n_strata))
-            found = RateLimits(float(p @ tally.share), 0.0, 1.0, math.inf, math.inf)
-            if self._n_paths(n_strata) >= FEWEST_PATHS:
-                found = combined(p, tally, self._design.n_paths, level)
+            sure = paths_that_count(p, tally, -ROOM) < FEWEST_PATHS
+            found = RateLimits(float(p @ tally.share), 0.0, 1.0, math.inf, math.inf if sure else 0.0)
+            if paths_that_count(p, tally) >= FEWEST_PATHS:
+                found = combined(p, tally, self._design.n_independent, level)
             self._known[n_strata, level] = found
         return self._known[n_strata, level]
 
-    def _n_paths(self, n_strata: int) -> float:
-        """Number of paths that the crashes in the first strata lie on, in effect."""
-        weight = self._design.p / self.tally.at_least_one
-        return self._paths.number(np.where(np.arange(weight.size) < n_strata, weight, 0.0))
-
     def _cautions(self) -> list[str]:
-        if (n := self._n_paths(self._design.p.size)) >= FEWEST_PATHS:
+        if (n := paths_that_count(self._design.p, self.tally)) >= FEWEST_PATHS:
             return []
         return [
             f"no interval: nearly all crashes lie on some {max(n, 1.0):.0f} of the {self._design.n_paths:,} paths that "
-            f"the vehicle was driven along, and {FEWEST_PATHS:.0f} are needed; raise pool.shadow_paths, and run into a "
-            "new folder"
+            f"the vehicle was driven along, and {FEWEST_PATHS:.0f} are needed; raise pool.shadow_paths, to some "
+            f"{two_digits_up(self._design.n_paths * FEWEST_PATHS / max(n, 1.0)):,} or more, and run into a new folder"
         ]
 
     def within(self, statement: str, confidence: float) -> Within:
@@ -293,7 +298,7 @@ class Shells:
         n, level = given.n_inside, Level.two_sided(confidence)
         inside, outside = tally.part(slice(0, n)), tally.part(slice(n, None))
         limits, (n_outside, n_crashes_outside, _) = self._limits(n, level), outside.totals
-        bound = combined(design.p[n:], outside, design.n_paths, Level.of_bound(confidence, n_outside)).high
+        bound = combined(design.p[n:], outside, design.n_independent, Level.of_bound(confidence, n_outside)).high
         crashed = sorted(episode for s, episodes in self._crashed.items() if s >= n for episode in episodes)
         who = given.name, given.boundary, given.assumes, n
         rate = limits.rate, limits.low, limits.high, limits.rhw, *limits.from_pool_relative()
@@ -309,11 +314,17 @@ class Shells:
         rows = zip(self._design.strata, *(np.asarray(column).tolist() for column in columns), strict=True)
         return tuple(Shell(*row) for row in rows)
 
-    def _warnings(self, tally: Tally) -> list[str]:
+    def _warnings(self, tally: Tally, confidence: float) -> list[str]:
         design, found = self._design, []
         if empty := ", ".join(name for name, n in zip(design.strata, tally.tests, strict=True) if n == 0):
             found.append(f"no test in {empty}: the interval allows for any share of crashes there")
         kept = zip(design.strata, tally.tests, design.available, strict=False)
+        free = self._limits(design.p.size, Level.two_sided(confidence))
+        if design.shadow_runs and tally.crashes.any() and free.low <= 0.0 and free.from_pool < math.inf:
+            found.append(
+                f"the lower limit is 0 in spite of {int(tally.crashes.sum()):,} crashes: {design.n_paths:,} baseline "
+                f"runs alone leave ±{share(free.from_pool_relative()[0])} of the rate, as far as these can tell"
+            )
         if used_up := ", ".join(name for name, n, available in kept if n >= available > 0):
             found.append(
                 f"all cut-ins that the pool has kept of {used_up} were tested: for more precision raise "
@@ -371,21 +382,21 @@ def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideRef
                 tests.joined(design.joined),
                 design.joined.T @ (tests.crash_mass @ crashes_too),
                 (rate, square),
-                design.n_paths,
+                design.n_independent,
                 level,
             )
             for tests in (cells, worst)
         )
         ratio = own / rate if rate > 0.0 else math.nan, low[0], high[1]
-        preventable = preventable_share(design.cell_p, cells, ~crashes_too, design.n_paths, level)
-        error = math.sqrt(max(square - rate * rate, 0.0) / design.n_paths)
+        preventable = preventable_share(design.cell_p, cells, ~crashes_too, design.n_independent, level)
+        error = math.sqrt(max(square - rate * rate, 0.0) / design.n_independent)
         who = reference.name, reference.described, reference.delay_s
         found.append(BesideReference(*who, rate, error, *ratio, *preventable))
     return tuple(found)
 
 
 def rate_ratio_limits(
-    p: FloatArray, tally: Tally, with_reference: FloatArray, moments: tuple[float, float], n_paths: int, level: Level
+    p: FloatArray, tally: Tally, with_reference: FloatArray, moments: tuple[float, float], n_paths: float, level: Level
 ) -> tuple[float, float]:
     """Limits of Σ p_s θ_s over the crash rate of a reference.
 
@@ -406,7 +417,7 @@ def rate_ratio_limits(
 
 
 def preventable_share(
-    p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: int, level: Level
+    p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: float, level: Level
 ) -> tuple[float, float, float]:
     """Share of Σ p_c θ_c that lies in the ``prevented`` ones of all cells (C,), with limits; NaN without a crash."""
     contributions = p * cells.share
@@ -417,9 +428,11 @@ def preventable_share(
     return share, min(low, 1.0), min(high, 1.0)
 
 
-def _share_limits(p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: int, level: Level) -> tuple[float, float]:
+def _share_limits(
+    p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: float, level: Level
+) -> tuple[float, float]:
     scale = p / cells.at_least_one
-    first, second = (mean_square(scale * part, cells.crash_mass) for part in (prevented, ~prevented))
+    first, second = (crash_square(scale * part, cells) for part in (prevented, ~prevented))
     rates = p * cells.share
     of_prevented, of_others = float(rates[prevented].sum()), float(rates[~prevented].sum())
 

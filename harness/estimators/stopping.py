@@ -144,6 +144,8 @@ class Look:
     """Whether the error of the pool, which no test narrows, is too large for the asked precision."""
     decision: Decision | None = None
     """What is known about the limit that the campaign asks about, if it does; then that is waited for."""
+    rhw_from_pool: float = 0.0
+    """What the pool's error alone would leave of ``rhw``; 0 while little is known."""
 
 
 class Rule:
@@ -188,7 +190,8 @@ class Rule:
         unmet = tuple(condition for condition, is_met in met.items() if not is_met)
         self._passes = 0 if unmet else self._passes + 1
         stopped, too_rough = self._passes >= self._needed, pool[1] > self._target
-        self.look = Look(rhw, one_more_crash, stopped, unmet or ((also,) if also else self.look.unmet), too_rough)
+        unmet = unmet or ((also,) if also else self.look.unmet)
+        self.look = Look(rhw, one_more_crash, stopped, unmet, too_rough, rhw_from_pool=pool[0])
         return stopped or (too_rough and pool[0] ** 2 >= POOL_SHARE * rhw**2)
 
 

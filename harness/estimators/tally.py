@@ -7,9 +7,10 @@ monotone in each stratum's crashes, so that [L(k), U(k + f)] holds whatever the 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from harness.estimators.likelihood import Counts, Level, likelihood_limit
@@ -18,8 +19,12 @@ from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 FEWEST_PATHS = 40.0
 """Below so many paths that count there is no interval: their error alone would be above 16 %, and is not known."""
-FEWEST_PAIRS = 3
-"""Pairs of crashed tests on one path that say something: with ever so many paths one pair may happen."""
+FEWEST_PAIRS, FEWEST_CRASHES = 3, 10
+"""Pairs of crashed tests of one baseline run, or crashes, that say something about the number of paths."""
+FEW_PAIRS = 10
+"""Below so many, the variance has room for one more pair."""
+ROOM = 1.645
+"""Standard errors of the variance, as told by the number of pairs, that are added to it."""
 
 
 class RateLimits(NamedTuple):
@@ -50,7 +55,8 @@ class Tally(NamedTuple):
     """What tests of strata have come to.
 
     ``tests``, ``crashes``, ``failed`` (S,). ``crash_mass``, ``failed_mass`` (S, S): over the crashed or failed tests of
-    each stratum, the sum of their paths' probability of a cut-in of every stratum.
+    each stratum, the sum of their paths' probability of a cut-in of every stratum. ``runs`` is what is known of the
+    baseline runs, of vehicles that act before the cut-in.
     """
 
     tests: IntArray
@@ -58,21 +64,24 @@ class Tally(NamedTuple):
     failed: Counts
     crash_mass: FloatArray
     failed_mass: FloatArray
+    runs: OnRuns | None = None
 
     def part(self, strata: slice) -> Tally:
         """That of some strata."""
         counts = self.tests[strata], self.crashes[strata], self.failed[strata]
-        return Tally(*counts, self.crash_mass[strata, strata], self.failed_mass[strata, strata])
+        runs = self.runs and self.runs.joined(np.eye(self.tests.size)[:, strata])
+        return Tally(*counts, self.crash_mass[strata, strata], self.failed_mass[strata, strata], runs)
 
     def plus(self, other: Tally) -> Tally:
-        """With further tests of the same strata."""
+        """With further tests of the same strata; whose runs are not known."""
         counts = self.tests + other.tests, self.crashes + other.crashes, self.failed + other.failed
         return Tally(*counts, self.crash_mass + other.crash_mass, self.failed_mass + other.failed_mass)
 
     def joined(self, groups: FloatArray) -> Tally:
         """That of groups of strata: ``groups``, shape (S, G), is 1 where a stratum belongs to one."""
         tests, crashes, failed = (np.rint(each @ groups).astype(np.int64) for each in self[:3])
-        return Tally(tests, crashes, failed, groups.T @ self.crash_mass @ groups, groups.T @ self.failed_mass @ groups)
+        masses = groups.T @ self.crash_mass @ groups, groups.T @ self.failed_mass @ groups
+        return Tally(tests, crashes, failed, *masses, self.runs and self.runs.joined(groups))
 
     def failed_as_crashes(self, where: BoolArray | None = None) -> Tally:
         """The same tests, had all failed ones crashed; with ``where``, shape (S,) bool, those of some strata alone."""
@@ -80,9 +89,9 @@ class Tally(NamedTuple):
             return self
         counted = np.ones(self.tests.size, np.bool_) if where is None else where
         failed, mass = self.failed * counted, self.failed_mass * counted[:, None]
-        return Tally(
-            self.tests, self.crashes + failed, self.failed - failed, self.crash_mass + mass, self.failed_mass - mass
-        )
+        counts, runs = (self.tests, self.crashes + failed, self.failed - failed), self.runs
+        masses = self.crash_mass + mass, self.failed_mass - mass
+        return Tally(*counts, *masses, runs and runs.failed_as_crashes(counted))
 
     @property
     def outcomes(self) -> Counts:
@@ -111,15 +120,118 @@ def empty_tally(n_strata: int) -> Tally:
     return Tally(*none, *no_mass)
 
 
-def pool_variance(p: FloatArray, tally: Tally, n_paths: int, factor: FloatArray | float = 1.0) -> float:
+class CrashedTests(NamedTuple):
+    """Crashed and failed tests, (n,) each: baseline run, step of the cut-in, its ``mass``, and ``place``.
+
+    The last is the stratum, plus the number of strata where the test failed.
+    """
+
+    run: IntArray
+    step: IntArray
+    mass: FloatArray
+    place: IntArray
+
+
+class OnRuns(NamedTuple):
+    """Which baseline runs crashed tests repeat, and failed ones: what tells the error of few paths, without a bound.
+
+    The pool of a vehicle that acts before the cut-in knows some hundred paths, of which G_i is each one's weighted
+    probability of a crash. A crashed test is a draw of a cut-in in proportion to its probability m. So Σ y m over these
+    tests, with y = p_s/n_s, estimates the mean over paths of what Σ m² is over their crashes, and Σ y y' over pairs of
+    tests of one run in different steps, times the number of runs, that of Σ m m'. Both are the mean of G². Pairs alone
+    would not do: a cut-in is tested once, so that what it adds by itself does not show in them.
+
+    ``own`` (2 S,) are sums of m, ``pairs`` (2 S, 2 S) numbers of ordered pairs, crashed tests of each stratum before
+    failed ones.
+    """
+
+    n_runs: int
+    own: FloatArray
+    pairs: FloatArray
+
+    @classmethod
+    def of(cls, n_runs: int, n_strata: int, tests: CrashedTests) -> OnRuns:
+        """Of crashed and failed tests."""
+        run, step, mass, place = tests
+
+        def same(keys: NDArray[Any]) -> FloatArray:
+            _, group = np.unique(keys, return_inverse=True)
+            counts = np.zeros((group.max(initial=-1) + 1, 2 * n_strata))
+            np.add.at(counts, (group, place), 1.0)
+            return np.asarray(counts.T @ counts)
+
+        own = np.bincount(place, mass, minlength=2 * n_strata).astype(np.float64)
+        return cls(n_runs, own, same(run) - same(run + 1j * step))
+
+    def _mapped(self, to: FloatArray) -> OnRuns:
+        return OnRuns(self.n_runs, self.own @ to, to.T @ self.pairs @ to)
+
+    def joined(self, groups: FloatArray) -> OnRuns:
+        """That of groups of strata, see `Tally.joined`."""
+        none = np.zeros_like(groups)
+        return self._mapped(np.block([[groups, none], [none, groups]]))
+
+    def failed_as_crashes(self, where: BoolArray) -> OnRuns:
+        """The same tests, had the failed ones of some strata (S,) crashed."""
+        to, s = np.eye(self.own.size), where.size
+        to[s:, :s], to[s:, s:] = np.diag(where), np.diag(~where)
+        return self._mapped(to)
+
+    def n_pairs(self, strata: BoolArray) -> float:
+        """Pairs of crashed tests of one run, in different steps, within some strata (S,)."""
+        return float(self.pairs[: strata.size, : strata.size][np.ix_(strata, strata)].sum()) / 2.0
+
+    def square(self, scale: FloatArray, tally: Tally, errors: float = 0.0) -> float:
+        """Estimate of the mean of G² over paths, each crash of a stratum counting ``scale`` (S,).
+
+        ``errors`` are standard errors of the variance on top of it, or below; pairs tell how large one is. Without a
+        pair nothing is known above, and below nothing but the square of the mean.
+        """
+        s, n = scale.size, self.n_pairs(scale > 0.0)
+        pairs = self.pairs[:s, :s] + np.diag(self.pairs.diagonal()[:s] / np.maximum(tally.tests - 1, 1))
+        square = float(scale @ self.own[:s] + self.n_runs * (scale @ pairs @ scale))
+        if errors == 0.0:
+            return square
+        if n == 0.0:
+            return math.inf if errors > 0.0 else 0.0
+        of_mean = float(scale @ tally.crashes) ** 2
+        excess = max(square - of_mean, 0.0) * max(1.0 + errors * math.sqrt(2.0 / n), 0.0)
+        if n < FEW_PAIRS and errors > 0.0:
+            excess += 2.0 * self.n_runs * float(np.max(scale[tally.crashes > 0])) ** 2
+        return of_mean + excess
+
+
+def paths_that_count(p: FloatArray, tally: Tally, errors: float = 0.0) -> float:
+    """Of how many equal paths crashes would lie as close together: (ΣG)²/ΣG²; infinite while little is known.
+
+    If nearly all crashes lie on a few paths, as those of a vehicle that gives way do, then paths which would matter
+    most may well be missing, and nothing in the tests says so. ``errors`` see `OnRuns.square`.
+    """
+    runs, scale = tally.runs, p / tally.at_least_one
+    few = int(tally.crashes.sum()) < FEWEST_CRASHES
+    if runs is None or (few and runs.n_pairs(p > 0.0) < FEWEST_PAIRS):
+        return math.inf
+    square = runs.square(scale, tally, errors)
+    return runs.n_runs * float(scale @ tally.crashes) ** 2 / square if square > 0.0 else math.inf
+
+
+def pool_variance(
+    p: FloatArray, tally: Tally, n_paths: float, factor: FloatArray | float = 1.0, errors: float = ROOM
+) -> float:
     """Variance of Σ p_s c_s that comes from the pool's finite number of paths, wherever the vehicle crashes.
 
-    It is (Σ E[x_s x_t] - μ²)/n, see `mean_square`. A stratum in which no crash was seen adds nothing. ``factor`` (S,)
+    It is (Σ E[x_s x_t] - μ²)/n, see `crash_square`. A stratum in which no crash was seen adds nothing. ``factor`` (S,)
     says by how much crashes of each stratum are fewer than seen.
     """
     scale = p / tally.at_least_one * factor
     rate = float(scale @ tally.crashes)
-    return max(mean_square(scale, tally.crash_mass) - rate * rate, 0.0) / n_paths
+    return max(crash_square(scale, tally, errors) - rate * rate, 0.0) / n_paths
+
+
+def crash_square(scale: FloatArray, tally: Tally, errors: float = ROOM) -> float:
+    """Σ E[x_s x_t], x_s being a path's probability of a crash in stratum s: its bound, or what is known of runs."""
+    bound = mean_square(scale, tally.crash_mass)
+    return bound if tally.runs is None else min(bound, tally.runs.square(scale, tally, errors))
 
 
 def mean_square(scale: FloatArray, crash_mass: FloatArray) -> float:
@@ -134,7 +246,7 @@ def mean_square(scale: FloatArray, crash_mass: FloatArray) -> float:
     return float(np.minimum(np.minimum(bound, bound.T), own[:, None] * own).sum())
 
 
-def combined(p: FloatArray, tally: Tally, n_paths: int, level: Level) -> RateLimits:
+def combined(p: FloatArray, tally: Tally, n_paths: float, level: Level) -> RateLimits:
     """Rate Σ p_s c_s with the two limits of an interval; ``p`` (S,) are known from ``n_paths`` paths of a pool.
 
     The upper limit may lie above Σ p_s, which is as uncertain as the pool: a vehicle that crashes on all cut-ins has
@@ -146,39 +258,6 @@ def combined(p: FloatArray, tally: Tally, n_paths: int, level: Level) -> RateLim
     high = likelihood_limit(p, worst.crashes, worst.tests, level, 1.0, variance_of_worst)
     least = clopper_pearson(tally.crashes, tally.tests, float(ndtr(-level.z)))[0]
     least = np.divide(least, tally.share, out=np.zeros_like(least), where=tally.crashes > 0)
-    from_pool, at_least = level.z * math.sqrt(variance), level.z * math.sqrt(pool_variance(p, tally, n_paths, least))
+    from_pool = level.z * math.sqrt(variance)
+    at_least = level.z * math.sqrt(pool_variance(p, tally, n_paths, least, -ROOM))
     return RateLimits(float(p @ tally.share), max(low, 0.0), min(high, 1.0), from_pool, at_least)
-
-
-class CrashPaths:
-    """Crashed tests by path and stratum: whether they lie on enough paths for an interval to be made of them.
-
-    The pool of a vehicle that acts before the cut-in knows some hundred paths. If nearly all of its crashes lie on a
-    few of them, as those of a vehicle that gives way do, then the paths which would matter most may well be missing,
-    and nothing in the tests says so. With G a path's probability of a crash, (ΣG)²/ΣG² is the number of paths that
-    count. Two crashed tests are of one path with the probability ΣG²/(ΣG)²: so it is estimated from pairs of them,
-    without knowing any G.
-    """
-
-    def __init__(self) -> None:
-        self._by_path: dict[bytes, IntArray] = {}
-
-    def add(self, cell_mass: FloatArray, crashes: IntArray) -> None:
-        """Count crashed tests of each stratum (n, S) on paths known by their probabilities of all cells (n, C)."""
-        for mass, of_path in zip(cell_mass.astype(np.float32), crashes, strict=True):
-            key = mass.tobytes()
-            self._by_path[key] = self._by_path.get(key, 0) + of_path
-
-    def number(self, weight: FloatArray) -> float:
-        """Number of paths that count, crashes of a stratum having its ``weight`` (S,); infinite while little is known.
-
-        Strata without a weight are left out.
-        """
-        used = np.flatnonzero(weight > 0.0)
-        if not self._by_path or not used.size:
-            return math.inf
-        crashes = np.array(list(self._by_path.values()))[:, used].astype(np.float64)
-        if (crashes.sum(1) * (crashes.sum(1) - 1.0)).sum() / 2.0 < FEWEST_PAIRS:
-            return math.inf
-        own, squares = crashes @ weight[used], crashes @ weight[used] ** 2
-        return float((own.sum() ** 2 - squares.sum()) / (own * own - squares).sum())

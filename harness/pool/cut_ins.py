@@ -54,8 +54,9 @@ class CutIns:
     them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,): how many of them are used. ``crashes`` (n, D + R): which
     surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
     a cut-in of each cell. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
-    in the pool of a vehicle that acts before it, or of its onset; else empty. ``lead`` (n,) is how many steps earlier
-    that is: 0 where cut-ins are one step.
+    in the pool of a vehicle that acts before it, or of its onset, and ``mass`` (n,) the probability of those
+    that each stands for; else empty. ``lead`` (n,) is how many steps earlier the onset is: 0 where cut-ins are one
+    step.
     """
 
     path: IntArray
@@ -70,6 +71,7 @@ class CutIns:
     crashes: BoolArray
     path_mass: Float32Array
     motion: UInt64Array = field(default_factory=lambda: np.zeros(0, np.uint64))
+    mass: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def onset(self) -> IntArray:

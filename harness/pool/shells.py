@@ -24,6 +24,9 @@ from harness.traffic.laws import Environment
 from harness.vehicles.library import Library, StatementSettings, library_records
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 
+CANDIDATES = 32_768
+"""Paths of an AV that holds its speed, of which baseline runs are chosen: they cost milliseconds each, and save two of
+three runs."""
 _REFERENCES = {"r157-cc": "a careful and competent driver", "r157-fsm": "a driver by the fuzzy safety model"}
 """Drivers of UN Regulation No. 157 in plain words."""
 
@@ -110,7 +113,8 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         statements=statements,
         p_cut_in=pool.p_cut_in,
         p_unreachable=pool.p_cut_in - float(p.sum()),
-        shadow_runs=pool.cut_ins.motion.size > 0,
+        shadow_runs=(acts := pool.cut_ins.motion.size > 0),
+        candidates=CANDIDATES if acts else 0,
     )
     if pool.p_after_failure == 0.0:
         return design
@@ -206,8 +210,9 @@ class PrescribedEpisodes:
     def cut_ins(self, rows: IntArray) -> PrescribedCutIns:
         """What records say of given cut-ins of the pool (n,)."""
         joined = np.eye(len(self.design.cell_stratum) + 1)[self._cells, :-1]  # the last row is for what is not tested
-        mass = self._cut_ins.path_mass[rows] @ joined
-        return PrescribedCutIns(rows, self._cells[self._cut_ins.cell[rows]], mass)
+        c, mass = self._cut_ins, self._cut_ins.path_mass[rows] @ joined
+        acts = slice(None) if self.design.shadow_runs else slice(0)
+        return PrescribedCutIns(rows, self._cells[c.cell[rows]], mass, c.row[rows[acts]], c.mass[rows[acts]])
 
     def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[RecordArray, PrescribedTraffic]:
         """Initial states (n,) and traffic of given cut-ins of the pool (n,), tested for given strata (n,)."""

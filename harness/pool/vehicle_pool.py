@@ -26,7 +26,7 @@ from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.cut_ins import Pool
-from harness.pool.shells import conservative_first
+from harness.pool.shells import CANDIDATES, conservative_first
 from harness.pool.walk import PILOT_PATHS, BaselineRuns, EnumeratedPaths, contributions, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
@@ -36,13 +36,6 @@ from harness.traffic.laws import Environment
 from harness.vehicles.library import Library
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
-CANDIDATES = 32_768
-"""Paths of an AV that holds its speed to choose from: they cost milliseconds each, and save two of three
-baseline runs.
-
-Their own error (standard error 0.4 % of the conservative surrogates' rates, against 2 % of 500 baseline runs; measured
-in the default traffic) is in no interval.
-"""
 EVENLY = 0.1
 """Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
 CHOICE_DRAW = 2
@@ -174,5 +167,8 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns) -
     key = hashlib.sha256(" ".join((paths.key, resolved.content_hash, runs.digest())).encode()).hexdigest()[:24]
     pool = pool_of(enumerated, paths.seed, paths.order, environment, library, resolved.campaign.pool, key)
     hashes = motion_hashes(runs.x_m, runs.v_mps)
-    cut_ins = replace(pool.cut_ins, motion=hashes[pool.cut_ins.row, pool.cut_ins.onset])
+    row, step, onset = pool.cut_ins.row, pool.cut_ins.step, pool.cut_ins.onset
+    # A kept cut-in stands for its like nearby, too, where these are too improbable to be kept one by one.
+    least = pool.shell_p[pool.shell] * (len(paths) / np.bincount(pool.shell)[pool.shell])
+    cut_ins = replace(pool.cut_ins, motion=hashes[row, onset], mass=np.maximum(mass[row, step], least))
     return replace(pool, cut_ins=cut_ins, p_after_failure=float((found.p_after_failure * paths.weight).mean()))

@@ -56,10 +56,20 @@ def _per(n: int) -> pa.DataType:
     return pa.list_(_F8, n) if n else pa.list_(_F8)
 
 
-def episodes_schema(n_importance: int, n_surrogates: int, n_cells: int = 0, *, takes_time: bool = False) -> pa.Schema:
+_OF_BASELINE_RUNS = (
+    _or_null("shadow", _I8, "1", "baseline run that the test repeats (method shells, vehicles that act before)"),
+    _or_null(
+        "cut_in_mass", _F8, "1", "P of the test's own cut-in, or of those it stands for, in the measure of cell_mass"
+    ),
+)
+
+
+def episodes_schema(
+    n_importance: int, n_surrogates: int, n_cells: int = 0, *, acts: bool = False, takes_time: bool = False
+) -> pa.Schema:
     """Schema of the ``episodes`` table for given numbers of importance functions, surrogates, and cells of shells.
 
-    Cut-ins that take time have columns of their own.
+    Shells of vehicles that act before the cut-in have columns of their own, and so have cut-ins that take time.
     """
     of_shells = [
         _field("cell", _I2, "1", "cell of shells.json: shell, and which references crash (method shells alone)"),
@@ -95,6 +105,7 @@ def episodes_schema(n_importance: int, n_surrogates: int, n_cells: int = 0, *, t
             _field("bv_maneuvers", pa.list_(_I1), "1", "BV's draws, in order; 31 marks the cut-in"),
             _or_null("pool_cut_in", _I8, "1", "row of the pool's cut-in (method shells), else null"),
             *(of_shells if n_cells else ()),
+            *(_OF_BASELINE_RUNS if acts else ()),
             *(_lateral_fields() if takes_time else ()),
             _or_null("failure", pa.string(), "", "cause, for failed episodes"),
         ]
@@ -243,11 +254,13 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
     }
     if prescribed is not None:
         columns |= {"cell": prescribed.cell.astype(np.int16), "cell_mass": rows(prescribed.cell_mass)}
+        columns |= {"shadow": prescribed.shadow, "cut_in_mass": prescribed.mass}
     if shard.lateral.present:
         columns |= _lateral_columns(e)
     of_all = shard.results.log_q.shape[1], shard.results.martingale.shape[1]
     n_cells = 0 if prescribed is None else prescribed.cell_mass.shape[1]
-    return _table(episodes_schema(*of_all, n_cells, takes_time=shard.lateral.present), columns, e)
+    acts = prescribed is not None and prescribed.shadow.size > 0
+    return _table(episodes_schema(*of_all, n_cells, acts=acts, takes_time=shard.lateral.present), columns, e)
 
 
 def _lateral_columns(e: RecordArray) -> dict[str, Any]:

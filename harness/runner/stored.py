@@ -15,7 +15,7 @@ from harness.campaign.campaign import Campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.block import MOMENT_COLUMNS, Block
+from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block
 from harness.estimators.one_pass import SPACING
 from harness.processes import made_ahead
 from harness.records.folder import CAMPAIGN, concatenated, no_episodes, read_kept, read_manifest
@@ -70,6 +70,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
         raise no_episodes(folder)
     source = source_of(campaign)
     design, needed = source.stored_design(folder), list(source.columns)
+    needed += BASELINE_COLUMNS if design is not None and design.candidates else ()
     ratios = list(MOMENT_COLUMNS) if moments and campaign.sampling.mixes_steps else []
 
     def read(group: _Shards) -> Block:

@@ -139,7 +139,7 @@ class Allocation:
         return inner_rhw(n) <= INNER_RHW
 
     def _inner_rhw(self, tally: Tally, n: int) -> float:
-        return combined(self.design.p[:n], tally.part(slice(0, n)), self.design.n_paths, _LEVEL).rhw
+        return combined(self.design.p[:n], tally.part(slice(0, n)), self.design.n_independent, _LEVEL).rhw
 
     def _spread(self, tally: Tally, size: int, most: IntArray) -> IntArray:
         weights, room = np.column_stack([self.design.p, np.zeros_like(self.design.p)]), ADDED * (tally.tests > 0)

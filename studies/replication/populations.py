@@ -6,7 +6,8 @@ from other paths, that no pool of the experiment has: crash rates, their ratios 
 ratios of two of them, so that each has a standard error.
 
 A vehicle that acts before the cut-in has a population of paths that it has walked. They are chosen as for a campaign's
-shadow runs, only many more of them, and every `STRIDE`-th of their cut-ins is asked. Surrogates and references take
+shadow runs, only many more of them. As there every cut-in is asked where pools are drawn, or the error of few paths
+would look larger than it is; of paths for the truth every `STRIDE`-th. Surrogates and references take
 over from the vehicle as in its pool, and the vehicle itself drives each of these cut-ins as a test of the campaign
 would: told the index of its shadow run, and held to the hash of what it did there.
 """
@@ -31,8 +32,8 @@ from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.errors import CampaignError, HarnessError
 from harness.importance.functions import build_importance
 from harness.pool.cut_ins import onset_steps
-from harness.pool.shells import acceleration_limit
-from harness.pool.vehicle_pool import CANDIDATES, BaselinePaths, walk_candidates
+from harness.pool.shells import CANDIDATES, acceleration_limit
+from harness.pool.vehicle_pool import BaselinePaths, walk_candidates
 from harness.pool.walk import PILOT_PATHS, STRIDE, Enumerator, enumerate_cut_ins, write_script
 from harness.progress import Progress
 from harness.resolved import resolve
@@ -282,8 +283,10 @@ def choose_paths(
     return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
 
 
-def walk_paths(campaign: Campaign, paths: BaselinePaths, executor: Executor, progress: Progress) -> SuperPopulation:
-    """Let the campaign's vehicle walk paths.
+def walk_paths(
+    campaign: Campaign, paths: BaselinePaths, executor: Executor, progress: Progress, stride: int = STRIDE
+) -> SuperPopulation:
+    """Let the campaign's vehicle walk paths, and ask every ``stride``-th of their cut-ins.
 
     Raises `HarnessError`: the vehicle failed, or did something else in a test than in its shadow run.
     """
@@ -291,11 +294,11 @@ def walk_paths(campaign: Campaign, paths: BaselinePaths, executor: Executor, pro
     for first in range(0, len(paths), WALKED_CHUNK):
         part = {name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in ("index", "state", "weight")}
         jobs.append((first, replace(paths, **part)))
-    walk = partial(_walk, campaign.model_dump_json())
+    walk = partial(_walk, campaign.model_dump_json(), stride)
     return joined(results_of("walked paths", jobs, walk, progress, run=executor.map, size=lambda job: len(job[1])))
 
 
-def _walk(campaign_json: str, job: tuple[int, BaselinePaths]) -> SuperPopulation:
+def _walk(campaign_json: str, stride: int, job: tuple[int, BaselinePaths]) -> SuperPopulation:
     """Walk paths that have numbers from a first one on, and drive the vehicle on their cut-ins as tests would be."""
     first, paths = job
     resolved = resolve(Campaign.model_validate_json(campaign_json))
@@ -304,9 +307,9 @@ def _walk(campaign_json: str, job: tuple[int, BaselinePaths]) -> SuperPopulation
     host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
     loop = EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)  # with all of its motion kept
     runs = recorded(without_cut_in(loop, paths.seed, first, paths.index, paths.state, environment), environment)
-    offset = np.random.default_rng([paths.seed, first]).integers(0, STRIDE, len(paths))
+    offset = np.random.default_rng([paths.seed, first]).integers(0, stride, len(paths))
     where = paths.seed, paths.index, paths.state, environment, library.followers(environment.lateral.present)
-    probability, bits, _ = enumerate_cut_ins(*where, runs, STRIDE, offset)
+    probability, bits, _ = enumerate_cut_ins(*where, runs, stride, offset)
     mass = probability * paths.weight[:, None]
     row, step = np.nonzero(mass > 0.0)
     lv, bv, _, _, lead = write_script(paths.seed, paths.index[row], step, paths.state[row], environment)

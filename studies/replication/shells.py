@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -26,7 +26,7 @@ from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import PairRule, RoundRule
-from harness.estimators.tally import Tally
+from harness.estimators.tally import CrashedTests, Tally, combined
 from harness.pool.cut_ins import CutIns, Pool
 from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata, shells_of
 from harness.sampling.allocation import Allocation
@@ -50,7 +50,7 @@ EQUAL_RATE = 0.02
 _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
 """How A and B end: both crash, only A, only B."""
 _STATEMENT = ("testing", "shells", "statement")
-BOUND = "shells, upper bound"
+BOUND, PAIRS_ALONE = "shells, upper bound", "shells, variance by pairs alone"
 
 
 def limit_at(factor: float, budget: int) -> dict[str, str]:
@@ -72,12 +72,36 @@ def result_of(statement: str) -> str:
     return f"{FREE}, {statement}"
 
 
+class CrashingCutIns(NamedTuple):
+    """Cut-ins of some paths on which a vehicle crashes, (m,) each, by ascending path.
+
+    ``number`` tells them apart, and ``cell`` is that of the pool, or of a design. Each happens with the probability
+    ``mass``, and with ``crash_mass`` the vehicle crashes besides.
+    """
+
+    path: IntArray
+    number: IntArray
+    cell: IntArray
+    mass: FloatArray
+    crash_mass: FloatArray
+
+    def of_paths(self, rows: IntArray, cells: IntArray) -> CrashingCutIns:
+        """Those of given paths (n,), which are numbered anew; ``cells`` (C,) are the cells that become of each."""
+        first, end = (np.searchsorted(self.path, rows, side=side) for side in ("left", "right"))
+        path = np.repeat(np.arange(rows.size), end - first)
+        places = np.arange(path.size) - np.repeat(np.cumsum(end - first) - end, end - first)
+        cell = cells[self.cell[places]]
+        path, places, cell = path[cell >= 0], places[cell >= 0], cell[cell >= 0]
+        return CrashingCutIns(path, self.number[places], cell, self.mass[places], self.crash_mass[places])
+
+
 @dataclass(frozen=True, eq=False)
 class DrawnPool:
     """A pool, and what a vehicle does on its paths.
 
     ``mass`` and ``crash_mass`` (n, C) are each path's probability of a cut-in of each cell of the design, and of a
-    crash in it; ``failing`` is the share of crashes that end as failed tests, ``failing_tests`` that of all tests.
+    crash in it; ``failing`` is the share of crashes that end as failed tests, ``failing_tests`` that of all tests. Of
+    paths that the vehicle has walked ``cut_ins`` are those on which it crashes, and tests fail on no others.
     """
 
     design: ShellDesign
@@ -85,6 +109,7 @@ class DrawnPool:
     crash_mass: FloatArray
     failing: float = 0.0
     failing_tests: float = 0.0
+    cut_ins: CrashingCutIns | None = None
 
     @cached_property
     def share(self) -> FloatArray:
@@ -102,13 +127,16 @@ class DrawnPool:
     @cached_property
     def _cumulative(self) -> tuple[FloatArray, FloatArray]:
         """Sums of mass, and of crash mass, up to each path, by cell, shape (C, n)."""
-        mass, crash_mass = (np.cumsum(np.ascontiguousarray(each.T), axis=1) for each in (self.mass, self.crash_mass))
+        crash_mass = self.crash_mass
+        if (known := self.cut_ins) is not None:
+            crash_mass = np.where(known.cell[:, None] == np.arange(self.mass.shape[1]), known.crash_mass[:, None], 0.0)
+        mass, crash_mass = (np.cumsum(np.ascontiguousarray(each.T), axis=1) for each in (self.mass, crash_mass))
         return mass, crash_mass
 
     def paths_of(self, n_by_cell: IntArray, rng: np.random.Generator, *, crashed: bool = True) -> list[IntArray]:
-        """Paths of so many crashed tests of each cell (C,), or of any."""
+        """Paths of so many crashed tests of each cell (C,), or of any; of crashed ones places in ``cut_ins``."""
         return [
-            np.searchsorted(up_to, rng.random(n) * up_to[-1], side="right")
+            np.searchsorted(up_to, rng.random(n) * up_to[-1:].sum(), side="right")
             for up_to, n in zip(self._cumulative[int(crashed)], n_by_cell.tolist(), strict=True)
         ]
 
@@ -128,18 +156,17 @@ class DrawnPool:
     def count(self, added: IntArray, seen: Shells, rng: np.random.Generator) -> None:
         """Draw so many more tests of each stratum (S,), and count what their records would say."""
         tests, *paths = self.tests_of(added, rng)
+        known, on_runs = self.cut_ins, None
+        if known is not None:
+            place = np.repeat(np.arange(2 * tests.size), [rows.size for cells in paths for rows in cells])
+            rows = np.concatenate([rows for cells in paths for rows in cells])
+            on_runs = CrashedTests(known.path[rows], known.number[rows], known.mass[rows], place)
+            paths = [[known.path[rows] for rows in cells] for cells in paths]
         (crashes, crash_mass), (failed, failed_mass) = (
             (np.array([rows.size for rows in cells]), np.array([self.mass[rows].sum(0) for rows in cells]))
             for cells in paths
         )
-        tally = Tally(tests, crashes, failed, crash_mass, failed_mass)
-        if not self.design.shadow_runs:
-            seen.count(self.design, tally)
-            return
-        by_cell = [np.bincount(rows, minlength=len(self.mass)) for rows in paths[0]]
-        by_path = np.column_stack(by_cell) @ self.design.joined.astype(np.int64)
-        used = by_path.any(1)
-        seen.count(self.design, tally, (self.mass[used], by_path[used]))
+        seen.count(self.design, Tally(tests, crashes, failed, crash_mass, failed_mass), on_runs)
 
     def available(self, campaign: Campaign) -> IntArray:
         """The most tests of each stratum, shape (S,)."""
@@ -197,7 +224,8 @@ class ShellCampaign:
 
     Judged are all statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
     crash rate, all of these are decided instead, as by ``accept``, and judged within each of the ``budgets``; what is
-    tested next depends on neither. ``siblings`` see `FORMER`.
+    tested next depends on neither. ``siblings`` see `FORMER`; and intervals of vehicles that act before the cut-in are
+    made by pairs of tests alone, see `OnRuns`.
     """
 
     campaign: Campaign
@@ -266,6 +294,10 @@ class ShellCampaign:
         outside = int(estimate.details["statements"][0]["n_crashes_outside"])
         row = estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
         yield row
+        if self.siblings and (runs := (tally := planner.tally).runs) is not None:
+            without = tally._replace(runs=runs._replace(own=np.zeros_like(runs.own)))
+            limits = combined(design.p, without, design.n_independent, Level.two_sided(estimate.confidence))
+            yield replace(row, result=PAIRS_ALONE, ci_low=limits.low, ci_high=limits.high, refused=False)
         bounds = [(BOUND, 0, estimate.crash_rate, row.std_error, estimate.upper_bound)]
         for found in estimate.details["statements"]:
             rate = estimate.crash_rate - found["crash_rate"]  # whose error nobody claims to know
@@ -358,7 +390,7 @@ class OvertakingShells:
     The ``template`` is a pool without cut-ins, whose probabilities each draw replaces; ``left_out`` are surrogates that
     are equals of a vehicle, ``limit_mps2`` is the hardest acceleration of the vehicles, and ``mass`` (n, C) the
     probability of a cut-in of each cell, by path of the super-population. ``crashing`` are the parts of it on which the
-    vehicle crashes, or both of two, only A, only B; ``failing`` and ``failing_tests`` see `DrawnPool`.
+    vehicle crashes, or both of two, only A, only B; ``failing``, ``failing_tests`` and ``cut_ins`` see `DrawnPool`.
     """
 
     template: Pool
@@ -368,6 +400,7 @@ class OvertakingShells:
     crashing: tuple[FloatArray, ...] = ()
     failing: float = 0.0
     failing_tests: float = 0.0
+    cut_ins: CrashingCutIns | None = None
 
     @property
     def crash_rate(self) -> float:
@@ -399,7 +432,8 @@ class OvertakingShells:
         cells = cells_in_strata(pool, shells_in_strata(pool, limit))[0]
         joined = np.eye(design.cell_p.size + 1)[cells, :-1]  # the last row is for what is not tested
         mass, failing = drawn @ joined, (self.failing, self.failing_tests)
-        return [DrawnPool(design, mass, each[rows] @ joined, *failing) for each in self.crashing]
+        cut_ins = self.cut_ins and self.cut_ins.of_paths(rows, cells)
+        return [DrawnPool(design, mass, each[rows] @ joined, *failing, cut_ins) for each in self.crashing]
 
 
 class Division:
@@ -456,7 +490,12 @@ class Division:
     def of_vehicle(self, crashing: FloatArray, made: Adversary | None = None) -> OvertakingShells:
         """Pools of a vehicle that crashes on this mass of cut-ins (m,), and fails as an adversary does."""
         failing, failing_tests = (0.0, 0.0) if made is None else (made.failing, made.failing_tests)
-        return replace(self._shells, crashing=(self.by_cell(crashing),), failing=failing, failing_tests=failing_tests)
+        found = replace(self._shells, crashing=(self.by_cell(crashing),), failing=failing, failing_tests=failing_tests)
+        if not found.template.cut_ins.motion.size:
+            return found
+        on, population = np.flatnonzero(crashing > 0.0), self._population
+        cut_ins = CrashingCutIns(population.path[on], on, self._cell[on], population.mass[on], crashing[on])
+        return replace(found, cut_ins=cut_ins)
 
     def of_pair(self, a: FloatArray, b: FloatArray) -> OvertakingShells:
         """Pools of two vehicles that crash on these masses of cut-ins (m,).

@@ -11,6 +11,7 @@ from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.pool.shells import acceleration_limit
+from harness.pool.walk import STRIDE
 from harness.progress import Progress
 from harness.strata import LIBRARY_STATEMENT
 from harness.traffic.loading import load_environment
@@ -62,7 +63,9 @@ def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> 
         walked = [choose_paths(experiment.campaign, seed, n_paths, progress) for seed, n_paths in sizes]
         for name in experiment.acting:
             campaign = experiment.subject(name)
-            yield _acting(experiment, name, *(walk_paths(campaign, paths, executor, progress) for paths in walked))
+            of_both = zip(walked, (STRIDE, 1), strict=True)
+            populations = (walk_paths(campaign, paths, executor, progress, stride) for paths, stride in of_both)
+            yield _acting(experiment, name, *populations)
 
 
 def _chain(experiment: Experiment, place: int, chain: Chain) -> Tested:

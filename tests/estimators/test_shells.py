@@ -12,7 +12,19 @@ from harness.estimators.block import Drawn
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
-from harness.estimators.tally import FEWEST_PATHS, CrashPaths, Tally, combined, empty_tally, pool_variance
+from harness.estimators.tally import (
+    FEWEST_PATHS,
+    ROOM,
+    CrashedTests,
+    OnRuns,
+    Tally,
+    combined,
+    crash_square,
+    empty_tally,
+    mean_square,
+    paths_that_count,
+    pool_variance,
+)
 from harness.numbers import interval
 from harness.strata import Statement
 from tests.estimators.small_blocks import EXACT, SHELLS, in_shells, tally
@@ -175,34 +187,93 @@ def test_plain_means_do_not_know_what_to_do_with_shells():
     assert "nde" in found["nde"].reason
 
 
-def counted(paths, strata, n_strata=2):
-    """Crashed tests of paths that are known by one number each."""
-    found = CrashPaths()
-    found.add(np.asarray(paths, np.float64)[:, None], np.eye(n_strata, dtype=np.int64)[strata])
-    return found
+def counted(run, step, mass, stratum, n_runs=100, tests=1000) -> Tally:
+    """Crashed tests of baseline runs in two strata, and as many others as never to be a bound."""
+    stratum, n = np.asarray(stratum), np.full(2, tests)
+    place = CrashedTests(*(np.broadcast_to(each, stratum.shape) for each in (run, step, mass)), stratum)
+    crashes = np.bincount(stratum, minlength=2)
+    loose = np.full((2, 2), 1e9)
+    return Tally(n, crashes, 0 * crashes, loose, 0 * loose, OnRuns.of(n_runs, 2, place))
 
 
-def test_pairs_of_one_path_are_counted_by_weight():
-    """Paths 1, 1, 1 and 2 in stratum 0, 2 and 3 in stratum 1: by hand."""
-    found = counted([1, 1, 1, 2, 2, 3], [0, 0, 0, 0, 1, 1])
-    w = [1.0] * 4 + [0.5] * 2
-    total = sum(w) ** 2 - sum(x * x for x in w)
-    same = 2 * (3 * 1.0 * 1.0) + 2 * (1.0 * 0.5)
-    assert found.number(np.array([1.0, 0.5])) == pytest.approx(total / same)
-    assert found.number(np.array([1.0, 0.0])) == pytest.approx(12 / 6)
+def test_the_mean_square_of_runs_is_that_of_their_tests_and_of_pairs_in_different_steps():
+    """Runs 1, 1, 1, 2 in stratum 0, 2 and 3 in stratum 1, of 1 one step twice: by hand."""
+    found = counted(
+        [1, 1, 1, 2, 2, 3], [5, 5, 6, 5, 6, 6], [1.0, 1.0, 2.0, 4.0, 8.0, 16.0], [0, 0, 0, 0, 1, 1], tests=4
+    )
+    own, pairs = (8.0 + 24.0 * 0.5), 100 * (4 / 3 * 2 * 2 + 2 * 0.5)
+    assert found.runs.square(np.array([1.0, 0.5]), found) == pytest.approx(own + pairs)
+    assert found.runs.square(np.array([1.0, 0.0]), found) == pytest.approx(8.0 + 100 * 4 / 3 * 4)
+    assert found.runs.n_pairs(np.ones(2, bool)) == 3.0
+    assert found.part(slice(1, 2)).runs.square(np.array([0.5]), found.part(slice(1, 2))) == pytest.approx(12.0)
 
 
-def test_one_or_two_pairs_say_nothing():
-    assert counted([1, 1, 2, 2, 3], [0] * 5).number(np.ones(2)) == math.inf
-    assert counted([1, 1, 1, 2], [0] * 4).number(np.ones(2)) == 2.0
-    assert CrashPaths().number(np.ones(2)) == math.inf
-    assert counted([1, 1, 1], [0] * 3).number(np.zeros(2)) == math.inf
+def test_failed_tests_are_of_runs_like_crashed_ones():
+    place = CrashedTests(*np.array([[1, 1, 2], [3, 4, 3], [1, 2, 4], [0, 2, 3]]))  # the second and third have failed
+    one, none = np.array([1, 0]), np.zeros((2, 2))
+    found = Tally(np.array([9, 9]), one, np.array([1, 1]), none, none, OnRuns.of(10, 2, place))
+    whole = np.array([1.0, 1.0])
+    assert found.runs.square(whole, found) == 1.0
+    assert found.failed_as_crashes(np.array([True, False])).runs.n_pairs(whole > 0.0) == 1.0
+    assert found.failed_as_crashes().runs.own.tolist() == [3.0, 4.0, 0.0, 0.0]
+
+
+def test_the_error_of_few_runs_is_neither_a_bound_nor_told_by_pairs_alone():
+    """Runs with few and with many crashes, mostly where nearly nobody crashes: there the bound is far too large."""
+    rng, n_runs, n_tests = np.random.default_rng(8), 150, 400
+    mass = rng.exponential(size=(n_runs, 1)) * rng.exponential(size=(n_runs, 20))
+    stratum = np.arange(20) % 2 * np.ones((n_runs, 1), int)
+    crash = rng.random(mass.shape) < np.where(stratum == 0, 0.6, 0.03 * (np.arange(n_runs) < 100)[:, None])
+    mass = np.where(stratum == 0, 0.05 * mass, mass)
+    p, by_path = np.array([mass[stratum == s].sum() for s in (0, 1)]) / n_runs, (mass * crash).sum(1)
+    row, step = np.indices(mass.shape)
+    found, alone, bound = [], [], []
+    for _ in range(200):
+        tests, crash_mass = [], np.zeros((2, 2))
+        for s in (0, 1):
+            drawn = rng.choice(mass.size, n_tests, p=np.where(stratum == s, mass, 0.0).ravel() / (p[s] * n_runs))
+            tests.append(drawn := drawn[crash.ravel()[drawn]])
+            crash_mass[s] = [mass[row.ravel()[drawn]][:, t::2].sum() for t in (0, 1)]
+        of = np.concatenate(tests)
+        place = CrashedTests(row.ravel()[of], step.ravel()[of], mass.ravel()[of], stratum.ravel()[of])
+        runs, crashes = OnRuns.of(n_runs, 2, place), np.array([each.size for each in tests])
+        tally = Tally(np.full(2, n_tests), crashes, 0 * crashes, crash_mass, 0 * crash_mass, runs)
+        scale = p / n_tests
+        found.append(runs.square(scale, tally))
+        alone.append(runs._replace(own=0.0 * runs.own).square(scale, tally))
+        bound.append(crash_square(scale, tally._replace(runs=None)))
+        assert crash_square(scale, tally) <= bound[-1]
+    true = np.mean(by_path**2)
+    assert np.mean(found) == pytest.approx(true, rel=0.03)
+    assert np.mean(alone) < 0.8 * true
+    assert np.mean(bound) > 2.5 * true
+
+
+def test_without_pairs_the_bound_stays_and_with_few_there_is_room_for_one_more():
+    none, weight = counted(range(12), 1, 1e-3, [0] * 12), np.array([1e-3, 1e-3])
+    assert none.runs.square(weight, none, ROOM) == math.inf
+    assert crash_square(weight, none) == mean_square(weight, none.crash_mass)
+    assert none.runs.square(weight, none, -ROOM) == 0.0
+    few = counted([0, 0, *range(10)], [1, 2, *[3] * 10], 1e-3, [0] * 12)
+    of_mean, square = 12e-3**2, few.runs.square(weight, few)
+    expected = of_mean + (square - of_mean) * (1.0 + ROOM * math.sqrt(2.0 / 3.0)) + 2.0 * 100 * 1e-6
+    assert few.runs.square(weight, few, ROOM) == pytest.approx(expected)
+
+
+def test_one_or_two_pairs_of_few_crashes_say_nothing():
+    p = np.ones(2)
+    assert paths_that_count(p, counted([1, 1, 2, 2, 3], range(5), 1.0, [0] * 5)) == math.inf
+    assert paths_that_count(p, counted([1, 1, 1, 2], range(4), 0.0, [0] * 4)) == pytest.approx(16 / 6, rel=2e-3)
+    assert paths_that_count(p, empty_tally(2)) == math.inf
+    noisy = counted([1, 1, 1, *range(2, 12)], range(13), 1e-4, [0] * 13)
+    assert paths_that_count(p, noisy) < FEWEST_PATHS < paths_that_count(p, noisy, -ROOM)
 
 
 @pytest.mark.parametrize("n_paths", [8, 25, 150, 500])
 def test_it_is_the_number_of_equal_paths_and_the_guard_tells_few_from_many(n_paths):
-    """Eighty crashes; the guard decides wrongly in 1,000 draws never."""
+    """Eighty crashes, each a cut-in of its own; the guard decides wrongly in 1,000 draws never."""
     rng = np.random.default_rng(n_paths)
-    numbers = np.array([counted(rng.integers(n_paths, size=80), [0] * 80).number(np.ones(2)) for _ in range(1000)])
+    drawn = (counted(rng.integers(n_paths, size=80), range(80), 1e-4, [0] * 80, n_paths) for _ in range(1000))
+    numbers = np.array([paths_that_count(np.ones(2), each) for each in drawn])
     assert np.mean(1.0 / numbers) == pytest.approx(1.0 / n_paths, rel=0.05)
     assert np.all((numbers < FEWEST_PATHS) == (n_paths < FEWEST_PATHS))

@@ -14,11 +14,12 @@ from scipy.stats import binomtest
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Run, Stop
+from harness.estimators.answer import conclusion
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import accumulator
 from harness.estimators.pairs import CRASH, NO_CRASH, no_pairs
 from harness.estimators.shells import Shells
-from harness.estimators.stopping import LOOK_RATIO, Decision, RoundRule, StopRule, look_grid
+from harness.estimators.stopping import LOOK_RATIO, Decision, Look, RoundRule, Rule, StopRule, look_grid
 from harness.estimators.tally import Tally
 from harness.strata import ASSUMPTION_FREE, Statement
 from tests.estimators.small_blocks import SHELLS, block
@@ -195,3 +196,23 @@ def test_a_vehicle_that_always_crashes_may_have_a_rate_above_that_of_this_pool()
         cut += true <= np.minimum(high, [design.p.sum(), design.p[2], design.p.sum()])
     assert all(binomtest(n, 300, 0.9, alternative="less").pvalue > 1e-4 for n in covered.tolist())
     assert all(binomtest(n, 300, 0.9, alternative="less").pvalue < 1e-9 for n in cut.tolist())
+
+
+@pytest.mark.parametrize(
+    ("rhw", "from_pool", "says"),
+    [
+        (0.5, 0.15, "tests dominate; raise stop.episodes to about 11,000 and go on with --resume"),
+        (0.5, 0.4, "both are too few; pool.shadow_paths of about 1,800 and 6,000 tests"),
+        (0.32, 0.28, "baseline runs are too few; pool.shadow_paths of about 880 and 1,600 tests"),
+        (math.inf, math.inf, "raise it and go on with --resume"),
+    ],
+)
+def test_what_is_missing_is_named_with_how_much_of_it(rhw, from_pool, says):
+    """The squares of both half-widths add up to that which is seen; each falls as one over its number."""
+    av = {"controller": "examples.acting:Holds", "before_cut_in": "controller", "limits": {"max_acceleration_mps2": 2}}
+    content = {"name": "x", "testing": {"method": "shells"}, "stop": {"rhw": 0.3, "episodes": 3_000}, "av": av}
+    rule = Rule(0.3, 10)
+    rule.look = Look(rhw, unmet=("stop.rhw (0.3)",), rhw_from_pool=from_pool)
+    stopped_by, sentence = conclusion(Campaign.model_validate(content), rule, 3_000)
+    assert stopped_by == "episodes"
+    assert says in sentence

@@ -113,18 +113,21 @@ def test_adversaries_crash_on_few_paths_inside_or_in_a_share_of_all_outside(made
 
 @pytest.fixture(scope="module")
 def with_references():
-    """A pool with references."""
+    """A pool with references, and the same as one of paths that the vehicle has walked."""
     library = load_library("ladder-2")
     drivers = Drivers.of(library, {"own": AVS["own"]})
     population = enumerated(drivers)
     crashing = population.crash_mass(drivers.vehicles["own"])
-    source = Division(library, population, [crashing], 512, limit_mps2=2.0).of_vehicle(crashing)
-    return source.draw(np.random.default_rng(4))[0]
+    sources = (
+        Division(library, population, [crashing], 512, limit_mps2=2.0, shadow_runs=acts).of_vehicle(crashing)
+        for acts in (False, True)
+    )
+    return [source.draw(np.random.default_rng(4))[0] for source in sources]
 
 
 def test_cells_divide_strata_by_what_references_do(with_references):
     """Rates, moments and cells of the design are those of the drawn paths, test by test."""
-    drawn, design = with_references, with_references.design
+    drawn, design = with_references[0], with_references[0].design
     np.testing.assert_allclose(drawn.mass.mean(0), design.cell_p, rtol=1e-12)
     crash_too = (np.array(design.cell_references) & 1).astype(bool)
     of_reference = drawn.mass[:, crash_too].sum(1)
@@ -144,34 +147,41 @@ def test_cells_divide_strata_by_what_references_do(with_references):
 def as_block(drawn, tests, crashed, failed, first) -> Block:
     """The same tests as rows of records, those of a cell one after the other, in any order."""
     ends = zip(tests.tolist(), crashed, failed, strict=True)
+    known = drawn.cut_ins
     rows = [
-        (cell, outcome, drawn.mass[path] if path >= 0 else np.zeros(tests.size))
+        (cell, outcome, path)
         for cell, (n, *bad) in enumerate(ends)
         for outcome, paths in zip((CRASH, FAILED, TIMEOUT), (*bad, [-1] * (n - sum(map(len, bad)))), strict=True)
         for path in paths
     ]
-    cell, outcome, mass = (np.array(column) for column in zip(*rows, strict=True))
+    cell, outcome, place = (np.array(column) for column in zip(*rows, strict=True))
+    path = place if known is None else known.path[place]
+    mass = np.where((place >= 0)[:, None], drawn.mass[path], 0.0)
     columns = {"stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
+    if known is not None:
+        columns |= {"shadow": path, "step": known.number[place], "cut_in_mass": known.mass[place]}
     return Block(first, outcome, np.zeros(cell.size), columns, Drawn("shells", shells=drawn.design))
 
 
 @pytest.mark.parametrize("shadow_runs", [False, True])
 def test_counted_tests_say_what_their_records_would(with_references, shadow_runs):
     """Whole campaigns: rounds, counts, limits and results, with failed tests and paths that the vehicle has walked."""
-    design = replace(with_references.design, shadow_runs=shadow_runs)
-    drawn = replace(with_references, design=design, failing=0.1, failing_tests=0.02)
+    drawn = replace(with_references[shadow_runs], failing=0.3, failing_tests=0.0 if shadow_runs else 0.02)
+    design = drawn.design
     campaign, rng = campaign_of(2_000), np.random.default_rng(6)
     by_row, level, n = ShellRounds(campaign, design, drawn.available(campaign)), Level.two_sided(0.9), 0
     for seen, _, enough in looks(campaign, drawn, np.random.default_rng(6)):
         added = by_row.next_round()
         assert by_row.enough(as_block(drawn, *drawn.tests_of(added, rng), n)) == enough
         n += int(added.sum())
-        for one, other in zip(seen.tally, by_row.tally, strict=True):
+        numbers = ((*tally[:5], *(tally.runs or ())) for tally in (seen.tally, by_row.tally))
+        for one, other in zip(*numbers, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-12)
         limits = by_row.seen.limits_of(ASSUMPTION_FREE, level)
         assert seen.limits_of(ASSUMPTION_FREE, level) == pytest.approx(limits, rel=1e-12)
     assert n == 2_000
-    assert limits == combined(design.p, by_row.tally, design.n_paths, level)  # of all tests, not of an earlier look
+    of_all = combined(design.p, by_row.tally, design.n_independent, level)
+    assert limits == of_all  # not of an earlier look
     assert by_row.tally.totals[2] > 40
     found, expected = (as_tree(each.result(0.9)) for each in (seen, by_row.seen))
     assert unlike(found, expected, digits=1e-12) == []
@@ -188,7 +198,7 @@ def as_tree(estimate: Estimate) -> dict[str, object]:
 
 def test_a_raised_budget_is_looked_at_where_it_ends_and_goes_on_as_without(with_references):
     def tests(episodes, budgets=()):
-        found = looks(campaign_of(episodes), with_references, np.random.default_rng(8), budgets)
+        found = looks(campaign_of(episodes), with_references[0], np.random.default_rng(8), budgets)
         return [seen.tally.tests.tolist() for seen, *_ in found]
 
     raised, alone = tests(2_000, (300, 900, 2_000)), tests(300)
