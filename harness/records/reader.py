@@ -30,6 +30,7 @@ from harness.records.folder import (
     damaged,
     listed_crc32,
     no_episodes,
+    read_as,
     read_kept,
     read_manifest,
     require_unchanged,
@@ -154,6 +155,12 @@ class StoredRun:
     """
 
     folder: Path
+
+    @property
+    def estimates(self) -> dict[str, Any]:
+        """Content of ``estimates.json``: estimates, the ``answer`` in rows, and the ``severity`` of crashes."""
+        again = f"Make it again with `harness estimate {self.folder} --write`."
+        return read_as(dict[str, Any], self.folder / "estimates.json", mend=again)
 
     def episodes(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """One row per test, failed ones included, with its ``weight`` and all ``columns``, or those that are named.

@@ -34,7 +34,7 @@ from harness.traffic.laws import Environment
 from harness.vehicles.library import library_records
 from harness.vocabulary import CRASH, CUT_IN, FAILED, FloatArray, IntArray, states_from
 
-WEIGHT_BINS, CELLS = 70, 36
+WEIGHT_BINS = 70
 SHARES = {0.0: GRID, 0.25: REDS[0], 0.5: REDS[1], 0.75: REDS[3], 1.0: REDS[5]}
 """Up to which share of cut-ins that crash a cell of the map has a colour."""
 KEEPS_SPEED = 20
@@ -129,7 +129,8 @@ def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | N
     weight, crash = rows["weight"][cut_in], rows["outcome"][cut_in] == CRASH
     of = crash if crash.any() else np.ones_like(crash)
     far, fast = 1.4 * float(np.quantile(gap[of], 0.98)) + 1.0, 1.15 * float(np.quantile(closing[of], 0.98)) + 1.0
-    edges = np.linspace(0.0, far, CELLS + 1), np.linspace(0.0, fast, CELLS // 2 + 1)
+    cells = int(np.clip(0.7 * math.sqrt(gap.size), 12, 40))  # with few cut-ins each in one of its own
+    edges = np.linspace(0.0, far, cells + 1), np.linspace(0.0, fast, cells // 2 + 1)
     every, crashed = (np.histogram2d(gap, closing, edges, weights=w)[0].T for w in (weight, weight * crash))
     shares = np.divide(crashed, every, out=np.full_like(every, -1.0), where=every > 0.0)
     figure = new_figure(FULL_WIDTH_IN, 3.5)
@@ -137,8 +138,8 @@ def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | N
     for low, (high, colour) in zip((-0.5, *SHARES), SHARES.items(), strict=False):
         if (here := (shares > low) & (shares <= high)).any():
             rows_here, columns_here = np.nonzero(here)
-            cells, label = _cells_path(rows_here, columns_here, *edges[::-1]), f"≤ {share(high)}" if high else "none"
-            axes.add_patch(PathPatch(cells, facecolor=colour, edgecolor="none", label=label))
+            area, label = _cells_path(rows_here, columns_here, *edges[::-1]), f"≤ {share(high)}" if high else "none"
+            axes.add_patch(PathPatch(area, facecolor=colour, edgecolor="none", label=label))
     known = environment is not None and not environment.lateral.present
     lines = limits_of_others(environment, summary, fast) if environment is not None and known else {}
     for (name, (speeds, gaps)), colour, style in zip(lines.items(), (INK, BLUE), ("-", (0, (4, 2))), strict=False):

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 
+import harness
 from harness.compiled import unboxed
 from harness.episode.path import empty_trajectory
 from harness.estimators.block import Block, Drawn, joined
@@ -29,7 +30,7 @@ from tests.stored_runs import estimates, golden, stored_table
 @pytest.mark.parametrize("name", ["nde-twin", "step-recursive-twin", "mixture-twin", "shells-twin", "shells-sumo"])
 def test_it_is_the_rate_of_harder_crashes_by_the_same_estimator(name, stored_run):
     folder, own = stored_run(name), SAMPLING[golden(name).testing.method].headline
-    content, rows = estimates(folder), stored_table(folder, "episodes").to_pandas()
+    content, rows = harness.read(folder).estimates, stored_table(folder, "episodes").to_pandas()
     crashes = rows[rows.outcome == "crash"]
     found = {row["above_mps"]: row for row in content["severity"]["exceedance"]}
     assert tuple(found) == SPEEDS_MPS

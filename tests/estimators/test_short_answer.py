@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -80,6 +81,20 @@ def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     assert (rows["rate"]["what"], rows["rate"]["interval"]) == ("crash rate > 50 m/s", "no crash seen")
     assert rows["rate"]["value"].startswith("< ")
     assert content["severity"] is None
+
+
+def test_a_vehicle_that_only_touches_is_said_so(stored_run):
+    """Of the same tests had each crash been fifty times softer; its rate is what it was."""
+    folder, campaign = stored_run("shells-refuted"), golden("shells-refuted")
+    blocks = [
+        replace(block, columns={**block.columns, "impact_mps": 0.02 * block.impact_mps})
+        for block in stored_blocks(folder, moments=False)
+    ]
+    content = estimate_blocks(blocks, campaign, read_manifest(folder))
+    text = lines(content["answer"], 1.0)
+    assert any(re.match(r"  impact +median 0.1 m/s +100 % below 1 m/s +0 % above 5 m/s", line) for line in text)
+    assert "  ! 100 % of this rate are touches below 1 m/s" in text
+    assert content["answer"]["rows"][0] == estimates(folder)["answer"]["rows"][0]
 
 
 def test_much_to_warn_of_leaves_room_for_the_rate(stored_run):
