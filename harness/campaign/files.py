@@ -141,8 +141,10 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict
     A path that leads through something that is not a section is a `CampaignError`.
     """
     changed = dict(data)
-    # What replaces the vehicle comes first: what is said of the vehicle is said of the new one.
-    for override in sorted(overrides, key=lambda each: not _names_the_driver(each)):
+    # A whole vehicle replaces what was said of one before. Of the rest the driver comes first: parameters are its own.
+    whole = max((i for i, each in enumerate(overrides) if each.path == ("av",)), default=0)
+    counted = [each for i, each in enumerate(overrides) if i >= whole or each.path[0] != "av"]
+    for override in sorted(counted, key=lambda each: not _names_the_driver(each)):
         if _names_the_driver(override) and len(override.path) > 1:
             changed = with_another_driver(changed, override.path[1], override.value)
         if override.path[0] == "surrogates" and len(override.path) > 1 and "surrogates" not in changed:

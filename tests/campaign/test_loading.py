@@ -302,6 +302,16 @@ ANOTHER_DRIVER = [
 ]
 
 
+def test_a_whole_vehicle_replaces_what_was_said_of_one_before(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("name: c\n")
+    said = ["av.parameters.min_acceleration_mps2=-1.5", "av={model: idm, parameters: {min_acceleration_mps2: -8}}"]
+    av = load_campaign(file, said).av
+    assert (av.model, av.parameters.min_acceleration_mps2) == ("idm", -8.0)
+    assert load_campaign(file, [said[1], "av.model=fvdm"]).av.model == "fvdm"
+    assert load_campaign(file, said[::-1]).av.parameters.min_acceleration_mps2 == -1.5
+
+
 @pytest.mark.parametrize(("written", "option", "parameters"), ANOTHER_DRIVER)
 def test_one_override_changes_the_vehicle(written, option, parameters, own):
     file = own / "campaigns" / "c.yaml"
