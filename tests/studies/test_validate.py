@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import select
+import signal
+import subprocess
+import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -20,6 +24,7 @@ from studies.replication.populations import Known
 from studies.work import worker_processes
 from tests.studies.here import Here
 
+FOLDER = Path(__file__).parents[2] / "scenarios" / "validate"
 CHAINS = """
 format: validation-experiment
 version: 1
@@ -88,6 +93,30 @@ def test_weighted_methods_run_in_the_twin(tmp_path, capsys, monkeypatch):
     assert abs(found["bias"]) < 5.0 * found["bias_std_error"]
 
 
+PARENT = """
+import os, time
+from studies.work import worker_processes
+
+if __name__ == "__main__":
+    with worker_processes(1) as executor:
+        print(executor.submit(os.getpid).result(), flush=True)
+        executor.submit(time.sleep, 60).result()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="waits for the end of another's child: Linux only")
+def test_a_worker_ends_when_the_experiment_is_killed(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT, encoding="utf-8")
+    found = {**os.environ, "PYTHONPATH": str(FOLDER.parents[1])}
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=found) as parent:
+        worker = os.pidfd_open(int(parent.stdout.readline()))  # can be read from when it ends
+        assert select.select([worker], [], [], 0.0)[0] == []
+        parent.send_signal(signal.SIGKILL)
+    assert select.select([worker], [], [], 20.0)[0] == [worker]
+    os.close(worker)
+
+
 def test_an_interrupted_experiment_does_not_wait_for_its_workers():
     futures = []
 
@@ -105,7 +134,6 @@ def test_an_interrupted_experiment_does_not_wait_for_its_workers():
 
 # -- experiments are read strictly, and what cannot be repeated is refused in words --
 
-FOLDER = Path(__file__).parents[2] / "scenarios" / "validate"
 HEAD = "format: validation-experiment\nversion: 1\nname: x\n"
 SHELLS, FORCED = (f"campaign: {{testing: {{method: {method}}}}}\n" for method in ("shells", "forced"))
 ACTS = "avs: {c: {controller: 'a.b:C', before_cut_in: controller}}\n"
