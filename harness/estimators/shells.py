@@ -258,7 +258,7 @@ class Shells:
         if not design.n_inside or not self.tally.totals[1]:
             return None
         avoids = np.asarray(design.cell_stratum) > 0
-        share, low, high = preventable_share(design.cell_p, self._cells, avoids, design.n_paths, level)
+        share, low, high = preventable_share(design.cell_p, self._cells, avoids, design.n_independent, level)
         return Unavoidable(design.strata[0], 1.0 - share, 1.0 - high, 1.0 - low)
 
     def limits_of(self, statement: str, level: Level) -> RateLimits:
