@@ -14,7 +14,7 @@ from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import PairedEstimate
 from harness.estimators.severity import Severity
 from harness.estimators.short_answer import ShortAnswer, short_answer
-from harness.estimators.stopping import Look, Rule
+from harness.estimators.stopping import RoundRule, Rule
 from harness.importance.functions import importance_names
 from harness.numbers import WIDEST_RHW, interval, number, plain, ratio, share, two_digits_up
 from harness.records.folder import StoppedBy
@@ -292,36 +292,29 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
     elif campaign.stop.rhw is not None or look.decision is not None:
         after, why = f"{after} without {unmet}", MENDS[stopped_by]
         if campaign.has_baseline_runs and stopped_by in ("episodes", "pool_error"):
-            why = _runs_or_tests(look, campaign, n_episodes) or why
+            why = _runs_or_tests(rule, campaign, n_episodes) or why
     else:
         why = "stop.episodes was all that was asked for" if stopped_by == "episodes" else MENDS[stopped_by]
     wide = stopped_by == "rhw" and campaign.sampling.strata and (campaign.stop.rhw or 0.0) > BIASED_RHW
     return stopped_by, f"{after}: {why}." + (TOO_WIDE if wide else "")
 
 
-def _runs_or_tests(look: Look, campaign: Campaign, n_tests: int) -> str | None:
+def _runs_or_tests(rule: Rule, campaign: Campaign, n_tests: int) -> str | None:
     """Which of baseline runs and tests are too few for the precision that is asked, and how many of both it may take.
 
-    The squares of what both leave add up, and each falls as one over their number.
+    What the runs leave may be all that is asked over √2; what the tests then do is expected from their limits.
     """
-    target, n_runs = campaign.stop.rhw or 0.0, campaign.pool.shadow_paths
-    of_runs, of_tests = look.rhw_from_pool**2, look.rhw**2 - look.rhw_from_pool**2
-    if not (target and 0.0 < of_runs < math.inf and 0.0 < of_tests < math.inf):
+    target, n_runs, pool = campaign.stop.rhw, campaign.pool.shadow_paths, rule.look.rhw_from_pool
+    if not isinstance(rule, RoundRule) or target is None or not 0.0 < pool < math.inf:
         return None
-    found = (
-        f"{n_runs:,} baseline runs alone leave ±{share(look.rhw_from_pool)} of the rate, {n_tests:,} tests alone "
-        f"±{share(math.sqrt(of_tests))}"
-    )
-    if of_runs <= target**2 / 2.0:
-        more = two_digits_up(n_tests * of_tests / (target**2 - of_runs))
-        return f"{found}: tests dominate; raise stop.episodes to about {more:,} and go on with --resume"
-    runs, tests = (
-        two_digits_up(n * square * 2.0 / target**2) for n, square in ((n_runs, of_runs), (n_tests, of_tests))
-    )
-    what = "baseline runs are too few" if of_tests <= target**2 / 2.0 else "both are too few"
-    return (
-        f"{found}: {what}; pool.shadow_paths of about {runs:,} and {tests:,} tests are expected to do, in a new folder"
-    )
+    more_runs = max(2.0 * (pool / target) ** 2, 1.0)
+    more_tests = rule.more_tests(target, more_runs)
+    found = f"{n_runs:,} baseline runs alone leave ±{share(pool)} of the rate, of ±{share(rule.look.rhw)} in all"
+    runs, tests = two_digits_up(n_runs * more_runs), two_digits_up(n_tests * more_tests)
+    if more_runs == 1.0:
+        return f"{found}: tests are too few; raise stop.episodes to about {tests:,} and go on with --resume"
+    what = "baseline runs" if more_tests <= 1.0 else "both"
+    return f"{found}: {what} are too few; some {runs:,} (pool.shadow_paths) and {tests:,} tests may do, in a new folder"
 
 
 def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:

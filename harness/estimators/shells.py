@@ -27,7 +27,7 @@ import numpy as np
 
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Number
-from harness.estimators.likelihood import CRASH, Level, ratio_limits
+from harness.estimators.likelihood import CRASH, Counts, Level, likelihood_limit, ratio_limits
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.tally import (
     FEWEST_PATHS,
@@ -46,6 +46,8 @@ from harness.numbers import share, two_digits_up
 from harness.strata import ShellDesign
 from harness.vocabulary import BoolArray, FloatArray
 
+GROWTH, MOST_TIMES = 1.1, 1e6
+"""Of numbers of tests that are looked at, and where there is no more looking."""
 MOST_NAMED = 10
 """Tests that are named of those that refute a statement, or show that its reason fails."""
 
@@ -264,6 +266,25 @@ class Shells:
     def limits_of(self, statement: str, level: Level) -> RateLimits:
         """Rate and limits of a statement, or of all strata."""
         return self._limits(self._design.n_within(statement), level)
+
+    def more_tests(self, statement: str, level: Level, rhw: float, more_runs: float) -> float:
+        """How many times as many tests of each stratum, crashing as often, would leave a relative half-width.
+
+        That is with so many times as many baseline runs; 1 if these tests are enough, infinite beyond a million times.
+        """
+        n, times, width = self._design.n_within(statement), 1.0, 2.0 * rhw * self.limits_of(statement, level).rate
+        p, tally = self._design.p[:n], self.tally.part(slice(0, n))
+        variance = pool_variance(p, tally, self._design.n_independent) / more_runs
+
+        def limit(crashes: Counts, side: float) -> float:
+            tests = np.rint(tally.tests * times).astype(np.int64)
+            return likelihood_limit(p, np.minimum(crashes * times, tests), tests, level, side, variance)
+
+        while limit(tally.crashes + tally.failed, 1.0) - max(limit(tally.crashes, -1.0), 0.0) > width:
+            times *= GROWTH
+            if times > MOST_TIMES:
+                return math.inf
+        return times
 
     def contradicts(self, statement: str) -> bool:
         """Whether a test crashed beyond the boundary of a statement, or was ahead of it where that is checked."""

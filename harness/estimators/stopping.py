@@ -263,6 +263,7 @@ class RoundRule(Rule):
     """
 
     of_first_tests = False
+    _seen: Shells
     level_at = staticmethod(decision_level)
 
     def __init__(self, campaign: Campaign, held: int = 0) -> None:
@@ -272,6 +273,7 @@ class RoundRule(Rule):
 
     def observe(self, seen: Shells) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
+        self._seen = seen
         if self._accept is not None:
             return self._decided(seen, self._accept.crash_rate_below)
         limits, tally = seen.limits_of(self._statement, Level.two_sided(self._confidence)), seen.tally
@@ -279,6 +281,10 @@ class RoundRule(Rule):
         pool = limits.from_pool_relative() if n_crashes >= self._min_crashes else (0.0, 0.0)
         enough = self._looked(limits.rhw, n_crashes, also=also, pool=pool)
         return self.look.stopped or (enough and tally.tests.sum() >= self._held)
+
+    def more_tests(self, target: float, more_runs: float) -> float:
+        """How many times as many tests are expected to reach a relative half-width, see `Shells.more_tests`."""
+        return self._seen.more_tests(self._statement, Level.two_sided(self._confidence), target, more_runs)
 
     def _decided(self, seen: Shells, limit: float) -> bool:
         """Look at a limit until it is decided; that answer stays, also while the folder holds further tests."""

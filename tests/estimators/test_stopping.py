@@ -19,7 +19,7 @@ from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import accumulator
 from harness.estimators.pairs import CRASH, NO_CRASH, no_pairs
 from harness.estimators.shells import Shells
-from harness.estimators.stopping import LOOK_RATIO, Decision, Look, RoundRule, Rule, StopRule, look_grid
+from harness.estimators.stopping import LOOK_RATIO, Decision, RoundRule, StopRule, look_grid
 from harness.estimators.tally import Tally
 from harness.strata import ASSUMPTION_FREE, Statement
 from tests.estimators.small_blocks import SHELLS, block
@@ -198,21 +198,34 @@ def test_a_vehicle_that_always_crashes_may_have_a_rate_above_that_of_this_pool()
     assert all(binomtest(n, 300, 0.9, alternative="less").pvalue < 1e-9 for n in cut.tolist())
 
 
+def test_tests_that_are_missing_are_those_that_would_do():
+    """Tests of each stratum that crash as often, also where nothing has crashed."""
+    tests, crashes, level = np.array([40, 60, 400]), np.array([30, 10, 0]), Level.two_sided(0.9)
+    for target in (0.25, 0.1):
+        times = seen(tests, crashes).more_tests(ASSUMPTION_FREE, level, target, 1.0)
+        assert times > 1.2
+        enough, few = (
+            seen(*(np.rint(each * k).astype(np.int64) for each in (tests, crashes))) for k in (times, times / 1.2)
+        )
+        assert enough.limits_of(ASSUMPTION_FREE, level).rhw <= 1.02 * target < few.limits_of(ASSUMPTION_FREE, level).rhw
+
+
 @pytest.mark.parametrize(
-    ("rhw", "from_pool", "says"),
+    ("from_pool", "says"),
     [
-        (0.5, 0.15, "tests dominate; raise stop.episodes to about 11,000 and go on with --resume"),
-        (0.5, 0.4, "both are too few; pool.shadow_paths of about 1,800 and 6,000 tests"),
-        (0.32, 0.28, "baseline runs are too few; pool.shadow_paths of about 880 and 1,600 tests"),
-        (math.inf, math.inf, "raise it and go on with --resume"),
+        (0.1, "alone leave ±10 % of the rate, of ±"),
+        (0.1, "tests are too few; raise stop.episodes to about"),
+        (0.4, "both are too few; some 1,800 (pool.shadow_paths) and"),
+        (math.inf, "stop.episodes was spent; raise it"),
     ],
 )
-def test_what_is_missing_is_named_with_how_much_of_it(rhw, from_pool, says):
-    """The squares of both half-widths add up to that which is seen; each falls as one over its number."""
+def test_what_is_missing_is_named(from_pool, says):
     av = {"controller": "examples.acting:Holds", "before_cut_in": "controller", "limits": {"max_acceleration_mps2": 2}}
-    content = {"name": "x", "testing": {"method": "shells"}, "stop": {"rhw": 0.3, "episodes": 3_000}, "av": av}
-    rule = Rule(0.3, 10)
-    rule.look = Look(rhw, unmet=("stop.rhw (0.3)",), rhw_from_pool=from_pool)
-    stopped_by, sentence = conclusion(Campaign.model_validate(content), rule, 3_000)
+    content = {"name": "x", "testing": {"method": "shells"}, "stop": {"rhw": 0.3, "episodes": 500}, "av": av}
+    campaign = Campaign.model_validate(content)
+    looking = RoundRule(campaign)
+    looking.observe(seen(np.array([40, 60, 400]), np.array([30, 10, 0])))
+    looking.look = replace(looking.look, rhw_from_pool=from_pool)
+    stopped_by, sentence = conclusion(campaign, looking, 500)
     assert stopped_by == "episodes"
     assert says in sentence
