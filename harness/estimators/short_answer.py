@@ -166,7 +166,7 @@ def _within(found: Mapping[str, Any]) -> Row:
     what = f"keeping to {name}"
     if found["refuted"]:
         return Row("within", what, "REFUTED", "", f"{count(n)} crashes in {outside} tests beyond")
-    beyond = f"no crash in {outside} tests beyond" if found["n_episodes_outside"] else "nothing was tested beyond"
+    beyond = f"no crash in {outside} beyond it" if found["n_episodes_outside"] else "nothing was tested beyond"
     if found["n_ahead"]:
         beyond = f"NOT KEPT TO in {count(found['n_ahead'])} of {count(found['n_checked'])} tests"
     if not found["n_crashes"]:

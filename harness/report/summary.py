@@ -28,7 +28,7 @@ from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_shards, stored_columns
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import CRASH, FAILED, OUTCOMES, FloatArray, IntArray
+from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray, IntArray
 
 ROWS_TOGETHER = 5_000
 """Of small shards: each batch costs a millisecond."""
@@ -232,6 +232,10 @@ def summarise(run: RunFolder) -> RunSummary:
     kept: list[dict[str, FloatArray]] = []
     for batch in run.episodes(*COLUMNS, "outcome", "failure"):
         outcome = _outcome_index(batch.column("outcome"), run)
+        if (
+            counted := run.campaign.crash.counts_above_mps
+        ) > 0.0:  # what is no harder is none here, as in the estimates
+            outcome[(outcome == CRASH) & (floats(batch.column("impact_speed_mps")) <= counted)] = TIMEOUT
         count += np.bincount(outcome, minlength=len(OUTCOMES))
         for item in batch.column("failure").drop_null().value_counts():
             # Causes may hold numbers and so be all different: memory stays bounded, the count per outcome is exact.

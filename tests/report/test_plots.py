@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.style
@@ -177,6 +178,16 @@ def test_values_on_an_edge_and_weighted_quantiles():
     values, weights = np.array([9.0, 1.0, 2.0]), np.array([8.0, 1.0, 1.0])
     assert weighted_quantiles(values, weights, (0.5, 0.15)) == [9.0, 2.0]
     assert math.isnan(weighted_quantiles(values, 0.0 * weights, (0.5,))[0])
+
+
+def test_crashes_that_do_not_count_are_none_on_the_page_either(runs):
+    run = runs["weighted"]
+    harder = replace(run, campaign=run.campaign.replaced(("crash", "counts_above_mps"), 5.0))
+    every, counted = summarise(run), summarise(harder)
+    impact, weight = (every.crashes[name] for name in ("impact_speed_mps", "weight"))
+    assert 0 < counted.n_crashes == (impact > 5.0).sum() < every.n_crashes
+    assert counted.n_episodes == every.n_episodes
+    assert counted.weight[CRASH] == pytest.approx(weight[impact > 5.0].sum())
 
 
 @pytest.mark.parametrize("name", ["shells", "shells_refuted"])
