@@ -117,6 +117,8 @@ SAMPLING: dict[Method, Sampling] = {
 
 RUN_FOLDER = "FOLDER"
 """Stands for the run's folder in sentences of ``estimates.json``, which may be moved; what shows them names it."""
+COMPARISON = "compare.json"
+"""By this file a folder is that of a comparison, and not of a run."""
 
 OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")
 CRASH, PASSED, TIMEOUT, BV_LV_CONTACT, FAILED = range(len(OUTCOMES))

@@ -36,7 +36,8 @@ from harness.sampling.protocol import ShardRequest
 def without_page() -> Iterator[None]:
     """It takes longer than small campaigns; test_api.py looks at it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.report.page.write_report", lambda folder, **_: folder / "report.html")
+        for write in ("page.write_report", "compare_page.write_comparison"):
+            patch.setattr(f"harness.report.{write}", lambda folder, **_: folder / "report.html")
         yield
 
 

@@ -265,7 +265,8 @@ def compare(
     stop.rhw of the larger rate, or --margin is decided.
 
     A may be a run folder: its tests are copied and not driven again. Finished parts of an earlier call with the same
-    --out are used again, too. The folder receives the run folders a and b, and compare.json.
+    --out are used again, too. The folder receives the run folders a and b, compare.json and
+    report.html.
 
     Exit code 5 says that B is worse than A by more than --margin; 4 that the budget was spent before it was known.
     """
@@ -298,7 +299,7 @@ def compare(
         print_json(found.content)
     else:
         remarks = [f"note: {remark}" for remark in found.content["warnings"]]
-        say(*found.content["statements"], *remarks, folder / "compare.json")
+        say(*found.content["statements"], *remarks, folder / "compare.json", found.report)
     ctx.exit(found.exit_code)
 
 

@@ -11,7 +11,7 @@ import click
 from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, verbose_option, written_file
 from harness.commands.printing import in_folder, print_answer, print_estimates, print_json, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
-from harness.vocabulary import ESTIMATORS
+from harness.vocabulary import COMPARISON, ESTIMATORS
 
 if TYPE_CHECKING:
     from harness.runner.stored import ReplayResult
@@ -75,13 +75,18 @@ def estimate(
         ctx.exit(EXIT_BAD_INPUT)
 
 
-@click.command(short_help="Write report.html of a run anew.", epilog=examples("harness report runs/smoke"))
+@click.command(
+    short_help="Write report.html of a run or comparison anew.", epilog=examples("harness report runs/smoke")
+)
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 def report(folder: Path) -> None:
-    """Write DIR/report.html and its plots anew, and print where the page is."""
-    from harness.report.page import write_report  # noqa: PLC0415 - keeps --help fast
+    """Write report.html of the run or of the comparison in DIR anew, and print where the page is."""
+    if (folder / COMPARISON).is_file():
+        from harness.report.compare_page import write_comparison as write  # noqa: PLC0415 - keeps --help fast
+    else:
+        from harness.report.page import write_report as write  # noqa: PLC0415 - keeps --help fast
 
-    say(write_report(folder))
+    say(write(folder))
 
 
 @click.command(

@@ -4,6 +4,7 @@
 (() => {
   const STEP = 0.1, LENGTH = 5, WIDTH = 1.9, LANE = 3.6, BRAKES = -0.5, NEAR = 1e-6;
   const COLOURS = { LV: "green", BV: "vermillion", AV: "blue", "r157-cc": "reference", "brakes-8": "muted" };
+  Object.assign(COLOURS, { A: "blue", B: "reference" });
   const SPEEDS = [0.1, 0.25, 0.5, 1], TICKS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200];
   const COLUMNS = ["", "speed", "acceleration", "gap to BV", "closing", "time to collision"];
   const STAR = "M0-15 3.5-5 12-10 6-1 15 3 5 5 6 14 0 7-6 14-5 5-15 3-6-1-12-10-3.5-5Z";
@@ -41,7 +42,8 @@
     const facts = add(root, "dl", { class: "told" });
 
     // -- what a scene holds --
-    const colour = (track) => `--own: var(--${COLOURS[track.name]})`;
+    const called = (track) => track.label ?? track.name;
+    const colour = (track) => `--own: var(--${COLOURS[called(track)]})`;
     const dashed = (track) => (others.includes(track) ? " dashed" : "");
     const last = (track) => (scene.first + track.x.length - 1) * STEP;
     const there = (track) => t <= last(track) + NEAR;
@@ -75,7 +77,7 @@
       for (const each of COLUMNS) add(head, "th", { scope: "col" }, each);
       cells = [tracks.AV, ...others, tracks.BV, tracks.LV].map((track) => {
         const row = add(body, "tr");
-        add(row, "th", { scope: "row", class: `key${dashed(track)}`, style: colour(track) }, track.name);
+        add(row, "th", { scope: "row", class: `key${dashed(track)}`, style: colour(track) }, called(track));
         return [track, COLUMNS.slice(1).map(() => add(row, "td"))];
       });
       t = Math.max(first, ((scene.cut_in ?? 0) - 5) * STEP);
@@ -108,7 +110,7 @@
         const group = add(view, "g", { class: `car${dashed(track)}`, style: colour(track) });
         add(group, "rect", { class: "body", x: -l, y: -w / 2, width: l, height: w, rx: w * 0.28 });
         add(group, "rect", { class: "glass", x: -0.3 * l, y: -0.4 * w, width: 0.08 * l, height: 0.8 * w, rx: 2 });
-        add(group, "text", { x: -0.6 * l, "font-size": clamp(0.62 * w, 8, 13) }, track.name);
+        add(group, "text", { x: -0.6 * l, "font-size": clamp(0.62 * w, 8, 13) }, called(track));
         const lights = add(group, "rect", { class: "lights", x: -l - 1, y: -0.42 * w, width: 4, height: 0.84 * w });
         return { track, ghost, group, lights, label: add(view, "text", { class: "label", style: colour(track) }) };
       });
@@ -183,7 +185,7 @@
         show(lights, !gone && now.a <= BRAKES);
         const ahead = rear > width - 8, far = Math.round(now.x - at(tracks.AV, t).x - LENGTH);
         show(label, seen && (ghost >= 0 || ahead));
-        const name = `${x < 8 ? "◂ " : ""}${track.name}${crashed ? " crashed" : ""}`;
+        const name = `${x < 8 ? "◂ " : ""}${called(track)}${crashed ? " crashed" : ""}`;
         label.textContent = ahead ? `${name} ${far} m ▸` : name;
         const height = ghost < 0 ? y + (track === tracks.LV ? -4 : 11) : low + 18 + 14 * ghost;
         const from = ahead ? width - 6 : clamp(rear, 4, width - 130);

@@ -122,7 +122,8 @@ class Scenes:
         [end], path = self._drive(environment, row, trace, motion)
         last = shown = av["x"].size - 1
         if av["crash"] is not None:
-            shown = max(_over(last, int(ended), driven, path) for ended, driven in zip(end, motion, strict=True))
+            ends = zip(end, motion, strict=True)
+            shown = max(_over(last, int(ended), driven[:, 1], path.v_after) for ended, driven in ends)
             bv["x"] = np.append(bv["x"], path.x_after[last + 1 : shown + 1])
             bv["v"] = np.append(bv["v"], path.v_after[last + 1 : shown + 1])
         ghosts = []
@@ -132,6 +133,25 @@ class Scenes:
             begun = {key: np.append(av[key][: onset + 1], own[k]) for k, key in enumerate("xv")}
             ghosts.append({"name": name, **begun, "crash": ended if ended == until else None})
         return ghosts
+
+
+def beside_other(scene: Scene, label: str, other: str, trace: pa.Table) -> Scene:
+    """The scene of a crash of the vehicle ``label``, and who met the same cut-in without a crash, by its trace.
+
+    The scene is one without ghosts. BV goes on after the crash as in the other's test.
+    """
+    first, (_, bv, av) = scene["first"], scene["tracks"]
+    ghost, goes_on = (_states(_of(trace, name)) for name in ("AV", "BV"))
+    crash = first + av["x"].size - 1
+    shown = _over(crash, -1, ghost["v"], goes_on["v"]) + 1
+    for key in "xv":
+        bv[key] = np.append(bv[key], goes_on[key][crash + 1 : shown])
+        ghost[key] = ghost[key][first:shown]
+    ghost |= {"name": other, "crash": None, "brakes": _brakes(ghost["v"], first)}
+    told = [(name.replace("AV", label), phrase) for name, phrase in _facts(scene, bv, av)]
+    moments = [(step, name.replace("AV", label)) for step, name in scene["moments"]]
+    av["label"], facts = label, [*told, (other, _ending(ghost, bv, scene))]
+    return {**scene, "ghosts": [ghost], "facts": facts, "moments": moments}
 
 
 def _states(rows: pa.Table) -> dict[str, Any]:
@@ -155,13 +175,13 @@ def _of(traces: pa.Table, vehicle: str) -> pa.Table:
     return traces.filter(pc.equal(traces.column("vehicle").cast(pa.string()), vehicle))
 
 
-def _over(crash: int, end: int, driven: FloatArray, path: Trajectory) -> int:
+def _over(crash: int, end: int, v: FloatArray, v_bv: FloatArray) -> int:
     """Last step that is shown of another driver after the AV's crash: it too has crashed, or no longer closes in."""
     until = end
     if end < 0:
-        safe = np.flatnonzero(driven[crash:, 1] <= path.v_after[crash:])
+        safe = np.flatnonzero(v[crash:] <= v_bv[crash:])
         until = crash + int(safe[0]) if safe.size else crash + AFTER
-    return int(min(max(until, crash), crash + AFTER, path.v_after.size - 1 - LEFT)) + LEFT
+    return int(min(max(until, crash), crash + AFTER, v_bv.size - 1 - LEFT)) + LEFT
 
 
 def _brakes(v: FloatArray, first: int) -> int | None:

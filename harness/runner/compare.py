@@ -30,6 +30,7 @@ from harness.runner.resume import require_own_folder
 from harness.runner.run import Run
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import PairRounds, Shells, round_requests
+from harness.vocabulary import COMPARISON
 
 SIDES = ("a", "b")
 MAY_DIFFER = frozenset({"av", "name", "description"})
@@ -43,14 +44,15 @@ Both = tuple[Resolved, Resolved]
 class Comparison:
     """Two finished campaigns, in run folders ``a`` and ``b``, and the difference.
 
-    ``content`` is that of ``compare.json``. The exit code is 4 when the budget was spent before the asked precision, or
-    with the margin open, and 5 when B is worse than A by more than the margin.
+    ``content`` is that of ``compare.json``, ``report`` the page. The exit code is 4 when the budget was spent before
+    the asked precision, or with the margin open, and 5 when B is worse than A by more than the margin.
     """
 
     folder: Path
     difference: PairedEstimate
     content: dict[str, Any]
     exit_code: int
+    report: Path
 
 
 def compare_campaigns(
@@ -104,10 +106,13 @@ def compare_campaigns(
         "statement": statements[0],
         "statements": statements,
     }
-    write_json(out / "compare.json", content)
+    write_json(out / COMPARISON, content)
     missed = a.stop.rhw is not None and not rule.look.stopped
     code = (EXIT_BUDGET_SPENT if missed else EXIT_DONE) if rule.margin is None else EXIT_OF[rule.margin.verdict]
-    return Comparison(out, found, content, code)
+    # Each run has loaded matplotlib by now, for its own page.
+    from harness.report.compare_page import write_comparison  # noqa: PLC0415
+
+    return Comparison(out, found, content, code, write_comparison(out))
 
 
 def _compared(

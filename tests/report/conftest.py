@@ -7,8 +7,12 @@ from typing import Any
 
 import pytest
 
+import harness
 from harness.report.page import write_report
 from harness.report.summary import RunFolder, read_run_folder
+from tests.golden.campaigns import SHELLS
+from tests.golden.record import load
+from tests.in_process import controllers_here, one_process, without_page
 from tests.report.page_text import write_run
 
 
@@ -39,6 +43,17 @@ def reports(folders: dict[str, Path]) -> dict[str, Path]:
 def runs(folders: dict[str, Path]) -> dict[str, RunFolder]:
     """The same folders, read."""
     return OnDemand(lambda name: read_run_folder(folders[name]))
+
+
+@pytest.fixture(scope="session")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A comparison without its page: of A, and of B, which brakes harder and later, there are crashes alone."""
+    shared = (*SHELLS, "world.engine=twin", "stop.rhw=0.4", "stop.episodes=240", "records.traces=crash")
+    late = "av={model: idm, parameters: {min_acceleration_mps2: -8}, reaction: {delay_s: 0.5}}"
+    out = tmp_path_factory.mktemp("compared") / "out"
+    with one_process(), controllers_here(), without_page():
+        harness.compare(load(*shared), load(*shared, late), out, workers=1)
+    return out
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import harness
+from harness.report.compare_page import write_comparison
 from harness.report.page import write_report
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of
@@ -175,6 +176,24 @@ def test_a_report_changes_between_crashes(opened, report):
     assert page.locator(".told dt").all_text_contents() == [name for name, _ in scenes[0]["facts"]]
     page.keyboard.press("End")
     assert page.locator(".go").is_visible()
+
+
+def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
+    file = write_comparison(copy_of(compared, tmp_path / "out"))
+    page, scene = opened(file, 400, "dark"), scenes_in(file.read_text())[0]
+    assert page.evaluate("document.documentElement.scrollWidth") <= 400
+    for step, hit in ((scene["cut_in"], False), (scene["tracks"][2]["crash"], True)):
+        page.fill(".bar input", str(step))
+        for name, track in (("B", scene["tracks"][2]), ("A", scene["ghosts"][0])):
+            assert cell(page, name, "speed") == f"{track['v'][step - scene['first']]:.1f} m/s"
+        assert page.locator(".star").is_visible() == hit
+    begin = seconds(page)
+    assert page.locator(".car.dashed").is_visible()
+    page.click(".go")
+    page.clock.run_for(1000)
+    assert seconds(page) > begin
+    page.locator(".pick button").last.click()
+    assert "Only A crashes" in page.inner_text(".player h3")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -1,0 +1,135 @@
+"""The page of a comparison: its numbers are those of compare.json, its pairs and motions those of the records."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pyarrow.compute as pc
+import pytest
+
+import harness
+from harness.cli import main
+from harness.errors import RunFolderError
+from harness.numbers import interval, number, ratio
+from harness.report.compare_page import WHO, Contrast, crashing_pairs, verdict, write_comparison
+from harness.report.summary import read_run_folder
+from tests.golden.campaigns import SHELLS
+from tests.golden.record import load
+from tests.in_process import controllers_here, one_process, without_page
+from tests.report.page_text import Page
+from tests.report.test_player import motion, scenes_in
+from tests.stored_runs import copy_of, edit, stored_table
+
+HOSTILE = "</script><script>alert('x')</script><!--"
+
+
+@pytest.fixture(scope="module")
+def page(compared):
+    write_comparison(compared)
+    return Page(compared)
+
+
+def content_of(folder):
+    return json.loads((folder / "compare.json").read_text())
+
+
+def test_the_numbers_are_those_of_the_comparison(compared, page):
+    found = content_of(compared)
+    for side in (found["a"], found["b"], {"crash_rate": found["difference"], **found}):
+        assert number(side["crash_rate"]) in page.words
+        assert interval(side["ci_low"], side["ci_high"]) in page.words
+    for side in ("a", "b"):
+        assert f"{found[side]['n_crashes']:,} in {found[side]['n_episodes']:,}" in page.words
+        assert number(found[f"only_{side}"]["value"]) in page.words
+        rows = {
+            row["key"]: row for row in json.loads((compared / side / "estimates.json").read_text())["answer"]["rows"]
+        }
+        assert f"{rows['ratio']['value']} {rows['ratio']['interval']}" in page.words
+    assert f"A/B = {ratio(found['ratio'])} ({ratio(found['ratio_low'])} to {ratio(found['ratio_high'])})" in page.words
+    assert "B idm min_acceleration_mps2 −8 reaction.delay_s 0.5" in page.words
+    assert all(" ".join(text.split()) in page.words for text in found["statements"])
+    assert len(page.ids) == len(set(page.ids))
+
+
+def test_the_map_holds_each_pair_with_a_crash(compared, page):
+    found, runs = content_of(compared), [read_run_folder(compared / side) for side in "ab"]
+    pairs = crashing_pairs(runs, found["shells"])
+    counts = {who: sum(shell[f"n_{who.lower().replace(' ', '_')}"] for shell in found["shells"]) for who in WHO}
+    assert pairs.counts == counts
+    assert min(counts.values()) > 0
+    for place, side in ((1, "only_a"), (2, "only_b")):
+        assert pairs.weight[pairs.who == place].sum() == pytest.approx(found[side]["value"])
+    for who, n in counts.items():
+        assert f"{who} on {n}" in page.words
+        assert f">{who} ({n})</text>" in page.html
+
+
+def test_a_scene_is_the_motion_of_both_tests(compared, page):
+    """The hardest crashes of B alone first; the other's test, which was not traced, is run again."""
+    scenes = scenes_in(page.html)
+    assert [scene["title"][:6] for scene in scenes] == ["Only B"] * 3 + ["Only A"] * (len(scenes) - 3)
+    impacts = [float(re.search(r"at ([\d.]+) m/s", scene["title"])[1]) for scene in scenes]
+    assert impacts[:3] == sorted(impacts[:3], reverse=True)
+    for scene in (scenes[0], scenes[-1]):
+        tests = dict(zip("AB", map(int, re.findall(r"test (\d+) of", scene["title"])), strict=True))
+        first, (_, bv, own), [ghost] = scene["first"], scene["tracks"], scene["ghosts"]
+        crashed = stored_table(compared / own["label"].lower(), "traces")
+        crashed = crashed.filter(pc.equal(crashed["episode"], tests[own["label"]]))
+        other = harness.replay(compared / ghost["name"].lower(), tests[ghost["name"]])
+        assert (other.outcome != "crash", {own["label"], ghost["name"]}) == (True, {"A", "B"})
+        for ours, column in (("x", "x_m"), ("v", "v_mps")):
+            assert own[ours] == motion(crashed, "AV", column)[first:]
+            for track, vehicle in ((ghost, "AV"), (bv, "BV")):
+                n = len(track[ours])
+                assert track[ours] == motion(other.trace, vehicle, column)[first : first + n]
+                assert n > len(own[ours])
+        told = dict(scene["facts"])
+        assert told[own["label"]].startswith("crashes")
+        assert told[ghost["name"]].startswith("avoids it")
+        assert "AV" not in " ".join((*told, *(name for _, name in scene["moments"])))
+
+
+def test_hostile_names_stay_text(compared, tmp_path):
+    folder = copy_of(compared, tmp_path / "out")
+    found = content_of(folder)
+    found["campaigns"]["a"]["label"] = found["shells"][0]["shell"] = found["statements"][0] = HOSTILE
+    edit(folder, "compare.json", **found)
+    html = write_comparison(folder).read_text()
+    assert html.count("<script") == 2
+    assert HOSTILE not in html
+    assert "alert" in html
+
+
+def test_without_a_pair_on_which_they_differ_the_page_says_so(tmp_path):
+    shared = (*SHELLS, "world.engine=twin", "stop.rhw=null", "stop.episodes=60", "records.traces=none")
+    with one_process(), controllers_here(), without_page():
+        harness.compare(load(*shared), load(*shared, "name=again"), tmp_path, workers=1)
+    assert main(["report", str(tmp_path)]) == 0
+    words = Page(tmp_path).words
+    assert "There is no cut-in on which only one of them crashed." in words
+    assert "Not told apart" in words
+    assert "<script" not in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("low", "n", "margin", "said"),
+    [
+        (1e-9, 3, None, "B crashes less often than A"),
+        (-3e-9, 3, None, "B crashes more often than A"),
+        (-1e-9, 3, None, "Not told apart"),
+        (1e-9, 0, None, "Not told apart"),
+        (1e-9, 3, "refuted", "B IS WORSE than A by more than 0.1 times A's rate"),
+    ],
+)
+def test_the_verdict(low, n, margin, said):
+    decision = margin and {"margin": 0.1, "verdict": margin, "confidence": 0.98, "given_the_library": False}
+    assert verdict(Contrast(ci_low=low, ci_high=low + 2e-9, n_differing=n), decision) == said
+
+
+def test_runs_of_another_comparison_are_refused(compared, tmp_path):
+    folder = copy_of(compared, tmp_path / "out")
+    (folder / "b").rename(folder / "was")
+    copy_of(folder / "a", folder / "b")
+    with pytest.raises(RunFolderError, match="a run of campaign"):
+        write_comparison(folder)
