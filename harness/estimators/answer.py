@@ -308,7 +308,8 @@ def _runs_or_tests(rule: Rule, campaign: Campaign, n_tests: int) -> str | None:
     if not isinstance(rule, RoundRule) or target is None or not 0.0 < pool < math.inf:
         return None
     more_runs = max(2.0 * (pool / target) ** 2, 1.0)
-    more_tests = rule.more_tests(target, more_runs)
+    if math.isinf(more_tests := rule.more_tests(target, more_runs)):
+        return None  # a stratum that cannot be tested: nothing will do
     found = f"{n_runs:,} baseline runs alone leave ±{share(pool)} of the rate, of ±{share(rule.look.rhw)} in all"
     runs, tests = two_digits_up(n_runs * more_runs), two_digits_up(n_tests * more_tests)
     if more_runs == 1.0:

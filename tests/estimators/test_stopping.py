@@ -211,20 +211,21 @@ def test_tests_that_are_missing_are_those_that_would_do():
 
 
 @pytest.mark.parametrize(
-    ("from_pool", "says"),
+    ("from_pool", "outside", "says"),
     [
-        (0.1, "alone leave ±10 % of the rate, of ±"),
-        (0.1, "tests are too few; raise stop.episodes to about"),
-        (0.4, "both are too few; some 1,800 (pool.shadow_paths) and"),
-        (math.inf, "stop.episodes was spent; raise it"),
+        (0.1, 400, "alone leave ±10 % of the rate, of ±"),
+        (0.1, 400, "tests are too few; raise stop.episodes to about"),
+        (0.4, 400, "both are too few; some 1,800 (pool.shadow_paths) and"),
+        (math.inf, 400, "stop.episodes was spent; raise it"),
+        (0.1, 0, "stop.episodes was spent; raise it"),
     ],
 )
-def test_what_is_missing_is_named(from_pool, says):
+def test_what_is_missing_is_named(from_pool, outside, says):
     av = {"controller": "examples.acting:Holds", "before_cut_in": "controller", "limits": {"max_acceleration_mps2": 2}}
     content = {"name": "x", "testing": {"method": "shells"}, "stop": {"rhw": 0.3, "episodes": 500}, "av": av}
     campaign = Campaign.model_validate(content)
     looking = RoundRule(campaign)
-    looking.observe(seen(np.array([40, 60, 400]), np.array([30, 10, 0])))
+    looking.observe(seen(np.array([40, 60, outside]), np.array([30, 10, 0])))
     looking.look = replace(looking.look, rhw_from_pool=from_pool)
     stopped_by, sentence = conclusion(campaign, looking, 500)
     assert stopped_by == "episodes"
