@@ -25,7 +25,7 @@ from harness.report.player import templates
 from harness.report.rate_plots import convergence_plot, severity_plot, shells_plot
 from harness.report.style import RC, Plot, inline_svg, svg
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
-from harness.report.test_plots import weight_plot, where_plot
+from harness.report.test_plots import where_plot
 from harness.traffic.laws import Environment
 from harness.vocabulary import OUTCOMES, RUN_FOLDER
 
@@ -78,8 +78,7 @@ def _plots(run: RunFolder, summary: RunSummary, traffic: Environment | None) -> 
     plots = [
         severity_plot(run.estimates),
         where_plot(summary, traffic),
-        # Within a shell all tests weigh the same: there is nothing to draw of weights.
-        weight_plot(summary) if run.shells is None else shells_plot(run.shells),
+        None if run.shells is None else shells_plot(run.shells),
         convergence_plot(run.estimates, run.target_rhw, of_statement=run.asked_statement),
     ]
     return [plot for plot in plots if plot is not None]

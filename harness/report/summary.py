@@ -34,7 +34,7 @@ ROWS_TOGETHER = 5_000
 """Of small shards: each batch costs a millisecond."""
 MOST_CAUSES = 1_000
 COLUMNS = (
-    "episode", "component", "log_weight", "n_control_steps", "impact_speed_mps", "crash_time_s", "cut_in_step",
+    "episode", "component", "log_weight", "impact_speed_mps", "crash_time_s", "cut_in_step",
     "cut_in_r2_m", "cut_in_r2dot_mps", "v_bv_mps",
 )  # fmt: skip
 

@@ -1,32 +1,27 @@
-"""What tests were like: which cut-ins crash, beside what others avoid, and how tests weigh."""
+"""Which cut-ins crash, beside what others avoid."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
-from matplotlib.ticker import MaxNLocator
 
 from harness.compiled import unboxed
 from harness.episode.path import empty_trajectory
-from harness.numbers import count, power_of_ten, share
+from harness.numbers import count, share
 from harness.pool.replay import StoredPaths, drive_others
 from harness.pool.walk import Script
 from harness.report.player import OTHERS
 from harness.report.style import (
     BLUE,
     FULL_WIDTH_IN,
-    GREY,
     GRID,
     INK,
     REDS,
-    VERMILLION,
     Plot,
     head,
-    log_axis,
     new_figure,
 )
 from harness.report.summary import RunSummary
@@ -34,86 +29,10 @@ from harness.traffic.laws import Environment
 from harness.vehicles.library import library_records
 from harness.vocabulary import CRASH, CUT_IN, FAILED, FloatArray, IntArray, states_from
 
-WEIGHT_BINS = 70
 SHARES = {0.0: GRID, 0.25: REDS[0], 0.5: REDS[1], 0.75: REDS[3], 1.0: REDS[5]}
 """Up to which share of cut-ins that crash a cell of the map has a colour."""
 KEEPS_SPEED = 20
 """Index of the maneuver 0 m/s²."""
-
-
-class Bins(NamedTuple):
-    """``edges`` (n+1) in the variable's unit, counts (n), and shares of the sum of weights (n) in per cent."""
-
-    edges: FloatArray
-    counts: FloatArray
-    shares: FloatArray
-
-
-def binned(values: FloatArray, weights: FloatArray, edges: FloatArray) -> Bins:
-    """Values (n,) that are finite in bins, those on an edge in the upper one."""
-    known = np.isfinite(values)
-    values, weights, lower = values[known], weights[known], edges - 1e-9 * (edges[1] - edges[0])
-    counts, sums = np.histogram(values, lower)[0].astype(np.float64), np.histogram(values, lower, weights=weights)[0]
-    return Bins(edges, counts, _percent(sums))
-
-
-def edges_for(values: FloatArray, width: float, most: int) -> FloatArray:
-    """Edges of about ``most`` bins that hold all values, multiples of the width times 1, 2 or 5 and powers of ten."""
-    ends = (values.min(), values.max()) if values.size else (0.0, 0.0)
-    # A value such as 0.3 on bins of 0.1 must not fall below its edge by rounding.
-    first, last = (math.floor(end / width + 1e-9) for end in ends)
-    return width * np.asarray(MaxNLocator(most, steps=[1, 2, 5, 10], integer=True).tick_values(first, last + 1))
-
-
-def _percent(values: FloatArray) -> FloatArray:
-    total = float(values.sum())
-    return 100.0 * values / total if total > 0.0 else values
-
-
-def weight_plot(summary: RunSummary) -> Plot | None:
-    """Draw counts of log10 weights (all tests, crashes) and share of the estimate; None when every weight is one."""
-    if summary.all_weights_one:
-        return None
-    rows, crashes = summary.rows, summary.crashes
-    valid = rows["outcome"] != FAILED
-    log10 = rows["log_weight"][valid] / math.log(10.0)
-    edges = edges_for(log10, 0.02, WEIGHT_BINS)
-    everything = binned(log10, rows["weight"][valid], edges)
-    crashed = binned(crashes["log_weight"] / math.log(10.0), crashes["weight"], edges)
-    figure = new_figure(FULL_WIDTH_IN, 4.2 if summary.n_crashes else 2.7)
-    upper, *lower = figure.subplots(2 if summary.n_crashes else 1, 1, sharex=True, squeeze=False)[:, 0]
-    # Crashes are drawn over all tests, of which they are a part.
-    for bins, colour, label in ((everything, GREY, "all tests"), (crashed, VERMILLION, "crashes")):
-        if bins.counts.any():
-            upper.stairs(bins.counts, bins.edges, baseline=0.5, fill=True, color=colour, label=label)
-    log_axis(upper.yaxis, 0.5, 2.0 * max(float(everything.counts.max()), 1.0))
-    upper.set_ylabel("tests per bin")
-    head(upper, "How often each weight occurs")
-    for axes in lower:
-        axes.stairs(crashed.shares, edges, fill=True, color=VERMILLION)
-        axes.set_ylim(0.0, 1.15 * max(float(crashed.shares.max()), 1e-9))
-        axes.set_ylabel("share, %")
-        axes.set_title("What each weight contributes to the estimate")
-    last = (upper, *lower)[-1]
-    last.xaxis.set_major_formatter(lambda value, _: power_of_ten(round(value)) if value == round(value) else "")
-    last.xaxis.set_major_locator(MaxNLocator(nbins=12, integer=True))
-    last.set_xlabel("likelihood ratio (weight) of a test")
-    alt = (
-        f"Histogram of weights from 10^{log10.min():.1f} to 10^{log10.max():.1f}, all tests and crashes, on a "
-        "logarithmic axis."
-    )
-    return Plot("weights", figure, alt, _weight_caption(crashed))
-
-
-def _weight_caption(crashed: Bins) -> str:
-    if not crashed.counts.any():
-        return "Weights of all tests. There was no crash, so none of them contributes to the estimate."
-    last = np.flatnonzero(crashed.counts)[-1]
-    return (
-        "Sound sampling has the two panels overlap: the weights that carry the estimate (below) are also the ones that "
-        f"crashes often have (above, orange). Here the rightmost bin with a crash holds {count(crashed.counts[last])} "
-        f"of {count(crashed.counts.sum())} crashes and {share(crashed.shares[last] / 100.0)} of the estimate."
-    )
 
 
 def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | None:

@@ -11,8 +11,6 @@ import matplotlib.style
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import harness.report
 from harness.estimators.severity import weighted_quantiles
@@ -23,7 +21,7 @@ from harness.report.player import UNKNOWN
 from harness.report.rate_plots import POOL, severity_plot, shells_plot
 from harness.report.style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg
 from harness.report.summary import read_run_folder, summarise
-from harness.report.test_plots import binned, edges_for, limits_of_others, where_plot
+from harness.report.test_plots import limits_of_others, where_plot
 from harness.vocabulary import CRASH, OUTCOMES
 from tests.report.test_page import edit
 
@@ -163,18 +161,7 @@ def test_gallery_prefers_traced_crashes_where_few_are_traced(run_folder, summary
     assert any(row.scene is None for row in rows)
 
 
-@given(st.lists(st.floats(-3.0, 13.0), min_size=1, max_size=40), st.integers(8, 80))
-def test_bins_hold_every_value_and_are_few(values, most):
-    values = np.array(values)
-    bins = binned(values, np.full(values.size, 0.5), edges_for(values, 0.1, most))
-    assert bins.counts.sum() == values.size
-    assert bins.shares.sum() == pytest.approx(100.0)
-    assert bins.counts.size <= most + 1
-
-
-def test_values_on_an_edge_and_weighted_quantiles():
-    tenths = 0.1 * np.arange(10)  # of which 0.3 is a little less than its edge
-    assert binned(tenths, tenths, 0.1 * np.arange(11)).counts.tolist() == [1.0] * 10
+def test_weighted_quantiles():
     values, weights = np.array([9.0, 1.0, 2.0]), np.array([8.0, 1.0, 1.0])
     assert weighted_quantiles(values, weights, (0.5, 0.15)) == [9.0, 2.0]
     assert math.isnan(weighted_quantiles(values, 0.0 * weights, (0.5,))[0])
