@@ -294,7 +294,7 @@ def compare(
         from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
 
         case = Case("difference", found.content["statement"], outcome_of(found.exit_code))
-        write_junit(junit, " and ".join(labels), [case], [folder / "compare.json"])
+        write_junit(junit, " and ".join(labels), [case], [found.report, folder / "compare.json"])
     if as_json:
         print_json(found.content)
     else:

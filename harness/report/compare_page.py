@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from inspect import getmembers, isfunction
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import matplotlib.style
 import numpy as np
@@ -18,22 +19,20 @@ from harness import numbers
 from harness.errors import HarnessError, RunFolderError, printable
 from harness.estimators.pairs import MarginDecision
 from harness.estimators.short_answer import vehicle_words
-from harness.numbers import count, number, tenths
+from harness.numbers import count, tenths
 from harness.pool.replay import LEAD, PATH_COLUMNS
 from harness.records.folder import read_as, write_bytes
 from harness.records.reader import read_traces, stored_columns
 from harness.report.page import sentence
+from harness.report.pairs_map import MEND, PURPLE, Pairs, crashing_pairs, map_plot
 from harness.report.player import TRACE_COLUMNS, Scene, Scenes, beside_other, templates
-from harness.report.style import BLUE, FULL_WIDTH_IN, GREY, PAPER, RC, Plot, head, inline_svg, new_figure, svg
-from harness.report.summary import RunFolder, floats, read_run_folder
+from harness.report.style import RC, inline_svg, svg
+from harness.report.summary import RunFolder, read_run_folder
 from harness.runner.stored import replay_episode
-from harness.vocabulary import COMPARISON, FloatArray, IntArray
+from harness.vocabulary import COMPARISON
 
-PURPLE = "#7a3aa8"
-"""Of B; on the page it is ``--reference``, in which the player draws B."""
-WHO = {"both": GREY, "only A": BLUE, "only B": PURPLE}
-SHOWN, LARGEST_PT2, CELL_M, CELL_MPS = 3, 250.0, 1.0, 0.5
-MEND = "Run `harness compare` again with the same --out."
+SHOWN = 2
+"""Crashes of each: a vehicle in foreign code is run again in a process of its own."""
 
 
 class Contrast(BaseModel, extra="allow"):
@@ -52,26 +51,6 @@ class Stored(Contrast):
     conditional: Contrast
     margin: dict[str, Any] | None
     shells: list[dict[str, Any]]
-
-
-class Pairs(NamedTuple):
-    """Pairs with a crash: who of `WHO`, what it adds to the rate, gap (m) and closing speed (m/s) at the cut-in, (n,).
-
-    The cut-in is that of the vehicle that crashes, A's where both do. ``episode`` and ``impact_mps`` are of A and B,
-    (2, n); a failed test, which counts as no crash, has no impact, and a negative episode.
-    """
-
-    who: IntArray
-    weight: FloatArray
-    gap_m: FloatArray
-    closing_mps: FloatArray
-    episode: IntArray
-    impact_mps: FloatArray
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Pairs by who crashes."""
-        return {name: int(np.count_nonzero(self.who == place)) for place, name in enumerate(WHO)}
 
 
 def write_comparison(folder: str | Path) -> Path:
@@ -113,55 +92,6 @@ def verdict(found: Contrast, margin: dict[str, Any] | None) -> str:
     return "B crashes more often than A" if found.n_differing and found.ci_high < 0.0 else "Not told apart"
 
 
-def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> Pairs:
-    """Pairs on which A or B crashes, by the records: the i-th test of a shell of A and of B."""
-    columns = ("episode", "component", "impact_speed_mps", "cut_in_r2_m", "cut_in_r2dot_mps")
-    n_pairs, found = [shell["n_pairs"] for shell in shells], []
-    for run in runs:
-        rows = pa.Table.from_batches(run.episodes(*columns, "outcome"))
-        component = rows["component"].to_numpy()
-        first = [np.flatnonzero(component == s)[:n] for s, n in enumerate(n_pairs)]
-        if [each.size for each in first] != n_pairs:
-            raise RunFolderError(str(run.path), "fewer tests than pairs", f"those of {COMPARISON}", MEND)
-        tests, outcome = rows.take(np.concatenate(first)), rows["outcome"].cast(pa.string())
-        outcome = outcome.take(np.concatenate(first)).to_numpy()
-        values = {name: floats(tests[name]) for name in columns}
-        episode = np.where(outcome == "failed", -1.0, values["episode"])
-        found.append({**values, "episode": episode, "crash": outcome == "crash"})
-    a, b = (each["crash"] for each in found)
-    weight = np.repeat([shell["p"] / max(n, 1) for shell, n in zip(shells, n_pairs, strict=True)], n_pairs)
-    kept = a | b
-    gap, rate = (np.where(a, found[0][name], found[1][name])[kept] for name in columns[-2:])
-    episode, impact = (np.stack([of[name][kept] for of in found]) for name in ("episode", "impact_speed_mps"))
-    who = np.where(a & b, 0, np.where(a, 1, 2))[kept]
-    return Pairs(who, weight[kept], gap, -rate, episode.astype(np.int64), impact)
-
-
-def map_plot(pairs: Pairs) -> Plot | None:
-    """Map of the cut-ins on which a vehicle crashes, over gap and closing speed; None without any."""
-    if not pairs.who.size:
-        return None
-    cells = np.stack((pairs.who, pairs.gap_m // CELL_M, pairs.closing_mps // CELL_MPS))
-    (who, *_), place = np.unique(cells, axis=1, return_inverse=True)
-    weight = np.bincount(place, pairs.weight)
-    gap, closing = (np.bincount(place, pairs.weight * x) / weight for x in (pairs.gap_m, pairs.closing_mps))
-    figure = new_figure(FULL_WIDTH_IN, 3.6)
-    axes = figure.subplots()
-    for kind, (name, colour) in enumerate(WHO.items()):
-        of = who == kind
-        area = LARGEST_PT2 * weight[of] / weight.max()
-        axes.scatter(gap[of], closing[of], area, colour, alpha=0.7, edgecolors=PAPER, linewidths=0.5)
-        axes.scatter([], [], 36.0, colour, label=f"{name} ({count(pairs.counts[name])})")
-    axes.set(xlim=(0.0, None), xlabel="gap at the cut-in, m", ylabel="closing speed, m/s")
-    head(axes, "Cut-ins that crash, by who crashes")
-    who_crashes = ", ".join(f"{name} on {count(n)}" for name, n in pairs.counts.items())
-    text = (
-        f"Cut-ins on which a vehicle crashes: {who_crashes}. The area of a disc is what cut-ins within {CELL_M:g} m "
-        f"and {CELL_MPS:g} m/s add to the rate, {number(float(weight.max()))} per test for the largest."
-    )
-    return Plot("pairs", figure, text, text)
-
-
 def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:
     """The hardest crashes of B alone, then of A alone, beside the other vehicle on the same cut-in."""
     for side, other in ((1, 0), (0, 1)):
@@ -170,22 +100,21 @@ def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:
         for place in places[np.argsort(-impact[places], kind="stable")][:SHOWN]:
             episodes = [int(each) for each in pairs.episode[:, place]]
             told = f"{tenths(float(impact[place]))} m/s"
-            try:
-                scene = Scenes(runs[side].campaign, None).scene(*motion_of(runs[side], episodes[side]))
-                _, trace = motion_of(runs[other], episodes[other])
-            except HarnessError:  # not on record, and it cannot be run again
+            row, trace = motion_of(runs[side], episodes[side])
+            if trace is None:
                 continue
-            scene = beside_other(scene, name, "AB"[other], trace)
+            scene = Scenes(runs[side].campaign, None).scene(row, trace)
+            scene = beside_other(scene, name, "AB"[other], motion_of(runs[other], episodes[other])[1])
             where = " and ".join(f"test {count(n)} of {of}" for n, of in zip(episodes, "AB", strict=True))
             yield {**scene, "episode": f"only {name}, {told}", "title": f"Only {name} crashes, at {told} ({where})"}
 
 
-def motion_of(run: RunFolder, episode: int) -> tuple[pa.Table, pa.Table]:
-    """Row and trace of an episode: what is stored, or of the test run again."""
+def motion_of(run: RunFolder, episode: int) -> tuple[pa.Table, pa.Table | None]:
+    """Row and trace of an episode: the stored one, or of the test run again; None where that cannot be done."""
     lateral = {LEAD} & stored_columns(run.path)
+    rows = pa.Table.from_batches(run.episodes(*PATH_COLUMNS, "outcome", *lateral))
     trace = read_traces(run.path, {episode}, [*TRACE_COLUMNS, *(["lateral_m"] if lateral else [])])
     if trace is None:
-        again = replay_episode(run.path, episode)
-        return pa.Table.from_pylist([again.row]), again.trace
-    rows = pa.Table.from_batches(run.episodes(*PATH_COLUMNS, "outcome", *lateral))
+        with suppress(HarnessError):  # of another version, a vehicle that is gone or does not do the same again
+            trace = replay_episode(run.path, episode).trace
     return rows.filter(pc.equal(rows["episode"], episode)), trace

@@ -135,23 +135,26 @@ class Scenes:
         return ghosts
 
 
-def beside_other(scene: Scene, label: str, other: str, trace: pa.Table) -> Scene:
-    """The scene of a crash of the vehicle ``label``, and who met the same cut-in without a crash, by its trace.
+def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None) -> Scene:
+    """The scene of a crash of the vehicle ``label``, and who met the same cut-in without a crash, if it was traced.
 
     The scene is one without ghosts. BV goes on after the crash as in the other's test.
     """
-    first, (_, bv, av) = scene["first"], scene["tracks"]
-    ghost, goes_on = (_states(_of(trace, name)) for name in ("AV", "BV"))
-    crash = first + av["x"].size - 1
-    shown = _over(crash, -1, ghost["v"], goes_on["v"]) + 1
-    for key in "xv":
-        bv[key] = np.append(bv[key], goes_on[key][crash + 1 : shown])
-        ghost[key] = ghost[key][first:shown]
-    ghost |= {"name": other, "crash": None, "brakes": _brakes(ghost["v"], first)}
-    told = [(name.replace("AV", label), phrase) for name, phrase in _facts(scene, bv, av)]
+    first, (_, bv, av), ghosts = scene["first"], scene["tracks"], list[Scene]()
+    told = {other: "does not crash; its motion is not on record, and it cannot be run again"}
+    if trace is not None:
+        ghost, goes_on = (_states(_of(trace, name)) for name in ("AV", "BV"))
+        crash = first + av["x"].size - 1
+        shown = _over(crash, -1, ghost["v"], goes_on["v"]) + 1
+        for key in "xv":
+            bv[key] = np.append(bv[key], goes_on[key][crash + 1 : shown])
+            ghost[key] = ghost[key][first:shown]
+        ghosts.append(ghost | {"name": other, "crash": None, "brakes": _brakes(ghost["v"], first)})
+        told[other] = _ending(ghosts[0], bv, scene)
+    facts = [(name.replace("AV", label), phrase) for name, phrase in _facts(scene, bv, av)]
     moments = [(step, name.replace("AV", label)) for step, name in scene["moments"]]
-    av["label"], facts = label, [*told, (other, _ending(ghost, bv, scene))]
-    return {**scene, "ghosts": [ghost], "facts": facts, "moments": moments}
+    av["label"] = label
+    return {**scene, "ghosts": ghosts, "facts": [*facts, *told.items()], "moments": moments}
 
 
 def _states(rows: pa.Table) -> dict[str, Any]:
