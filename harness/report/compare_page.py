@@ -17,9 +17,8 @@ from pydantic import BaseModel
 
 from harness import numbers
 from harness.errors import HarnessError, RunFolderError, printable
-from harness.estimators.pairs import MarginDecision
 from harness.estimators.short_answer import vehicle_words
-from harness.numbers import count, tenths
+from harness.numbers import count, share, tenths
 from harness.pool.replay import LEAD, PATH_COLUMNS
 from harness.records.folder import read_as, write_bytes
 from harness.records.reader import read_traces, stored_columns
@@ -86,7 +85,9 @@ def write_comparison(folder: str | Path) -> Path:
 def verdict(found: Contrast, margin: dict[str, Any] | None) -> str:
     """The answer in one line."""
     if margin is not None:
-        return MarginDecision(**margin).sentence.partition(" (")[0]
+        most = share(margin["margin"])
+        told = {"proven": f"B is at most {most} worse than A", "refuted": f"B is more than {most} worse than A"}
+        return told.get(margin["verdict"], f"Open whether B is more than {most} worse than A")
     if found.n_differing and found.ci_low > 0.0:
         return "B crashes less often than A"
     return "B crashes more often than A" if found.n_differing and found.ci_high < 0.0 else "Not told apart"
