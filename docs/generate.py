@@ -250,6 +250,7 @@ VALIDATED = (
     "shells_panel",
     "shells_adversaries",
     "shells_acting",
+    "shells_acting_room",
     "shells_pairs",
     "lateral",
     "chains_shells",
