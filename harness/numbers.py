@@ -48,7 +48,7 @@ def interval(low: float | None, high: float | None, point: float | None = None) 
     """``(1.17 to 1.29) × 10⁻⁷``, or ``1.23 (1.17 to 1.29) × 10⁻⁷``: in one power of ten, with the same decimals."""
     if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
         return f"{number(low)} to {number(high)}"
-    like = max(abs(low), abs(high)) if point is None else point
+    like = point or max(abs(low), abs(high))
     exponent = exponent_of(like)
     ends = " to ".join(number(end, exponent=exponent, like=like) for end in (low, high))
     if point is not None:
