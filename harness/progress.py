@@ -21,13 +21,20 @@ FORESEEN = 10.0
 
 
 class Progress:
-    """What the runner tells about its work; shown to nobody, as for the Python API. Nothing here changes a result."""
+    """What the runner tells about its work; shown to nobody, as for the Python API. Nothing here changes a result.
+
+    Who sets ``cancelled`` ends work in another thread the next time that it reports something.
+    """
+
+    cancelled = False
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
         """Begin a stage of ``total`` units (None: not known), ``done`` of which were finished by an earlier run."""
 
-    def advance(self, n: int) -> None:
-        """Report ``n`` more units as finished."""
+    def advance(self, n: int) -> None:  # noqa: ARG002 - for those who show it
+        """Report ``n`` more units as finished; a KeyboardInterrupt where nobody wants the rest."""
+        if self.cancelled:
+            raise KeyboardInterrupt
 
     def status(self, **figures: Figure) -> None:
         """Show figures beside the bar, keeping those not named; ``crashes`` and ``rhw`` also give the time left."""
@@ -105,6 +112,7 @@ class ShownProgress(Progress):
 
     def advance(self, n: int) -> None:
         """Move the bar on."""
+        super().advance(n)
         for task in self._bars.tasks:  # one, or none before the first stage
             self._bars.update(task.id, advance=n)
         self.status()

@@ -209,7 +209,8 @@ def _default_campaign(vehicle: str) -> dict[str, Any]:
     place, _, name = vehicle.rpartition(":")
     words = Path(vehicle).stem if vehicle.endswith(".fmu") else f"{Path(place).name.removesuffix('.py')}-{name}"
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", words).strip("-._")
-    return {"name": name, "av": named_vehicle(vehicle), "stop": {"rhw": 0.3}}
+    kept = {"traces": "crash"}  # for the page's player
+    return {"name": name, "av": named_vehicle(vehicle), "stop": {"rhw": 0.3}, "records": kept}
 
 
 def named_vehicle(text: str, option: str = "") -> dict[str, Any]:

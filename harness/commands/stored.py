@@ -155,7 +155,7 @@ def export(folder: Path, episode: int, *, form: str, out: Path | None) -> None:
         try:
             from harness.report.openscenario import write_openscenario as write  # noqa: PLC0415 - an extra
         except ModuleNotFoundError as error:
-            mend = "Install it: pip install 'harness[export]', in the checkout pip install '.[export]'."
+            mend = "Install it, in the harness's folder: pip install '.[export]'."
             raise HarnessError("--to xosc", f"no package {error.name}", "the extra 'export'", mend) from error
     else:
         from harness.report.player import write_csv as write  # noqa: PLC0415 - keeps --help fast

@@ -48,6 +48,8 @@ TRACE_COLUMNS = ("episode", "step", "vehicle", "lane", *MOTION)
 LANE_M = 3.6
 BRAKES_MPS2 = 0.5
 """Who slows down by less only coasts."""
+UNDECIDED_S = 4.0
+"""Who ends with a shorter time to collision has not avoided one yet."""
 BEFORE, AFTER, LEFT, FEWEST = 20, 40, 5, 40
 """Steps shown before the onset, at most after a crash, and when all is over; and at least up to the crash."""
 
@@ -218,7 +220,10 @@ def _ending(track: Scene, bv: Scene, scene: Scene) -> str:
     first, cut, crash = scene["first"], scene["cut_in"], track["crash"]
     if crash is None:
         places = range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
-        return f"avoids it, {tenths(min(_gap(track, bv, place) for place in places))} m at the closest"
+        closest, end = min(_gap(track, bv, place) for place in places), places[-1]
+        if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:
+            return f"no crash until the test ends, {tenths(closest)} m behind BV and still {tenths(rate)} m/s faster"
+        return f"avoids it, {tenths(closest)} m at the closest"
     v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
     from_the_side = scene["onset"] < cut and crash == cut + 1
     who = "BV strikes it from the side" if from_the_side else "strikes BV from behind"

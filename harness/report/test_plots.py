@@ -57,7 +57,10 @@ def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | N
     for low, (high, colour) in zip((-0.5, *SHARES), SHARES.items(), strict=False):
         if (here := (shares > low) & (shares <= high)).any():
             rows_here, columns_here = np.nonzero(here)
-            area, label = _cells_path(rows_here, columns_here, *edges[::-1]), f"≤ {share(high)}" if high else "none"
+            area, label = (
+                _cells_path(rows_here, columns_here, *edges[::-1]),
+                f"≤ {share(high)}" if high else "tested, none",
+            )
             axes.add_patch(PathPatch(area, facecolor=colour, edgecolor="none", label=label))
     known = environment is not None and not environment.lateral.present
     lines = limits_of_others(environment, summary, fast) if environment is not None and known else {}
@@ -65,7 +68,10 @@ def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | N
         axes.plot(gaps, speeds, color=colour, linestyle=style, label=f"{name}’s limit")
     axes.set(xlim=(0.0, far), ylim=(0.0, fast), xlabel="gap at the cut-in, m", ylabel="closing speed, m/s")
     head(axes, "Share of cut-ins that crash")
-    text = f"Each of {count(cut_in.sum())} cut-ins by its gap and closing speed; {count(crash.sum())} of them crashed."
+    text = (
+        f"Each of {count(cut_in.sum())} cut-ins by its gap and closing speed; {count(crash.sum())} of them crashed. "
+        "White: not tested."
+    )
     if lines:
         text += (
             " Left of its line the competent driver (r157-cc), or the best of brakes (8 m/s² at once), crashes in the "

@@ -278,6 +278,6 @@ def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) ->
             "run.executor",
             "ray, but no package ray",
             "the extra for clusters",
-            "Install it here and on all machines of the cluster: pip install 'harness[ray]'.",
+            "Install it here and on all machines of the cluster: pip install '.[ray]' in the harness's folder.",
         ) from error
     return RayWorkers(resolved, n_workers, n_runs=n_runs)

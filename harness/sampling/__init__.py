@@ -54,18 +54,22 @@ def source_of(campaign: Campaign) -> type[Source]:
 
 def prepare(resolved: Resolved, progress: Progress | None = None) -> Source:
     """Build (or read) what a campaign's tests are drawn from, while kernels are compiled if they have to be."""
-    progress, is_warm = progress or Progress(), is_cached(judge)
-    if not is_warm:
-        progress.stage("compiling, once per version", None)
+    progress, build = progress or Progress(), source_of(resolved.campaign)
+    if is_cached(judge):
+        return build(resolved, progress)
+    progress.stage("compiling, once per version", None)
     with ThreadPoolExecutor(1) as thread:
-        building = thread.submit(source_of(resolved.campaign), resolved, progress)
-        if not is_warm:
+        building = thread.submit(build, resolved, progress)
+        try:
             gc.disable()  # a compiler makes many small objects, and next to no garbage
             try:
                 compile_kernels(resolved)
             finally:
                 gc.enable()
-        return building.result()
+            return building.result()
+        except BaseException:
+            progress.cancelled = True  # or leaving would wait until all is built
+            raise
 
 
 def compile_kernels(resolved: Resolved) -> None:

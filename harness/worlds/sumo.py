@@ -133,7 +133,9 @@ def sumo_program(name: str, where: str) -> Path:
 
         if (path := Path(str(sumo.SUMO_HOME)) / "bin" / name).exists():
             return path
-    raise CampaignError(where, f"no {name}", "the extra 'sumo'", "Install it: pip install 'harness[sumo]'.")
+    raise CampaignError(
+        where, f"no {name}", "the extra 'sumo'", "Install it, in the harness's folder: pip install '.[sumo]'."
+    )
 
 
 SPEED_CHECK_STEPS = 10

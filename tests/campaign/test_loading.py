@@ -266,7 +266,9 @@ NAMED = {
 def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, own):
     campaign = load_campaign(vehicle, ["seed=2"])
     av = json.loads(json.dumps(av).replace("{}", str(own)))
-    assert campaign == Campaign(name=name, av=av, seed=2, testing={"method": "shells"}, stop={"rhw": 0.3})
+    own_player = {"traces": "crash"}
+    stop, testing = {"rhw": 0.3}, {"method": "shells"}
+    assert campaign == Campaign(name=name, av=av, seed=2, testing=testing, stop=stop, records=own_player)
     assert load_campaign("mine.yaml", av=vehicle).av == campaign.av
 
 

@@ -13,7 +13,7 @@ import pytest
 import harness
 from harness.campaign.files import load_campaign
 from harness.cli import main
-from harness.report import crashes
+from harness.report import crashes, player
 from harness.report.page import write_report
 from harness.report.player import OTHERS, UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
@@ -198,3 +198,13 @@ def test_a_crash_that_was_not_traced_is_listed_without_a_scene(reports):
     page = (reports["failed"] / "report.html").read_text(encoding="utf-8")
     assert "<script" not in page
     assert "nothing to watch" in page
+
+
+@pytest.mark.parametrize(
+    ("speed", "said"), [(21.0, "no crash until the test ends, 1.5 m behind BV and still 1.0 m/s"), (20.0, "avoids it")]
+)
+def test_a_test_that_ends_while_the_vehicle_closes_in_has_avoided_nothing(speed, said):
+    time_s = np.arange(6) / 10
+    bv = {"x": 7.0 + 20.0 * time_s, "v": np.full(6, 20.0)}
+    av = {"x": speed * time_s, "v": np.full(6, speed), "crash": None}
+    assert player._ending(av, bv, {"first": 0, "cut_in": 0, "onset": 0}).startswith(said)

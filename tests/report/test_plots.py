@@ -77,8 +77,8 @@ def test_the_map_has_a_colour_for_every_cut_in(runs):
     assert axes.patches
     assert not axes.lines
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels[0] == "none"
-    assert set(labels) <= {"none", "≤ 25 %", "≤ 50 %", "≤ 75 %", "≤ 100 %"}
+    assert labels[0] == "tested, none"
+    assert set(labels) <= {"tested, none", "≤ 25 %", "≤ 50 %", "≤ 75 %", "≤ 100 %"}
 
 
 def test_the_plot_shows_contributions_and_half_widths(runs):

@@ -5,12 +5,15 @@ from __future__ import annotations
 import errno
 import os
 import pickle
+import time
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
 
+from harness import sampling
 from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
@@ -165,3 +168,21 @@ def test_memory_of_a_worker_stays_within_ten_percent(record_property):
     record_property("resident_mb", after_warm_up[:: WARM_UP // SHARD])
     print(f"resident MB every {WARM_UP} episodes:", *(f"{mb:.1f}" for mb in after_warm_up[:: WARM_UP // SHARD]))  # noqa: T201
     assert max(after_warm_up) <= 1.1 * after_warm_up[0]
+
+
+def test_an_interrupted_first_run_does_not_build_its_pool_to_the_end(monkeypatch):
+    def build(_resolved, progress):
+        for _ in range(6_000):
+            progress.advance(1)
+            time.sleep(0.01)
+
+    def interrupted(_resolved):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sampling, "source_of", lambda _campaign: build)
+    monkeypatch.setattr(sampling, "is_cached", lambda _kernel: False)
+    monkeypatch.setattr(sampling, "compile_kernels", interrupted)
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        sampling.prepare(SimpleNamespace(campaign=None))
+    assert time.monotonic() - began < 30.0
