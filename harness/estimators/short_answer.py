@@ -115,6 +115,8 @@ def _rows(
     if not best.n_crashes:
         shown, ends, value = best.upper_bound, "no crash seen", f"< {number(best.upper_bound)} per test"
     per_km = "" if not distance_km else f"{number(shown * 1e6 / distance_km)} per million km"
+    if best.n_crashes and any(each["p"] > 0.0 and not each["n_episodes"] for each in best.details.get("shells", ())):
+        value, per_km = f"≥ {value}", "counts none where not tested"
     yield Row("rate", counted, value, ends, per_km)
     for each in best.details.get("references", ())[:1]:
         if each["crash_rate"] > 0.0:

@@ -117,3 +117,13 @@ def test_vehicles_are_named_with_what_is_not_a_default():
     ):
         campaign = load_campaign(BASE, ["testing.method=forced", av], check_files=False)
         assert vehicle_words(campaign.av) == (name, parameters)
+
+
+@pytest.mark.parametrize(("name", "untested"), [("shells-need-based", True), ("shells-twin", False)])
+def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, untested, stored_run):
+    content = estimates(stored_run(name))
+    (rate,) = [row for row in content["answer"]["rows"] if row["key"] == "rate"]
+    shells = content["estimates"]["shells"]["details"]["shells"]
+    assert any(not each["n_episodes"] for each in shells) == untested
+    assert rate["value"].startswith("≥ ") == untested
+    assert (rate["remark"] == "counts none where not tested") == untested

@@ -65,7 +65,7 @@ def test_shards_are_read_in_groups_without_changing_a_bit(most, sizes, twin_run,
     assert ([len(block) for block in one_by_one], [len(block) for block in grouped]) == ([80] * 5, sizes)
     whole, again = joined(one_by_one), joined(grouped)
     assert whole.columns.keys() == again.columns.keys()
-    assert all(np.array_equal(column, again.columns[name]) for name, column in whole.columns.items())
+    assert all(column.tobytes() == again.columns[name].tobytes() for name, column in whole.columns.items())
     np.testing.assert_array_equal(whole.outcome, again.outcome)
     np.testing.assert_array_equal(whole.log_weight, again.log_weight)
 
