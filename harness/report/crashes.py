@@ -99,12 +99,13 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
     """Places of crashes by what they are shown for; who ``avoided`` (n, D) them, and if ``someone`` (n,) may have."""
     crashes, among = summary.crashes, someone if someone.any() else ~someone
     episode, impact, weight = (crashes[name] for name in ("episode", "impact_speed_mps", "weight"))
-    keys = {"impact": impact, "typical": -np.abs(impact - weighted_quantiles(impact, weight, (0.5,))[0])}
+    hardest = "hardest avoidable" if someone.any() else "hardest"
+    keys = {hardest: impact, "typical": -np.abs(impact - weighted_quantiles(impact, weight, (0.5,))[0])}
     if summary.from_shells:
         keys["outermost"] = crashes["component"]
     elif not summary.all_weights_one:
         keys["weight"] = weight
-    first = {"avoidable": worst_crashes(impact, episode, avoided[:, 0])}
+    first = {"avoided by r157-cc": worst_crashes(impact, episode, avoided[:, 0])}
     return first | {name: worst_crashes(key, episode, among) for name, key in keys.items()}
 
 

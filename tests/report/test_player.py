@@ -115,9 +115,12 @@ NOBODY, BRAKES, BOTH = (30, 30), (30, -1), (-1, -1)
 @pytest.mark.parametrize(
     ("who", "leads"),
     [
-        ({1: BOTH, 3: BRAKES, 4: BOTH}, ["avoidable no. 1", "avoidable no. 2", "impact no. 2"]),
-        ({5: BRAKES}, ["impact no. 1, typical no. 1, weight no. 1"]),
-        ({}, ["impact no. 1", "impact no. 2", "impact no. 3"]),
+        (
+            {1: BOTH, 3: BRAKES, 4: BOTH},
+            ["avoided by r157-cc no. 1", "avoided by r157-cc no. 2", "hardest avoidable no. 2"],
+        ),
+        ({5: BRAKES}, ["hardest avoidable no. 1, typical no. 1, weight no. 1"]),
+        ({}, ["hardest no. 1", "hardest no. 2", "hardest no. 3"]),
     ],
 )
 def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_not(who, leads, runs, monkeypatch):
@@ -139,7 +142,7 @@ def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_n
     avoided = {allowed[i]: words[end] for i, end in enumerate(who.values())}
     assert [row.avoided_by for row in rows] == [avoided.get(episode, "nobody") for episode in shown]
     assert [scene["episode"] for scene in scenes] == shown
-    hardest = [row.crash.impact_speed_mps for row in rows if row.reason.startswith("avoidable")]
+    hardest = [row.crash.impact_speed_mps for row in rows if row.reason.startswith("avoided")]
     assert hardest == sorted(hardest, reverse=True)
 
 
