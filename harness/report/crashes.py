@@ -99,7 +99,8 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
     """Places of crashes by what they are shown for; who ``avoided`` (n, D) them, and if ``someone`` (n,) may have."""
     crashes, among = summary.crashes, someone if someone.any() else ~someone
     episode, impact, weight = (crashes[name] for name in ("episode", "impact_speed_mps", "weight"))
-    hardest = "hardest avoidable" if someone.any() else "hardest"
+    known = someone.any() and (avoided.any(1) == someone).all()
+    hardest = "hardest avoidable" if known else "hardest"
     keys = {hardest: impact, "typical": -np.abs(impact - weighted_quantiles(impact, weight, (0.5,))[0])}
     if summary.from_shells:
         keys["outermost"] = crashes["component"]
