@@ -51,7 +51,7 @@ def command(method: str, out: Path, episodes: int) -> list[str]:
 COMMANDS = {
     "compare": "compare {scenario} --out {work} --against-av late-600ms --workers 2 --quiet --set world.engine=twin "
     "--set stop.rhw=0.3",
-    "pool": "pool {scenario} --set pool.relative_error=0.05 --out {work}/pool.parquet",
+    "pool": "pool {scenario} --set pool.relative_error=0.05",
     "estimate": "estimate {work} --write",
     "report": "report {work}",
 }
@@ -218,6 +218,8 @@ def struck_command(name: str, folder: Path, run: Path, chance: random.Random, ki
                 raise RuntimeError(f"{name} ended with {process.returncode}: {complaints.decode()}")
             if not left and process.returncode in DONE:
                 break
+        if cache:
+            shutil.copytree(folder / side / "cache" / "pools", work / "pools")
         wrong += [str(path) for path in temporary.iterdir()]
     of_time = ("manifest.json", "report.html") if name == "compare" else ()
     return wrong + differing_files(folder / "undisturbed" / "work", folder / "killed" / "work", of_time)
