@@ -12,11 +12,11 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    ModelWrapValidatorHandler,
     ValidationError,
     field_validator,
     model_validator,
 )
-from pydantic.functional_validators import ModelWrapValidatorHandler  # since 2.11 of pydantic itself, too
 
 from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, in_words
 from harness.strata import ASSUMPTION_FREE
