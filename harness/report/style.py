@@ -1,4 +1,4 @@
-"""One look for all plots, axes that show small rates, and three forms: PNG, SVG file, and SVG inside the page.
+"""One look for all plots, axes that show small rates, and its forms: an SVG file, SVG inside the page, PNG for studies.
 
 Inside the page the palette's colours become CSS variables, so that plots follow the page's light or dark scheme, and
 text stays text in the page's own typeface. Everything that would make two runs differ (dates, random ids) is fixed.
@@ -155,11 +155,6 @@ def head(axes: Axes, title: str) -> None:
             loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, borderpad=0.3, ncols=len(handles),
             fontsize=8, labelcolor=MUTED, columnspacing=1.1, handlelength=1.5,
         )  # fmt: skip
-
-
-def only_horizontal_grid(axes: Axes) -> None:
-    """For bars and lines over a categorical or wide axis: vertical lines would add nothing."""
-    axes.grid(visible=False, axis="x")
 
 
 def log_axis(axis: XAxis | YAxis, low: float, high: float) -> None:

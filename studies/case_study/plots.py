@@ -25,7 +25,6 @@ from harness.report.style import (
     head,
     new_figure,
     note,
-    only_horizontal_grid,
     scaled,
     tick_label,
     two_panels,
@@ -152,7 +151,7 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
             decades(axes.yaxis, *axes.get_ylim())
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         head(axes, title)
-        only_horizontal_grid(axes)
+        axes.grid(visible=False, axis="x")
     caption = (
         "Left: tests, control variates and rank of the columns. Right: spread of Y (NADE) and of Z = Y − Hβ (SCV)."
     )
