@@ -8,7 +8,6 @@ from harness.errors import RunFolderError
 from harness.estimators.block import block_from_tables
 from harness.importance.functions import mixture_weights
 from harness.vocabulary import OUTCOMES
-from tests.estimators.small_blocks import block
 from tests.stored_runs import golden, stored_table
 
 NAME = "step-recursive-twin"
@@ -87,15 +86,3 @@ def test_a_failed_episode_may_lack_its_weight_and_its_moments(tables):
 def test_damaged_tables_name_the_place(damage, text, tables):
     with pytest.raises(RunFolderError, match=text):
         read(*damage(*tables))
-
-
-def test_weighted_crashes_and_ratios():
-    some = block([True, False], [-1.0, -2.0], log_q=np.array([[1.0, -np.inf], [2.0, 0.0]]))
-    np.testing.assert_allclose(some.weighted_crashes(), [np.exp(-1.0), 0.0])
-    np.testing.assert_allclose(some.mixture_ratios(), [[1.0, 0.0], [1.0, np.exp(-2.0)]])
-
-
-def test_take_keeps_indices_right():
-    some = block([True, False, True], first_episode=40, first_ratios=np.ones((3, 9, 2)))
-    part = some.take(slice(1, 3))
-    assert (part.first_episode, part.crash.tolist(), part.first_ratios.shape) == (41, [False, True], (2, 9, 2))

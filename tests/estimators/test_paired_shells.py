@@ -58,13 +58,6 @@ def test_rates_are_those_of_each_and_intervals_hold_what_was_seen():
     assert free["ci_high"] - inside["ci_high"] < 3e-5 * 2.6 / 4000
 
 
-def test_vehicles_changed_over_change_signs():
-    swapped = PairCounts(DESIGN, PAIRS.ends.transpose(0, 2, 1), PAIRS.mass.transpose(0, 2, 1, 3))
-    there, back = PAIRS.difference(LEVEL), swapped.difference(LEVEL)
-    assert (-back.ci_high, -back.ci_low) == pytest.approx((there.ci_low, there.ci_high))
-    assert swapped.alone(1, LEVEL) == pytest.approx(PAIRS.alone(0, LEVEL))
-
-
 def test_failed_tests_widen_both_ways():
     """A fails 3 times where B does not crash, B twice where A does."""
     failed = pairs_of((30, 8, 2, 5), (0, 5, 0, 45), (0, 0, 0, 4000))

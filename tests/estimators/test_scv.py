@@ -12,7 +12,6 @@ from harness.estimators.scv import (
     MixtureCv,
     Scv,
     Stratum,
-    fold_rows,
     n_columns,
     steps_used,
 )
@@ -110,12 +109,6 @@ def test_columns_that_never_vary_explain_nothing():
 def test_columns_stay_within_729(level, surrogates, steps, columns):
     assert steps_used(level, surrogates) == steps
     assert n_columns(level, surrogates) == columns
-
-
-@pytest.mark.parametrize(("k", "order"), [(3, "C"), (4, "F")])
-def test_arrays_that_would_be_misread_are_refused(k, order):
-    with pytest.raises(ValueError, match="Fortran"):
-        fold_rows(np.zeros((k, k), order="F"), np.ones((4, 3), order=order))
 
 
 def test_mixture_cv_is_the_intercept_of_least_squares():

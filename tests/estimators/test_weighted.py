@@ -122,13 +122,6 @@ def test_clopper_pearson_is_scipys_exact_interval(n_crashes, n, confidence):
     assert high == pytest.approx(reference.high, rel=1e-9)
 
 
-@given(st.integers(1, 10**9), levels, st.floats(1e-12, 1.0))
-def test_without_a_crash_the_capped_bound_is_clopper_pearson_times_the_cap(n, confidence, cap):
-    upper = clopper_pearson(0, n, 1.0 - confidence)[1]
-    assert capped_mean_upper(0.0, cap, n, confidence) == pytest.approx(cap * upper, rel=1e-12)
-    assert upper == pytest.approx(1.0 - (1.0 - confidence) ** (1.0 / n), abs=1e-15)
-
-
 @given(st.floats(1e-12, 1.0), st.floats(0.0, 1.0), st.integers(1, 10**9), levels)
 def test_the_capped_bound_solves_hoeffdings_equation(cap, share, n, confidence):
     upper = capped_mean_upper(share * cap, cap, n, confidence)
