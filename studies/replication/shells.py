@@ -51,6 +51,8 @@ _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
 """How A and B end: both crash, only A, only B."""
 _STATEMENT = ("testing", "shells", "statement")
 BOUND, PAIRS_ALONE = "shells, upper bound", "shells, variance by pairs alone"
+result_of, bound_outside = f"{FREE}, {{}}".format, f"{FREE}, upper bound beyond {{}}".format
+"""Names of a statement's rows, and of the bound on the crash rate beyond its boundary."""
 
 
 def limit_at(factor: float, budget: int) -> dict[str, str]:
@@ -60,16 +62,6 @@ def limit_at(factor: float, budget: int) -> dict[str, str]:
     """
     wrong = ["accepted"] * (factor <= 1.0) + ["rejected"] * (factor >= 1.0)
     return {f"limit {factor:g} x rate, {verdict} within {budget:,} tests": verdict for verdict in wrong}
-
-
-def bound_outside(statement: str) -> str:
-    """Name of the bound on the crash rate beyond a statement's boundary."""
-    return f"{FREE}, upper bound beyond {statement}"
-
-
-def result_of(statement: str) -> str:
-    """Name of a statement's rows among results."""
-    return f"{FREE}, {statement}"
 
 
 class CrashingCutIns(NamedTuple):
@@ -219,8 +211,25 @@ def former_bound(p: FloatArray, tally: Tally, confidence: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class ShellCampaign:
-    """A shells campaign to replicate, each time on a new pool; its stop rule, statement and first tests are used.
+class _Drawn:
+    """What is replicated, each time on a new pool; ``campaign`` is that of the vehicle, or of either of two."""
+
+    campaign: Campaign
+    draw: Draw
+    seed: int
+
+    def run(self, replications: range) -> list[Row]:
+        """Rows of all results for each replication."""
+        streams = ((each, np.random.default_rng([self.seed, each])) for each in replications)
+        return [row for each, rng in streams for row in self._replicate(each, self.draw(rng), rng)]
+
+    def _replicate(self, replication: int, drawn: Sequence[DrawnPool], rng: np.random.Generator) -> Iterator[Row]:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class ShellCampaign(_Drawn):
+    """A shells campaign to replicate; its stop rule, statement and first tests are used.
 
     Judged are all statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
     crash rate, all of these are decided instead, as by ``accept``, and judged within each of the ``budgets``; what is
@@ -228,21 +237,12 @@ class ShellCampaign:
     made by pairs of tests alone, see `OnRuns`.
     """
 
-    campaign: Campaign
-    draw: Draw
-    seed: int
     limits: Mapping[float, float] = field(default_factory=dict)
     budgets: Sequence[int] = ()
     siblings: bool = False
 
-    def run(self, replications: range) -> list[Row]:
-        """Rows of all results for each replication."""
-        found = list[Row]()
-        for replication in replications:
-            rng = np.random.default_rng([self.seed, replication])
-            (drawn,) = self.draw(rng)
-            found += (self._decide if self.limits else self._replicate)(replication, drawn, rng)
-        return found
+    def _replicate(self, replication: int, drawn: Sequence[DrawnPool], rng: np.random.Generator) -> Iterator[Row]:
+        return (self._decide if self.limits else self._estimate)(replication, drawn[0], rng)
 
     def _decide(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
         rules: dict[tuple[float, str], RoundRule] = {}
@@ -278,7 +278,7 @@ class ShellCampaign:
         decided = verdict != "undecided"
         return Row(verdict, replication, n, n_crashes, rate, seen.std_error(), 0.0, math.inf, decided)
 
-    def _replicate(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
+    def _estimate(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
         design = drawn.design
         names = [each.name for each in design.statements]
         rules = {name: RoundRule(self.campaign.replaced(_STATEMENT, name)) for name in names}
@@ -334,21 +334,10 @@ def _reference_rows(estimate: Estimate, reference: str, replication: int, *, rea
         yield Row(name, replication, *counts, value, error, low, high, reached, refused=found is None)
 
 
-@dataclass(frozen=True, eq=False)
-class PairedCampaign:
-    """A comparison of two vehicles to replicate, by both statements; ``campaign`` is that of either vehicle."""
+class PairedCampaign(_Drawn):
+    """A comparison of two vehicles to replicate, by both statements."""
 
-    campaign: Campaign
-    draw: Draw
-    seed: int
-
-    def run(self, replications: range) -> list[Row]:
-        """Rows of both results for each replication."""
-        return [row for replication in replications for row in self._replicate(replication)]
-
-    def _replicate(self, replication: int) -> Iterator[Row]:
-        rng = np.random.default_rng([self.seed, replication])
-        drawn = self.draw(rng)
+    def _replicate(self, replication: int, drawn: Sequence[DrawnPool], rng: np.random.Generator) -> Iterator[Row]:
         planner = PairRounds(self.campaign, drawn[0].design, drawn[0].available(self.campaign), None)
         pairs, early = no_pairs(drawn[0].design), None
         inside, enough = PairRule(self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT), None), False
@@ -543,11 +532,11 @@ def leave_out(library: Library, names: set[str], conservative_first: tuple[str, 
     names = names - {library.envelope}
     if library.boundary in names:
         place = conservative_first.index(library.boundary)
-        candidates = [*reversed(conservative_first[:place]), *conservative_first[place + 1 :]]
-        left = [name for name in candidates if name not in names and name != library.envelope]
-        if not left:
+        nearest = [*reversed(conservative_first[:place]), *conservative_first[place + 1 :]]
+        boundary = next((name for name in nearest if name not in {*names, library.envelope}), None)
+        if boundary is None:
             found = f"no surrogate but the envelope, without the vehicle's equals ({', '.join(sorted(names))})"
             mend = "Add a surrogate to the library, or leave this vehicle out of the experiment."
             raise CampaignError("campaign.pool.library", found, "one that can be the boundary", mend)
-        library = library.model_copy(update={"boundary": left[0]})
+        library = library.model_copy(update={"boundary": boundary})
     return library.without(names)
