@@ -28,7 +28,7 @@ stop: {episodes: 60}
 run: {shard_size: 60}
 """
 RECIPES = [text for kind, text in BLOCKS if kind == "yaml"]
-FOLLOWS = [text for text in RECIPES if "Follows" in text]
+BRAKES = [text for text in RECIPES if "Brakes" in text]
 
 
 @pytest.fixture(scope="module")
@@ -69,14 +69,14 @@ def per_vehicle(folder):
 @pytest.mark.parametrize("recipe", RECIPES[1:], ids=lambda recipe: " ".join(recipe.split())[:50])
 def test_recipes_of_the_same_controller_are_the_same_vehicle_and_all_others_run(recipe, folder, per_vehicle):
     rows = run(folder, recipe)
-    assert (len(RECIPES), len(FOLLOWS)) == (7, 5)
+    assert (len(RECIPES), len(BRAKES)) == (7, 5)
     assert {row["outcome"] for row in per_vehicle} >= {"crash", "timeout"}
     if "fmu:" in recipe:
         assert [row["outcome"] for row in rows] == [row["outcome"] for row in per_vehicle]
         assert [row["av_distance_m"] for row in rows] == pytest.approx(
             [row["av_distance_m"] for row in per_vehicle], abs=1e-9
         )
-    elif recipe in FOLLOWS:
+    elif recipe in BRAKES:
         assert rows == per_vehicle
 
 
