@@ -25,6 +25,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.drivers import PARAMETERS
 from harness.campaign.sections import EnvironmentSettings
 from harness.records.schemas import baseline_schema, episodes_schema, moments_schema, traces_schema
 from harness.traffic.loading import load_parameters
@@ -67,77 +68,64 @@ def _choices(annotation: Any) -> str:
     return ", ".join(filter(None, map(_choices, get_args(annotation)))) if get_origin(annotation) is not dict else ""
 
 
-def _default(field: FieldInfo) -> str:
-    if field.is_required():
-        return "*required*"
-    value = field.get_default(call_default_factory=True, validated_data={})
-    if value is None:
-        return "none"
-    if value in ("", {}):
-        return "empty"
-    return "below" if isinstance(value, BaseModel | dict) else f"`{value}`"
+def _setting(name: str, field: FieldInfo) -> tuple[str, ...]:
+    """A key with its default, as both stand in a campaign file, and what it means."""
+    value = None if field.is_required() else field.get_default(call_default_factory=True, validated_data={})
+    plain = value in (None, "", {}) or isinstance(value, BaseModel | dict)
+    key = f"`{name}`" if plain else f"`{name}: {value}`"
+    choices, words = _choices(field.annotation), field.description or ""
+    told = all(choice.strip("`") in words for choice in choices.split(", "))
+    text = words if told or not choices else f"{choices}: {words}"
+    return key + (" (required)" if field.is_required() else ""), text.replace("|", "\\|")
 
 
-def _settings_rows(section: type[BaseModel]) -> list[tuple[str, ...]]:
-    """Rows of a section's keys, but for sections in it, which have a heading and words of their own."""
+def _settings_rows(section: type[BaseModel], prefix: str = "") -> list[tuple[str, ...]]:
+    """Rows of a section's keys, each before those of the section that it may be itself."""
     rows = []
     for name, field in section.model_fields.items():
-        if not field.description and _is_section(field.annotation):
-            continue
-        choices, words = _choices(field.annotation), field.description or ""
-        told = all(choice.strip("`") in words for choice in choices.split(", "))
-        text = words if told or not choices else f"{choices}: {words}"
-        rows.append((f"`{name}`", _default(field), text.replace("|", "\\|")))
+        rows += [_setting(prefix + name, field)] if field.description else []
+        below = _sections(field.annotation)
+        rows += _settings_rows(below[0], f"{prefix}{name}.") if len(below) == 1 else []
     return rows
 
 
-def _is_section(annotation: Any) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def _sections(annotation: Any, path: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
-    """Every section of a campaign with its dotted path, unions and mappings looked through."""
-    if not _is_section(annotation):
-        inner = [option for option in get_args(annotation) if not isinstance(option, str)]
-        models = [option for option in inner if _is_section(option)]
-        below = f"{path}.NAME" if get_origin(annotation) is dict else path
-        for option in inner:
-            yield from _sections(option, below if len(models) < 2 else f"{path} ({option.__name__})")
-        return
-    yield path, annotation
-    for name, field in annotation.model_fields.items():
-        yield from _sections(field.annotation, f"{path}.{name}".lstrip("."))
+def _sections(annotation: Any) -> list[type[BaseModel]]:
+    """The sections that a setting can be."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [section for option in get_args(annotation) for section in _sections(option)]
 
 
 def settings_reference() -> str:
-    """All sections, each with a heading and its table; a section or a row that was shown already is only named."""
-    shown: dict[type[BaseModel], str] = {}
-    rows_of: dict[tuple[str, ...], str] = {}
-    text = []
-    for path, section in _sections(Campaign):
-        text.append(f"### {f'`{path}`' if path else 'Top level'}\n\n")
-        if section in shown:
-            text.append(f"As `{shown[section]}`.\n\n")
-            continue
+    """A table for each section of a campaign and each driver model's parameters; a row shown already is only named."""
+    fields = Campaign.model_fields
+    top = [_setting(name, field) for name, field in fields.items() if not _sections(field.annotation)]
+    text = [f"\n{_table(_SETTING, top)}\n"]
+    for name, field in fields.items():
+        if below := _sections(field.annotation):
+            key = f"{name}.NAME" if get_origin(field.annotation) is dict else name
+            text.append(f"### `{key}`\n\n{_own_words(below[0])}\n\n{_table(_SETTING, _settings_rows(below[0]))}\n")
+    model_of: dict[tuple[str, ...], str] = {}
+    for model, section in PARAMETERS.items():
         rows = _settings_rows(section)
-        known = {row: rows_of[row] for row in rows if row in rows_of}
-        text.append(f"{_own_words(section)}\n\n")
+        shared = {row: model_of[row] for row in rows if row in model_of}
+        text.append(f"### `av.parameters` of `{model}`\n\n{_own_words(section)}")
         text += [
-            f"As in `{other}`: {', '.join(row[0] for row in known if known[row] == other)}.\n\n"
-            for other in dict.fromkeys(known.values())
+            f" As of `{other}`: {', '.join(row[0].split(':')[0].strip('`') for row in shared if shared[row] == other)}."
+            for other in dict.fromkeys(shared.values())
         ]
-        new = [row for row in rows if row not in known]
-        text += [f"{_table(('key', 'default', 'meaning'), new)}\n"] if new else []
-        below = [f"`{name}`" for name, field in section.model_fields.items() if _is_section(field.annotation)]
-        text += [f"Sections, below: {', '.join(below)}.\n\n"] if below else []
-        shown[section] = path
-        rows_of = dict.fromkeys(new, path) | rows_of
-    return "\n" + "".join(text)
+        new = [row for row in rows if row not in shared]
+        text.append(f"\n\n{_table(_SETTING, new)}\n")
+        model_of = dict.fromkeys(new, model) | model_of
+    return "".join(text)
 
 
-def _own_words(annotation: Any) -> str:
+_SETTING = ("key: default", "meaning")
+
+
+def _own_words(section: type[BaseModel]) -> str:
     """First line of a section's docstring."""
-    return str(annotation.__doc__).strip().splitlines()[0] if _is_section(annotation) else ""
+    return str(section.__doc__).strip().splitlines()[0]
 
 
 def columns_table(name: str) -> str:

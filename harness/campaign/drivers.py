@@ -23,7 +23,7 @@ Speed = Annotated[float, Field(gt=0.0, le=MAX_CONFIGURED_SPEED_MPS)]
 
 
 class Following(Section):
-    """How an intelligent driver model follows; defaults are SM-I's (environment.md: [cutin] except where said)."""
+    """How an intelligent driver model follows; defaults are SM-I's."""
 
     acceleration_mps2: Strength = Field(2.0, description="maximum acceleration, the alpha of Table I [cutin]")
     comfortable_deceleration_mps2: Strength = Field(3.0, description="b [cutin]")
@@ -34,27 +34,27 @@ class Following(Section):
 
 
 class IDMParameters(Following):
-    """Intelligent driver model; defaults are SM-I's (environment.md: [cutin] except where said)."""
+    """Intelligent driver model; defaults are SM-I's."""
 
     min_acceleration_mps2: Braking = Field(-4.0, description="hardest braking a_min [assumed]")
 
 
 class FVDMParameters(Section):
-    """Full velocity difference model; defaults from the co-author's code ([cutin]) except where said."""
+    """Full velocity difference model."""
 
     kappa_per_s: Positive = Field(0.85, le=20.0, description="sensitivity to the optimal velocity [cutin]")
     lambda_per_s: float = Field(0.5, ge=0.0, le=20.0, description="sensitivity to the speed difference [assumed]")
     max_speed_mps: Speed = Field(40.0, description="v_max [assumed]")
-    v1: Positive = Field(6.75, le=1000.0, description="V1 of the optimal velocity function [cutin]")
-    v2: Positive = Field(7.91, le=1000.0, description="V2 of the optimal velocity function [cutin]")
-    c1_per_m: Positive = Field(0.13, le=100.0, description="C1 of the optimal velocity function [cutin]")
-    c2: float = Field(1.57, ge=-1000.0, le=1000.0, description="C2 of the optimal velocity function [cutin]")
+    v1: Positive = Field(6.75, le=1000.0, description="V1 [cutin]")
+    v2: Positive = Field(7.91, le=1000.0, description="V2 [cutin]")
+    c1_per_m: Positive = Field(0.13, le=100.0, description="C1 [cutin]")
+    c2: float = Field(1.57, ge=-1000.0, le=1000.0, description="C2 [cutin]")
     min_acceleration_mps2: Braking = Field(-1.0, description="hardest braking a_min [paper: -1, -6]")
     max_acceleration_mps2: Strength = Field(2.0, description="upper clip [assumed]")
 
 
 class ConstantParameters(Section):
-    """A vehicle that accelerates in the same way whatever happens before it: 0 never brakes."""
+    """The same acceleration whatever happens: 0 never brakes."""
 
     acceleration_mps2: float = Field(0.0, ge=-20.0, le=20.0, description="its acceleration [assumed]")
 
@@ -82,14 +82,13 @@ class Reference(Following):
         0.75, ge=0.0, le=5.0, description="from the evaluated risk to the brakes [JRC-FSM: CC_rt, FSM_rt]"
     )
     lateral_speed_mps: Positive = Field(
-        1.8, le=10.0, description="BV's, where the cut-in is one step [JRC-FSM: 0.72 m in 0.4 s]"
+        1.8, le=10.0, description="of BV, where the cut-in is one step [JRC-FSM: 0.72 m in 0.4 s]"
     )
     evaluated_at_m: float = Field(
         0.505,
         ge=0.0,
         le=5.0,
-        description="lateral distance when the risk has been evaluated: 1.6, less 0.375 of wandering, less 0.72 in "
-        "which it is evaluated [JRC-FSM: CC_calc_dist_to_react]",
+        description="lateral distance when the risk has been evaluated [JRC-FSM: CC_calc_dist_to_react]",
     )
     risk_evaluation_s: StepTime = Field(
         RISK_EVALUATION_S,
@@ -101,7 +100,7 @@ class Reference(Following):
         -7.59294, description="hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"
     )
     braking_jerk_mps3: Positive = Field(
-        12.65, le=1000.0, description="how fast it comes to brake harder, 0.774 g in 0.6 s [JRC-FSM: CC_min_jerk]"
+        12.65, le=1000.0, description="build-up of braking, 0.774 g in 0.6 s [JRC-FSM: CC_min_jerk]"
     )
     following_min_acceleration_mps2: Braking = Field(-4.0, description="hardest braking of that IDM [assumed]")
 
@@ -127,25 +126,17 @@ class CarefulCompetentParameters(Reference):
     critical_ttc_s: Strength = Field(
         2.0, description="time to collision below which it brakes [JRC-FSM: CC_critical_ttc]"
     )
-    coasting_mps2: float = Field(
-        0.4, ge=0.0, le=5.0, description="deceleration off the accelerator, until it brakes [JRC-FSM]"
-    )
+    coasting_mps2: float = Field(0.4, ge=0.0, le=5.0, description="deceleration off the accelerator [JRC-FSM]")
 
 
 class FuzzySafetyParameters(Reference):
-    """The fuzzy safety model of the Joint Research Centre, a performance model of UN Regulation No. 157."""
+    """The fuzzy safety model of UN Regulation No. 157."""
 
-    comfortable_braking_mps2: Strength = Field(
-        4.0, description="b_min: braking in anticipation, and the least in danger [JRC-FSM: FSM_br_min]"
-    )
-    hard_braking_mps2: Strength = Field(6.0, description="b_max: braking in the greatest danger [JRC-FSM: FSM_br_max]")
+    comfortable_braking_mps2: Strength = Field(4.0, description="braking in anticipation [JRC-FSM: FSM_br_min]")
+    hard_braking_mps2: Strength = Field(6.0, description="braking in the greatest danger [JRC-FSM: FSM_br_max]")
     leader_braking_mps2: Strength = Field(7.0, description="how hard the vehicle ahead may brake [JRC-FSM: FSM_bl]")
-    standstill_gap_m: Gap = Field(
-        2.0, description="part of the gap that anticipation does not count [JRC-FSM: FSM_margin_dist]"
-    )
-    safe_margin_m: Positive = Field(
-        2.0, le=50.0, description="gap beyond the safe one that is felt as safe [JRC-FSM: FSM_margin_safe_dist]"
-    )
+    standstill_gap_m: Gap = Field(2.0, description="gap not counted in anticipation [JRC-FSM: FSM_margin_dist]")
+    safe_margin_m: Positive = Field(2.0, le=50.0, description="gap beyond the safe one [JRC-FSM: FSM_margin_safe_dist]")
 
     @model_validator(mode="after")
     def _hard_is_harder(self) -> Self:
@@ -157,16 +148,12 @@ class FuzzySafetyParameters(Reference):
 
 
 class NeedBasedParameters(Section):
-    """A vehicle that accelerates until it needs to brake, and a delay later brakes with what it needs."""
+    """Accelerates until it needs to brake, and a delay later brakes with what it needs."""
 
     acceleration_mps2: Strength = Field(1.0, description="until it needs to brake [assumed]")
-    deceleration_mps2: Strength = Field(
-        3.0, description="hardest braking, from the delay after the first need on [assumed]"
-    )
-    reaction_time_s: Delay = Field(0.5, description="between the first need and the brakes [assumed]")
-    needed_mps2: Strength = Field(
-        1.0, description="it needs to brake where no less than this prevents a collision [assumed]"
-    )
+    deceleration_mps2: Strength = Field(3.0, description="hardest braking [assumed]")
+    reaction_time_s: Delay = Field(0.5, description="from the first need to the brakes [assumed]")
+    needed_mps2: Strength = Field(1.0, description="braking that must be needed to prevent a collision [assumed]")
     standstill_gap_m: Gap = Field(2.0, description="gap that is to remain [assumed]")
 
     @property
@@ -245,7 +232,7 @@ class Driver(Section):
 
     model: ModelName = Field(description="driver model")
     parameters: Annotated[BuiltInParameters, Parameters] = Field(
-        default_factory=dict, validate_default=True, description="of the model; defaults where left out"
+        default_factory=dict, validate_default=True, description="of the model, as under av"
     )
 
 
@@ -254,7 +241,7 @@ class Surrogate(Driver):
 
     model: Literal["idm", "fvdm"] = Field(description="driver model")
     parameters: Annotated[IDMParameters | FVDMParameters, Parameters] = Field(
-        default_factory=dict, validate_default=True, description="of the model; defaults where left out"
+        default_factory=dict, validate_default=True, description="of the model, as under av"
     )
 
 
@@ -272,17 +259,16 @@ class Reflexes(Section):
     """How a driver lags behind its model: surrogates may be late and smooth, but not random."""
 
     delay_s: StepTime = Field(
-        0.0, ge=0.0, le=10.0, description="time after the cut-in during which it keeps its speed [assumed]"
+        0.0, ge=0.0, le=10.0, description="time after the cut-in in which it keeps its speed [assumed]"
     )
     max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = Field(
-        None, description="fastest change of its acceleration; unlimited when left out [assumed]"
+        None, description="fastest change of acceleration; none: unlimited [assumed]"
     )
     perceives_lateral_m: float = Field(
         PERCEIVES_LATERAL_M,
         ge=0.0,
         le=10.0,
-        description="lateral distance after which the driver sees a cut-in that takes time; 0: from its onset "
-        "[JRC-FSM: 0.375 of wandering]",
+        description="how far BV has come over when it is seen, where cut-ins take time [JRC-FSM: 0.375 of wandering]",
     )
 
 
@@ -292,6 +278,4 @@ class Reaction(Reflexes):
     inattention_probability: Probability = Field(
         0.0, description="share of episodes in which it reacts later still [assumed]"
     )
-    inattention_delay_s: StepTime = Field(
-        0.0, ge=0.0, le=10.0, description="how much later it then reacts to the cut-in [assumed]"
-    )
+    inattention_delay_s: StepTime = Field(0.0, ge=0.0, le=10.0, description="how much later it then reacts [assumed]")

@@ -93,14 +93,14 @@ class EnvironmentSettings(Section):
     lane_change_level: Positive = Field(
         1.0,
         le=1e8,
-        description="multiplies the cut-in hazard: 1 = dense-learning tables, 100 = a later table, about 350 = highD",
+        description="multiplies the cut-in hazard; highD: about 350",
     )
     acceleration_hold_s: StepTime = Field(
-        1.0, ge=0.1, le=2.0, description="how long a drawn acceleration is held, in whole 0.1 s steps; 1.0 or 0.1"
+        1.0, ge=0.1, le=2.0, description="how long a drawn acceleration is held: 1.0 or 0.1"
     )
     cut_in_lead_s: LeadTime | None = Field(
         None,
-        description="time from onset to overlap of every cut-in, in place of the parameters' lateral motion",
+        description="time from onset to overlap of every cut-in; none: as the parameters say",
     )
 
 
@@ -108,7 +108,7 @@ class CrashSettings(Section):
     """Which crashes count."""
 
     counts_above_mps: float = Field(
-        0.0, ge=0.0, le=50.0, description="impact speed above which a crash counts, for all drivers alike; 0: every one"
+        0.0, ge=0.0, le=50.0, description="impact speed above which a crash counts, for all drivers"
     )
 
 
@@ -119,16 +119,16 @@ class ShellSettings(Section):
 
     statement: str = Field(
         ASSUMPTION_FREE,
-        description="what has to reach stop.rhw: assumption_free, or a statement, outside of which nothing is tested",
+        description="which statement has to reach stop.rhw; outside of it nothing is tested",
     )
     first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
-        None, description="tests of each shell before any is preferred; by its probability"
+        None, description="tests of each shell before any is preferred; none: by its probability"
     )
     smallest_round: Whole = Field(
         1,
         ge=1,
         le=10_000,
-        description="fewest tests of a round: as many as workers, where a test takes seconds",
+        description="fewest tests of a round; raise it for many workers",
     )
 
 
@@ -137,20 +137,17 @@ class Testing(Section):
 
     method: Method = Field(
         "shells",
-        description="nde: no control; forced: cut-in time drawn given that one happens; step_mixture: published NADE; "
-        "episode_mixture: one importance function per episode, forced cut-in as defence; shells: cut-ins of a pool, "
-        "counted within shells of known probability",
+        description="shells: cut-ins of a pool; forced: a cut-in in every test; nde: no control; step_mixture: NADE as "
+        "published; episode_mixture: one importance function per test",
     )
     challenge: Literal["immediate", "recursive"] = Field(
         "recursive", description="immediate: crash if BV cuts in now (published); recursive: backward induction"
     )
-    epsilon: Probability = Field(0.1, description="share of p in every importance function; the paper leaves it open")
+    epsilon: Probability = Field(0.1, description="share of natural driving in every importance function")
     alpha: dict[SurrogateName, Probability] | None = Field(
-        None, description="mixture weight per surrogate, summing to 1; equal when left out"
+        None, description="weight of each surrogate, summing to 1; none: equal"
     )
-    defensive_share: float = Field(
-        0.1, gt=0.0, lt=1.0, description="alpha_0, share of forced cut-ins in the episode mixture"
-    )
+    defensive_share: float = Field(0.1, gt=0.0, lt=1.0, description="share of forced cut-ins in the episode mixture")
     criticality_threshold: float = Field(0.0, ge=0.0, lt=1.0, description="a moment is critical above it")
     shells: ShellSettings = ShellSettings()
 
@@ -172,25 +169,24 @@ class PoolSettings(Section):
         0.005,
         ge=0.001,
         le=0.2,
-        description="relative standard error to reach of the surrogates' crash rates; four times as much for those "
-        "beyond the boundary",
+        description="relative standard error of the surrogates' crash rates; four times that beyond the boundary",
     )
     cut_ins_per_shell: Whole = Field(
-        25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: the most tests that it can give"
+        25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: its most tests"
     )
     shadow_paths: Whole = Field(
         500,
         ge=50,
         le=100_000,
-        description="baseline runs of a vehicle that acts before the cut-in (av.before_cut_in: controller)",
+        description="baseline runs of a vehicle that acts before the cut-in",
     )
-    seed: Whole = Field(1, ge=0, lt=2**63, description="every random number of the pool follows from it")
+    seed: Whole = Field(1, ge=0, lt=2**63, description="of the pool's random numbers")
 
 
 class World(Section):
     """Where episodes are simulated."""
 
-    engine: Literal["sumo", "twin"] = Field("sumo", description="sumo: libsumo; twin: the same dynamics in numba")
+    engine: Literal["sumo", "twin"] = Field("sumo", description="twin: the same motion without SUMO")
     cells: Whole = Field(64, ge=1, le=4096, description="episodes simulated side by side; never changes a result")
 
 
@@ -199,9 +195,7 @@ class Records(Section):
 
     moments: Literal["all", "first_9", "none"] = Field("first_9", description="control steps kept; scv needs first_9")
     traces: Literal["all", "crash", "critical", "none"] = Field("none", description="episodes whose motion is kept")
-    trace_share: Probability = Field(
-        0.0, description="share of episodes traced whatever their outcome, by a hash of the index"
-    )
+    trace_share: Probability = Field(0.0, description="share of episodes traced whatever their outcome")
 
 
 class Stop(Section):
@@ -211,11 +205,11 @@ class Stop(Section):
 
     episodes: Whole = Field(100_000, ge=1, le=10**10, description="most episodes to run")
     rhw: float | None = Field(
-        None, gt=0.0, lt=10.0, description="stop at this relative half-width of the interval; not for step_mixture"
+        None, gt=0.0, lt=10.0, description="stop at this half-width of the interval over the rate; not for step_mixture"
     )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = Field(
-        None, description="sampled crashes needed before RHW may stop the campaign; 100, with shells 1"
+        None, description="crashes needed before rhw may stop the campaign; none: 100, with shells 1"
     )
 
 
@@ -223,9 +217,7 @@ class Accept(Section):
     """A limit: a run of shells ends as soon as it is known on which side of it the crash rate lies."""
 
     crash_rate_below: float = Field(gt=0.0, lt=1.0, description="crashes per test: accepted below it, rejected above")
-    statement: str | None = Field(
-        None, description="which statement decides, as testing.shells.statement, whose place it takes"
-    )
+    statement: str | None = Field(None, description="which statement decides; none: testing.shells.statement")
 
 
 class Resources(Section):
@@ -239,7 +231,7 @@ class RaySettings(Section):
     """A Ray cluster, used where run.executor is ray."""
 
     address: str | None = Field(
-        None, description="HOST:6379 or auto, as ray.init takes it; null: $RAY_ADDRESS, else a cluster of this machine"
+        None, description="HOST:6379 or auto; none: $RAY_ADDRESS, else a cluster of this machine"
     )
     resources: Resources = Resources()
     runtime_env: dict[str, Any] = Field(
@@ -256,10 +248,10 @@ class Run(Section):
 
     shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = Field(
         None,
-        description="episodes per file and per task; null: 5,000, and more in long runs",
+        description="episodes per file and per task; none: 5,000, and more in long runs",
     )
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
-    executor: Literal["local", "ray"] = Field("local", description="where workers run: on this machine, or a cluster")
+    executor: Literal["local", "ray"] = Field("local", description="where workers run")
     ray: RaySettings = RaySettings()
 
     @property

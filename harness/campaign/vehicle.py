@@ -55,24 +55,20 @@ def with_another_driver(data: dict[str, Any], source: str, value: Any) -> dict[s
 class Limits(Section):
     """What an AV may ask for; beyond it an episode fails instead of being simulated with nonsense."""
 
-    min_acceleration_mps2: float = Field(
-        -15.0, ge=-50.0, le=0.0, description="hardest braking a controller may ask for"
-    )
+    min_acceleration_mps2: float = Field(-15.0, ge=-50.0, le=0.0, description="hardest braking it may ask for")
     max_acceleration_mps2: Positive = Field(10.0, le=50.0, description="hardest acceleration it may ask for")
-    step_time_s: Positive = Field(10.0, le=3600.0, description="time that one call of the controller may take")
+    step_time_s: Positive = Field(10.0, le=3600.0, description="time that one call may take")
     construction_time_s: Positive = Field(60.0, le=86_400.0, description="time that its constructor may take")
 
 
 class TraciProcess(Section):
     """The user's program, connected to a real SUMO as an ordinary TraCI client."""
 
-    command: str = Field(
-        min_length=1, description="starts the program; {port} and {cells} are filled in, e.g. './my_av --port {port}'"
-    )
-    connect_time_s: Positive = Field(60.0, le=3600.0, description="time that the program may take to connect")
-    restarts: Whole = Field(3, ge=0, le=100, description="times that a program that ended is started again")
+    command: str = Field(min_length=1, description="starts the program; {port} and {cells} are filled in")
+    connect_time_s: Positive = Field(60.0, le=3600.0, description="time it may take to connect")
+    restarts: Whole = Field(3, ge=0, le=100, description="times that it is started again when it has ended")
     allow_public: bool = Field(
-        False, description="run also where the machine has a public address: SUMO's server listens on all of them"
+        False, description="run also on a machine with a public address: SUMO's server listens on all"
     )
 
     @field_validator("command")
@@ -101,11 +97,10 @@ class FmuController(Section):
     file: str = Field(min_length=1, description="path of the .fmu, relative to the campaign file")
     inputs: dict[str, str] = Field(
         default_factory=dict,
-        description="FMU input variable for each observation: speed_mps, gap_m, lead_speed_mps, time_s, ...; when left "
-        "out, the inputs that are named as an observation",
+        description="input variable of each observation (speed_mps, gap_m, …); empty: inputs named as one",
     )
     output: str | None = Field(
-        None, min_length=1, description="FMU output variable that holds the acceleration, m/s2; when left out, the only"
+        None, min_length=1, description="output variable that is the acceleration, m/s2; none: the only one"
     )
     start_values: dict[str, float] = Field(default_factory=dict, description="values set before initialisation")
 
@@ -134,35 +129,33 @@ class AutomatedVehicle(Section):
 
     model_config = ConfigDict(json_schema_extra=_schema_of_sources)
 
-    model: ModelName | None = Field(None, description="built-in driver model; idm when nothing is named")
+    model: ModelName | None = Field(None, description="built-in driver model; none: idm, if nothing else is named")
     controller: str | None = Field(
         None,
         pattern=CONTROLLER_PATTERN,
         examples=["my_av.py:MyClass", "my_package.my_module:MyClass"],
-        description="your own: 'file.py:Class', relative to the campaign file, or 'package.module:Class'; instead of a "
-        "class a function step(seen)",
+        description="your own: 'file.py:Class' or 'package.module:Class', or a function step(seen)",
     )
     sumo: dict[str, str | float] | None = Field(
-        None, description="SUMO drives it: carFollowModel and any other vType attribute"
+        None, description="SUMO drives it: carFollowModel and other vType attributes"
     )
     traci: TraciProcess | None = Field(None, description="your program, in any language, as a TraCI client")
     fmu: FmuController | None = Field(None, description="an FMI 2.0 co-simulation FMU")
     parameters: Annotated[BuiltInParameters | dict[str, Any], Parameters] = Field(
         default_factory=dict,
         validate_default=True,
-        description="parameters of the built-in model (defaults where left out) or of the controller",
+        description="of the built-in model or of the controller",
     )
     reaction: Reaction = Reaction()
     before_cut_in: Literal["hold_speed", "controller"] = Field(
         "hold_speed",
-        description="until the cut-in the AV keeps its speed [itsc], or its controller acts from the start",
+        description="whether it keeps its speed until the cut-in [itsc]",
     )
     warm_up_s: StepTime = Field(
         2.0,
         ge=0.0,
         le=60.0,
-        description="time before the cut-in that a controller or FMU whose AV keeps its speed until then is shown, "
-        "without its answers being used; others ignore it",
+        description="time before the cut-in shown to a controller or FMU that keeps its speed; its answers are unused",
     )
     limits: Limits = Limits()
 
