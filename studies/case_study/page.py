@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from harness import numbers
 from harness.errors import HarnessError
-from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.estimators.one_pass import LOW_MEAN_WEIGHT
 from harness.records.folder import write_bytes
 from harness.report.style import RC, png
@@ -44,7 +43,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(shown=shown, number=numbers.number, count=count, cell=cell)
+    environment.filters.update(shown=shown, number=numbers.number, point=point, count=count, cell=cell, spans=spans)
     steps = [(name, step, made[name].result) for name, step in study.steps.items()]
     page = environment.get_template("case_study.md.j2").render(
         study=study,
@@ -53,7 +52,6 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
         plots=plots,
         remarks=_remarks(claims),
         answers=dict(Counter(claim["verdict"] for claim in claims)),
-        stratum_rows=stratum_rows,
         UNSETTLED=UNSETTLED,
         LOW_MEAN_WEIGHT=LOW_MEAN_WEIGHT,
     )
@@ -99,17 +97,26 @@ def _answered(claim: dict[str, Any], made: Mapping[str, Made], *, conclusive: bo
 
 def shown(found: dict[str, Any]) -> str:
     """A figure with its interval, as the page has it, and its mark."""
-    return _plainly(found) + ("" if is_settled(found) else " " + UNSETTLED)
+    return _plainly(found) + _mark(found)
+
+
+def point(found: dict[str, Any]) -> str:
+    """A figure without its interval, with its mark."""
+    return numbers.number(found["value"]) + _mark(found)
+
+
+def _mark(found: dict[str, Any]) -> str:
+    return "" if is_settled(found) else " " + UNSETTLED
 
 
 def _plainly(found: dict[str, Any]) -> str:
     value, low, high = found["value"], found["low"], found["high"]
     if value is None:
         return "–" if low is None else f"above {numbers.number(low)}"
-    if low is None and high is None:
-        return numbers.number(value)
     if low == high:
-        return count(value) if float(value).is_integer() else numbers.number(value)
+        return count(value) if float(value).is_integer() and low is not None else numbers.number(value)
+    if {numbers.number(end, like=value) for end in (low, high)} == {numbers.number(value)}:
+        return numbers.number(value)
     if value == 0.0:
         return f"0 (to {numbers.number(high)})"
     if high is None:
@@ -122,13 +129,11 @@ def count(value: float | None) -> str:
     return numbers.count(value) if value is None or abs(value) < 1e6 else numbers.number(value)
 
 
-def stratum_rows(result: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Rows of the table of strata, with labels: those of up to nine steps, longer ones together, and all."""
-    for row in result["strata"]:
-        if row["control_steps"] <= MAX_CONTROL_STEPS:
-            yield str(row["control_steps"]), row
-    yield f"{MAX_CONTROL_STEPS + 1} and more", result["beyond"]
-    yield "all together", result["all"]
+def spans(of: list[int]) -> str:
+    """Rising numbers with a dash for neighbours, such as 13, 20–31."""
+    first = [n for n in of if n - 1 not in of]
+    last = [n for n in of if n + 1 not in of]
+    return ", ".join(f"{a}–{b}" if a < b else str(a) for a, b in zip(first, last, strict=True))
 
 
 def cell(text: str) -> str:

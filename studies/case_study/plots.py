@@ -90,12 +90,8 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
     axes.set_xticks(range(len(ours)), list(ours), fontsize=8)
     axes.grid(visible=False, axis="x")
     axes.set_ylabel(f"tests for a relative half-width of {rhw:g}")
-    caption = (
-        "Filled: here, with intervals (triangles: lower limits; grey, †: not converged). NADE by ε are averages over "
-        "shuffles (RNoT), SCV truly is by repeated campaigns, the others by their intervals. Hollow: the paper's, with "
-        "an ε that is not published."
-    )
-    return Plot("tests", figure, "Number of tests by method, on a logarithmic axis. " + caption, caption)
+    caption = "Tests by method. Filled: here (triangles: lower limits; grey, †: not converged). Hollow: the paper's."
+    return Plot("tests", figure, caption, caption)
 
 
 def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw: float, confidence: float) -> Plot:
@@ -123,11 +119,8 @@ def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw
         axes.set_xscale("log")
         decades(axes.xaxis, max(axes.get_xlim()[0], 1.0), axes.get_xlim()[1])
         head(axes, title)
-    caption = (
-        f"Left: crash rates with their {confidence:.0%} bands; dashed: that of {step.reference}. Right: relative "
-        f"half-widths; dashed: {rhw:g}."
-    )
-    return Plot(name, figure, f"Convergence of {', '.join(step.of)}. {caption}", caption)
+    caption = f"Crash rates with {confidence:.0%} bands (dashed: {step.reference}), and relative half-widths, by tests."
+    return Plot(name, figure, caption, caption)
 
 
 def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
@@ -152,10 +145,8 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         head(axes, title)
         axes.grid(visible=False, axis="x")
-    caption = (
-        "Left: tests, control variates and rank of the columns. Right: spread of Y (NADE) and of Z = Y − Hβ (SCV)."
-    )
-    return Plot(name, figure, "By number of control steps. " + caption, caption)
+    caption = "By control steps: tests, columns and their rank; spread of results of NADE (Y) and SCV (Z)."
+    return Plot(name, figure, caption, caption)
 
 
 MOST_RATE = 3.0
@@ -193,12 +184,7 @@ def growth_plot(name: str, looks: list[dict[str, Any]], rhw: float) -> Plot | No
         axes.set_xscale("log")
         decades(axes.xaxis, *axes.get_xlim())
         head(axes, title)
-    caption = (
-        f"Left: relative half-widths on growing parts of one run; dashed: {rhw:g}. Right: the gain that SCV claims; "
-        "what is left of it without what its fit explains by chance (leave-one-out beyond the axis is on it; strata of "
-        "more than 4,096 tests take the mean leverage); and the gain between estimates of parts of the run, which is 1 "
-        "(dashed), as the estimates are NADE's."
-    )
+    caption = "By tests: relative half-widths; and SCV's gain as claimed, corrected in two ways, and replicated."
     return Plot(name, figure, caption, caption)
 
 
@@ -223,10 +209,7 @@ def spread_plot(name: str, results: pa.Table) -> Plot | None:
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: tick_label(value) or "0"))
         axes.set_xticks([-1.0, 0.0, 1.0], ["-1", "0", "1"])
     figure.legend(*panels[0].get_legend_handles_labels(), ncols=2, fontsize=8, loc="outside lower left")
-    caption = (
-        "Tests by their result over the median of all weighted crashes, before (Y) and after adjustment (Z = Y − Hβ), "
-        "by number of control steps l, and all; those with result 0 are left out."
-    )
+    caption = "Results over their median, before (Y) and after adjustment (Z), by control steps l; without zeros."
     return Plot(name, figure, caption, caption)
 
 
@@ -254,7 +237,6 @@ def settings_plot(name: str, variants: list[dict[str, Any]], known_rate: float, 
         axes.set_xticks(places, [row["variant"] for row in variants], fontsize=7.5, rotation=30)
         head(axes, title)
     caption = (
-        "Left: tests that campaigns claim to need, RNoT over shuffles, and tests by what the campaigns' estimates "
-        "scatter by around the known rate; triangles: lower limits. Right: how a run shows that it works."
+        "Tests as claimed, over shuffles (RNoT) and by replication (triangles: lower limits); signs of convergence."
     )
     return Plot(name, figure, caption, caption)

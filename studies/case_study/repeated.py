@@ -14,7 +14,6 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.estimators.scv import Scv
 from harness.resolved import resolve
-from harness.runner.run import run_campaign
 from harness.sampling import prepare
 from harness.vocabulary import EstimatorName, FloatArray
 from studies.case_study.counted import Claims, Counted, KnownMeans
@@ -31,17 +30,14 @@ from studies.case_study.figures import (
     tests_for,
 )
 from studies.case_study.study import Context, Variants
-from studies.case_study.tested import AT_ONCE, IN_THE_TWIN, figures_of_shells
+from studies.case_study.tested import AT_ONCE, IN_THE_TWIN
 from studies.replication.weighted import prepared_twin, twin_episodes
 from studies.rnot import Procedure, Tests, over_shuffles
 
 
-def variants_of(step: Variants, *, shells: bool = False) -> dict[str, Campaign]:
-    """The campaign in each of its forms, in the twin, by name; or the one of shells for the same vehicles."""
-    file, always = (step.shells, step.shells_set) if shells else (step.campaign, step.set)
-    if file is None:
-        return {}
-    always = [*always, *IN_THE_TWIN]
+def variants_of(step: Variants) -> dict[str, Campaign]:
+    """The campaign in each of its forms, in the twin, by name."""
+    file, always = step.campaign, [*step.set, *IN_THE_TWIN]
     settings = {**step.settings, **{f"ε = {each:g}": [f"testing.epsilon={each}"] for each in step.epsilons}}
     for chosen in product(*(options.items() for options in step.each_of)) if step.each_of else ():
         settings[", ".join(name for name, _ in chosen)] = [value for _, values in chosen for value in values]
@@ -54,7 +50,7 @@ SHOWN = ("true", "rnot", "gain_true", "scv_claimed")
 
 
 def test_variants(step: Variants, context: Context) -> dict[str, Any]:
-    """Test each in the twin, one to a worker, and each with shells, if asked for."""
+    """Test each in the twin, one to a worker."""
     campaigns = variants_of(step)
     for campaign in campaigns.values():
         prepare(resolve(campaign), context.progress)  # tables are built once, before the workers start
@@ -63,11 +59,6 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
     jobs = [campaign.model_dump_json() for campaign in campaigns.values()]
     claims = context.by_workers(jobs, make)
     rows = [{"variant": name, **row} for name, row in zip(campaigns, claims, strict=True)]
-    for k, (row, campaign) in enumerate(zip(rows, variants_of(step, shells=True).values(), strict=False)):
-        folder = context.folder / f"shells-{k}"
-        done = run_campaign(campaign, folder, workers=context.workers, resume=True, progress=context.progress)
-        found = figures_of_shells(done, context.rhw)
-        row |= {"shells_rate": found["crash_rate"], "shells_tests": found["tests_for_rhw"]}
     figures = {row["variant"]: row["gain_claimed"] for row in rows}
     mean = mean_of((gain["value"] for gain in figures.values()), context.confidence)
     figures |= {f"{key}, {row['variant']}": row[key] for row in rows for key in SHOWN}

@@ -24,7 +24,7 @@ from studies.case_study.counted import compare_control_variates, count_required_
 from studies.case_study.page import write_page
 from studies.case_study.repeated import test_variants, variants_of
 from studies.case_study.small_case import answer_small_case
-from studies.case_study.study import FILES, Context, Made, Step, Study, inputs_of
+from studies.case_study.study import Context, Made, Step, Study, inputs_of
 from studies.case_study.tested import keep_run, test_in_twin
 from studies.case_study.theorems import check_theorems
 from studies.work import sources_of
@@ -94,7 +94,7 @@ def step_keys(study: Study) -> dict[str, str]:
             made_by = "*.py", "chains/*.py", "replication/*.py", "case_study/[!p]*.py"  # not page.py and plots.py
             code = source_hash((*WORLD_SOURCES, "estimators/*.py")), sources_of(*made_by)
         content = {
-            "step": step.model_dump(mode="json", exclude=set(FILES)),
+            "step": step.model_dump(mode="json", exclude={"campaign"}),
             "file": _content(step),
             "reads": [(key, keys[wanted]) for key, wanted in inputs_of(step)],
             "asks": (study.rhw, study.confidence),
@@ -110,6 +110,6 @@ def _content(step: Step) -> Any:
         campaign = load_campaign(step.campaign, step.set)
         return campaign.model_dump(mode="json", exclude={"run"}), resolve(campaign).content_hash
     if step.kind == "variants":
-        forms = [*variants_of(step).items(), *variants_of(step, shells=True).items()]
+        forms = variants_of(step).items()
         return [(name, one.model_dump(mode="json", exclude={"run"}), resolve(one).content_hash) for name, one in forms]
     return None

@@ -74,16 +74,14 @@ class RequiredNumbers(Section):
 
 
 class Variants(Section):
-    """One campaign with other vehicles or settings: what NADE and SCV claim of each, and shells beside it."""
+    """One campaign with other vehicles or settings: what NADE and SCV claim of each."""
 
     kind: Literal["variants"]
-    title: str
+    title: str | None = Field(None, description="of its table on the page, if it has a reference and a title")
     campaign: str = Field(description="campaign file, relative to the study's; of any method but shells")
     set: Overrides = _OVERRIDES
     tests: Whole = Field(ge=2, le=100_000_000, description="of each campaign")
     replications: Whole = Field(1, ge=1, le=10_000, description="campaigns with each of them")
-    shells: str | None = Field(None, description="campaign of shells, which each is tested with, too")
-    shells_set: Overrides = _OVERRIDES
     avs: list[str] = Field(default_factory=list, description="vehicles of the shipped panel")
     settings: dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides] = Field(
         default_factory=dict, description="values laid over the campaign's, by a name for the table"
@@ -182,9 +180,6 @@ class Study(Section):
         return self
 
 
-FILES = ("campaign", "shells")
-
-
 def inputs_of(step: Step) -> list[tuple[str, str]]:
     """Key and name of every step that a step reads."""
     found: list[tuple[str, str]] = []
@@ -214,8 +209,8 @@ def load_study(path: Path, *, quick: bool = False) -> Study:
         study = small.model_copy(update={"title": title, "conclusive": False})
     placed = {}
     for name, step in study.steps.items():
-        files = {key: str((path.parent / named).resolve()) for key in FILES if (named := getattr(step, key, None))}
-        placed[name] = step.model_copy(update=files)
+        file = getattr(step, "campaign", None)
+        placed[name] = step.model_copy(update={"campaign": str((path.parent / file).resolve())}) if file else step
     return study.model_copy(update={"steps": placed})
 
 
