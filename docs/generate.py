@@ -133,16 +133,16 @@ def columns_table(name: str) -> str:
     rows = _column_rows(SCHEMAS[name])
     known = [row for row in rows if name != "episodes" and row in _column_rows(SCHEMAS["episodes"])]
     shared = f"As in `episodes`: {', '.join(row[0] for row in known)}.\n\n" if known else ""
-    return shared + _table(("column", "unit", "meaning"), [row for row in rows if row not in known])
+    return shared + _table(("column", "meaning"), [row for row in rows if row not in known])
 
 
 def _column_rows(schema: pa.Schema) -> list[tuple[str, ...]]:
     rows = []
     for field in schema:
         words = {key.decode(): value.decode() for key, value in field.metadata.items()}
-        unit = [words["unit"]] if words["unit"] not in ("", "1") else []
-        text = words["doc"].replace("|", "\\|")
-        rows.append((f"`{field.name}`", ", ".join([*unit, *(["null"] if field.nullable else [])]), text))
+        unit = words["unit"] if not words["unit"].startswith("m") and words["unit"] not in ("", "1", "s") else ""
+        more = ", ".join(filter(None, [unit, "null" if field.nullable else ""]))  # else the unit is in the name
+        rows.append((f"`{field.name}`{more and f' ({more})'}", words["doc"].replace("|", "\\|")))
     return rows
 
 
