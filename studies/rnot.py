@@ -15,9 +15,9 @@ in shards, and not by the estimator, so that two estimators of one run see the s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -132,8 +132,18 @@ def read_run(folder: Path, *, with_ratios: bool = False) -> tuple[Tests, Block]:
 
 def first_block(folder: Path, n: int) -> Block:
     """The first n tests of a stored run, with ratios of control steps."""
-    blocks = stored_blocks(folder, moments=True)
-    return joined(list(takewhile(lambda block: block.first_episode < n, blocks))).take(slice(0, n))
+    return joined(list(cut_at(stored_blocks(folder, moments=True), [n])))
+
+
+def cut_at(blocks: Iterator[Block], ends: Sequence[int]) -> Iterator[Block]:
+    """The same tests up to the last of some rising ends, in blocks that end at each of these, too."""
+    for block in blocks if ends else ():
+        first, stop = block.first_episode, block.first_episode + len(block)
+        cuts = [0, *(end - first for end in ends[:-1] if first < end < stop), min(len(block), ends[-1] - first)]
+        for start, end in pairwise(cuts):
+            yield block.take(slice(start, end))
+        if stop >= ends[-1]:
+            return
 
 
 @dataclass(frozen=True, eq=False)

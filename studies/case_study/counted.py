@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from harness.estimators.block import MAX_CONTROL_STEPS, Block
+from harness.estimators.block import Block
 from harness.estimators.estimate import FailureBounds
 from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import CHUNK_ROWS as CHUNK
@@ -34,6 +34,7 @@ from studies.rnot import (
     Procedure,
     RequiredTests,
     acceleration,
+    cut_at,
     first_block,
     over_shuffles,
     required_tests,
@@ -77,7 +78,6 @@ class Claims:
         settled = weights_are_in(self._method, mean_weight)
         row: dict[str, Any] = {
             "n": self._n,
-            "n_crashes": nade.n_crashes,
             "mean_weight": mean_weight,
             "settled": settled,
             "largest_weight_share": nade.largest_weight_share,
@@ -92,64 +92,52 @@ class Claims:
         row["gain_claimed"] = None if beside is None else (nade.std_error / beside.std_error) ** 2
         for key in CORRECTED:
             row[f"gain_{key}"] = None if beside is None else beside.details["gain"][key]
-        row["n_saturated"] = 0 if scv is None else len(scv.details["gain"]["saturated"])
         row["difference"] = None if beside is None else abs(beside.crash_rate / nade.crash_rate - 1.0)
         return row
 
 
 def compare_control_variates(step: ControlVariates, context: Context) -> dict[str, Any]:
     """Both estimates at every size, in one pass, and the strata after the last one."""
-    run = context.made[step.of]
-    shown = [size for size in step.sizes if size <= run.result["n"]]
+    n, run = context.made[step.of].result["n"], context.made[step.of].folder / "run"
+    shown = [size for size in step.sizes if size <= n]
     between = np.geomspace(min(300, shown[-1]), shown[-1], step.looks) if shown else np.zeros(0)
     sizes = sorted({*shown, *between.astype(int).tolist()})
     claims, rows = Claims(leave_one_out=True), list[dict[str, Any]]()
-    context.progress.stage("both estimates", sizes[-1] if sizes else 0)
-    for block in cut_at(stored_blocks(run.folder / "run", moments=True), sizes) if sizes else ():
+    context.progress.stage("both estimates", max(sizes, default=0))
+    for block in cut_at(stored_blocks(run, moments=True), sizes):
         claims.add(block)
         context.progress.advance(len(block))
-        if (n := block.first_episode + len(block)) in sizes:
-            rows.append(claims.row(context.rhw, context.confidence))
-        if n == sizes[-1]:
-            break
-    parts = stored_blocks(run.folder / "run", moments=True)
-    again = gains_of_parts(parts, sizes, run.result["n"], step.parts, context.confidence)
-    rows = [{**row, "gain_replicated": again.get(row["n"], figure(None))} for row in rows]
-    fits = claims.scv.fits()
-    strata = [{"control_steps": level, **_together([fit])} for level, fit in fits] if step.spread_tests else []
+        if (size := block.first_episode + len(block)) in sizes:
+            again = gain_of_parts(run, size, n, step.parts, context.confidence)
+            rows.append({**claims.row(context.rhw, context.confidence), "gain_replicated": again})
+    fits, strata = claims.scv.fits(), list[dict[str, Any]]()
     if step.spread_tests:
-        first = first_block(run.folder / "run", min(step.spread_tests, run.result["n"]))
-        write_table(context.folder / SPREAD, spread(first))
-    return {
-        "looks": rows,
-        "sizes": [row for row in rows if row["n"] in shown],
-        "left_out": [size for size in step.sizes if size not in shown],
-        "strata": strata,
-        "beyond": _together([fit for level, fit in fits if level > MAX_CONTROL_STEPS]),
-        "all": _together([fit for _, fit in fits]),
-        "figures": _figures(rows, fits),
-    }
+        strata = [
+            {"control_steps": level, "columns": fit.n_columns, "rank": fit.rank, **_spread_of([fit])}
+            for level, fit in fits
+        ]
+        write_table(context.folder / SPREAD, spread(first_block(run, min(step.spread_tests, n))))
+    figures = {}
+    if rows:
+        late = _spread_of([fit for level, fit in fits if level >= 4])
+        left = late["sd_after"] / late["sd_before"] if late["sd_before"] else None
+        figures["rate_over_nade"] = exactly(1.0 + max(row["difference"] or 0.0 for row in rows))
+        figures["sd_left_from_4"] = marked(figure(left, left, left), settled=rows[-1]["settled"])
+    sizes_shown = [row for row in rows if row["n"] in shown]
+    return {"looks": rows, "sizes": sizes_shown, "strata": strata, "figures": figures}
 
 
-def gains_of_parts(
-    blocks: Iterator[Block], sizes: Sequence[int], n: int, parts: int, confidence: float
-) -> dict[int, dict[str, Any]]:
-    """NADE's variance over SCV's by size, between the estimates of as many parts of the same run, if it has them."""
-    found = {size: list[tuple[float, float]]() for size in sizes if n >= parts * size}
-    states = {size: Claims() for size in found}
-    ends = sorted({k * size for size in found for k in range(1, 1 + parts)})
-    for block in cut_at(blocks, ends) if ends else ():
-        stop = block.first_episode + len(block)
-        for size, rates in found.items():
-            if len(rates) < parts:
-                states[size].add(block)
-                if stop % size == 0:
-                    rates.append(states[size].rates())
-                    states[size] = Claims()
-        if stop == ends[-1]:
-            break
-    pairs = {size: np.array(rates).T for size, rates in found.items()}
-    return {size: ratio_of_variances(pair[0], pair[1], confidence) for size, pair in pairs.items()}
+def gain_of_parts(run: Path, size: int, n: int, parts: int, confidence: float) -> dict[str, Any]:
+    """NADE's variance over SCV's between the estimates of as many parts of a run of n tests, if it has them."""
+    if n < parts * size:
+        return figure(None)
+    claims, rates = Claims(), list[tuple[float, float]]()
+    for block in cut_at(stored_blocks(run, moments=True), [k * size for k in range(1, 1 + parts)]):
+        claims.add(block)
+        if (block.first_episode + len(block)) % size == 0:
+            rates.append(claims.rates())
+            claims = Claims()
+    return ratio_of_variances([nade for nade, _ in rates], [scv for _, scv in rates], confidence)
 
 
 SPREAD = "results.parquet"
@@ -189,69 +177,26 @@ class KnownMeans:
     """
 
     def __init__(self, others: Scv) -> None:
-        self._fits, self._mean = others.fits(TESTS_EACH), others.mean()
-        self._of_campaigns = list[FloatArray]()
+        self._fits, self._of_campaigns = others.fits(TESTS_EACH), list[FloatArray]()
 
     def add(self, block: Block) -> None:
-        """Add a campaign: variances and means of Y, of Y adjusted by strata alone, and by columns within them."""
+        """Add a campaign: variances of Y, and of Y adjusted."""
         y = block.weighted_crashes()
-        results = np.vstack([y, y - explained_by(block, self._fits) + self._mean])
-        self._of_campaigns.append(np.array([results.var(axis=1), results.mean(axis=1)]))
+        self._of_campaigns.append(np.vstack([y, y - explained_by(block, self._fits)[1:]]).var(axis=1))
 
-    def row(self, confidence: float) -> dict[str, Any]:
-        """Gains over NADE: in other tests at most, and with degrees of freedom; by strata, and by columns in them."""
-        (plain, strata, *columns), (plain_rate, _, *rates) = np.array(self._of_campaigns).transpose(1, 2, 0)
-        best = int(np.argmin([np.mean(one) for one in columns]))
-        fits = [fit for _, fit in self._fits]
-        total, squares = sum(fit.total_squares for fit in fits), [fit.squares() for fit in fits]
-        left = {key: sum(one[key] for one in squares) for key in ("claimed", "degrees_of_freedom")}
-        return {
-            **{f"within_{key}": figure(total / one if one > 0.0 else None) for key, one in left.items()},
-            "gain_strata": ratio_of_means(plain, strata, confidence),
-            "gain_known": ratio_of_means(plain, columns[best], confidence),
-            "gain_known_replicated": ratio_of_variances(plain_rate, rates[best], confidence),
-        }
+    def gain(self, confidence: float) -> dict[str, Any]:
+        """NADE's variance over what is left of it."""
+        plain, *adjusted = np.transpose(self._of_campaigns)
+        return ratio_of_means(plain, min(adjusted, key=np.mean), confidence)
 
 
-def cut_at(blocks: Iterator[Block], sizes: list[int]) -> Iterator[Block]:
-    """The same tests in blocks that end where a size is reached, too."""
-    for block in blocks:
-        first, stop = block.first_episode, block.first_episode + len(block)
-        cuts = [0, *(size - first for size in sizes if first < size < stop), len(block)]
-        for start, end in pairwise(cuts):
-            yield block.take(slice(start, end))
-
-
-def _together(fits: Sequence[StratumFit]) -> dict[str, Any]:
-    """One stratum, or several: their tests and results together, the most columns, the largest rank."""
+def _spread_of(fits: Sequence[StratumFit]) -> dict[str, Any]:
+    """Tests of strata together, and the spread of their results before and after adjustment."""
     n = sum(fit.n for fit in fits)
     mean = sum(fit.n * fit.intercept for fit in fits) / max(n, 1)
     between = sum(fit.n * (fit.intercept - mean) ** 2 for fit in fits)
-    before, after = sum(fit.total_squares for fit in fits), sum(fit.residual_squares for fit in fits)
-    fair = sum(fit.squares()["degrees_of_freedom"] for fit in fits)
-    return {
-        "n": n,
-        "columns": max((fit.n_columns for fit in fits), default=0),
-        "rank": max((fit.rank for fit in fits), default=0),
-        "sd_before": float(np.sqrt((before + between) / max(n, 1))),
-        "sd_after": float(np.sqrt((after + between) / max(n, 1))),
-        "sd_corrected": float(np.sqrt((fair + between) / max(n, 1))),
-    }
-
-
-def _figures(rows: list[dict[str, Any]], fits: list[tuple[int, StratumFit]]) -> dict[str, Any]:
-    if not rows:
-        return {}
-    total, late_total = (
-        sum(fit.n * fit.intercept for level, fit in fits if level > k) for k in (-1, MAX_CONTROL_STEPS)
-    )
-    late, settled = _together([fit for level, fit in fits if level >= 4]), rows[-1]["settled"]
-    left = late["sd_after"] / late["sd_before"] if late["sd_before"] else None
-    return {
-        "rate_over_nade": exactly(1.0 + max(row["difference"] or 0.0 for row in rows)),
-        "sd_left_from_4": figure(None) if left is None else marked(exactly(left), settled=settled),
-        "late_share": figure(late_total / total if total else None),
-    }
+    left = {"before": sum(fit.total_squares for fit in fits), "after": sum(fit.residual_squares for fit in fits)}
+    return {"n": n, **{f"sd_{key}": float(np.sqrt((one + between) / max(n, 1))) for key, one in left.items()}}
 
 
 CURVES = "curves.parquet"
@@ -272,7 +217,6 @@ def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
         required = required_tests(rhw[None, :], n, procedure.rhw)
         found = {
             "settled": figure(None, tests.n) if required.is_lower_limit else exactly(required.n[0]),
-            "rhw": exactly(rhw[-1]) if np.isfinite(rhw[-1]) else figure(None),
             "over_reference": ratio(context.made[name].result["figures"]["crash_rate"], reference),
         }
         is_in = settled(context.made[name])
@@ -285,7 +229,6 @@ class Counted(NamedTuple):
     """RNoT of every shuffle of some tests, and whether their weights have come in."""
 
     rnot: RequiredTests
-    tests: int
     settled: bool
 
     def figure(self, confidence: float) -> dict[str, Any]:
@@ -318,12 +261,7 @@ def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, A
         pairs["nade_over_scv"] = "nade_beside_scv", "scv"
     figures = {name: each.figure(context.confidence) for name, each in found.items()}
     ratios = {name: found[a].over(found[b], context.confidence) for name, (a, b) in pairs.items()}
-    return {
-        "never_reached": {name: int(np.count_nonzero(each.rnot.never_reached)) for name, each in found.items()},
-        "shuffles": {name: len(each.rnot.n) for name, each in found.items()},
-        "tests": {name: each.tests for name, each in found.items()},
-        "figures": figures | ratios,
-    }
+    return {"figures": figures | ratios}
 
 
 def _required(
@@ -332,7 +270,6 @@ def _required(
     """Of the mean of Y, or of what SCV claims, on all tests of a step or its first ones."""
     tests = tests_of(made).first(first)
     context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", procedure.n_shuffles)
-
     block = first_block(made.folder / "run", tests.n) if scv else None
     found = over_shuffles(tests, procedure, lambda: context.progress.advance(1), scv_of=block)
-    return Counted(found, tests.n, settled(made))
+    return Counted(found, settled(made))

@@ -120,19 +120,18 @@ def claims_in_twin(
     rnot = figure(None)
     if step.shuffles:
         found = over_shuffles(Tests.joined(parts), Procedure(rhw, confidence, step.shuffles))
-        rnot = Counted(found, n * step.replications, row["settled"]).figure(confidence)
+        rnot = Counted(found, row["settled"]).figure(confidence)
     return {
         **row,
         "claimed": marked(mean_of(tests["nade"], confidence), settled=row["settled"]),
         "true": true_tests(rates["nade"], reference, tests_for(n, rhw, confidence)),
         "rnot": rnot,
         "most_frequent_steps": int(np.argmax(steps[1:]) + 1) if len(steps) > 1 else 0,
-        "covers": {name: covered([each[f"{name}_rate"] for each in rows], reference) for name in ("nade", "scv")},
-        "scv_tests": mean_of(tests["scv"], confidence),
+        "covers": covered([each["nade_rate"] for each in rows], reference),
         "scv_claimed": marked(mean_of(tests["scv"], confidence), settled=row["settled"]),
         "gain_claimed": marked(ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
         "gain_true": ratio_of_variances(rates["nade"], rates["scv"], confidence),
-        **(known.row(confidence) if known else {}),
+        **({"gain_known": known.gain(confidence)} if known else {}),
         "difference": max((each["difference"] for each in rows if each["difference"] is not None), default=None),
     }
 

@@ -239,45 +239,34 @@ def _apart(wanted: float, found: dict[str, Any]) -> float:
 def claims_of_setting(
     step: SmallCase, confidence: float, setting: tuple[int, tuple[bool, float, float]]
 ) -> dict[str, Any]:
-    """One setting: its exact variance, what NADE and SCV claim of the same tests, and what repeating both shows.
-
-    Its place among all seeds its tests.
-    """
+    """One setting: its exact variance, and what NADE and SCV claim; its place among all seeds its tests."""
     world, n = _world(step.lane_change_level), step.tests_of_draw
     place, (recursive, threshold, epsilon) = setting
     proposals = world.proposals(epsilon, recursive=recursive, threshold=threshold)
-
-    blocks = (world.draw(proposals, n, np.random.default_rng([3, place, k])) for k in range(step.draws))
-    first = Claims()
-    first.add(world.draw(proposals, step.tests, np.random.default_rng([2, place])))
-    once, known, many = first.row(step.rhw, confidence), KnownMeans(first.scv), list[dict[str, Any]]()
-    for block in blocks:
-        found = Claims()
+    others = Claims()
+    others.add(world.draw(proposals, step.tests, np.random.default_rng([2, place])))
+    known, many = KnownMeans(others.scv), list[dict[str, Any]]()
+    for k in range(step.draws):
+        found, block = Claims(), world.draw(proposals, n, np.random.default_rng([3, place, k]))
         found.add(block)
         known.add(block)
         many.append(found.row(step.rhw, confidence))
     exact = tests_for(world.relvar(proposals), step.rhw, confidence)
-    claimed = {name: mean_of((each[f"{name}_tests"] for each in many), confidence) for name in ("nade", "scv")}
-    row: dict[str, Any] = {
+    nade, scv = (mean_of((each[f"{name}_tests"] for each in many), confidence) for name in ("nade", "scv"))
+    once = others.row(step.rhw, confidence)
+    means_something = once["settled"] and holds(nade["value"], exact)
+    return {
         "challenge": "recursive" if recursive else "immediate",
         "threshold": threshold,
         "epsilon": epsilon,
         "mean_weight": once["mean_weight"],
         "difference": once["difference"],
         "nade_exact": exact,
-        **known.row(confidence),
+        "nade_claimed": marked(nade, settled=means_something),
+        "scv_claimed": marked(scv, settled=means_something),
+        "nade_covers": covered([each["nade_rate"] for each in many], world.crash_rate),
+        "gain_known": known.gain(confidence),
     }
-    means_something = once["settled"] and holds(claimed["nade"]["value"], exact)
-    for name, tests in claimed.items():
-        rates = [each[f"{name}_rate"] for each in many]
-        errors = [(rate["value"] or 0.0) / world.crash_rate - 1.0 for rate in rates]
-        row |= {
-            f"{name}_claimed_once": once[f"{name}_tests"],
-            f"{name}_claimed": marked(tests, settled=means_something),
-            f"{name}_repeated": tests_for(n * float(np.mean(np.square(errors))), step.rhw, confidence),
-            f"{name}_covers": covered(rates, world.crash_rate),
-        }
-    return row
 
 
 def holds(claimed: float | None, exact: float) -> bool:

@@ -129,11 +129,9 @@ def test_steps_agree_with_the_run_that_they_keep(made):
     assert nade.result["figures"]["crashes"]["value"] == estimates["n_crashes"]
     rows = made["adjusted"].result["sizes"]
     assert [row["n"] for row in rows] == [700, 1_200]
-    assert made["adjusted"].result["left_out"] == [5_000]
     assert rows[-1]["nade_rate"]["value"] == pytest.approx(estimates["crash_rate"], rel=1e-12)
     assert all(row["difference"] < 1e-12 and row["gain_claimed"] >= 1.0 for row in made["adjusted"].result["looks"])
     assert sum(row["n"] for row in made["adjusted"].result["strata"]) == 1_200
-    assert made["adjusted"].result["all"]["n"] == 1_200
     curves = pq.read_table(made["curves"].folder / "curves.parquet").to_pandas()
     last = curves[curves["step"] == "nade"].iloc[-1]
     assert last["n"] == 1_200
@@ -221,10 +219,7 @@ def test_known_means_gain_what_theorem_3_promises():
     known = KnownMeans(scv)
     for _ in range(5):
         known.add(world.block("step_mixture", world.maneuvers(500, rng)))
-    row = known.row(0.9)
-    assert row["gain_known"]["value"] > 1e6
-    assert row["gain_known_replicated"]["value"] > 1e6
-    assert row["gain_strata"]["value"] == pytest.approx(1.0, rel=0.01)  # all tests have one control step
+    assert known.gain(0.9)["value"] > 1e6
 
 
 def test_relative_variance_of_known_weights():
