@@ -9,16 +9,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from harness.errors import HarnessError
 from harness.estimators.scv import Scv
 from studies.__main__ import main
 from studies.case_study import repeated, tested
-from studies.case_study.counted import KnownMeans, spread
+from studies.case_study.counted import KnownMeans
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
 from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
-from studies.chains.chain import CHAINS
-from studies.chains.sampler import blocks, with_optimal_function
+from studies.chains.sampler import with_optimal_function
 from tests.stored_runs import SCENARIOS
 
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
@@ -147,14 +145,6 @@ def test_the_theorems_hold_on_exact_chains(made):
     assert figures["scatter_estimated"]["value"] > 0.01
 
 
-def test_a_name_that_is_none_is_refused_in_words(tmp_path):
-    file = tmp_path / "study.yaml"
-    file.write_text(STUDY.replace("{same: []}", "{a.b: []}"))
-    with pytest.raises(HarnessError, match="settings") as refused:
-        load_study(file)
-    assert "text that matches ^[^.|]+$" in str(refused.value)
-
-
 def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
     for quick in (False, True):
         study = load_study(SHIPPED, quick=quick)
@@ -167,16 +157,11 @@ def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
     [
         (figure(10.0, 6.0, 19.0), "reproduced"),
         (figure(10.0, 4.0, 19.0), "cannot be told"),
-        (figure(30.0, 21.0, 40.0), "not reproduced"),
         (figure(30.0, 21.0), "not reproduced"),
-        (figure(10.0, 6.0), "cannot be told"),
         (figure(10.0), "cannot be told"),
-        (figure(None), "cannot be told"),
         (figure(None, 21.0), "not reproduced"),
         (exactly(20.0), "reproduced"),
-        (exactly(20.1), "not reproduced"),
         (marked(exactly(20.1), settled=False), "cannot be told"),
-        (marked(exactly(10.0), settled=True), "reproduced"),
     ],
 )
 def test_a_verdict_is_of_the_whole_interval(found, expected):
@@ -200,16 +185,6 @@ def test_replicated_tests_are_a_lower_limit_where_the_rate_is_missed():
     missed = repeated.true_tests(np.array([0.2, 0.21, 0.22]), 1.0, 100.0)
     assert (missed["value"], missed["low"]) == (None, pytest.approx(62.4, rel=0.01))
     assert repeated.true_tests(np.array([1.0, 1.0]), None, 100.0) == figure(None)
-
-
-def test_the_spread_after_adjustment_is_what_algorithm_1_claims():
-    (block,) = blocks(CHAINS["decisive"], "step_mixture", [2_000], 1)
-    found, scv = spread(block).to_pandas(), Scv()
-    scv.add(block)
-    for level, fit in scv.fits():
-        z = found[found.control_steps == level].z.to_numpy()
-        squares = np.sum((z - fit.intercept) ** 2) + (fit.n - len(z)) * fit.intercept**2
-        assert squares == pytest.approx(fit.residual_squares, rel=1e-9, abs=1e-20)
 
 
 def test_known_means_gain_what_theorem_3_promises():

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from functools import cache, partial
-from typing import Any
 
 import pytest
 
@@ -95,77 +94,57 @@ def test_decisions_by_a_wrong_probability_are_caught():
     assert min(one["p_value_holm"] for one in found) < 1e-6
 
 
-COMMITTED = ["chains_shells", "chains_forced"]
+COMMITTED = {"chains_shells": 5000, "chains_forced": 5000, "shells_panel": 2000, "gate": 500, "shells_bounds": 300}
+"""Results in docs/, and how often each was repeated."""
 CONDITIONAL = result_of(LIBRARY_STATEMENT)
 
 
-def committed(name: str) -> tuple[dict[str, Any], Experiment]:
-    """Results in docs/, and the experiment that they are of: how tests are cut into shards has no part in it."""
+def committed(name: str) -> tuple[dict[tuple[str, str], Judgement], Experiment]:
+    """Judgements by subject and result, and the experiment that they are of: shards have no part in it."""
     content = json.loads((ROOT / "docs" / "validation" / f"{name}.json").read_text())
     content["experiment"].pop("fault", None)  # of earlier versions, and always null
     shipped = load_experiment(ROOT / "scenarios" / "validate" / f"{name}.yaml")
-    one, other = (
-        each.model_dump(exclude={"campaign": {"run"}})
-        for each in (Experiment.model_validate(content["experiment"]), shipped)
-    )
+    both = Experiment.model_validate(content["experiment"]), shipped
+    one, other = (each.model_dump(exclude={"campaign": {"run"}}) for each in both)
     assert one == other
-    return content, shipped
+    return {(one["subject"], one["result"]): one for one in content["judgements"]}, shipped
 
 
 @pytest.mark.parametrize("name", COMMITTED)
-def test_committed_experiments_say_so_at_full_length(name):
-    content, _ = committed(name)
-    judgements = [one for one in content["judgements"] if one["result"] != CONDITIONAL]
-    assert len(judgements) >= 4
-    for one in judgements:
-        assert one["replications"] >= 5000
-        assert abs(one["bias"]) <= LARGEST_BIAS
-        assert not one["coverage_too_low"]
+def test_committed_experiments_were_run_at_full_length_and_right_methods_cover(name):
+    found, shipped = committed(name)
+    assert {subject for subject, _ in found} == {*shipped.avs, *shipped.adversaries, *shipped.chains}
+    for (_, result), one in found.items():
+        assert one["replications"] >= COMMITTED[name]
+        assert not one["coverage_too_low"] or FORMER in result
+        assert "chains" not in name or abs(one["bias"]) <= LARGEST_BIAS or result == CONDITIONAL
 
 
-def test_the_committed_panel_meets_what_shells_promise():
-    content, shipped = committed("shells_panel")
-    assert content["largest_relative_error_of_truth"] <= 0.005
-    found = {(one["subject"], one["result"]): one for one in content["judgements"]}
-    assert {subject for subject, _ in found} == set(shipped.avs)
+def test_committed_numbers_of_tests_and_errors_are_those_that_docs_promise():
+    panel, _ = committed("shells_panel")
     most = {FREE: 3000, CONDITIONAL: 110, result_of("need-based"): 250}
-    for (_, result), one in found.items():
-        assert one["replications"] >= 2000
-        assert not one["coverage_too_low"]
-        assert one["tests_median"] <= most.get(result, most[FREE])
-    assert found["idm", FREE]["tests_median"] <= 1300
-    assert {ratio_to("r157-cc"), preventable_by("r157-cc")} < {result for _, result in found}
-    assert not found["SM-II", CONDITIONAL]["assumption_met"]
-    assert found["SM-II", FREE]["alarm"] == found["never-brakes", FREE]["alarm"] == 1.0
-
-
-def test_the_committed_gate_errs_as_rarely_as_it_says():
-    content, shipped = committed("gate")
-    found = {(one["subject"], one["result"]): one for one in content["judgements"]}
-    assert {subject for subject, _ in found} == {*shipped.avs, *shipped.adversaries}
-    for (_, result), one in found.items():
-        assert one["replications"] >= 500
-        assert one["coverage"] >= 0.95 or FORMER in result
+    assert all(one["tests_median"] <= most.get(result, most[FREE]) for (_, result), one in panel.items())
+    assert panel["idm", FREE]["tests_median"] <= 1300
+    assert {ratio_to("r157-cc"), preventable_by("r157-cc")} < {result for _, result in panel}
+    assert not panel["SM-II", CONDITIONAL]["assumption_met"]
+    assert panel["SM-II", FREE]["alarm"] == panel["never-brakes", FREE]["alarm"] == 1.0
+    gate, _ = committed("gate")
+    assert all(one["coverage"] >= 0.95 or FORMER in result for (_, result), one in gate.items())
+    former = f"limit 1 x rate, rejected within 400,000 tests{FORMER}"
     for subject in ("idm", "brakes-8", "late-600ms", "inattentive", "SM-II"):
-        assert found[subject, f"limit 1 x rate, rejected within 400,000 tests{FORMER}"]["p_value_holm"] < 1e-20
-    needed = {subject: found[subject, "limit 2 x rate, rejected within 400,000 tests"] for subject in shipped.avs}
-    assert needed["idm"]["tests_median"] <= 950
-    assert needed["brakes-8"]["tests_median"] <= 1650
-
-
-def test_committed_bounds_hold_after_stopping_and_one_of_the_former_ones_does_not():
-    content, _ = committed("shells_bounds")
-    bounds = [one for one in content["judgements"] if "upper bound" in one["result"]]
-    failed = {one["subject"] for one in bounds if one["coverage_too_low"]}
-    assert failed == {"full-throttle"} == {one["subject"] for one in bounds if one["coverage"] < 0.8}
-    assert not any(one["coverage_too_low"] for one in bounds if FORMER not in one["result"])
+        assert gate[subject, former]["p_value_holm"] < 1e-20
+    for subject, tests in (("idm", 950), ("brakes-8", 1650)):
+        assert gate[subject, "limit 2 x rate, rejected within 400,000 tests"]["tests_median"] <= tests
+    bounds, _ = committed("shells_bounds")
+    low = [subject for (subject, result), one in bounds.items() if "upper bound" in result and one["coverage"] < 0.8]
+    assert set(low) == {"full-throttle"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", COMMITTED)
+@pytest.mark.parametrize("name", ["chains_shells", "chains_forced"])
 def test_committed_experiments_are_what_the_command_gives(name, tmp_path):
-    content, shipped = committed(name)
+    stored, shipped = committed(name)
     validate(shipped, tmp_path)
     found = json.loads((tmp_path / "results.json").read_text())["judgements"]
-    as_trees = (dict(enumerate(judgements)) for judgements in (found, content["judgements"]))
+    as_trees = (dict(enumerate(judgements)) for judgements in (found, stored.values()))
     assert unlike(*as_trees, digits=1e-9) == []  # in all digits on one CPU family

@@ -68,14 +68,6 @@ def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one
     assert not np.array_equal(sibling.crashes(VEHICLE), sibling.crashes(brakes_3))
 
 
-def test_a_vehicle_that_holds_its_speed_has_the_holders_rate(walk):
-    """1.345e-7 is that of the default IDM, from 98,304 enumerated paths."""
-    found = walk(campaign("examples.acting:Holds"), PATHS)
-    rate = of_vehicle(found, found.mass * found.crashes(VEHICLE), {})[RATE]
-    assert rate.relative_error < 0.06
-    assert rate.value == pytest.approx(1.345e-7, abs=4.0 * rate.std_error)
-
-
 @pytest.mark.parametrize("name", ["FreshNoise", "Breaks"])
 def test_a_vehicle_without_a_known_truth_is_refused(walk, name):
     with pytest.raises(HarnessError, match="failed"):
