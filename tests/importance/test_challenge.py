@@ -11,7 +11,7 @@ from scipy import special
 from harness.vehicles.kinematics import CONTACT_M
 from tests.chains.seed import SEED
 from tests.episode.twin_runs import Mean, prepared, run
-from tests.importance.kernels import tabulated
+from tests.kernels import tabulated
 
 BRAKES = np.linspace(-4.0, -1.0, 16)
 BRAKE_SHARES = np.exp(0.18 * BRAKES) / np.exp(0.18 * BRAKES).sum()

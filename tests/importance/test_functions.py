@@ -17,7 +17,7 @@ from harness.importance.tables import Tables
 from harness.vehicles.kinematics import CONTACT_M
 from harness.vocabulary import CUT_IN, STATE_COLUMNS, STAY
 from tests.episode.twin_runs import prepared, run
-from tests.importance.kernels import accumulated, after_cut_in, before_cut_in, drawn, tabulated
+from tests.kernels import accumulated, after_cut_in, before_cut_in, drawn, tabulated
 
 CHALLENGES = {"immediate": "two", "recursive": "default"}  # and the surrogates
 EPSILONS = (0.0, 0.1, 1.0)

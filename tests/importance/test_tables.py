@@ -9,7 +9,7 @@ from harness.importance import tables as cache
 from harness.importance.functions import build_importance
 from harness.importance.tables import Tables, build_tables, table_path, tables_hash
 from harness.vehicles.drivers import MODEL_FIELDS, driver_records
-from tests.traffic.kernels import environment
+from tests.kernels import environment
 
 DRIVER = driver_records([IDMParameters()])
 OTHER = driver_records([IDMParameters(time_headway_s=1.5)])

@@ -22,8 +22,8 @@ from harness.sampling.baseline import as_recorded, baseline_requests, run_baseli
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
+from tests.kernels import cut_in_terms
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
-from tests.traffic.kernels import cut_in_terms
 
 N = 256
 ACTING = "{{controller: 'tests.controllers.early:{}', before_cut_in: controller, limits: {{max_acceleration_mps2: 2}}}}"

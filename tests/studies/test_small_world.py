@@ -17,8 +17,8 @@ from studies.case_study.small_case import AV_MPS, _crashes, small_world
 from studies.case_study.study import Context, SmallCase
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
+from tests.kernels import smallest_gaps
 from tests.studies.here import Here
-from tests.vehicles.kernels import smallest_gaps
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from scipy import special, stats
 
 from harness.traffic.laws import InitialStates, t_table
 from tests.chains.seed import SEED
-from tests.traffic.kernels import car_following, cut_in_terms, environment, free_driving, t_distribution
+from tests.kernels import bv_accelerations, cut_in_terms, environment, t_distribution
 
 speeds = st.floats(0.0, 60.0)
 gaps = st.floats(-0.001, 200.0)
@@ -96,45 +96,26 @@ def step_probability(p_1s):
 # -- probabilities and draws --
 
 
-@given(speeds)
-def test_free_driving_probabilities(speed):
-    pmf = free_driving(speed)[0][0]
+@pytest.mark.parametrize("follows", [False, True])
+@given(speeds, gaps, rates)
+def test_probabilities_are_the_formula_and_the_guard_caps_at_the_largest_safe_acceleration(follows, speed, r1, r1dot):
+    pmf, cap, _ = (each[0] for each in bv_accelerations((speed, r1, r1dot), follows=follows))
+    expected = car_following_pmf(speed, r1, r1dot, cap) if follows else free_driving_pmf(speed)
+    assert cap in (guard_caps(r1, r1dot) if follows else [30])
     assert pmf.sum() == pytest.approx(1.0, abs=1e-12)
     assert (pmf >= 0.0).all()
-    np.testing.assert_allclose(pmf, free_driving_pmf(speed), rtol=0, atol=2e-8)
+    np.testing.assert_allclose(pmf, expected, rtol=0, atol=2e-8)
+    assert (pmf[cap + 1 :] == 0.0).all()
 
 
-@given(speeds, gaps, rates)
-def test_car_following_probabilities(speed, r1, r1dot):
-    pmf, cap, _ = car_following((speed, r1, r1dot))
-    assert pmf[0].sum() == pytest.approx(1.0, abs=1e-12)
-    assert (pmf >= 0.0).all()
-    np.testing.assert_allclose(pmf[0], car_following_pmf(speed, r1, r1dot, cap[0]), rtol=0, atol=2e-8)
-    assert (pmf[0, cap[0] + 1 :] == 0.0).all()
-
-
-@given(gaps, rates)
-def test_the_guard_caps_at_the_largest_safe_acceleration(r1, r1dot):
-    assert car_following((30.0, r1, r1dot))[1][0] in guard_caps(r1, r1dot)
-
-
-def largest_difference(drawn, pmf):
-    """Equal steps of the uniform give every acceleration its probability to within one step, 1e-5."""
-    assert (np.diff(drawn) >= 0).all()
-    return np.abs(np.bincount(drawn, minlength=31) / UNIFORMS.size - pmf).max()
-
-
-@pytest.mark.parametrize("speed", [15.0, 22.0, 30.0, 45.0])
-def test_free_driving_draws_invert_the_distribution(speed):
-    pmf, drawn = free_driving(speed, UNIFORMS)
-    assert largest_difference(drawn[0], pmf[0]) < 1.001e-5
-
-
+@pytest.mark.parametrize("follows", [False, True])
 @pytest.mark.parametrize("state", STATES)
-def test_car_following_draws_invert_the_distribution(state):
-    pmf, cap, drawn = car_following(state, UNIFORMS)
-    assert largest_difference(drawn[0], pmf[0]) < 1.001e-5
-    assert drawn.max() <= cap[0]
+def test_draws_invert_the_distribution(state, follows):
+    """Equal steps of the uniform give every acceleration its probability to within one step, 1e-5."""
+    pmf, cap, drawn = (each[0] for each in bv_accelerations(state, UNIFORMS, follows=follows))
+    assert (np.diff(drawn) >= 0).all()
+    assert np.abs(np.bincount(drawn, minlength=31) / UNIFORMS.size - pmf).max() < 1.001e-5
+    assert drawn.max() <= cap
 
 
 # -- Student's t as a table --
@@ -171,19 +152,27 @@ def test_the_hazard_is_the_formula(v, r1, r1dot, r2, r2dot, level):
 # -- initial states against distribution functions by scipy, with the published numbers --
 
 
-N = 400_000
 open_unit = st.floats(1e-9, 1.0 - 1e-9)
 inside_v = st.floats(20.0, 40.0)
+SPEED = stats.skewnorm(-2.41, 33.86, 5.174)
 
 
-@pytest.fixture(scope="module")
-def sampler():
-    return InitialStates(environment().numbers)
+def speed_distribution(v):
+    low, high = SPEED.cdf(20.0), SPEED.cdf(40.0)
+    return (SPEED.cdf(v) - low) / (high - low)
 
 
-@pytest.fixture(scope="module")
-def states(sampler):
-    return sampler.draw(SEED, 0, N)
+@pytest.mark.parametrize(
+    ("column", "distribution"),
+    [
+        ("r2_m", stats.uniform(20.0, 80.0).cdf),
+        ("r2dot_mps", stats.uniform(-10.0, 5.0).cdf),
+        ("v_bv_mps", speed_distribution),
+    ],
+)
+def test_speeds_are_skew_normal_and_the_avs_part_is_uniform(column, distribution):
+    states = InitialStates(environment().numbers).draw(SEED, 0, 20_000)
+    assert stats.kstest(states[column], distribution).pvalue > 1e-4
 
 
 def gap_distribution(v):
@@ -197,22 +186,6 @@ def rate_distribution(v, r1):
     u, w = (v - 30.0) / 10.0, (r1 - 40.0) / 40.0
     location = 0.331 - 0.687 * u - 0.219 * w - 0.904 * u * w - 0.230 * u**2
     return stats.t(4.98, location, np.exp(-0.015 - 0.109 * u + 0.808 * w - 0.327 * w**2))
-
-
-@pytest.mark.parametrize(
-    ("column", "reference"),
-    [("r2_m", stats.uniform(20.0, 80.0)), ("r2dot_mps", stats.uniform(-10.0, 5.0))],
-    ids=["R2", "R2dot"],
-)
-def test_the_avs_part_is_uniform(states, column, reference):
-    assert stats.kstest(states[column], reference.cdf).pvalue > 1e-4
-
-
-def test_speeds_are_skew_normal(states):
-    free = stats.skewnorm(-2.41, 33.86, 5.174)
-    low, high = free.cdf(20.0), free.cdf(40.0)
-    sample = states["v_bv_mps"][:20_000]
-    assert stats.kstest(sample, lambda v: (free.cdf(v) - low) / (high - low)).pvalue > 1e-4
 
 
 @given(inside_v, open_unit)

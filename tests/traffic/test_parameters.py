@@ -1,12 +1,20 @@
-"""The parameter file: every number reaches the kernels, and a wrong one is named."""
+"""The parameter file: every number reaches the kernels, a wrong one is named; how long cut-ins show themselves."""
 
+import math
+
+import numpy as np
 import pytest
 
+from harness.campaign.files import read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
+from harness.pool.cut_ins import environment_hash
+from harness.traffic import lateral as of_lateral
+from harness.traffic.lateral import constant_lead, lateral_position, log_normal_speed, perceived_in
 from harness.traffic.loading import load_environment, load_parameters
-from harness.traffic.parameters import SHIPPED_FOLDER
+from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
+from tests.kernels import alone
 
 SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
 TEXT = SHIPPED.read_text(encoding="utf-8")
@@ -110,3 +118,78 @@ def test_a_lateral_section_that_says_too_little_or_too_much_is_refused(mine, num
     said = refusal(mine(TEXT + "lateral:\n" + "".join(lines)))
     assert "lateral" in said
     assert found in said
+
+
+# -- leads: by known answers, files by their rules, hashes that stay where nothing is said --
+
+
+draw_lead = alone(of_lateral.draw_lead)
+PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
+
+
+def leads(law, n=20_000, seed=1):
+    return np.array([draw_lead(57, seed, path, law) for path in range(n)])
+
+
+@pytest.mark.parametrize("lead_s", [0.0, 0.1, 0.5, 2.0])
+def test_a_constant_lead_is_always_that_also_in_place_of_the_files(lead_s):
+    instead = load_environment(EnvironmentSettings(parameters=LATERAL, cut_in_lead_s=lead_s)).lateral
+    assert instead.distance_m == 1.7
+    for lateral in (constant_lead(lead_s), instead):
+        assert set(leads(lateral, 500).tolist()) == {round(10 * lead_s)}
+
+
+def test_leads_of_a_log_normal_speed_have_its_quantiles():
+    """1.7 m at a median of 0.69 m/s: half of the leads are below 2.46 s; a speed of 1.39 m/s is two deviations up."""
+    lateral = log_normal_speed(1.7, 0.69, 0.35, 4.0)
+    assert lateral.cumulative.size == 41
+    assert lateral.cumulative[24] == pytest.approx(0.5, abs=0.01)  # up to 2.45 s
+    two = 1.7 / (0.69 * math.exp(2 * 0.35))
+    assert np.interp(two, 0.1 * (np.arange(41) + 0.5), lateral.cumulative) == pytest.approx(0.0228, abs=0.002)
+    found = leads(lateral)
+    assert (found == 40).mean() == pytest.approx(1.0 - lateral.cumulative[39], abs=0.01)
+    # Kolmogorov's bound: a right sampler fails once in a thousand seeds.
+    share = np.array([(found <= k).mean() for k in range(41)])
+    assert np.abs(share - lateral.cumulative).max() < 1.95 / math.sqrt(found.size)
+    assert np.abs(share - log_normal_speed(1.7, 0.69, 0.5, 4.0).cumulative).max() > 1.95 / math.sqrt(found.size)
+
+
+@pytest.mark.parametrize(
+    ("perceives_m", "lead", "expected"),
+    [(0.0, 10, 91), (0.375, 10, 94), (0.375, 15, 90), (0.85, 10, 96), (1.7, 10, 101), (9.0, 10, 101), (0.375, 0, 101)],
+)
+def test_who_perceives_so_much_may_act_from_that_step(perceives_m, lead, expected):
+    """BV cuts in in step 100. 0.375 of 1.7 m take 2.2 of 10 steps, and 3.3 of 15: the next whole one counts."""
+    first, earlier = perceived_in(perceives_m, 100, lead, 1.7)
+    assert first == expected
+    reached = lateral_position(first, 100, lead, 1.7)
+    assert reached >= min(perceives_m, 1.7) - 1e-9
+    assert lead == 0 or first == 91 or lateral_position(first - 1, 100, lead, 1.7) < perceives_m
+    assert earlier == pytest.approx((reached - min(perceives_m, 1.7)) * lead / 1.7, abs=1e-8)
+
+
+def test_an_onset_before_the_test_is_seen_in_its_first_step_with_what_has_come_over_by_then():
+    assert perceived_in(0.0, 4, 20, 1.7) == (1, 0.0)
+    assert perceived_in(0.375, 4, 20, 1.7) == (1, 0.0)  # 1.275 m have come over
+    assert perceived_in(1.5, 4, 20, 1.7)[0] == 3
+
+
+def test_the_shipped_environment_is_the_papers_with_a_section_more():
+    paper, lateral = (read_model(SHIPPED_FOLDER / f"{name}.yaml", EnvironmentParameters) for name in (PAPER, LATERAL))
+    assert lateral.model_copy(update={"lateral": None}) == paper
+    assert {name for name in lateral.values() if name not in paper.values()} == {
+        f"lateral__{name}" for name in ("distance_m", "speed_median_mps", "speed_log_sd", "longest_lead_s")
+    }
+    numbers = [load_environment(EnvironmentSettings(parameters=name)).numbers for name in (PAPER, LATERAL)]
+    assert numbers[0].dtype == numbers[1].dtype  # kernels are compiled once for both
+    assert numbers[0] == numbers[1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "of_before"),
+    [({}, True), ({"cut_in_lead_s": 0.0}, True), ({"cut_in_lead_s": 0.5}, False), ({"parameters": LATERAL}, False)],
+)
+def test_what_says_nothing_of_leads_has_the_hash_of_before(settings, of_before):
+    """Written down before cut-ins could take time; those of campaigns are in tests/campaign."""
+    found = environment_hash(load_environment(EnvironmentSettings(**settings)))
+    assert (found == "e5b943592be3f1b7d3db2db8") == of_before
