@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
@@ -58,18 +58,6 @@ class Campaign(Section):
     stop: Stop = Stop()
     accept: Accept | None = Field(None, description="stop at a decision instead of at a precision")
     run: Run = Run()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _what_decides_is_what_is_tested(cls, content: Any) -> Any:
-        """One place says which statement a run is about, and that its tests follow: ``testing.shells.statement``."""
-        if not isinstance(content, dict) or not isinstance(accept := content.get("accept"), dict):
-            return content
-        asked, testing = accept.get("statement"), content.get("testing") or {}
-        shells = testing.get("shells") or {} if isinstance(testing, dict) else None
-        if asked is None or not isinstance(shells, dict) or "statement" in shells:
-            return content
-        return {**content, "testing": {**testing, "shells": {**shells, "statement": asked}}}
 
     @model_validator(mode="after")
     def _parts_go_together(self) -> Self:
@@ -174,13 +162,6 @@ REFUSED = (
         "a limit, with testing.method {testing.method}",
         "testing.method shells: how often decisions are wrong is known for its intervals alone",
         "Choose shells, or delete the section and compare the interval with the limit yourself.",
-    ),
-    Combination(
-        "accept.statement",
-        lambda c, _: c.accept is not None and c.accept.statement not in (None, c.testing.shells.statement),
-        "{accept.statement}, and {testing.shells.statement} in testing.shells.statement",
-        "the same statement, or one of the two keys alone",
-        "Delete one of them.",
     ),
     # -- vehicles that act before the cut-in --
     Combination(

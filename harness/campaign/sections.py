@@ -119,7 +119,7 @@ class ShellSettings(Section):
 
     statement: str = Field(
         ASSUMPTION_FREE,
-        description="which statement has to reach stop.rhw; outside of it nothing is tested",
+        description="which statement stop.rhw or accept is about; outside of it nothing is tested",
     )
     first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
         None, description="tests of each shell before any is preferred; none: by its probability"
@@ -214,10 +214,11 @@ class Stop(Section):
 
 
 class Accept(Section):
-    """A limit: a run of shells ends as soon as it is known on which side of it the crash rate lies."""
+    """A limit: a run of shells ends when it is known on which side of it the rate of testing.shells.statement lies."""
+
+    gone = {"statement": (None,)}
 
     crash_rate_below: float = Field(gt=0.0, lt=1.0, description="crashes per test: accepted below it, rejected above")
-    statement: str | None = Field(None, description="which statement decides; none: testing.shells.statement")
 
 
 class Resources(Section):

@@ -62,8 +62,7 @@ def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None)
 def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_json: bool) -> None:
     """Validate CAMPAIGN, or that of VEHICLE; print it with every default filled in, and what it will cost.
 
-    No test is run and nothing is written; an AV that is not built in is run for about a second, to see what it costs.
-    The output is itself a campaign file; its cost stands in comments.
+    No test is run and nothing is written. The output is itself a campaign file; its cost stands in comments.
     """
     campaign = loaded(campaign_file, overrides, av)
     from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast

@@ -25,8 +25,8 @@ SCOPE = "The interval is about sampling error in this environment, not about how
 MENDS: dict[str, str] = {
     "episodes": "stop.episodes was spent; raise it and go on with --resume",
     "pool": "all cut-ins that the pool keeps of a shell were tested; raise pool.cut_ins_per_shell and use a new folder",
-    "contradicted": "the vehicle does not do what the statement assumes; ask for accept.statement: assumption_free and "
-    "use a new folder",
+    "contradicted": "the vehicle does not do what the statement assumes; ask for testing.shells.statement: "
+    "assumption_free and use a new folder",
     "pool_error": "the pool's own error alone is wider; lower pool.relative_error (or raise pool.shadow_paths, of a "
     "vehicle that acts before the cut-in) and use a new folder",
 }

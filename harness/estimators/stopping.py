@@ -111,8 +111,8 @@ class Decision:
         if self.verdict == "undecided" and self.contradicted:
             text = (
                 f"UNDECIDED: whether the crash rate is below {limit} per test is not known: the vehicle does not do "
-                f"what statement {self.statement} assumes. Ask for accept.statement: {ASSUMPTION_FREE}, and use a new "
-                "folder."
+                f"what statement {self.statement} assumes. Ask for testing.shells.statement: "
+                f"{ASSUMPTION_FREE}, and use a new folder."
             )
         elif self.verdict == "undecided":
             between = f"it may be {number(self.low)} as well as {number(self.high)}"

@@ -1,4 +1,4 @@
-"""Look before anything is spent on a campaign: what the AV does, how fast it is, and what tests cost."""
+"""Look before anything is spent on a campaign: what the AV does and how fast it is, and what tests cost."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +16,17 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.find import AvEndedProcessError, build_host, has_foreign_code, run_apart
-from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
+from harness.controllers.find import has_foreign_code, run_apart
+from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.resolved import require_ready, require_world, resolve
 from harness.runner.workers import Bits, bits_of
 from harness.sampling import EPISODES_PER_S, prepare, source_of
-from harness.sampling.protocol import ShardRequest, Source
+from harness.sampling.protocol import Source
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED
-from harness.worlds import AVLostError, build_world
+from harness.worlds import build_world
 from harness.worlds.shim import shim_library
 
 EPISODES = 48
@@ -257,133 +256,28 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
 
 # -- what a campaign costs --
 
-KB_PER_EPISODE = 0.2
-KB_PER_MOMENT = 0.1
-MOMENTS_PER_EPISODE = {"all": 70, "first_9": 9, "none": 0}
-MEASURED_S = 1.0
-SLOW_TEST_S = 0.1
-"""Time of a test from which tests are handed out one by one, to keep workers busy (docs/internals/performance.md)."""
-STEPS, STEPS_WITH_CUT_IN = 89, 185
-"""Mean steps of a test without and with a cut-in, of the default IDM in 5,000 tests of `nde` and of `forced`."""
-STEPS_ACTED = 162
-"""Of the latter, those after the cut-in."""
-
 
 def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     """Cost of a campaign: what it is expected to take, and at most.
 
     That is ``expected_tests`` and ``expected_seconds`` (to within a factor of three; in words where nobody can tell),
-    ``most_tests`` and ``most_seconds``, the budget; ``tests_per_second`` (all cores), ``tables`` (in words) and
-    ``most_disk_mb``; of an AV that is not built in ``av_ms_per_test``, measured, or in words why there is none.
+    ``most_tests`` and ``most_seconds``, the budget; ``tests_per_second`` (all cores, without what an AV of one's own
+    takes) and ``tables`` (in words).
 
     Raises `CampaignError`: a run would refuse the campaign before it starts.
     """
     resolved, source = require_ready(campaign), source_of(campaign)
     engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
-    per_core: float = EPISODES_PER_S[campaign.testing.method][engine]
-    of_av: dict[str, float | str] = {}
-    if campaign.av.model is None:
-        measured = seconds_per_test(campaign)
-        of_av["av_ms_per_test"] = measured if isinstance(measured, str) else _rounded(1e3 * measured)
-        if isinstance(measured, float):
-            moved_by_sumo = campaign.av.source in ("sumo", "traci")
-            per_core = 1.0 / (measured + (0.0 if moved_by_sumo else 1.0 / per_core))
-            of_av |= _if_slow(measured, campaign)
-    rate = _rounded(per_core * (os.cpu_count() or 1))
-    moments = MOMENTS_PER_EPISODE[campaign.records.moments] if campaign.sampling.mixes else 0
-    episodes, expected = campaign.stop.episodes, source.expected_tests(resolved)
+    rate = float(f"{EPISODES_PER_S[campaign.testing.method][engine] * (os.cpu_count() or 1):.2g}")
+    most, expected = campaign.stop.episodes, source.expected_tests(resolved)
     until = "the limit is decided" if campaign.accept is not None else "stop.rhw is reached"
+    own = {} if campaign.av.model else {"av": "its own time comes on top: `harness av-check` measures it"}
     return {
-        "expected_tests": int(_rounded(expected)) if expected else f"not known beforehand: until {until}",
+        "expected_tests": int(float(f"{expected:.2g}")) if expected else f"not known beforehand: until {until}",
         **({"expected_seconds": round(expected / rate)} if expected else {}),
-        "most_tests": episodes,
-        "most_seconds": round(episodes / rate),
+        "most_tests": most,
+        "most_seconds": round(most / rate),
         "tests_per_second": rate,
         "tables": source.building(resolved),
-        "most_disk_mb": round(episodes * (KB_PER_EPISODE + KB_PER_MOMENT * moments) / 1000.0, 1),
-        **of_av,
+        **own,
     }
-
-
-def _if_slow(test_s: float, campaign: Campaign) -> dict[str, str]:
-    """How many workers are fed where a test takes long."""
-    if test_s < SLOW_TEST_S or campaign.run.smallest_shard == 1:
-        return {}
-    task_s = test_s * campaign.run.smallest_shard
-    said = f"with run.shard_size 1 a task is one test of {test_s:.2g} s, and now up to {task_s:,.0f} s"
-    if campaign.sampling.strata:
-        said += "; testing.shells.smallest_round feeds so many workers from the first round on"
-    return {"slow_av": said}
-
-
-def _rounded(value: float) -> float:
-    """Two digits: more are not known."""
-    return float(f"{value:.2g}")
-
-
-def seconds_per_test(campaign: Campaign) -> float | str:
-    """Time (s) that the campaign's AV adds to a test on one core, the world's included where SUMO moves the AV.
-
-    In words why, where there is none.
-    """
-    try:
-        return run_apart(campaign.av, _measure, campaign)
-    except AvEndedProcessError as error:
-        return f"not known: {error.found}"
-
-
-class _TimeIsUpError(Exception):
-    """Enough has been measured, or the AV has failed, which is the message."""
-
-
-def _measure(campaign: Campaign, *, black_box: Path | None = None) -> float | str:
-    """Forced cut-ins in the loop itself until the clock ends it."""
-    testing = campaign.testing.model_copy(update={"method": "forced"})
-    records = campaign.records.model_copy(update={"moments": "none"})
-    source = prepare(resolve(campaign.model_copy(update={"testing": testing, "records": records})))
-    spent_s, n_seen, until = 0.0, 0, time.perf_counter() + MEASURED_S
-
-    def watch(owner: object, name: str, n_vehicles: Callable[[Any], int], failures: Callable[[Any], Any]) -> None:
-        """Measure a method of an object; what it answers says which vehicles have failed, and why."""
-        call = getattr(owner, name)
-
-        def measured(*arguments: Any, **options: Any) -> Any:
-            nonlocal spent_s, n_seen
-            began = time.perf_counter()
-            answer = call(*arguments, **options)
-            now = time.perf_counter()
-            spent_s, n_seen = spent_s + now - began, n_seen + n_vehicles(arguments[0])
-            for cause in failures(answer).values():
-                raise _TimeIsUpError(cause)
-            if now > until and n_seen:
-                raise _TimeIsUpError
-            return answer
-
-        setattr(owner, name, measured)
-
-    try:
-        world = build_world(campaign)
-    except AVLostError as error:
-        return f"not known: {error}"
-    host = build_host(campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box)
-    loop = EpisodeLoop(world, source.policy, RecordPolicy(0, "none", 0.0), host)
-    try:
-        if host is not None:
-            watch(host, "start", lambda _: 0, dict)
-            watch(host, "act", lambda seen: len(seen[0]), lambda answer: answer[1])
-        else:
-            watch(world, "step", lambda _: world.n_cells, lambda _: {})
-        for k in count():
-            source.run(loop, ShardRequest(0, k * world.n_cells, world.n_cells))
-    except (AVLostError, _TimeIsUpError) as error:
-        if error.args:
-            return f"not known: {error}"
-    finally:
-        loop.close()
-        world.close()
-    rare = not campaign.sampling.controlled
-    if host is None:
-        n_steps = STEPS if rare else STEPS_WITH_CUT_IN
-    else:
-        n_steps = STEPS_ACTED + host.warm_up_steps if not rare else STEPS * host.acts_before_cut_in
-    return n_steps * spent_s / n_seen

@@ -249,22 +249,6 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
         assert "started, below Python" in printed.err
 
 
-def test_check_survives_a_controller_that_does_not(tmp_path, capsys):
-    assert _main("check --json", tmp_path, _of("Always", where="step")) == EXIT_DONE
-    assert "in the call of step" in json.loads(capsys.readouterr().out)["plan"]["av_ms_per_test"]
-
-
-def test_check_says_how_a_slow_controller_keeps_many_workers_busy(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("harness.runner.look.seconds_per_test", lambda _: 12.0)
-    for size in (100, 1):
-        assert _main("check --json", tmp_path, _of("Prints"), f"run.shard_size={size}") == EXIT_DONE
-        plan = json.loads(capsys.readouterr().out)["plan"]
-        said = plan.get("slow_av", "").startswith(
-            "with run.shard_size 1 a task is one test of 12 s, and now up to 1,200 s"
-        )
-        assert said == (size == 100)
-
-
 @pytest.mark.parametrize("field", ["cell", "episode", "gap_m", "lv_speed_mps", "cells", "episodes"])
 def test_nothing_that_a_batch_controller_is_handed_can_be_written_into(field):
     failures = drive(f"av={_of('Batch', overwrites=field)}", cells=8, n=24).failures

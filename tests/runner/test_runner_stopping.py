@@ -100,7 +100,7 @@ def test_a_shard_is_written_when_all_before_it_are_in(campaign, run_here, tmp_pa
         (("accept.crash_rate_below=4e-7",), 0, "accepted"),
         (("accept.crash_rate_below=5e-8",), 5, "rejected"),
         (("accept.crash_rate_below=1.4e-7", "stop.episodes=300"), 4, "undecided"),
-        (("accept={crash_rate_below: 4e-7, statement: library}",), 0, "accepted"),
+        (("testing.shells.statement=library", "accept.crash_rate_below=4e-7"), 0, "accepted"),
     ],
 )
 def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, code, verdict):
@@ -129,22 +129,23 @@ def test_a_second_limit_is_answered_and_said(campaign, run_here, tmp_path):
 def test_nothing_is_accepted_given_what_the_vehicle_does_not_do(campaign, run_here, tmp_path):
     """SM-II crashes 8.8e-6 times per test, mostly outside, and brakes later than the need-based driver."""
     changes = (
-        "accept={crash_rate_below: 1e-6, statement: need-based}",
+        "accept.crash_rate_below=1e-6",
+        "testing.shells.statement=need-based",
         "av={model: fvdm, parameters: {min_acceleration_mps2: -1.0}}",
     )
     found = run_here(campaign(*SHELLS, "world.engine=twin", *changes), tmp_path / "run")
     assert (found.exit_code, found.stopped_by) == (4, "contradicted")
     assert found.estimates["decision"]["sentence"].startswith("UNDECIDED")
-    assert "ask for accept.statement: assumption_free" in found.ending
+    assert "ask for testing.shells.statement: assumption_free" in found.ending
 
 
 @pytest.mark.parametrize(
     ("changes", "where"),
     [
         (("testing.method=forced", "accept.crash_rate_below=1e-7"), "accept"),
-        (("accept={crash_rate_below: 1e-7, statement: library}", "testing.shells.statement=need-based"), "statement"),
+        (("accept={crash_rate_below: 1e-7, statement: library}",), "'statement' belongs under testing.shells"),
         (("accept.crash_rate_below=0",), "accept.crash_rate_below"),
-        (("accept={crash_rate_below: 1e-7, statement: nobody}",), "nobody"),
+        (("testing.shells.statement=nobody", "accept.crash_rate_below=1e-7"), "nobody"),
     ],
 )
 def test_limits_that_cannot_be_decided_are_refused(campaign, run_here, tmp_path, changes, where):

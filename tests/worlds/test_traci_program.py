@@ -108,7 +108,6 @@ def test_a_machine_with_a_public_address_is_refused_unless_it_is_allowed(monkeyp
     assert "127.0.0.1" in own_addresses()
     addresses = {"127.0.0.1", "10.1.2.3", "192.168.0.9"}
     monkeypatch.setattr("harness.worlds.program.own_addresses", lambda: addresses)
-    monkeypatch.setattr("harness.runner.look.seconds_per_test", lambda _: 0.1)
     plain, allowed = (load(f"{EXAMPLE} {{port}} {{cells}}", more) for more in ("", ", allow_public: true"))
     plan_campaign(plain)
     addresses.add("8.8.4.4")
