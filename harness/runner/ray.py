@@ -121,18 +121,17 @@ def _fill_cache(files: Files) -> None:
 
 
 class RayWorker:
-    """An actor, seen from the run; ``pending`` is what it is asked for."""
+    """An actor, seen from the run as a `WorkerProcess`; ``pending`` is what it is asked for."""
 
     def __init__(self, actor: Any, pending: ray.ObjectRef[Any], workers: RayWorkers) -> None:
         self._actor, self.pending, self._workers = actor, pending, workers
 
     def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
-        """See `harness.runner.workers.WorkerProcess`: that it is dead shows in its answer."""
+        # That it is dead shows in its answer.
         self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.baseline)
         return True
 
     def answer(self) -> Result | WorkerDeath:
-        """See `harness.runner.workers.WorkerProcess`."""
         answer = self.result()
         if isinstance(answer, WorkerDeath):
             self._workers.ready.append(self)  # its actor lives, and will start another process
@@ -153,15 +152,12 @@ class RayWorker:
         return result
 
     def kill(self) -> None:
-        """See `harness.runner.workers.WorkerProcess`; its process follows it at once."""
-        ray.kill(self._actor)
+        ray.kill(self._actor)  # its process follows it at once
 
     def dismiss(self) -> None:
-        """See `harness.runner.workers.WorkerProcess`."""
         self.pending = self._actor.close.remote()
 
     def wait(self, seconds: float) -> None:
-        """See `harness.runner.workers.WorkerProcess`."""
         ray.wait([self.pending], timeout=2.0 * seconds)
         self.kill()
 
@@ -208,22 +204,18 @@ class RayWorkers(Workers):
         )
 
     def cpus(self) -> set[str]:
-        """See `Workers.cpus`."""
         return self._cpus
 
     def follow_from(self, baseline: bytes) -> None:
-        """See `Workers.follow_from`."""
         self.baseline = [ray.put(baseline)]
 
     def new_worker(self) -> RayWorker | None:
-        """See `Workers.new_worker`."""
         while len(self._busy) + len(self.ready) + len(self._starting) < self.n_workers:
             actor = self._actor_class.remote(self._content)
             self._starting.append(RayWorker(actor, actor.begin.remote(self._cached), self))
         return self.ready.pop() if self.ready else None
 
     def first_to_answer(self, busy: Sequence[RayWorker]) -> RayWorker | None:
-        """See `Workers.first_to_answer`."""
         pending = {worker.pending: worker for worker in [*busy, *self._starting]}
         while not (answered := ray.wait(list(pending), num_returns=1, timeout=LOOK_S)[0]):
             if not busy and time.monotonic() > self._patient_until:
@@ -275,7 +267,6 @@ class RayWorkers(Workers):
         )
 
     def close(self) -> None:
-        """See `Workers.close`."""
         super().close()
         for worker in [*self._starting, *self.ready]:
             worker.kill()

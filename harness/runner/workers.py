@@ -392,18 +392,14 @@ class LocalWorkers(Workers):
         self._server = fork_server(*worker_modules(resolved.campaign.world.engine))
 
     def new_worker(self) -> WorkerProcess:
-        """See `Workers.new_worker`."""
         return WorkerProcess(self._server, serve, self._resolved.path, self._baseline.path)
 
     def follow_from(self, baseline: bytes) -> None:
-        """See `Workers.follow_from`."""
         self._baseline.path.write_bytes(baseline)
 
     def first_to_answer(self, busy: Sequence[WorkerProcess]) -> WorkerProcess:
-        """See `Workers.first_to_answer`."""
         return first_to_answer(busy)
 
     def close(self) -> None:
-        """See `Workers.close`."""
         super().close()
         self._server.close()

@@ -205,7 +205,6 @@ class SumoWorld(SumoCells):
         self._require_equal("m/s", self._get_speed, speeds, names)
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.worlds.World`."""
         changing = cut_in.nonzero()[0].tolist()
         for k in changing:
             self._begin_cut_in(self._names[k][BV])
