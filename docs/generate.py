@@ -61,6 +61,10 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _listed(rows: list[tuple[str, ...]]) -> str:
+    return "".join(f"- {name}: {text}\n" for name, text in rows)
+
+
 def _choices(annotation: Any) -> str:
     """The values that a setting can have, where they can be listed."""
     if str(get_origin(annotation)) == "typing.Literal":
@@ -75,8 +79,7 @@ def _setting(name: str, field: FieldInfo) -> tuple[str, ...]:
     key = f"`{name}`" if plain else f"`{name}: {value}`"
     choices, words = _choices(field.annotation), field.description or ""
     told = all(choice.strip("`") in words for choice in choices.split(", "))
-    text = words if told or not choices else f"{choices}: {words}"
-    return key + (" (required)" if field.is_required() else ""), text.replace("|", "\\|")
+    return key + (" (required)" if field.is_required() else ""), words if told or not choices else f"{words}: {choices}"
 
 
 def _settings_rows(section: type[BaseModel], prefix: str = "") -> list[tuple[str, ...]]:
@@ -97,14 +100,14 @@ def _sections(annotation: Any) -> list[type[BaseModel]]:
 
 
 def settings_reference() -> str:
-    """A table for each section of a campaign and each driver model's parameters; a row shown already is only named."""
+    """A list for each section of a campaign and each driver model's parameters; a row shown already is only named."""
     fields = Campaign.model_fields
     top = [_setting(name, field) for name, field in fields.items() if not _sections(field.annotation)]
-    text = [f"\n{_table(_SETTING, top)}\n"]
+    text = [f"\n{_listed(top)}\n"]
     for name, field in fields.items():
         if below := _sections(field.annotation):
             key = f"{name}.NAME" if get_origin(field.annotation) is dict else name
-            text.append(f"### `{key}`\n\n{_own_words(below[0])}\n\n{_table(_SETTING, _settings_rows(below[0]))}\n")
+            text.append(f"### `{key}`\n\n{_own_words(below[0])}\n\n{_listed(_settings_rows(below[0]))}\n")
     model_of: dict[tuple[str, ...], str] = {}
     for model, section in PARAMETERS.items():
         rows = _settings_rows(section)
@@ -115,12 +118,9 @@ def settings_reference() -> str:
             for other in dict.fromkeys(shared.values())
         ]
         new = [row for row in rows if row not in shared]
-        text.append(f"\n\n{_table(_SETTING, new)}\n")
+        text.append(f"\n\n{_listed(new)}\n")
         model_of = dict.fromkeys(new, model) | model_of
     return "".join(text)
-
-
-_SETTING = ("key: default", "meaning")
 
 
 def _own_words(section: type[BaseModel]) -> str:
@@ -129,11 +129,11 @@ def _own_words(section: type[BaseModel]) -> str:
 
 
 def columns_table(name: str) -> str:
-    """Table of a schema's columns; those that episodes have as well are only named."""
+    """A schema's columns; those that episodes have as well are only named."""
     rows = _column_rows(SCHEMAS[name])
     known = [row for row in rows if name != "episodes" and row in _column_rows(SCHEMAS["episodes"])]
     shared = f"As in `episodes`: {', '.join(row[0] for row in known)}.\n\n" if known else ""
-    return shared + _table(("column", "meaning"), [row for row in rows if row not in known])
+    return shared + _listed([row for row in rows if row not in known])
 
 
 def _column_rows(schema: pa.Schema) -> list[tuple[str, ...]]:
@@ -142,7 +142,7 @@ def _column_rows(schema: pa.Schema) -> list[tuple[str, ...]]:
         words = {key.decode(): value.decode() for key, value in field.metadata.items()}
         unit = words["unit"] if not words["unit"].startswith("m") and words["unit"] not in ("", "1", "s") else ""
         more = ", ".join(filter(None, [unit, "null" if field.nullable else ""]))  # else the unit is in the name
-        rows.append((f"`{field.name}`{more and f' ({more})'}", words["doc"].replace("|", "\\|")))
+        rows.append((f"`{field.name}`{more and f' ({more})'}", words["doc"]))
     return rows
 
 

@@ -186,15 +186,19 @@ class PoolSettings(Section):
 class World(Section):
     """Where episodes are simulated."""
 
-    engine: Literal["sumo", "twin"] = Field("sumo", description="twin: the same motion without SUMO")
+    engine: Literal["sumo", "twin"] = Field("sumo", description="sumo, or twin: the same motion without SUMO")
     cells: Whole = Field(64, ge=1, le=4096, description="episodes simulated side by side; never changes a result")
 
 
 class Records(Section):
     """What is kept of every episode."""
 
-    moments: Literal["all", "first_9", "none"] = Field("first_9", description="control steps kept; scv needs first_9")
-    traces: Literal["all", "crash", "critical", "none"] = Field("none", description="episodes whose motion is kept")
+    moments: Literal["all", "first_9", "none"] = Field(
+        "first_9", description="control steps kept: all, first_9 (which scv needs) or none"
+    )
+    traces: Literal["all", "crash", "critical", "none"] = Field(
+        "none", description="episodes whose motion is kept: all, crash, critical or none"
+    )
     trace_share: Probability = Field(0.0, description="share of episodes traced whatever their outcome")
 
 
@@ -252,7 +256,9 @@ class Run(Section):
         description="episodes per file and per task; none: 5,000, and more in long runs",
     )
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
-    executor: Literal["local", "ray"] = Field("local", description="where workers run")
+    executor: Literal["local", "ray"] = Field(
+        "local", description="workers run on this machine (local) or on a Ray cluster (ray)"
+    )
     ray: RaySettings = RaySettings()
 
     @property

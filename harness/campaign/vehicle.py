@@ -68,7 +68,7 @@ class TraciProcess(Section):
     connect_time_s: Positive = Field(60.0, le=3600.0, description="time it may take to connect")
     restarts: Whole = Field(3, ge=0, le=100, description="times that it is started again when it has ended")
     allow_public: bool = Field(
-        False, description="run also on a machine with a public address: SUMO's server listens on all"
+        False, description="run also on a machine with a public address: SUMO's server listens on every address"
     )
 
     @field_validator("command")
@@ -129,7 +129,7 @@ class AutomatedVehicle(Section):
 
     model_config = ConfigDict(json_schema_extra=_schema_of_sources)
 
-    model: ModelName | None = Field(None, description="built-in driver model; none: idm, if nothing else is named")
+    model: ModelName | None = Field(None, description="built-in driver model, idm where nothing is named")
     controller: str | None = Field(
         None,
         pattern=CONTROLLER_PATTERN,
@@ -149,7 +149,7 @@ class AutomatedVehicle(Section):
     reaction: Reaction = Reaction()
     before_cut_in: Literal["hold_speed", "controller"] = Field(
         "hold_speed",
-        description="whether it keeps its speed until the cut-in [itsc]",
+        description="hold_speed until the cut-in [itsc], or controller: it acts from the start",
     )
     warm_up_s: StepTime = Field(
         2.0,
