@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-
-import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.episode.loop import Shard
@@ -17,22 +14,6 @@ from harness.worlds.twin import TwinWorld
 from tests.worlds.running import smoke
 
 LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
-FMU = """
-from pythonfmu import Fmi2Causality, Fmi2Slave, Real
-{imports}
-
-
-class {name}(Fmi2Slave):
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
-        for name in {variables}:
-            setattr(self, name, 0.0)
-            self.register_variable(Real(name, causality=Fmi2Causality.output if name == "a" else Fmi2Causality.input))
-
-    def do_step(self, current_time, step_size):
-        {step}
-        return True
-"""
 
 
 def forced(*overrides: str) -> Campaign:
@@ -58,15 +39,3 @@ def fmu_av(file: str | Path, more: str = "") -> str:
     """YAML of the FMU of the examples, with further keys."""
     inputs = "{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap}"
     return f"{{fmu: {{file: '{file}', inputs: {inputs}, output: a}}{more}}}"
-
-
-def make_fmu(folder: Path, name: str, inputs: str, step: str, imports: str = "", files: Sequence[Path] = ()) -> Path:
-    """An FMU that makes ``a`` of its inputs by the lines of ``step``. No other of this process may have its name."""
-    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
-    lines = "\n        ".join(step.strip().splitlines())
-    script = folder / f"{name.lower()}.py"
-    script.write_text(FMU.format(name=name, imports=imports, variables=(*inputs.split(), "a"), step=lines))
-    with pytest.MonkeyPatch.context() as patch:
-        for file in files:  # to be found as where the FMU is unpacked
-            patch.syspath_prepend(file.parent)
-        return builder.FmuBuilder.build_FMU(script, dest=folder, project_files=list(files))

@@ -18,15 +18,32 @@ from harness.controllers.find import build_host, require_controller
 from harness.controllers.fmu import OBSERVATIONS, fmu_maker, wire
 from harness.errors import CampaignError
 from harness.resolved import resolve
-from tests.controllers.driving import make_fmu
 
 WIRED = "inputs: {speed_mps: x}, output: a"
+COUNTER = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+
+class Counter(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.x = self.a = 0.0
+        self.register_variable(Real("x", causality=Fmi2Causality.input))
+        self.register_variable(Real("a", causality=Fmi2Causality.output))
+
+    def do_step(self, current_time, step_size):
+        self.a += self.x / 100.0
+        return True
+"""
 
 
 @pytest.fixture(scope="module")
 def fmu(tmp_path_factory):
     """Output: the sum of its inputs so far, in hundredths."""
-    return make_fmu(tmp_path_factory.mktemp("fmu"), "Counter", "x", "self.a += self.x / 100.0")
+    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
+    script = tmp_path_factory.mktemp("fmu") / "counter.py"
+    script.write_text(COUNTER)
+    return builder.FmuBuilder.build_FMU(script, dest=script.parent)
 
 
 def load(folder, text):
@@ -67,7 +84,9 @@ def test_inputs_that_are_named_as_observations_and_an_only_output_need_no_wiring
     own = FmuController(file="my.fmu")
     found = wire(own, variables(gap_m="input", k="parameter", bv_speed_mps="input", a="output"))
     assert (found.inputs, found.output) == ([0, 2], 3)
-    assert found.readings == [OBSERVATIONS["gap_m"], OBSERVATIONS["bv_speed_mps"]]
+    seen = Observation(0.0, 1.0, 2.0, 3.0, 4.0, 5.0, Neighbour(6.0, 7.0, 1), Neighbour(8.0, 9.0, 1), 10.0, 11.0, True)
+    assert [read(seen) for read in found.readings] == [4.0, 7.0]
+    assert [OBSERVATIONS[f"bv_{name}"](seen) for name in ("lateral_m", "lateral_speed_mps", "overlaps")] == [10, 11, 1]
     with pytest.raises(CampaignError, match=r"inputs gap_m, v;.*--set 'av.fmu.inputs="):
         wire(own, variables(gap_m="input", v="input", a="output"))
     with pytest.raises(CampaignError, match=r"av.fmu.output: found a, b;.*--set av.fmu.output=NAME"):

@@ -8,15 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from examples import idm_batch
-from examples.idm import IDM, idm_acceleration
+from examples.idm import IDM
 from harness.controllers.hosts import BatchHost, Guard
 from harness.controllers.protocol import Observation
-from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
 from harness.vocabulary import PASSED
-from tests.controllers.driving import LATERAL, drive, fmu_av, forced, make_fmu, motion
-from tests.stored_runs import ROOT
+from tests.controllers.driving import LATERAL, drive, fmu_av, forced, motion
 
 FORMS = {
     "per vehicle": "av={controller: 'examples.idm:IDM'}",
@@ -48,7 +45,7 @@ def test_an_fmu_gives_the_same_motion_and_gets_its_start_values_in_every_episode
     assert braking[0] == -1.5 > braking[1]
 
 
-# -- of a BV that comes over all forms see the same --
+# -- what is seen of a BV that comes over --
 
 
 HERE = "tests.controllers.test_forms"
@@ -70,52 +67,14 @@ class Notes(IDM):
         return 0.0
 
 
-class YieldsBatch(idm_batch.IDM):
-    """`examples.sees_lateral` over arrays."""
-
-    def step_batch(self, seen):
-        comes = (seen.bv_lateral_speed_mps > 0.0) & (seen.bv_lateral_m >= 0.375 - 1e-9)
-        gap = seen.bv_position_m - 5.0 - seen.position_m
-        follows = super().step_batch(seen._replace(gap_m=gap, lead_speed_mps=seen.bv_speed_mps))
-        return np.where(comes | (seen.bv_overlaps == 1), follows, 0.0)
-
-
-class YieldsScript(TraciStyleController):
-    """The same as a TraCI script, which knows lanes and positions in them."""
-
-    def on_step(self, traci, veh_id, time):
-        vehicle = traci.vehicle
-        over = -vehicle.getLateralLanePosition("BV")
-        comes = vehicle.getLateralSpeed("BV") < 0.0 and over >= 0.375 - 1e-9
-        if not comes and vehicle.getLaneIndex("BV") == 1:
-            return
-        gap = vehicle.getLanePosition("BV") - vehicle.getLength("BV") - vehicle.getLanePosition(veh_id)
-        a = idm_acceleration(vehicle.getSpeed(veh_id), vehicle.getSpeed("BV"), gap)
-        vehicle.setAcceleration(veh_id, a, 0.1)
-
-
-YIELDS_FMU = """
-gap = self.x_bv - 5.0 - self.x
-comes = self.moves > 0.0 and self.over >= 0.375 - 1e-9
-self.a = idm_acceleration(self.v, self.v_bv, gap) if comes or self.overlaps else 0.0
-"""
-
-
 @pytest.fixture(scope="module")
 def built_in():
     return episodes(LATERAL)
 
 
-@pytest.mark.parametrize("form", ["examples.sees_lateral:Yields", f"{HERE}:YieldsBatch", f"{HERE}:YieldsScript", "fmu"])
-def test_a_controller_that_sees_it_is_the_built_in_model_to_the_last_bit(form, built_in, tmp_path):
-    av = f"{{controller: '{form}'}}"
-    if form == "fmu":
-        imports, files = "from idm import idm_acceleration", [ROOT / "examples/idm.py"]
-        fmu = make_fmu(tmp_path, "YieldsFmu", "x v x_bv v_bv over moves overlaps", YIELDS_FMU, imports, files)
-        inputs = "position_m: x, speed_mps: v, bv_position_m: x_bv, bv_speed_mps: v_bv, bv_lateral_m: over"
-        inputs += ", bv_lateral_speed_mps: moves, bv_overlaps: overlaps"
-        av = f"{{fmu: {{file: '{fmu}', inputs: {{{inputs}}}, output: a}}}}"
-    assert episodes(LATERAL, f"av={av}").tobytes() == built_in.tobytes()
+def test_a_controller_that_sees_it_is_the_built_in_model_to_the_last_bit(built_in):
+    yields = episodes(LATERAL, "av={controller: 'examples.sees_lateral:Yields'}")
+    assert yields.tobytes() == built_in.tobytes()
 
 
 def test_one_that_waits_for_the_overlap_is_another_vehicle(built_in):
