@@ -122,15 +122,9 @@ def test_wrong_calls_end_with_2(capsys, arguments):
     [
         (["check", "{}.yaml"], 2),
         (["check", SMOKE, "--set", "{}=1"], 2),
-        (["check", SMOKE, "--av", "{}"], 2),
-        (["replay", ".", "{}"], 2),
-        (["report", "{}"], 2),
-        (["run", SMOKE, "--out", "{}"], 2),
         (["{}"], 2),
         (["run", *CAMPAIGN, "--out", "an out", "--resume"], 0),
-        (["report", "an out"], 0),
         (["estimate", "an out"], 0),
-        (["export", "an out", "1", "--to", "csv", "--out", "{}.csv"], 0),
     ],
 )
 def test_names_move_no_cursor(folder, capsys, monkeypatch, arguments, code):

@@ -147,25 +147,12 @@ def test_the_lock_pins_what_the_project_depends_on():
         assert wanted.specifier.contains(pins[canonicalize_name(wanted.name)]), text
 
 
-def test_workflows_pin_what_they_use_may_only_read_and_cover_the_pythons_that_are_promised():
-    for path in (ROOT / ".github/workflows").glob("*.yml"):
-        workflow = yaml.safe_load(path.read_text(encoding="utf-8"))
-        assert workflow["permissions"] == {"contents": "read"}
-        for job in workflow["jobs"].values():
-            used = [step["uses"] for step in job["steps"] if "uses" in step]
-            assert all(re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", action) for action in used)
-            assert job["timeout-minutes"] <= 240
+def test_the_pythons_that_are_promised_are_tested_and_have_wheels():
     (job,) = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8"))["jobs"].values()
     pythons = job["strategy"]["matrix"]["python"]
     assert PROJECT["project"]["requires-python"] == f">={pythons[0]},<3.{int(pythons[-1].partition('.')[2]) + 1}"
     wheels = ",".join(python.removeprefix("3.1") for python in pythons)
     assert PROJECT["tool"]["cibuildwheel"]["build"] == f"cp31{{{wheels}}}-manylinux_x86_64"
-
-
-def test_the_citation_is_of_this_version():
-    project, citation = PROJECT["project"], yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert (citation["title"], citation["version"]) == (project["name"], project["version"])
-    assert citation["license"] == project["license"]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from harness.errors import CampaignError
 from harness.records.folder import read_manifest
 from harness.runner.look import check_av
 from harness.runner.stored import replay_episode, suspects
-from tests.controllers.driving import fmu_av
 from tests.stored_runs import copy_of, edit
 from tests.worlds.running import EXAMPLE, ROOT
 
@@ -142,34 +141,21 @@ def test_the_command_line(capfd):
 # -- vehicles that are no Python classes --
 
 
-@pytest.fixture
-def checked(capfd):
-    def check_form(av: str) -> tuple[int, dict]:
-        code = main(["av-check", FORCED, "--json", "--episodes", "6", "--set", f"av={av}"])
-        return code, json.loads(capfd.readouterr().out)
-
-    return check_form
-
-
-@pytest.mark.parametrize("form", ["ACC", "EIDM", "program", "fmu"])
-def test_it_sees_that_each_form_brakes_and_is_deterministic(form, checked, request):
-    if form == "fmu":
-        av = fmu_av(request.getfixturevalue("fmu"))
-    elif form == "program":
-        av = f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}"
-    else:
-        av = f"{{sumo: {{carFollowModel: {form}}}}}"
-    code, found = checked(av)
-    assert (code, found["deterministic"], found["failures"]) == (0, True, {})
-    assert found["behaviour"]["n_cut_ins"] == 6
-    braking = found["behaviour"]["min_acceleration_mps2"]
-    assert braking == pytest.approx(-4.0) if form in ("program", "fmu") else braking < -1.0
-
-
-def test_a_program_that_dies_is_found_out(checked):
-    code, found = checked("{traci: {command: 'false', connect_time_s: 5, restarts: 0}}")
-    assert code == 3
-    assert sum(found["failures"].values()) == 6
+@pytest.mark.parametrize(
+    ("av", "code"),
+    [
+        ("{sumo: {carFollowModel: EIDM}}", 0),
+        (f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}", 0),
+        ("{traci: {command: 'false', connect_time_s: 5, restarts: 0}}", 3),
+    ],
+    ids=["SUMO's EIDM", "a program", "a program that dies"],
+)
+def test_it_sees_that_each_form_brakes_and_is_deterministic_or_fails(av, code):
+    found = check_av(load_campaign(FORCED, [f"av={av}"]), 6)
+    assert (found.exit_code, sum(found.failures.values())) == (code, 6 * bool(code))
+    if code == 0:
+        assert found.behaviour.n_cut_ins == 6
+        assert found.behaviour.min_acceleration_mps2 < -1.0
 
 
 # -- a run repeats some of its own tests, and replay knows --

@@ -177,11 +177,3 @@ def test_without_the_package(run, campaign, tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "harness.runner.ray")
     with pytest.raises(CampaignError, match=r"pip install '\.\[ray\]'"):
         run(campaign(*TWIN, ON_RAY), tmp_path / "run")
-
-
-def test_folders_of_the_environment_are_relative_to_the_campaign(campaign):
-    asked = campaign("run.ray.runtime_env={working_dir: controllers, py_modules: [s3://bucket/a.zip, b]}")
-    scenarios = ROOT / "scenarios"
-    environment = asked.run.ray.runtime_env
-    assert environment["working_dir"] == str(scenarios / "controllers")
-    assert environment["py_modules"] == ["s3://bucket/a.zip", str(scenarios / "b")]
