@@ -27,7 +27,7 @@ from harness.records.folder import (
     write_json,
     write_shard,
 )
-from harness.records.reader import read, read_shards, table_sizes
+from harness.records.reader import read, table_sizes
 from harness.records.schemas import ShardTables
 from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
@@ -126,16 +126,6 @@ def test_a_damaged_table_is_named(damage, tmp_path, tables):
         read_table(path)
     assert raised.value.where == str(path)
     assert "--resume" in raised.value.mend
-
-
-def test_shards_are_read_in_the_manifests_order_and_no_others(tmp_path, tables):
-    shards = []
-    for index, first in enumerate((0, 30, 60)):
-        files = write_shard(tmp_path, index, encoded(ShardTables(tables.episodes.slice(first, 30), None, None)))
-        shards.append({"index": index, "first_episode": first, "n_episodes": 30, "files": files})
-    write_json(tmp_path / "manifest.json", {"campaign_hash": "", "n_episodes": 60, "shards": shards[:2]})
-    assert [episodes["episode"].to_pylist()[0] for episodes in read_shards(tmp_path)] == [0, 30]
-    assert [episodes.column_names for episodes in read_shards(tmp_path, ["outcome"])] == [["outcome"]] * 2
 
 
 # -- a bit that flips, or a file of another run, changes no number without a word --

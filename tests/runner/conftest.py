@@ -12,10 +12,12 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.runner.run import RunResult, run_campaign
 from tests.in_process import one_process, without_page
+from tests.pool.conftest import SMALL_POOL
 from tests.stored_runs import MIXTURE_FILE
 
 SMALL = ("stop.episodes=1600", "stop.rhw=null", "run.shard_size=80", "records.trace_share=0.05")
 TWIN = ("world.engine=twin", "stop.episodes=400")
+SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
 
 
 @pytest.fixture(scope="session")

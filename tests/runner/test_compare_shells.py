@@ -84,11 +84,6 @@ def test_both_meet_the_same_cut_ins_and_the_difference_is_that_of_the_records(do
     assert inside["ratio_low"] < 1.35e-7 / 7.5e-8 < inside["ratio_high"]
 
 
-def test_what_is_finished_is_not_driven_again(done, campaigns, driven):
-    assert compare_campaigns(*campaigns, done.folder, workers=1).content == done.content
-    assert driven == []
-
-
 def test_a_stored_run_of_a_is_taken_over(done, campaigns, run_here, campaign, tmp_path, driven):
     run_here(campaign(*SHELLS, "stop.rhw=0.9"), tmp_path / "stored")
     before = sum(driven)
@@ -113,8 +108,9 @@ def test_an_interrupted_comparison_goes_on(done, campaigns, tmp_path, monkeypatc
     with pytest.raises(KeyboardInterrupt):
         compare_campaigns(*campaigns, tmp_path, workers=1)
     assert manifest(tmp_path / "a")["status"] == manifest(tmp_path / "b")["status"] == "interrupted"
-    assert compare_campaigns(*campaigns, tmp_path, workers=1).content == done.content
-    assert sum(driven) == 2 * done.content["n_pairs"]
+    for _ in range(2):  # what is finished is not driven again
+        assert compare_campaigns(*campaigns, tmp_path, workers=1).content == done.content
+        assert sum(driven) == 2 * done.content["n_pairs"]
 
 
 @pytest.mark.parametrize(("swapped", "verdict", "exit_code"), [(False, "proven", 0), (True, "refuted", 5)])

@@ -9,7 +9,7 @@ from harness.runner.look import check_av, plan_campaign
 from studies.alarm import alarm_of_run
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
-from tests.stored_runs import golden, stored_table, unlike_columns
+from tests.stored_runs import golden, stored_table
 
 LEAD = "environment.cut_in_lead_s=0.5"
 COLUMNS = ["lead_steps", "onset_step", "onset_r2_m", "onset_r2dot_mps", "onset_ttc_s", "overlap_ttc_s", "contact"]
@@ -37,19 +37,6 @@ def test_stored_forced_tests_can_be_asked_what_surrogates_would_have_done(tmp_pa
     lateral = ("pool.library=ladder-lateral-1", "environment.lane_change_level=1", "stop.episodes=800")
     run_golden(golden("forced-lateral-twin", *lateral, "records.traces=none"), tmp_path / "run")
     assert alarm_of_run(tmp_path / "run")["p_value"] > 1e-3  # seed fixed; fails once in a thousand
-
-
-def test_a_vehicle_that_acts_before_the_onset_is_tested_after_shadow_runs(campaign, run_here, tmp_path):
-    """With forced cut-ins: in a test it must do what it did in its baseline run, through the step of the onset."""
-    asked = ("testing.method=forced", "world.engine=twin", LEAD, "stop.rhw=null", "stop.episodes=120")
-    speeds = f"av={ACTING.format('Speeds')}"
-    forced, again = (
-        run_here(campaign(*asked, speeds, f"world.cells={cells}"), tmp_path / str(cells)) for cells in (64, 5)
-    )
-    rows = stored_table(forced.folder, "episodes")
-    assert rows.column("failure").null_count == rows.num_rows == 120
-    assert set(rows.column("lead_steps").to_pylist()) == {5}
-    assert unlike_columns(forced.folder, again.folder) == []
 
 
 def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_refuses_one_that_acts_before(campaign):

@@ -18,8 +18,8 @@ import pytest
 
 from benchmarks.kills import descendants, orphans, started_by
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
-from tests.runner.conftest import TWIN
-from tests.runner.test_shadow_runs import FORCED, SHADOWS, SHELLS, of
+from tests.runner.conftest import SHELLS, TWIN
+from tests.runner.test_shadow_runs import FORCED, SHADOWS, of
 from tests.stored_runs import manifest, shard_files, unlike_columns
 
 ray = pytest.importorskip("ray")

@@ -8,9 +8,7 @@ from harness import estimate
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
 from harness.progress import Progress
 from harness.report.page import write_report
-from harness.runner.resume import Manifest
-from tests.runner.conftest import TWIN
-from tests.runner.test_shells_runs import SHELLS
+from tests.runner.conftest import SHELLS
 from tests.stored_runs import copy_of, estimates, manifest, shard_files, unlike_columns
 
 LOOSE, TIGHT = "stop.rhw=0.3", "stop.rhw=0.15"
@@ -75,20 +73,6 @@ def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campa
     result = run_here(campaign(*COMMON, LOOSE), out, resume=True)
     assert (result.exit_code, result.stopped_by) == (EXIT_DONE, "rhw")
     assert unlike_columns(runs / "loose", out) == []
-
-
-def test_a_shard_is_written_when_all_before_it_are_in(campaign, run_here, tmp_path, monkeypatch):
-    """Whatever ends the run, the folder holds a prefix of its shards: here the worker is ahead by one."""
-    counted, on_disk, add = [], [], Manifest.add
-
-    def noted(manifest, done):
-        add(manifest, done)
-        counted.append(len(manifest.shards))
-        on_disk.append(len(shard_files(tmp_path / "run")))
-
-    monkeypatch.setattr(Manifest, "add", noted)
-    run_here(campaign(*TWIN), tmp_path / "run")
-    assert on_disk == counted == [1, 2, 3, 4, 5]
 
 
 # -- a limit ends a run of shells as soon as it is known on which side of it the crash rate lies --

@@ -27,11 +27,6 @@ def test_sumo_and_the_twin(name, stored_run):
     assert unlike_columns(stored_run(f"{name}-sumo"), stored_run(f"{name}-twin")) == ["estimates.json"]
 
 
-@pytest.mark.parametrize("name", ["forced-batch", "forced-traci-style"])
-def test_the_idm_however_it_is_brought(name, stored_run):
-    assert unlike_columns(stored_run(name), stored_run("forced-twin")) == ["estimates.json"]
-
-
 @pytest.mark.parametrize(
     ("name", "cells"),
     [

@@ -14,11 +14,10 @@ from harness.errors import RunFolderError, TooManyFailedError
 from harness.pool.shells import CANDIDATES
 from harness.records.schemas import baseline_schema
 from tests.in_process import run_here as run_golden
-from tests.pool.conftest import SMALL_POOL
 from tests.pool.test_vehicle_pool import ACTING
+from tests.runner.conftest import SHELLS
 from tests.stored_runs import copy_of, edit, estimates, golden, manifest, shard_files, stored_table, unlike_columns
 
-SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
 SHADOWS, TWIN = "pool.shadow_paths=120", "world.engine=twin"
 FORCED = ("testing.method=forced", "stop.episodes=600", "run.shard_size=100")
 

@@ -17,10 +17,8 @@ from harness.strata import Statement
 from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import tally as counted
 from tests.in_process import run_here as run_golden
-from tests.pool.conftest import SMALL_POOL
+from tests.runner.conftest import SHELLS
 from tests.stored_runs import copy_of, edit, golden, manifest, shard_files
-
-SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
 
 
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
@@ -103,6 +101,10 @@ def test_shells_of_an_earlier_version_or_of_another_pool_are_refused(stored_run,
         with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
             act()
     content = json.loads((folder / "shells.json").read_text())
+    for wrong in ({"cell_p": [0.1]}, {"statements": []}, {"strata": {}}):
+        (folder / "shells.json").write_text(json.dumps({**content, **wrong}))
+        with pytest.raises(RunFolderError, match=r"shells\.json"):
+            estimate(folder)
     del content["statements"]
     (folder / "shells.json").write_text(json.dumps({**content, "n_inside": 6, "boundary": "brakes-2-late-1s"}))
     with pytest.raises(RunFolderError, match=r"an earlier version.*Run the campaign again into a new folder"):

@@ -13,7 +13,7 @@ from harness import estimate, replay
 from harness.campaign.drivers import NeedBasedParameters
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M
 from tests.pool.conftest import SMALL_POOL
-from tests.runner.test_shells_runs import SHELLS
+from tests.runner.conftest import SHELLS
 from tests.stored_runs import ROOT, stored_table, unlike_columns
 
 FAILING = "av={controller: 'tests.runner.test_vehicles:RaisesBeforeContact'}"
