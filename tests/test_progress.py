@@ -1,7 +1,5 @@
 """Progress: what a terminal and a log show, and how the time left is reckoned."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

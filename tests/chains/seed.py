@@ -1,7 +1,5 @@
 """The seed of statistical tests; set HARNESS_TEST_SEED to see that they do not hang on it."""
 
-from __future__ import annotations
-
 import os
 
 SEED = int(os.environ.get("HARNESS_TEST_SEED", "20240917"))

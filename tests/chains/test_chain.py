@@ -1,7 +1,5 @@
 """The chain itself: backward induction against enumeration and plain sampling, and the identities of its samplers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -3,8 +3,6 @@
 Four standard errors miss with probability 6e-5 per check, some 0.2 % for the whole panel.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 

@@ -6,7 +6,6 @@ For the step mixture the mean weight is a diagnostic and never a test: it is 0.0
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
 
 from harness.vocabulary import CUT_IN
 from tests.episode.twin_runs import Mean, run
@@ -44,11 +43,6 @@ def test_the_forced_component_in_closed_form():
     assert done.cut_in[done.episode["component"] == 0].all()
     counts = np.bincount(done.episode["component"], minlength=4)
     assert (np.abs(counts - N * done.alpha) < 4.0 * np.sqrt(N * done.alpha)).all()
-
-
-def test_the_weight_is_that_of_the_mixture_over_whole_episodes():
-    done = mixture()
-    np.testing.assert_allclose(done.log_weight, -logsumexp(done.log_q, b=done.alpha, axis=1), rtol=0, atol=1e-12)
 
 
 def fully_recorded(done):

@@ -6,7 +6,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.drivers import FVDMParameters, IDMParameters, Surrogate
+from harness.campaign.drivers import FVDMParameters, IDMParameters, Reaction, Surrogate
 from harness.campaign.sections import EnvironmentSettings, Records, Testing
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.loop import Shard
@@ -23,6 +23,9 @@ AVS = {
     "never_brakes": AutomatedVehicle(parameters=IDMParameters(min_acceleration_mps2=-0.0)),
     "SM-II": AutomatedVehicle(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-1.0)),
     "SM-III": AutomatedVehicle(model="fvdm", parameters=FVDMParameters(min_acceleration_mps2=-6.0)),
+    "sees the onset": AutomatedVehicle(reaction=Reaction(perceives_lateral_m=0.0)),
+    "blind": AutomatedVehicle(reaction=Reaction(perceives_lateral_m=10.0)),
+    "holds": AutomatedVehicle(model="constant"),
 }
 DEFAULT_SURROGATES = Campaign(name="default").surrogates
 SURROGATES = {
@@ -42,6 +45,8 @@ def campaign(
     *,
     level: float = 1.0,
     hold_s: float = 1.0,
+    lead_s: float | None = None,
+    parameters: str = "ndd-overtaking-1",
     av: str = "idm",
     surrogates: str = "default",
     epsilon: float = 0.1,
@@ -51,7 +56,9 @@ def campaign(
     return Campaign(
         name="test",
         seed=SEED,
-        environment=EnvironmentSettings(lane_change_level=level, acceleration_hold_s=hold_s),
+        environment=EnvironmentSettings(
+            parameters=parameters, lane_change_level=level, acceleration_hold_s=hold_s, cut_in_lead_s=lead_s
+        ),
         av=AVS[av],
         surrogates=SURROGATES[surrogates],
         testing=Testing(method=method, challenge=challenge, epsilon=epsilon, criticality_threshold=threshold),

@@ -1,7 +1,5 @@
 """Likelihood-ratio limits, alone and beside a reference: against the definition, identities, exact coverage."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product

@@ -1,7 +1,5 @@
 """Pairs within shells: their counts, limits both ways of failed tests, what the pool's error adds, and the verdict."""
 
-from __future__ import annotations
-
 import json
 import math
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Stopping: looks are declared beforehand, two passes are needed, the same data stop at the same place; decisions."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A small pool of the default environment, built once (about five seconds) and looked at by many tests."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

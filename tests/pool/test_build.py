@@ -1,7 +1,5 @@
 """A pool's probabilities are right, its shells divide all cut-ins, and it survives the disk."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

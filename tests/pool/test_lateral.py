@@ -1,7 +1,5 @@
 """The pool where cut-ins take time: what it says of every driver is what the episode loop drives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The pool of a vehicle that acts before the cut-in: its own hazard, and surrogates that take over from it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -105,17 +103,6 @@ def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one
     expected = pool.cut_ins.crashes[rows, pool.names.index("brakes-3")]
     assert 300 < expected.sum() < rows.size - 300
     np.testing.assert_array_equal(crashed, expected)
-
-
-def test_another_motion_is_noticed(speeds):
-    """The sibling that must fail: another vehicle on the same scripts."""
-    ready, _, _ = speeds
-    loop = prepare(resolve(acting("HoldsThenIdm"))).loop(TwinWorld(64))
-    rows = np.arange(0, len(ready.prescribed.of_rows(np.arange(50), np.zeros(50, np.int64))[0]))
-    shard = loop.run(0, *ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
-    assert len(shard.failures) == rows.size
-    assert set(shard.failures.values()) == {shard.failures[0]}
-    assert "something else than in its baseline run" in shard.failures[0]
 
 
 def test_weights_of_the_chosen_paths_keep_every_mean():

@@ -3,8 +3,6 @@
 ``python -m tests.report.page_text`` writes the golden pages anew.
 """
 
-from __future__ import annotations
-
 import re
 import tempfile
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """The player in a real browser, the system's own: it plays, follows the slider and the keys, and says no error."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The page of a comparison: its numbers are those of compare.json, its pairs and motions those of the records."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """The page of each kind of run: what it says, that it is self-contained, and that it comes out the same again."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

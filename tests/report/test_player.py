@@ -1,7 +1,5 @@
 """What the player plays is what was simulated, and what the twin says of others; which crashes come first."""
 
-from __future__ import annotations
-
 import json
 import re
 

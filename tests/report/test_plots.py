@@ -1,7 +1,5 @@
 """The look of all plots, scales of axes, intervals where they are, and names that no line can hide."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

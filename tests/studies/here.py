@@ -1,7 +1,5 @@
 """What several tests of studies need: work in this process, and pools that are wrong."""
 
-from __future__ import annotations
-
 from concurrent.futures import Executor
 from dataclasses import replace
 

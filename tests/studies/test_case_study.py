@@ -1,7 +1,5 @@
 """The study as a user runs it: made once, resumed, refused where it is wrong, and every number of its page traced."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

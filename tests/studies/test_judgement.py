@@ -1,7 +1,5 @@
 """Judgements from rows that are made up, and truths of a population that is added up by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

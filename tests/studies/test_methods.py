@@ -4,8 +4,6 @@ All seeds are fixed. A right method fails the small experiments with probability
 once and for all: with these seeds it passes. The wrong ones must fail at p < 1e-6.
 """
 
-from __future__ import annotations
-
 import json
 from functools import cache, partial
 

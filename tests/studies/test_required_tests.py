@@ -1,7 +1,5 @@
 """RNoT as published: known answers, rules at the edges, that nothing but seed and records decides; the command."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

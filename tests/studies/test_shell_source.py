@@ -1,7 +1,5 @@
 """A small super-population: its truths, and pools drawn from it with equals left out and the boundary replaced."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 
 import numpy as np

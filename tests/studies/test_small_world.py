@@ -1,7 +1,5 @@
 """The smaller case: backward induction against all paths and against drawn tests; identities; a wrong sibling fails."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The command end to end: files, table, the same bits for any number of workers, which do not outlive it, the twin."""
 
-from __future__ import annotations
-
 import json
 import os
 import select

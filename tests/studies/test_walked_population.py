@@ -1,7 +1,5 @@
 """Vehicles that act before the cut-in, walked once and repeated: exact where they equal a driver; faults are found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
