@@ -1,5 +1,7 @@
 """Progress: what a terminal and a log show, and how the time left is reckoned."""
 
+from __future__ import annotations
+
 import io
 import math
 import re
