@@ -56,11 +56,8 @@ def cli() -> None:
     )
     + "\n\n"
     + examples(
-        f"{_ME} validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
         f"{_ME} validate scenarios/validate/shells_panel.yaml --set campaign.stop.confidence=0.99 --out x",
         f"{_ME} validate scenarios/validate/chains_forced.yaml --set replications=100 --out quick",
-        f"{_ME} validate scenarios/validate/shells_acting.yaml --out runs/acting   # walks paths first",
-        f"{_ME} validate scenarios/validate/shells_pairs.yaml --out runs/pairs     # of `compare`",
     ),
 )
 @click.argument("experiment_file", metavar="EXPERIMENT", type=CAMPAIGN)
@@ -70,13 +67,7 @@ def cli() -> None:
 @quiet_option
 @json_option
 def validate(
-    experiment_file: Path,
-    folder: Path,
-    *,
-    overrides: Sequence[str],
-    workers: int | None,
-    quiet: bool,
-    as_json: bool,
+    experiment_file: Path, folder: Path, overrides: Sequence[str], *, workers: int | None, quiet: bool, as_json: bool
 ) -> None:
     """Repeat the campaign of EXPERIMENT for each of its vehicles, pairs or chains, and judge its intervals by that.
 
@@ -91,17 +82,15 @@ def validate(
 
     experiment = load_experiment(experiment_file, overrides)
     from harness.estimators.estimate import finite_json  # noqa: PLC0415 - slow to import: once the file is right
-    from studies.replication.run import RESULTS, table_row  # noqa: PLC0415
-    from studies.replication.run import validate as repeat  # noqa: PLC0415
+    from studies.replication import run  # noqa: PLC0415
 
-    bar = shown_progress(quiet=quiet)
-    with bar:
-        judgements = repeat(experiment, folder, workers=workers, progress=bar)
+    with (bar := shown_progress(quiet=quiet)):
+        judgements = run.validate(experiment, folder, workers=workers, progress=bar)
     if as_json:
         print_json(finite_json(judgements))
     else:
-        print_table(f"{experiment.replications:,} replications", [table_row(one) for one in judgements])
-        click.echo(str(folder / RESULTS))
+        print_table(f"{experiment.replications:,} replications", [run.table_row(one) for one in judgements])
+        click.echo(str(folder / run.RESULTS))
 
 
 @cli.command(
@@ -134,8 +123,7 @@ def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, q
         if not (as_json or quiet):
             click.echo(f"{name}: " + ("there already" if seconds is None else f"{seconds:.1f} s"))
 
-    bar = shown_progress(quiet=quiet)
-    with bar:
+    with (bar := shown_progress(quiet=quiet)):
         done = run_study(asked, folder, workers=workers, progress=bar, told=told)
     if as_json:
         print_json({"page": str(done.page), "claims": done.claims, "seconds": done.seconds})
@@ -178,8 +166,7 @@ def rnot(folders: Sequence[Path], *, estimators: Sequence[RnotEstimator], as_jso
     """
     from studies.rnot import SHOWN, Procedure, required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
 
-    bar = shown_progress()
-    with bar:
+    with (bar := shown_progress()):
         content = required_tests_of_runs(folders, Procedure(**asked), estimators=estimators, progress=bar)
     if as_json:
         print_json(content)
@@ -208,8 +195,7 @@ def alarm(ctx: click.Context, folder: Path, *, as_json: bool) -> None:
     """
     from studies.alarm import alarm_of_run  # noqa: PLC0415 - slow to import
 
-    bar = shown_progress()
-    with bar:
+    with (bar := shown_progress()):
         found = alarm_of_run(folder, bar)
     if as_json:
         print_json(found)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.estimators.block import Block
+from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import FailureBounds
 from harness.estimators.limits import normal_half_width
 from harness.estimators.scv import CHUNK_ROWS as CHUNK
@@ -110,15 +110,16 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
         if (size := block.first_episode + len(block)) in sizes:
             again = gain_of_parts(run, size, n, step.parts, context.confidence)
             rows.append({**claims.row(context.rhw, context.confidence), "gain_replicated": again})
-    fits, strata = claims.scv.fits(), list[dict[str, Any]]()
-    if step.spread_tests:
-        strata = [
-            {"control_steps": level, "columns": fit.n_columns, "rank": fit.rank, **_spread_of([fit])}
-            for level, fit in fits
-        ]
-        write_table(context.folder / SPREAD, spread(first_block(run, min(step.spread_tests, n))))
-    figures = {}
+    fits, figures = claims.scv.fits(), {}
+    strata = [
+        {"control_steps": level, "columns": fit.n_columns, "rank": fit.rank, **_spread_of([fit])}
+        for level, fit in (fits if step.strata else ())
+    ]
     if rows:
+        total, beyond = (
+            sum(fit.n * fit.intercept for level, fit in fits if level > k) for k in (-1, MAX_CONTROL_STEPS)
+        )
+        figures["late_share"] = figure(beyond / total if total else None)
         late = _spread_of([fit for level, fit in fits if level >= 4])
         left = late["sd_after"] / late["sd_before"] if late["sd_before"] else None
         figures["rate_over_nade"] = exactly(1.0 + max(row["difference"] or 0.0 for row in rows))
@@ -138,19 +139,6 @@ def gain_of_parts(run: Path, size: int, n: int, parts: int, confidence: float) -
             rates.append(claims.rates())
             claims = Claims()
     return ratio_of_variances([nade for nade, _ in rates], [scv for _, scv in rates], confidence)
-
-
-SPREAD = "results.parquet"
-
-
-def spread(block: Block) -> pa.Table:
-    """Results of some tests before and after adjustment, Y and Z = Y - Hβ, those that are not 0, by control steps."""
-    scv = Scv()
-    scv.add(block)
-    y, (of_stratum, explained) = block.weighted_crashes(), explained_by(block, scv.fits())
-    z = y - explained + of_stratum
-    kept = (y != 0.0) | (z != 0.0)
-    return pa.table({"control_steps": block.n_control_steps[kept], "y": y[kept], "z": z[kept]})
 
 
 def explained_by(block: Block, fits: Sequence[tuple[int, StratumFit]]) -> FloatArray:

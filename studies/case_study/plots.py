@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.axis import XAxis, YAxis
+from matplotlib.ticker import MaxNLocator
 
 from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.records.folder import read_table
@@ -29,13 +29,15 @@ from harness.report.style import (
     tick_label,
     two_panels,
 )
-from studies.case_study.counted import CURVES, SPREAD
+from studies.case_study.counted import CURVES
 from studies.case_study.figures import is_settled
-from studies.case_study.study import Convergence, Line, Made, Study, Variants
+from studies.case_study.study import Convergence, Line, Made, Study
 
 _COLOURS = {"low": GREY, "nade": BLUE, "scv": VERMILLION, "nde": INK, "": GREEN}
 """Of a method in all plots, by what its step or label contains."""
 _HOLLOW: dict[str, Any] = {"markerfacecolor": "none", "markersize": 7, "linewidth": 0.9}
+MOST_RATE, LEAST_GAIN = 3.0, 0.1
+"""Times the known rate up to which rates are drawn; the least gain: worse ones are on the axis."""
 _DASHED: dict[str, Any] = {"color": MUTED, "linewidth": 0.9, "linestyle": (0, (4, 3))}
 
 
@@ -45,14 +47,10 @@ def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str
     for name, step in study.steps.items():
         if isinstance(step, Convergence):
             plots.append(convergence_plot(name, step, made, study.rhw, study.confidence))
-        elif isinstance(step, Variants) and step.epsilons and step.reference:
-            known = made[step.reference].result["figures"]["crash_rate"]["value"]
-            plots.append(settings_plot(name, made[name].result["variants"], known, study.rhw))
         elif step.kind == "control_variates":
             plots.append(growth_plot(f"{name}_growth", made[name].result["looks"], study.rhw))
             if made[name].result["strata"]:
                 plots.append(strata_plot(name, made[name].result["strata"]))
-                plots.append(spread_plot(f"{name}_results", read_table(made[name].folder / SPREAD)))
     return {plot.name: plot for plot in plots if plot is not None}
 
 
@@ -75,15 +73,8 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
         is_limit = found["high"] is None and found["low"] is not None
         axes.errorbar(place, value, yerr=ends, fmt="^" if is_limit else "o", color=colour, capsize=4.0, markersize=7)
         words = ("> " if is_limit else "") + tick_label(float(f"{value:.2g}")) + (" †" if colour == GREY else "")
-        note(
-            axes,
-            words,
-            (place, found["high"] or value),
-            (0, -18 if is_limit else 7),
-            ha="center",
-            color=INK,
-            fontsize=8,
-        )
+        beneath: dict[str, Any] = {"ha": "center", "color": INK, "fontsize": 8}
+        note(axes, words, (place, found["high"] or value), (0, -18 if is_limit else 7), **beneath)
     low, high = axes.get_ylim()
     axes.set_ylim(low / 2.0, high * 4.0)
     decades(axes.yaxis, *axes.get_ylim())
@@ -92,6 +83,13 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
     axes.set_ylabel(f"tests for a relative half-width of {rhw:g}")
     caption = "Tests by method. Filled: here (triangles: lower limits; grey, †: not converged). Hollow: the paper's."
     return Plot("tests", figure, caption, caption)
+
+
+def _by_decades(*of: XAxis | YAxis) -> None:
+    """Make axes logarithmic, from end to end of what is drawn."""
+    for axis in of:
+        axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+        decades(axis, *axis.get_view_interval())
 
 
 def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw: float, confidence: float) -> Plot:
@@ -110,15 +108,9 @@ def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw
     left.axhline(reference, **_DASHED)
     left.set_ylim(0.0, MOST_RATE * reference or 1.0)
     right.axhline(rhw, **_DASHED)
-    right.set_yscale("log")
-    decades(right.yaxis, *right.get_ylim())
-    for axes, title in (
-        (left, f"crash rate per test{scaled(left.yaxis, MOST_RATE * reference or 1.0)}"),
-        (right, "RHW"),
-    ):
-        axes.set_xscale("log")
-        decades(axes.xaxis, max(axes.get_xlim()[0], 1.0), axes.get_xlim()[1])
-        head(axes, title)
+    _by_decades(left.xaxis, right.xaxis, right.yaxis)
+    head(left, f"crash rate per test{scaled(left.yaxis, MOST_RATE * reference or 1.0)}")
+    head(right, "RHW")
     caption = f"Crash rates with {confidence:.0%} bands (dashed: {step.reference}), and relative half-widths, by tests."
     return Plot(name, figure, caption, caption)
 
@@ -140,24 +132,12 @@ def strata_plot(name: str, strata: list[dict[str, Any]]) -> Plot | None:
         right.plot(steps, spread, "o-", color=colour, label=label, markersize=3, linewidth=width)
     for axes, title in ((left, "number in a stratum"), (right, "standard deviation of results")):
         if any(row["sd_before"] for row in shown) or axes is left:
-            axes.set_yscale("log")
-            decades(axes.yaxis, *axes.get_ylim())
+            _by_decades(axes.yaxis)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         head(axes, title)
         axes.grid(visible=False, axis="x")
     caption = "By control steps: tests, columns and their rank; spread of results of NADE (Y) and SCV (Z)."
     return Plot(name, figure, caption, caption)
-
-
-MOST_RATE = 3.0
-"""Times the known rate up to which rates are drawn."""
-LEAST_GAIN = 0.1
-"""Least gain that is drawn; worse ones are on the axis."""
-_GAINS = (
-    ("claimed", "claimed", _COLOURS["scv"]),
-    ("degrees_of_freedom", "degrees of freedom", INK),
-    ("leave_one_out", "leave-one-out", GREEN),
-)
 
 
 def growth_plot(name: str, looks: list[dict[str, Any]], rhw: float) -> Plot | None:
@@ -170,73 +150,16 @@ def growth_plot(name: str, looks: list[dict[str, Any]], rhw: float) -> Plot | No
     for key, label in (("nade", "NADE"), ("scv", "SCV, as it claims")):
         style: dict[str, Any] = {"color": _COLOURS[key], "linewidth": 4.0 if key == "nade" else 1.4, "markersize": 3}
         left.plot(n, [row[f"{key}_rhw"] for row in known], "o-", label=label, **style)
-    for key, label, colour in _GAINS:
+    for key, colour in (("claimed", _COLOURS["scv"]), ("degrees_of_freedom", INK), ("leave_one_out", GREEN)):
         gains = [max(row[f"gain_{key}"] or np.nan, LEAST_GAIN) for row in known]
-        right.plot(n, gains, "o-", color=colour, markersize=3, label=label)
+        right.plot(n, gains, "o-", color=colour, markersize=3, label=key.replace("_", " "))
     again = [row["gain_replicated"]["value"] or np.nan for row in known]
     right.plot(n, again, "D", color=BLUE, markersize=5, markerfacecolor="none", label="replication")
     right.set_ylim(bottom=max(right.get_ylim()[0], LEAST_GAIN))
     left.axhline(rhw, **_DASHED)
     right.axhline(1.0, **_DASHED)
-    for axes, title in ((left, "relative half-width"), (right, "NADE's variance over SCV's")):
-        axes.set_yscale("log")
-        decades(axes.yaxis, *axes.get_ylim())
-        axes.set_xscale("log")
-        decades(axes.xaxis, *axes.get_xlim())
-        head(axes, title)
+    _by_decades(left.xaxis, left.yaxis, right.xaxis, right.yaxis)
+    head(left, "relative half-width")
+    head(right, "NADE's variance over SCV's")
     caption = "By tests: relative half-widths; and SCV's gain as claimed, corrected in two ways, and replicated."
-    return Plot(name, figure, caption, caption)
-
-
-def spread_plot(name: str, results: pa.Table) -> Plot | None:
-    """Distributions of results before and after adjustment, by number of control steps and of all."""
-    steps, y, z = (results.column(key).to_numpy() for key in ("control_steps", "y", "z"))
-    scale = np.quantile(y[y > 0.0], 0.5) if np.any(y > 0.0) else 0.0
-    if scale == 0.0:
-        return None
-    most = max(np.abs(y).max(), np.abs(z).max()) / scale
-    edges = np.concatenate([-(side := np.geomspace(1e-2, 2.0 * most, 25))[::-1], side])
-    figure = new_figure(FULL_WIDTH_IN, 3.4)
-    panels = figure.subplots(2, 5, sharex=True, sharey=True).ravel()
-    for level, axes in enumerate(panels, start=1):
-        rows = steps == level if level <= MAX_CONTROL_STEPS else np.full(len(steps), True)
-        for values, key, label in ((y, "nade", "Y, NADE"), (z, "scv", "Z, SCV")):
-            style = {"histtype": "step", "color": _COLOURS[key], "linewidth": 1.1}
-            axes.hist(values[rows] / scale, edges, label=label, **style)
-        axes.set_title(f"l = {level}" if level <= MAX_CONTROL_STEPS else "all", fontsize=8.5)
-        axes.set_xscale("symlog", linthresh=1e-2, linscale=0.5)
-        axes.set_yscale("symlog", linthresh=1.0)
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: tick_label(value) or "0"))
-        axes.set_xticks([-1.0, 0.0, 1.0], ["-1", "0", "1"])
-    figure.legend(*panels[0].get_legend_handles_labels(), ncols=2, fontsize=8, loc="outside lower left")
-    caption = "Results over their median, before (Y) and after adjustment (Z), by control steps l; without zeros."
-    return Plot(name, figure, caption, caption)
-
-
-def settings_plot(name: str, variants: list[dict[str, Any]], known_rate: float, rhw: float) -> Plot:
-    """Of each setting tests as claimed, by replication and over shuffles; mean weight and rate over the known one."""
-    figure, left, right = two_panels(3.4, ("", ""))
-    places = range(len(variants))
-    looks = (("claimed", "as claimed", "o", GREY), ("rnot", "RNoT", "s", GREEN), ("true", "by replication", "o", BLUE))
-    for key, label, marker, colour in looks:
-        values = [row[key]["value"] for row in variants]
-        style: dict[str, Any] = {"color": colour, "linestyle": "none", "markersize": 8 if key == "claimed" else 5}
-        left.plot(places, [x or np.nan for x in values], marker, label=label, **style)
-        limits = [row[key]["low"] if x is None else np.nan for row, x in zip(variants, values, strict=True)]
-        left.plot(places, [np.nan if x is None else x for x in limits], "^", **style)
-    for values, label, colour in (
-        ([row["mean_weight"] for row in variants], "mean weight", INK),
-        ([(row["nade_rate"]["value"] or np.nan) / known_rate for row in variants], "rate / known rate", BLUE),
-    ):
-        right.plot(places, values, "o-", color=colour, label=label, markersize=4)
-    right.axhline(1.0, **_DASHED)
-    right.set_ylim(bottom=0.0)
-    left.set_yscale("log")
-    decades(left.yaxis, *left.get_ylim())
-    for axes, title in ((left, f"tests for a relative half-width of {rhw:g}"), (right, "should be 1")):
-        axes.set_xticks(places, [row["variant"] for row in variants], fontsize=7.5, rotation=30)
-        head(axes, title)
-    caption = (
-        "Tests as claimed, over shuffles (RNoT) and by replication (triangles: lower limits); signs of convergence."
-    )
     return Plot(name, figure, caption, caption)

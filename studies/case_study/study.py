@@ -53,9 +53,7 @@ class ControlVariates(Section):
     of: StepName = Field(description="step of kind run: a step mixture with records.moments first_9 or all")
     sizes: list[Whole] = Field(min_length=1, description="numbers of tests, rising, for the table")
     looks: Whole = Field(12, ge=2, le=100, description="numbers of tests between 300 and the last one, for the plot")
-    spread_tests: Whole | None = Field(
-        200_000, ge=10, description="first tests whose results are shown one by one; null to leave strata out"
-    )
+    strata: bool = Field(True, description="whether strata are shown one by one")
     parts: Whole = Field(
         10, ge=3, le=1_000, description="of each size that the run has so many of, for the gain by replication"
     )

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.stats import binomtest
 
 from harness.estimators.estimate import Estimate
@@ -100,17 +101,15 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
     tests, if it was fixed. ``reached`` is the share of replications that reached the precision asked for. Those refused
     count as covered; where they have no value either, nothing else takes notice of them.
     """
-    columns = {field.name: np.array([getattr(row, field.name) for row in rows]) for field in fields(Row)}
-    tests, reached, known, n = columns["n_tests"], columns["reached"], subject.truth(result), len(rows)
-    truth, scale = known.value, known.scale
-    has_value = np.isfinite(columns["crash_rate"])
+    table, known, n = pd.DataFrame(rows), subject.truth(result), len(rows)
+    truth, scale, known_rows = known.value, known.scale, table[np.isfinite(table.crash_rate)]
     with np.errstate(divide="ignore", invalid="ignore"):  # of what never crashes nothing relative is known
-        errors = (columns["crash_rate"][has_value] - truth) / scale
-        claimed = columns["std_error"][has_value] / scale
-    covered = int(np.count_nonzero((columns["ci_low"] <= truth) & (truth <= columns["ci_high"])))
+        errors = (known_rows.crash_rate.to_numpy() - truth) / scale
+        claimed = known_rows.std_error.to_numpy() / scale
+    covered = int(((table.ci_low <= truth) & (truth <= table.ci_high)).sum())
     low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
-    tests_5, median, tests_95 = (float(q) for q in np.quantile(tests, [0.05, 0.5, 0.95]))
-    fixed, relvar = not reached.any() and bool(np.all(tests == tests[0])), _mean(errors**2)
+    tests_5, median, tests_95 = table.n_tests.quantile([0.05, 0.5, 0.95]).tolist()
+    fixed, relvar = not table.reached.any() and table.n_tests.nunique() == 1, _mean(errors**2)
     met, z = subject.meets_assumption_of(result), normal_half_width(1.0, confidence)
     return {
         "subject": subject.name,
@@ -132,9 +131,9 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
         "tests_5": tests_5,
         "tests_95": tests_95,
         "tests_for_wanted_rhw": (z / WANTED_RHW) ** 2 * (relvar * median) if fixed else None,
-        "reached": float(reached.mean()),
-        "alarm": float(np.mean(columns["n_crashes_outside"] > 0)),
-        "refused": float(columns["refused"].mean()),
+        "reached": float(table.reached.mean()),
+        "alarm": float((table.n_crashes_outside > 0).mean()),
+        "refused": float(table.refused.mean()),
     }
 
 
@@ -145,22 +144,17 @@ def _mean(values: FloatArray) -> float:
 
 def corrected(judgements: Sequence[Judgement]) -> list[Judgement]:
     """The same with p-values corrected over all subjects, for each result by itself, and what they say at 5 %."""
-    found: dict[int, float] = {}
+    found = [{**one, "p_value_holm": None, "coverage_too_low": False} for one in judgements]
     for result in {one["result"] for one in judgements}:
-        known = {k: one["p_value"] for k, one in enumerate(judgements) if one["result"] == result}
-        known = {k: p for k, p in known.items() if p is not None}
-        found |= dict(zip(known, holm(list(known.values())), strict=True))
-    p_values = [found.get(k) for k in range(len(judgements))]
-    return [
-        {**one, "p_value_holm": p, "coverage_too_low": p is not None and p < SIGNIFICANCE}
-        for one, p in zip(judgements, p_values, strict=True)
-    ]
+        judged = [one for one in found if one["result"] == result and one["p_value"] is not None]
+        for one, p in zip(judged, holm([one["p_value"] for one in judged]), strict=True):
+            one |= {"p_value_holm": p, "coverage_too_low": p < SIGNIFICANCE}
+    return found
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's corrected p-values, in the order given."""
     order = np.argsort(p_values, kind="stable")
     raised = np.minimum(1.0, np.arange(len(order), 0, -1) * np.array(p_values)[order])
-    adjusted = np.zeros(len(order))
-    adjusted[order] = np.maximum.accumulate(raised)
-    return adjusted.tolist()
+    adjusted: list[float] = np.maximum.accumulate(raised)[np.argsort(order)].tolist()
+    return adjusted

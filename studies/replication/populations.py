@@ -14,7 +14,7 @@ would: told the index of its shadow run, and held to the hash of what it did the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -122,13 +122,12 @@ class Drivers:
 
     def only(self, names: set[str]) -> Drivers:
         """The envelope, the references and the drivers of some vehicles."""
-        vehicles = {name: one for name, one in self.vehicles.items() if name in names}
         enclosed = self.envelope != NO_ENVELOPE
         kept = [self.envelope] * enclosed + [*self.references.values()]
-        kept += [d for one in vehicles.values() for d in one]
-        renumbered = {name: {kept.index(d): share for d, share in one.items()} for name, one in vehicles.items()}
+        kept += [d for name, one in self.vehicles.items() if name in names for d in one]
+        vehicles = {n: {kept.index(d): p for d, p in one.items()} for n, one in self.vehicles.items() if n in names}
         references = {name: kept.index(driver) for name, driver in self.references.items()}
-        return Drivers(self.records[kept], 0 if enclosed else NO_ENVELOPE, renumbered, references)
+        return Drivers(self.records[kept], 0 if enclosed else NO_ENVELOPE, vehicles, references)
 
 
 def reference_drivers(library: Library) -> dict[str, int]:
@@ -227,7 +226,7 @@ class Truths:
     """Paths that vehicles' truths are from: aimed at all drivers, and again at some that these leave imprecise.
 
     Those mostly crash in quite other places than the rest. They are enumerated again with more paths, aimed at them
-    alone, and at vehicles that they are to be seen ``beside``.
+    alone, and at vehicles that they are compared with: ``together`` are pairs.
     """
 
     def __init__(
@@ -237,12 +236,12 @@ class Truths:
         seed: int,
         n_paths: int,
         progress: Progress,
-        beside: Mapping[str, set[str]] | None = None,
+        together: Iterable[set[str]] = (),
     ) -> None:
         self._enumerated = [(drivers, enumerate_paths(environment, drivers, seed, n_paths, progress))]
         imprecise = {name for name in drivers.vehicles if self.vehicle(name)[RATE].relative_error > LARGEST_ERROR}
         if imprecise:
-            again = drivers.only(imprecise.union(*((beside or {}).get(name, set()) for name in imprecise)))
+            again = drivers.only(imprecise.union(*(pair for pair in together if pair & imprecise)))
             population = enumerate_paths(environment, again, seed + 1, MORE_PATHS * n_paths, progress)
             self._enumerated.insert(0, (again, population))
 

@@ -41,12 +41,13 @@ def validate(
             stage = f"replications of {subject.name}"
             parts = results_of(stage, jobs, repeated.run, progress, run=executor.map, size=len)
             found[subject] = [row for part in parts for row in part]
-    judgements = []
-    for subject, rows in found.items():
-        for result in dict.fromkeys(row.result for row in rows):
-            of_result = [row for row in rows if row.result == result]
-            judgements.append(judge(subject, result, of_result, experiment.nominal))
-    judgements = corrected(judgements)
+    judgements = corrected(
+        [
+            judge(subject, result, [row for row in rows if row.result == result], experiment.nominal)
+            for subject, rows in found.items()
+            for result in dict.fromkeys(row.result for row in rows)
+        ]
+    )
     write_results(folder, experiment, judgements, found)
     return judgements
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-from itertools import permutations, product
+from itertools import product
 from typing import Any
 
 from harness.campaign.campaign import Campaign
@@ -80,16 +80,14 @@ def _chain(experiment: Experiment, place: int, chain: Chain) -> Tested:
 
 def _holding(experiment: Experiment, progress: Progress) -> Iterator[Tested]:
     """Vehicles that keep their speed before the cut-in, all enumerated together, or comparisons of these."""
-    campaign, size = experiment.campaign, experiment.super_population
+    campaign, size, pairs = experiment.campaign, experiment.super_population, experiment.pairs
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     drivers = Drivers.of(library, experiment.holding, see_onset=environment.lateral.present)
-    together: dict[str, set[str]] = {}
-    for one, other in [each for pair in experiment.pairs.values() for each in permutations((pair.a, pair.b))]:
-        together.setdefault(one, set()).update({other} & set(drivers.vehicles))
+    together = [{pair.a, pair.b} & {*drivers.vehicles} for pair in pairs.values()]
     truths = Truths(environment, drivers, experiment.seed + 1, size.reference_paths, progress, together)
     if campaign.testing.method == "shells":
         pools = enumerate_paths(environment, drivers, experiment.seed, size.paths, progress)
-        yield from (_pairs if experiment.pairs else _single)(experiment, library, drivers, truths, pools)
+        yield from (_pairs if pairs else _single)(experiment, library, drivers, truths, pools)
         return
     for name in experiment.holding:
         tested = experiment.subject(name)
@@ -105,21 +103,19 @@ def _acting(experiment: Experiment, name: str, truth: SuperPopulation, pools: Su
     known = of_vehicle(truth, truth.crash_mass(vehicle), reference_drivers(library))
     crashing, paths = pools.crash_mass(vehicle), campaign.pool.shadow_paths
     division = Division(library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
-    return _vehicle(experiment, campaign, name, division.of_vehicle(crashing), known)
+    return _vehicle(experiment, name, division.of_vehicle(crashing), known)
 
 
 def _seed(experiment: Experiment, name: str) -> int:
     return experiment.seed_of(list(experiment.avs).index(name))
 
 
-def _vehicle(
-    experiment: Experiment, campaign: Campaign, name: str, source: OvertakingShells, known: Mapping[str, Known]
-) -> Tested:
+def _vehicle(experiment: Experiment, name: str, source: OvertakingShells, known: Mapping[str, Known]) -> Tested:
     """A vehicle by what is known about it, its crash rate among it; adversaries have the seed of what they are of."""
-    seed = _seed(experiment, experiment.adversaries[name].of if name in experiment.adversaries else name)
+    of = experiment.adversaries[name].of if name in experiment.adversaries else name
     outside, boundary = source.crashes_outside(source.crashing[0]), source.template.library.boundary
-    more = {"left_out": source.left_out, "boundary": boundary}
-    return _of_shells(experiment, campaign, name, source.draw, seed, known, source.crash_rate, outside, **more)
+    own = experiment.subject(of), name, source.draw, _seed(experiment, of), known, source.crash_rate, outside
+    return _of_shells(experiment, *own, left_out=source.left_out, boundary=boundary)
 
 
 def _of_shells(
@@ -157,17 +153,16 @@ def _single(
     experiment: Experiment, library: Library, drivers: Drivers, truths: Truths, pools: SuperPopulation
 ) -> Iterator[Tested]:
     """Each vehicle, followed by the adversaries that are made of it."""
+    paths = experiment.super_population.pool_paths
     for name, av in experiment.holding.items():
-        tested, crashing = experiment.subject(name), pools.crash_mass(drivers.vehicles[name])
-        paths, limit = experiment.super_population.pool_paths, acceleration_limit(av)
-        division = Division(library, pools, [crashing], paths, limit_mps2=limit)
-        yield _vehicle(experiment, tested, name, division.of_vehicle(crashing), truths.vehicle(name))
+        crashing = pools.crash_mass(drivers.vehicles[name])
+        division = Division(library, pools, [crashing], paths, limit_mps2=acceleration_limit(av))
+        yield _vehicle(experiment, name, division.of_vehicle(crashing), truths.vehicle(name))
         for made_name, made in experiment.adversaries.items():
             if made.of == name:
                 of_adversary = division.as_adversary(made, crashing)
-                source = division.of_vehicle(of_adversary, made)
                 known = _exactly(of_vehicle(pools, of_adversary, drivers.references))
-                yield _vehicle(experiment, tested, made_name, source, known)
+                yield _vehicle(experiment, made_name, division.of_vehicle(of_adversary, made), known)
 
 
 def _pairs(
@@ -176,15 +171,14 @@ def _pairs(
     """Each comparison."""
     library, paths = library.model_copy(update={"references": {}}), experiment.super_population.pool_paths
     for place, (name, pair) in enumerate(experiment.pairs.items()):
-        both = [pair.a, pair.b]
-        adversaries = [experiment.adversaries.get(one) for one in both]
-        base = [one if made is None else made.of for one, made in zip(both, adversaries, strict=True)]
+        both, made = [pair.a, pair.b], experiment.adversaries
+        base = [made[one].of if one in made else one for one in both]
         of_base = [pools.crash_mass(drivers.vehicles[one]) for one in base]
         limit = max(acceleration_limit(experiment.avs[one]) for one in base)
         division = Division(library, pools, of_base, paths, limit_mps2=limit)
         a, b = (
-            crashing if made is None else division.as_adversary(made, crashing)
-            for made, crashing in zip(adversaries, of_base, strict=True)
+            division.as_adversary(made[one], crashing) if one in made else crashing
+            for one, crashing in zip(both, of_base, strict=True)
         )
         known = truths.pair(*both) if both == base else _exactly(of_pair(pools, a, b))
         source, scale = division.of_pair(a, b), known[CONDITIONAL_DIFFERENCE].scale
