@@ -28,11 +28,14 @@ def test_all_that_is_promised_is_there():
         _ = harness.nothing
 
 
-def test_importing_it_loads_nothing_slow():
+def test_importing_it_loads_nothing_slow_and_a_report_nothing_to_drive_or_to_plot_with():
     slow = {"numba", "scipy", "libsumo", "pandas", "pyarrow", "matplotlib"}
-    command = [sys.executable, "-c", f"import harness.cli, sys; print({slow} & set(sys.modules))"]
+    of_report = {"matplotlib", "libsumo", "ray", "fmpy"}
+    code = f"import harness.cli, sys; print({slow} & {{*sys.modules}})"
+    code += f"; import harness.report.page, harness.report.compare_page; print({of_report} & {{*sys.modules}})"
+    command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=MIXTURE_FILE.parents[1], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
+    assert done.stdout.split("\n") == ["set()", "set()", ""]
 
 
 def test_beside_the_clone_it_is_not_an_empty_namespace_package(tmp_path):

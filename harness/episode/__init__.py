@@ -19,5 +19,5 @@ names. `loop` calls five of their functions, each for all cells at once (`decide
 `fail`), and knows nothing else of them; runner, estimators and report know outcome, log weight, stratum and cell.
 Beyond these files the cut-in has a name where a family would add its own: maneuvers and outcomes in
 `harness.vocabulary`, columns in `harness.records.schemas`, what a controller sees in `harness.controllers.protocol`,
-the change of lanes in `harness.worlds`, and the plots of where crashes lie in `harness.report.test_plots`.
+the change of lanes in `harness.worlds`, and the plots of where crashes lie in `harness.report.plots`.
 """

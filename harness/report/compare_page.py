@@ -6,13 +6,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from inspect import getmembers, isfunction
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-import matplotlib.style
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from markupsafe import Markup
 from pydantic import BaseModel
 
 from harness import numbers
@@ -23,12 +21,13 @@ from harness.pool.replay import LEAD, PATH_COLUMNS
 from harness.records.folder import read_as, write_bytes
 from harness.records.reader import read_traces, stored_columns
 from harness.report.page import sentence
-from harness.report.pairs_map import MEND, PURPLE, Pairs, crashing_pairs, map_plot
 from harness.report.player import TRACE_COLUMNS, Scene, Scenes, beside_other, templates
-from harness.report.style import RC, inline_svg, svg
-from harness.report.summary import RunFolder, read_run_folder
+from harness.report.plots import WHO, pairs_plot
+from harness.report.summary import RunFolder, floats, read_run_folder
 from harness.runner.stored import replay_episode
-from harness.vocabulary import COMPARISON
+from harness.vocabulary import COMPARISON, FloatArray, IntArray
+
+MEND = "Run `harness compare` again with the same --out."
 
 SHOWN = 2
 """Crashes of each: a vehicle in foreign code is run again in a process of its own."""
@@ -67,19 +66,61 @@ def write_comparison(folder: str | Path) -> Path:
     pairs, inside = crashing_pairs(runs, stored.shells), stored.conditional
     given = runs[0].campaign.testing.shells.statement == "library" and not inside.refuted
     asked = inside if given else stored
-    with matplotlib.style.context(["default", RC]):
-        plot = map_plot(pairs)
-        drawing = "" if plot is None else inline_svg(svg(plot)).replace(PURPLE, "var(--reference)")
+    plot = pairs_plot(pairs.who, pairs.weight, pairs.gap_m, pairs.closing_mps)
     environment = templates()
     environment.filters.update(getmembers(numbers, isfunction), sentence=sentence, vehicle=vehicle_words)
     page = environment.get_template("compare.html.j2").render(
         compared=stored, asked=asked, given=given, verdict=verdict(asked, stored.margin),
         sides=list(zip("AB", runs, stored.campaigns.values(), strict=True)),
-        plot=plot, drawing=Markup(drawing),  # noqa: S704 - matplotlib's own, in which every text is escaped
+        plot=plot,
         scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
     )  # fmt: skip
     write_bytes(folder / "report.html", printable(page).encode("utf-8"))
     return folder / "report.html"
+
+
+class Pairs(NamedTuple):
+    """Pairs with a crash: who of `WHO`, what it adds to the rate, gap (m) and closing speed (m/s) at the cut-in, (n,).
+
+    The cut-in is that of the vehicle that crashes, A's where both do. ``episode`` and ``impact_mps`` are of A and B,
+    (2, n); a failed test, which counts as no crash, has no impact, and a negative episode.
+    """
+
+    who: IntArray
+    weight: FloatArray
+    gap_m: FloatArray
+    closing_mps: FloatArray
+    episode: IntArray
+    impact_mps: FloatArray
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Pairs by who crashes."""
+        return {name: int(np.count_nonzero(self.who == place)) for place, name in enumerate(WHO)}
+
+
+def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> Pairs:
+    """Pairs on which A or B crashes, by the records: the i-th test of a shell of A and of B."""
+    columns = ("episode", "component", "impact_speed_mps", "cut_in_r2_m", "cut_in_r2dot_mps")
+    n_pairs, found = [shell["n_pairs"] for shell in shells], []
+    for run in runs:
+        rows = pa.Table.from_batches(run.episodes(*columns, "outcome"))
+        component = rows["component"].to_numpy()
+        first = [np.flatnonzero(component == s)[:n] for s, n in enumerate(n_pairs)]
+        if [each.size for each in first] != n_pairs:
+            raise RunFolderError(str(run.path), "fewer tests than pairs", f"those of {COMPARISON}", MEND)
+        tests, outcome = rows.take(np.concatenate(first)), rows["outcome"].cast(pa.string())
+        outcome = outcome.take(np.concatenate(first)).to_numpy()
+        values = {name: floats(tests[name]) for name in columns}
+        episode = np.where(outcome == "failed", -1.0, values["episode"])
+        found.append({**values, "episode": episode, "crash": outcome == "crash"})
+    a, b = (each["crash"] for each in found)
+    weight = np.repeat([shell["p"] / max(n, 1) for shell, n in zip(shells, n_pairs, strict=True)], n_pairs)
+    kept = a | b
+    gap, rate = (np.where(a, found[0][name], found[1][name])[kept] for name in columns[-2:])
+    episode, impact = (np.stack([of[name][kept] for of in found]) for name in ("episode", "impact_speed_mps"))
+    who = np.where(a & b, 0, np.where(a, 1, 2))[kept]
+    return Pairs(who, weight[kept], gap, -rate, episode.astype(np.int64), impact)
 
 
 def verdict(found: Contrast, margin: dict[str, Any] | None) -> str:

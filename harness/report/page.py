@@ -7,8 +7,6 @@ from inspect import getmembers, isfunction
 from pathlib import Path
 from typing import Any
 
-import matplotlib.style
-from markupsafe import Markup
 from pydantic import BaseModel
 
 from harness import numbers
@@ -21,11 +19,10 @@ from harness.numbers import count, leaves, words
 from harness.records.folder import write_bytes
 from harness.records.reader import table_sizes
 from harness.report.crashes import crash_gallery, environment_of
+from harness.report.drawing import Plot
 from harness.report.player import templates
-from harness.report.rate_plots import convergence_plot, severity_plot, shells_plot
-from harness.report.style import RC, Plot, inline_svg, svg
+from harness.report.plots import convergence_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
-from harness.report.test_plots import where_plot
 from harness.traffic.laws import Environment
 from harness.vocabulary import OUTCOMES, RUN_FOLDER
 
@@ -47,8 +44,7 @@ def write_report(folder: str | Path) -> Path:
     folder = Path(folder)
     run = read_run_folder(folder)
     sizes, summary, traffic = table_sizes(folder), summarise(run), environment_of(run)
-    with matplotlib.style.context(["default", RC]):
-        files, figures = _rendered(_plots(run, summary, traffic))
+    plots = _plots(run, summary, traffic)
     gallery, scenes = crash_gallery(run, summary, traffic)
     environment = templates()
     environment.filters.update(getmembers(numbers, isfunction), verdict=verdict, sentence=sentence)
@@ -58,7 +54,7 @@ def write_report(folder: str | Path) -> Path:
         sizes=sizes,
         gallery=gallery,
         scenes=scenes,
-        figures=figures,
+        figures={plot.name: plot for plot in plots},
         lateral=lateral_facts(run),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         outcomes=outcome_rows(summary),
@@ -69,7 +65,7 @@ def write_report(folder: str | Path) -> Path:
         folder=run.typed,
         run_folder=RUN_FOLDER,
     )
-    _write_plots(folder / "plots", files)
+    _write_plots(folder / "plots", plots)
     write_bytes(folder / "report.html", printable(page).encode("utf-8"))
     return folder / "report.html"
 
@@ -84,19 +80,11 @@ def _plots(run: RunFolder, summary: RunSummary, traffic: Environment | None) -> 
     return [plot for plot in plots if plot is not None]
 
 
-def _rendered(plots: list[Plot]) -> tuple[dict[str, bytes], dict[str, dict[str, str]]]:
-    """Files by name, and by plot what the template needs: markup that is ours, and texts that it escapes."""
-    files, figures = {}, {}
-    for plot in plots:
-        files[f"{plot.name}.svg"] = drawing = svg(plot)
-        # The SVG is matplotlib's own output, in which every text is escaped: the one place that is not autoescaped.
-        markup = Markup(inline_svg(drawing))  # noqa: S704
-        figures[plot.name] = {"markup": markup, "alt": plot.alt, "caption": plot.caption}
-    return files, figures
-
-
-def _write_plots(folder: Path, files: dict[str, bytes]) -> None:
+def _write_plots(folder: Path, plots: list[Plot]) -> None:
+    css = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
+    style = "".join(re.findall(r"^:root \{.*?^\}$|^\.panel.*?$", css, flags=re.DOTALL | re.MULTILINE))
     folder.mkdir(exist_ok=True)
+    files = {f"{plot.name}.svg": plot.file(style) for plot in plots}
     for name, content in files.items():
         write_bytes(folder / name, content)
     for old in folder.iterdir():

@@ -273,13 +273,15 @@ def _log_tests(per_shell: Counter[int], run: RunFolder) -> FloatArray:
 
 
 def _outcome_index(column: pa.Array, run: RunFolder) -> IntArray:
-    index = pc.index_in(column.cast(pa.string()), pa.array(OUTCOMES), skip_nulls=True)
-    if index.null_count:
-        unknown = column.filter(pc.is_null(index))[0].as_py()
+    coded = column.cast(pa.string()).dictionary_encode()
+    names = coded.dictionary.to_pylist()
+    if coded.null_count or not {*names} <= {*OUTCOMES}:
+        unknown = next((name for name in names if name not in OUTCOMES), None)
         found = "an episode without outcome" if unknown is None else f"the outcome {unknown!r}"
         mend = "The records are from another version of the harness: use that version, or run again."
         raise RunFolderError(str(run.path / "episodes"), found, f"one of {', '.join(OUTCOMES)}", mend)
-    return np.asarray(index).astype(np.int64)
+    places: IntArray = np.array([OUTCOMES.index(name) for name in names], np.int64)[coded.indices.to_numpy()]
+    return places
 
 
 def lateral_facts(run: RunFolder) -> dict[str, Any] | None:

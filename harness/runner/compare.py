@@ -109,7 +109,6 @@ def compare_campaigns(
     write_json(out / COMPARISON, content)
     missed = a.stop.rhw is not None and not rule.look.stopped
     code = (EXIT_BUDGET_SPENT if missed else EXIT_DONE) if rule.margin is None else EXIT_OF[rule.margin.verdict]
-    # Each run has loaded matplotlib by now, for its own page.
     from harness.report.compare_page import write_comparison  # noqa: PLC0415
 
     return Comparison(out, found, content, code, write_comparison(out))

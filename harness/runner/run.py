@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from importlib import import_module
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -184,11 +182,8 @@ class Run:
         self.manifest.follow()
 
     def _known(self, request: ShardRequest) -> ShardResult | None:
-        """See `stored_shard`; workers are about to be busy with the first shard that it does not know."""
-        shard = stored_shard(self.out, self.source, self._retracing, self.manifest.listed(request), request)
-        if shard is None:
-            load_report_meanwhile()
-        return shard
+        """See `stored_shard`."""
+        return stored_shard(self.out, self.source, self._retracing, self.manifest.listed(request), request)
 
     def _add(self, shard: ShardResult) -> None:
         """Write a shard that is not there yet, and count it."""
@@ -250,16 +245,9 @@ class Run:
         self._progress.stage("writing estimates and report", None)
         estimates = estimate_run(self.out)
         write_sealed(self.out / ESTIMATES, estimates)
-        # No worker loads matplotlib, and it has been loaded here while workers were busy.
         from harness.report.page import write_report  # noqa: PLC0415
 
         return RunResult(self.out, write_report(self.out), estimates, stopped_by, said, code)
-
-
-@cache
-def load_report_meanwhile() -> None:
-    """Load matplotlib beside busy workers, once: no earlier, because it would slow down what makes them wait."""
-    threading.Thread(target=import_module, args=("harness.report.page",), daemon=True).start()
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:

@@ -15,10 +15,10 @@ from harness import numbers
 from harness.errors import HarnessError
 from harness.estimators.one_pass import LOW_MEAN_WEIGHT
 from harness.records.folder import write_bytes
-from harness.report.style import RC, png
 from studies.case_study.figures import Verdict, is_settled, verdict
 from studies.case_study.plots import plots_of
 from studies.case_study.study import Made, Study
+from studies.case_study.style import RC, png
 
 UNSETTLED = "†"
 PAGE, CLAIMS = "case_study.md", "claims.json"

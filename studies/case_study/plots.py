@@ -12,7 +12,11 @@ from matplotlib.ticker import MaxNLocator
 
 from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.records.folder import read_table
-from harness.report.style import (
+from harness.report.drawing import tick_label
+from studies.case_study.counted import CURVES
+from studies.case_study.figures import is_settled
+from studies.case_study.study import Convergence, Line, Made, Study
+from studies.case_study.style import (
     BLUE,
     FULL_WIDTH_IN,
     GREEN,
@@ -26,12 +30,8 @@ from harness.report.style import (
     new_figure,
     note,
     scaled,
-    tick_label,
     two_panels,
 )
-from studies.case_study.counted import CURVES
-from studies.case_study.figures import is_settled
-from studies.case_study.study import Convergence, Line, Made, Study
 
 _COLOURS = {"low": GREY, "nade": BLUE, "scv": VERMILLION, "nde": INK, "": GREEN}
 """Of a method in all plots, by what its step or label contains."""

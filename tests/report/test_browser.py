@@ -212,6 +212,11 @@ def test_it_is_readable_wide_and_narrow_in_light_and_in_the_dark(width, scheme, 
             "[...document.querySelectorAll('.player text, .player td')].map((e) => getComputedStyle(e).fontSize)"
         )
         assert min(float(size.removesuffix("px")) for size in sizes) >= 8
+        plots = page.evaluate(
+            "[...document.querySelectorAll('.plot')].filter((e) => e.checkVisibility()).flatMap((plot) =>"
+            " [plot.scrollWidth <= plot.clientWidth && 11 * plot.querySelector('svg').clientWidth / 420])"
+        )  # a panel is 420 units wide, and its text 11 high
+        assert all(height >= 8 for height in plots)
         page.set_viewport_size({"width": 700, "height": 900})  # what was drawn for one width is drawn for the next
         road = page.locator(".road").first  # waiting for a function would be `eval`, which the page's policy forbids
         width = road.evaluate("(e) => e.clientWidth")

@@ -10,8 +10,8 @@ import harness
 from harness.cli import main
 from harness.errors import RunFolderError
 from harness.numbers import interval, number, ratio
-from harness.report.compare_page import Contrast, verdict, write_comparison
-from harness.report.pairs_map import WHO, crashing_pairs
+from harness.report.compare_page import Contrast, crashing_pairs, verdict, write_comparison
+from harness.report.plots import WHO
 from harness.report.summary import read_run_folder
 from tests.golden.campaigns import SHELLS
 from tests.golden.record import load

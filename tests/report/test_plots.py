@@ -4,8 +4,8 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
-import matplotlib.style
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -15,11 +15,10 @@ from harness.estimators.severity import weighted_quantiles
 from harness.numbers import number
 from harness.report import crashes
 from harness.report.crashes import CANDIDATES, crash_gallery, environment_of, worst_crashes
+from harness.report.drawing import Axis, Panel
 from harness.report.player import UNKNOWN
-from harness.report.rate_plots import POOL, severity_plot, shells_plot
-from harness.report.style import CSS_NAMES, INK, RC, Plot, inline_svg, new_figure, svg
+from harness.report.plots import POOL, SHARES, limits_of_others, severity_plot, shells_plot, where_plot
 from harness.report.summary import read_run_folder, summarise
-from harness.report.test_plots import limits_of_others, where_plot
 from harness.vocabulary import CRASH, OUTCOMES
 from tests.report.test_page import edit
 
@@ -27,35 +26,59 @@ CSS = (Path(harness.report.__file__).parent / "report.css").read_text(encoding="
 LIGHT, DARK, PRINT = re.findall(r":root \{(.*?)\n\s*\}", CSS, flags=re.DOTALL)
 
 
+def colours(plot):
+    return set(re.findall(r"var\(--([\w-]+)\)", plot.markup))
+
+
 @pytest.mark.parametrize("block", [LIGHT, DARK, PRINT], ids=["light", "dark", "print"])
-def test_every_plot_colour_is_a_css_variable_in_every_scheme(block):
-    defined = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", block))
-    assert set(CSS_NAMES.values()) <= set(defined)
-    if block != DARK:
-        assert [name for colour, name in CSS_NAMES.items() if defined[name] != colour and name != "muted"] == []
+def test_every_plot_colour_is_a_css_variable_in_every_scheme(block, runs):
+    run = runs["shells"]
+    plots = [severity_plot(run.estimates), where_plot(summarise(run), None), shells_plot(run.shells)]
+    used = set().union(*map(colours, plots), SHARES.values()) - {"reference"}
+    assert used <= set(re.findall(r"--([\w-]+): #[0-9a-f]{6};", block))
 
 
-def test_inline_svg_is_themed_text_without_names_or_namespaces():
-    with matplotlib.style.context(["default", RC]):
-        figure = new_figure(2.0, 1.0)
-        axes = figure.subplots()
-        axes.plot([0.0, 1.0], [0.0, 1.0], "o-", color=INK)
-        axes.set_title("<b>a & b</b> $x$")
-        markup = inline_svg(svg(Plot("tiny", figure, "alt", "caption")))
-    assert markup.startswith("<svg viewBox=")
-    for there in ("var(--ink)", "&lt;b&gt;a &amp; b&lt;/b&gt; $x$", "var(--sans)"):
-        assert there in markup
-    for absent in ("xmlns", '<g id="', "DejaVu"):
-        assert absent not in markup
+def marks(panel, kind):
+    """Columns of the marks of a kind, by label."""
+    return {mark.label: tuple(map(np.atleast_1d, mark.columns)) for mark in panel.marks if mark.kind == kind}
+
+
+def test_texts_are_escaped_and_marks_stand_where_their_axis_says():
+    panel = Panel("<b>a & b</b>", Axis("gap", 0.0, 2e-7), Axis("rate", 1e-3, 10.0, log=True))
+    panel.add("line", "blue", [0.0, 1e-7, np.nan], [1e-3, 0.1, 1.0], label="a < b")
+    panel.add("dots", "grey", [2e-7], [10.0], 3.0)
+    svg = str(panel.svg)
+    ElementTree.fromstring(svg)
+    for there in ("&lt;b&gt;a &amp; b&lt;/b&gt;", "a &lt; b", ">gap, × 10⁻⁷</text>", ">0.5</text>", ">10</text>"):
+        assert there in svg
+    [(width, height)] = re.findall(r'<svg x="54" y="\S+" width="([\d.]+)" height="([\d.]+)">', svg)
+    ends = f'd="M0 {height}L{float(width) / 2:g} {float(height) / 2:g}"', f'd="M{float(width) - 3:g} 0a3'
+    assert [end for end in ends if end not in svg] == []
+
+
+@pytest.mark.parametrize(
+    ("axis", "ticks"),
+    [
+        (Axis("", 0.0, 3.1e-7), ["0", "1", "2", "3"]),
+        (Axis("", 0.0, 13.0), ["0", "2.5", "5", "7.5", "10", "12.5"]),
+        (Axis("", 2e-9, 3e-7, log=True), ["10⁻⁸", "10⁻⁷"]),
+        (Axis("", 0.04, 0.6, log=True), ["0.05", "0.1", "0.2", "0.5"]),
+        (Axis("", 1.0, 1e12, log=True), ["1", "1000", "10⁶", "10⁹", "10¹²"]),
+        (Axis("", 2.5, -0.5, names=("a", "b")), ["a", "b"]),
+    ],
+)
+def test_ticks_are_round_and_few(axis, ticks):
+    assert [text for _, text in axis.ticks()] == ticks
 
 
 @pytest.mark.parametrize("name", ["shells", "weighted", "nde"])
 def test_severity_is_drawn_as_it_was_estimated(name, runs):
     rows = [row for row in runs[name].estimates.severity.exceedance if row.crash_rate > 0.0]
-    axes = severity_plot(runs[name].estimates).figure.axes[0]
-    assert axes.lines[0].get_xydata().tolist() == [[row.above_mps, row.crash_rate] for row in rows]
-    band = axes.collections[0].get_paths()[0].vertices
-    assert {row.ci_high for row in rows} <= set(band[:, 1])
+    [panel] = severity_plot(runs[name].estimates).panels
+    above, rate = marks(panel, "line")["rate of harder crashes"]
+    assert list(zip(above, rate, strict=True)) == [(row.above_mps, row.crash_rate) for row in rows]
+    [(_, _, high)] = marks(panel, "band").values()
+    assert {row.ci_high for row in rows} <= set(high)
     assert severity_plot(runs["no_crash"].estimates) is None
 
 
@@ -71,32 +94,32 @@ def test_others_avoid_a_crash_from_the_gap_on_that_their_brakes_need(runs):
 
 
 def test_the_map_has_a_colour_for_every_cut_in(runs):
-    axes = where_plot(summarise(runs["shells"]), None).figure.axes[0]
-    assert axes.patches
-    assert not axes.lines
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels[0] == "tested, none"
-    assert set(labels) <= {"tested, none", "≤ 25 %", "≤ 50 %", "≤ 75 %", "≤ 100 %"}
+    [panel] = where_plot(summarise(runs["shells"]), None).panels
+    cells = marks(panel, "boxes")
+    assert next(iter(cells)) == "tested, none"
+    assert set(cells) <= {"tested, none", "≤ 25 %", "≤ 50 %", "≤ 75 %", "≤ 100 %"}
+    assert marks(panel, "line") == {}
 
 
 def test_the_plot_shows_contributions_and_half_widths(runs):
     """The latter are what is not known, that of the pool included."""
     found = runs["shells"].shells
-    rates, widths = shells_plot(found).figure.axes
-    assert [label.get_text() for label in rates.get_yticklabels()] == [*(s.shell for s in found.shells), POOL]
-    assert [bar.get_width() for bar in rates.patches] == [*(s.contribution for s in found.shells), 0.0]
+    rates, widths = shells_plot(found).panels
+    assert rates.y.names == widths.y.names == (*(s.shell for s in found.shells), POOL)
+    inside, outside, limits = (mark.columns for mark in rates.marks if mark.kind == "boxes")
+    assert [*inside[1], *outside[1]] == [s.contribution for s in found.shells]
+    assert [*map(tuple, np.transpose(limits[:2]))] == [(s.low, s.high) for s in found.shells]
     half_widths = [*(s.half_width for s in found.shells), found.pool_half_width]
-    assert [bar.get_width() for bar in widths.patches] == half_widths
+    assert marks(widths, "boxes")[""][1].tolist() == half_widths
     assert sum(map(found.share_of_uncertainty, half_widths)) == pytest.approx(1.0)
 
 
 def test_a_shell_without_tests_is_said_so_and_runs_out_of_the_plot(runs):
     found = runs["shells_inside_only"].shells
-    rates, widths = shells_plot(found).figure.axes
+    rates, widths = shells_plot(found).panels
     outside = found.shells[-1]
-    label = f"{outside.shell}\nnot tested: up to {number(outside.p)}"
-    assert rates.get_yticklabels()[len(found.shells) - 1].get_text() == label
-    assert max(rates.get_xlim()[1], widths.get_xlim()[1]) < 0.1 * outside.p
+    assert f"not tested: up to {number(outside.p)}" in marks(rates, "text")
+    assert max(rates.x.high, widths.x.high) < 0.1 * outside.p
 
 
 # -- counts, weights, rankings and bins against the whole table --

@@ -1,0 +1,265 @@
+"""Panels drawn as SVG: axes that show small rates, lines, bands, dots and boxes, in the colours of the page.
+
+A panel is as wide as a phone shows, so that its text stays readable there; on wider screens panels stand side by side.
+Colours are names of the page's CSS variables, and follow its light or dark scheme. The same data give the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import ArrayLike
+
+from harness.numbers import exponent_of, plain, power_of_ten
+from harness.vocabulary import FloatArray
+
+WIDTH, CHARACTER, LINE = 420.0, 5.9, 15.0
+"""Of a panel, and of its text: mean width and height."""
+RIGHT, BOTTOM, AXIS = 12.0, 36.0, 54.0
+"""Margins right, below, and left where an axis has numbers."""
+FEW_DECADES, MOST_TICKS = 1.7, 6
+
+
+class Axis(NamedTuple):
+    """From ``low`` to ``high``; logarithmic, or of rows with ``names`` at 0, 1 and so on."""
+
+    label: str
+    low: float
+    high: float
+    log: bool = False
+    names: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """The label, with the power of ten that the numbers at the ticks leave out."""
+        exponent = 0 if self.log else exponent_of(self.high)
+        return f"{self.label}, × {power_of_ten(exponent)}" if exponent else self.label
+
+    def place(self, values: ArrayLike) -> FloatArray:
+        """Where values are between the ends, 0 to 1; what is not finite is not there."""
+        low, high, at = self.low, self.high, np.asarray(values, np.float64)
+        if self.log:
+            low, high, at = math.log10(low), math.log10(high), np.log10(np.maximum(at, 1e-300))
+        return np.asarray(np.clip((at - low) / (high - low), -99.0, 99.0), np.float64)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        """Values and texts: powers of ten, also their multiples by 2 and 5 where there are few; or round numbers."""
+        if self.names:
+            return list(enumerate(self.names))
+        if self.log:
+            decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
+            few = math.log10(self.high / self.low) < FEW_DECADES
+            step = 1 if few else math.ceil(len(decades) / MOST_TICKS)
+            steps = [m * 10.0**k for k in decades[::step] for m in ((1, 2, 5) if few else (1,))]
+            return [
+                (value, tick_label(value))
+                for value in steps
+                if 0.999 <= value / self.low <= 1.001 * self.high / self.low
+            ]
+        rough = (self.high - self.low) / MOST_TICKS
+        unit = 10.0 ** math.floor(math.log10(rough))
+        step_size = next(m * unit for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * unit >= rough)
+        values = step_size * np.arange(
+            math.ceil(self.low / step_size - 1e-9), math.floor(self.high / step_size + 1e-9) + 1
+        )
+        scale = 10.0 ** exponent_of(self.high)
+        return [(float(value), plain(float(f"{value / scale:.6g}"))) for value in values]
+
+
+def tick_label(value: float) -> str:
+    """Plain digits from 0.01 to 9999, else ``10⁻⁷`` or ``2·10⁻⁷``; none for 0."""
+    if value <= 0.0:
+        return ""
+    if 0.0099 < value < 9_999.5:
+        return f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
+    exponent = math.floor(math.log10(value) + 1e-9)  # of a value such as 1e-7 it may come out just below
+    mantissa = f"{value / 10.0**exponent:.3g}"
+    return power_of_ten(exponent) if mantissa == "1" else f"{mantissa}·{power_of_ten(exponent)}"
+
+
+class Mark(NamedTuple):
+    """What is drawn, by its columns (n,).
+
+    They are x and y of a line; x, low and high of a band; x, y and radius of dots; left, right, low and high of boxes;
+    x and y of a text. ``dash`` is of a line, ``opacity`` of the rest.
+    """
+
+    kind: Literal["line", "band", "dots", "boxes", "text"]
+    colour: str
+    columns: tuple[ArrayLike, ...]
+    label: str = ""
+    dash: str = ""
+    opacity: float = 1.0
+    width: float = 1.8
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Axes with marks in them, in the order in which they are drawn; labels of marks make the legend."""
+
+    title: str
+    x: Axis
+    y: Axis
+    marks: list[Mark] = field(default_factory=list)
+    height: float = 250.0
+
+    def add(
+        self,
+        kind: Literal["line", "band", "dots", "boxes", "text"],
+        colour: str,
+        *columns: ArrayLike,
+        label: str = "",
+        dash: str = "",
+        opacity: float = 1.0,
+        width: float = 1.8,
+    ) -> None:
+        """Draw one more `Mark`."""
+        self.marks.append(Mark(kind, colour, columns, label, dash, opacity, width))
+
+    @property
+    def svg(self) -> Markup:
+        """The panel as an SVG element that is as wide as its place."""
+        legend = list(self._legend())
+        top = 20.0 + LINE * (1 + max((row for _, row, _ in legend), default=-1))
+        left = AXIS if not self.y.names else 14.0 + 1.05 * CHARACTER * max(map(len, self.y.names))
+        width, height = WIDTH - left - RIGHT, self.height - top - BOTTOM
+        parts = [Markup('<text x="0" y="12" style="fill:var(--ink);font-weight:600">{}</text>').format(self.title)]
+        parts += [
+            Markup('<g transform="translate({},{})">{}<text x="20" y="4">{}</text></g>').format(
+                _n(x), _n(28.0 + LINE * row), _swatch(mark), mark.label
+            )
+            for mark, row, x in legend
+        ]
+        for value, text in self.x.ticks():
+            x = _n(left + width * float(self.x.place(value)))
+            parts.append(
+                Markup('<path class="grid" d="M{0} {1}V{2}"/><text x="{0}" y="{3}" class="mid">{4}</text>').format(
+                    x, _n(top), _n(top + height), _n(top + height + 14.0), text
+                )
+            )
+        for value, text in self.y.ticks():
+            y = top + height * (1.0 - float(self.y.place(value)))
+            if not self.y.names:
+                parts.append(Markup('<path class="grid" d="M{} {}h{}"/>').format(_n(left), _n(y), _n(width)))
+            parts.append(Markup('<text x="{}" y="{}" class="end">{}</text>').format(_n(left - 6.0), _n(y + 4.0), text))
+        inner = Markup("").join(_drawn(mark, self, width, height) for mark in self.marks)
+        parts.append(
+            Markup('<svg x="{}" y="{}" width="{}" height="{}">{}</svg>').format(
+                *map(_n, (left, top, width, height)), inner
+            )
+        )
+        parts.append(
+            Markup('<path class="axis" d="M{} {}V{}H{}"/>').format(*map(_n, (left, top, top + height, left + width)))
+        )
+        parts.append(
+            Markup('<text x="{}" y="{}" class="mid">{}</text>').format(
+                _n(left + width / 2.0), _n(self.height - 4.0), self.x.title
+            )
+        )
+        if self.y.label:
+            parts.append(
+                Markup('<text transform="translate(11,{}) rotate(-90)" class="mid">{}</text>').format(
+                    _n(top + height / 2.0), self.y.title
+                )
+            )
+        return Markup('<svg viewBox="0 0 {} {}" aria-hidden="true" class="panel">{}</svg>').format(
+            _n(WIDTH), _n(self.height), Markup("").join(parts)
+        )
+
+    def _legend(self) -> Iterator[tuple[Mark, int, float]]:
+        """Marks with a label, in which row and where in it they stand."""
+        row, x = 0, 0.0
+        for mark in self.marks:
+            if mark.label and mark.kind != "text":
+                needs = 20.0 + CHARACTER * len(mark.label)
+                if x and x + needs > WIDTH:
+                    row, x = row + 1, 0.0
+                yield mark, row, x
+                x += needs + 12.0
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Panels with what a reader needs beside them.
+
+    ``name`` is its file's, without suffix; ``alt`` says what it shows to those who cannot see it, ``caption`` what to
+    read from it.
+    """
+
+    name: str
+    panels: Sequence[Panel]
+    alt: str
+    caption: str
+
+    @property
+    def markup(self) -> Markup:
+        """What stands on the page."""
+        return Markup("").join(panel.svg for panel in self.panels)
+
+    def file(self, style: str) -> bytes:
+        """An SVG file that stands alone, with the panels below each other in a ``style`` sheet."""
+        heights = [panel.height for panel in self.panels]
+        panels = Markup("").join(
+            Markup('<svg y="{}" width="{}" height="{}">{}</svg>').format(
+                _n(sum(heights[:k])), _n(WIDTH), _n(panel.height), panel.svg
+            )
+            for k, panel in enumerate(self.panels)
+        )
+        head = Markup('<svg xmlns="http://www.w3.org/2000/svg" viewBox="-8 -8 {} {}">').format(
+            _n(WIDTH + 16.0), _n(sum(heights) + 16.0)
+        )
+        return f"{head}<style>{style}</style>{panels}</svg>\n".encode()
+
+
+def _n(value: float) -> str:
+    """A coordinate."""
+    return f"{value:.1f}".removesuffix(".0")
+
+
+def _drawn(mark: Mark, panel: Panel, width: float, height: float) -> Markup:
+    """A mark in its panel's inner part, which cuts off what is beyond its edges."""
+    first, *rest = (np.atleast_1d(np.asarray(column, np.float64)) for column in mark.columns)
+    xs = [first, rest[0]] if mark.kind == "boxes" else [first]
+    ys = rest[1:] if mark.kind == "boxes" else rest[: 2 if mark.kind == "band" else 1]
+    x, y = ([axis.place(each) for each in of] for axis, of in ((panel.x, xs), (panel.y, ys)))
+    x, y = [width * each for each in x], [height * (1.0 - each) for each in y]
+    if mark.kind == "text":
+        anchor, dx = ("end", -4.0) if x[0][0] > 0.9 * width else ("start", 5.0)
+        return Markup('<text x="{}" y="{}" class="on" style="text-anchor:{};fill:var(--{})">{}</text>').format(
+            _n(x[0][0] + dx), _n(y[0][0] + 4.0), anchor, mark.colour, mark.label
+        )
+    if mark.kind == "dots":
+        discs = zip(x[0], y[0], np.broadcast_to(rest[1], x[0].shape), strict=True)
+        path = "".join(
+            f"M{_n(a - r)} {_n(b)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0"
+            for a, b, r in discs
+        )
+    elif mark.kind == "boxes":
+        path = "".join(f"M{_n(a)} {_n(c)}H{_n(b)}V{_n(d)}H{_n(a)}z" for a, b, c, d in zip(*x, *y, strict=True))
+    elif mark.kind == "band":
+        path = _joined(np.append(x[0], x[0][::-1]), np.append(y[0], y[1][::-1])) + "z"
+    else:
+        path = _joined(x[0], y[0])
+    return Markup('<path style="{}" d="{}"/>').format(_style(mark), path)
+
+
+def _joined(x: FloatArray, y: FloatArray) -> str:
+    known = np.isfinite(x) & np.isfinite(y)
+    return "M" + "L".join(f"{_n(a)} {_n(b)}" for a, b in zip(x[known], y[known], strict=True))
+
+
+def _style(mark: Mark) -> str:
+    if mark.kind == "line":
+        dash = f";stroke-dasharray:{mark.dash}" if mark.dash else ""
+        return f"fill:none;stroke:var(--{mark.colour});stroke-width:{mark.width:g}{dash}"
+    return f"fill:var(--{mark.colour})" + (f";fill-opacity:{mark.opacity:g}" if mark.opacity < 1.0 else "")
+
+
+def _swatch(mark: Mark) -> Markup:
+    form = {"line": "M0 0h15", "dots": "M4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0"}.get(mark.kind, "M1 -5h14v10h-14z")
+    return Markup('<path style="{}" d="{}"/>').format(_style(mark), form)

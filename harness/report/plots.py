@@ -1,0 +1,264 @@
+"""What pages draw: the rate, where it comes from, which cut-ins crash, and on which of them only one vehicle does."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from harness.compiled import unboxed
+from harness.episode.path import empty_trajectory
+from harness.estimators.answer import Estimates
+from harness.numbers import count, number, plain, share
+from harness.pool.replay import StoredPaths, drive_others
+from harness.pool.walk import Script
+from harness.report.drawing import Axis, Panel, Plot
+from harness.report.player import OTHERS
+from harness.report.summary import RunSummary, ShownShells
+from harness.traffic.laws import Environment
+from harness.vehicles.library import library_records
+from harness.vocabulary import CRASH, CUT_IN, FAILED, FloatArray, IntArray, states_from
+
+POOL = "pool’s own error"
+WEIGHTED = (
+    "The band should narrow around a level line. RHW should fall along the dotted line; each jump upwards is a crash "
+    "with a large weight, and many late jumps mean that the interval cannot be trusted yet."
+)
+IN_ROUNDS = (
+    "Tests come in rounds, first inside the narrowest boundary. A shell without tests counts as free of crashes in the "
+    "line and as anything in the band, which begins wide and one-sided. RHW falls faster than the dotted line while "
+    "what remains is to see no crash outside."
+)
+DASHED, DOTTED = "4 3", "1 3"
+SHARES = {0.0: "grid", 0.25: "red-1", 0.5: "red-2", 0.75: "red-4", 1.0: "red-6"}
+"""Up to which share of cut-ins that crash a cell of the map has a colour."""
+KEEPS_SPEED = 20
+"""Index of the maneuver 0 m/s²."""
+WHO = {"both": "grey", "only A": "blue", "only B": "reference"}
+"""Who crashes, and the colour: on the page the player draws B in that of reference drivers."""
+LARGEST, CELL_M, CELL_MPS = 9.0, 1.0, 0.5
+
+
+def severity_plot(estimates: Estimates) -> Plot | None:
+    """Draw the rate of crashes above each impact speed with its band; None without a crash."""
+    severity = estimates.severity
+    if severity is None:
+        return None
+    rows = [(row.above_mps, row.crash_rate, row.ci_low, row.ci_high) for row in severity.exceedance]
+    above, rate, low, high = np.array(rows, np.float64).T
+    seen = rate > 0.0
+    shown = slice(0, min(int(seen.sum()) + 1, rate.size))
+    bottom, top = 0.3 * float(rate[seen].min()), 2.0 * float(high[shown].max())
+    x = Axis("impact speed (closing speed at contact), m/s", 0.0, float(above[shown][-1]))
+    panel = Panel("Rate of crashes above an impact speed", x, Axis("crashes per test", bottom, top, log=True))
+    band = f"{share(estimates.confidence)} band, at each speed"
+    panel.add("band", "blue", above[shown], np.maximum(low[shown], bottom), high[shown], opacity=0.16, label=band)
+    panel.add("line", "blue", above[seen], rate[seen], label="rate of harder crashes")
+    panel.add("dots", "blue", above[seen], rate[seen], 2.5)
+    median = [severity.median_mps] * 2
+    panel.add("line", "muted", median, [bottom, top], dash=DASHED, width=1.0, label="median impact")
+    half, most = (f"{v:.1f} m/s ({3.6 * v:.0f} km/h)" for v in (severity.median_mps, severity.p95_mps))
+    text = f"Half of the crashes are below {half}, 95 % below {most}, as they would happen in this traffic."
+    return Plot("severity", [panel], f"Rate of crashes above each impact speed. {text}", text)
+
+
+def convergence_plot(estimates: Estimates, target_rhw: float | None, *, of_statement: str | None = None) -> Plot | None:
+    """Rate with its band, and RHW with its target, against tests; None without a crash, or a course to draw.
+
+    ``of_statement``: the target is one for a statement of a shells run about a boundary, which convergence does not
+    record.
+    """
+    points = sorted(estimates.convergence, key=lambda point: point.n)
+    if len(points) < 2 or not points[-1].crash_rate:
+        return None
+    columns = [(each.n, each.crash_rate, each.ci_low, each.ci_high, each.rhw) for each in points]
+    n, rate, low, high, rhw = np.array(columns, np.float64).T
+    confidence, level = share(estimates.confidence), plain(estimates.lane_change_level)
+    tests = Axis("tests", float(n[0]), float(n[-1]), log=True)
+    left = Panel("Crash rate", tests, Axis(f"per test (level {level})", 0.0, _rate_limit(rate, high)))
+    left.add("band", "blue", n, low, high, opacity=0.16, label=f"{confidence} interval")
+    left.add("line", "blue", n, rate, label="estimate")
+    left.add("line", "muted", n[[0, -1]], rate[[-1, -1]], dash=DASHED, width=1.0, label="at the end")
+    caption = WEIGHTED if estimates.headline != "shells" else IN_ROUNDS
+    if target_rhw is None:
+        caption += " No RHW was asked for."
+    elif of_statement:
+        caption += f" The RHW that was asked for is that of the statement {of_statement}, not of the rate drawn here."
+    alt = (
+        f"Crash rate against number of tests with its {confidence} band, ending at {number(rate[-1])} after "
+        f"{count(n[-1])} tests. Relative half-width against tests, ending at {number(rhw[-1])}."
+    )
+    right = _rhw_panel(tests, n, rhw, None if of_statement else target_rhw)
+    return Plot("convergence", [left, *([] if right is None else [right])], alt, caption)
+
+
+def _rate_limit(rate: FloatArray, high: FloatArray) -> float:
+    """Upper end of the rate axis: the last half of the curve fills it, the first wild intervals may leave it."""
+    high = high[np.isfinite(high)]
+    if not high.size:
+        return 1.0
+    settled = float(np.max(high[high.size // 3 :]))
+    return 1.15 * max(min(settled, 3.0 * float(high[-1])), float(np.nanmax(rate[-2:])), 1e-300)
+
+
+def _rhw_panel(tests: Axis, n: FloatArray, rhw: FloatArray, target: float | None) -> Panel | None:
+    known = np.isfinite(rhw) & (rhw > 0.0)
+    if not known.any():
+        return None
+    n, rhw = n[known], rhw[known]
+    shown = rhw if target is None else np.append(rhw, target)
+    y = Axis("RHW", float(shown.min()) / 1.5, float(shown.max()) * 1.6, log=True)
+    panel = Panel("Relative half-width (RHW)", tests, y)
+    panel.add("line", "blue", n, rhw, label=f"RHW, {rhw[-1]:.3g} at the end")
+    if target is not None:
+        panel.add("line", "vermillion", [tests.low, tests.high], [target] * 2, dash="6 3", label=f"target {target:g}")
+    panel.add("line", "grey", n, rhw[-1] * np.sqrt(n[-1] / n), dash=DOTTED, width=1.2, label="∝ 1/√tests")
+    return panel
+
+
+def shells_plot(found: ShownShells) -> Plot:
+    """Draw contribution with its limits (left) and half-width (right), from careful to careless."""
+    shells, names = found.shells, (*(shell.shell for shell in found.shells), POOL)
+    half_widths = np.array([*(shell.half_width for shell in shells), found.pool_half_width])
+    # An untested shell may hold anything up to its probability: it would flatten all others, and runs out instead.
+    tested = [shell for shell in shells if shell.n_episodes] or list(shells)
+    limit = 1.12 * max(shell.high for shell in tested)
+    widest = 1.3 * max(*(shell.half_width for shell in tested), found.pool_half_width)
+    rows, y = np.arange(len(names)), Axis("", len(names) - 0.4, -0.6, names=names)
+    left, right = (
+        Panel(title, Axis(f"{label}, per test", 0.0, end), y, height=62.0 + 22.0 * len(names))
+        for title, label, end in (
+            ("Where the rate comes from", "contribution to the crash rate", limit),
+            ("Where the uncertainty lies", "half-width", widest),
+        )
+    )
+    at, inside = rows[:-1], np.array([shell.inside for shell in shells])
+    low, rate, high = np.array([(shell.low, shell.contribution, shell.high) for shell in shells]).T
+    for kind, colour in ((inside, "blue"), (~inside, "vermillion")):
+        left.add("boxes", colour, 0.0 * at[kind], rate[kind], at[kind] - 0.3, at[kind] + 0.3, opacity=0.85)
+    left.add("boxes", "ink", low, high, at - 0.04, at + 0.04)
+    for row, shell in enumerate(shells):
+        if shell.high > limit:
+            left.add("text", "muted", 0.1 * limit, row - 0.26, label=f"not tested: up to {number(shell.high)}")
+    right.add("boxes", "grey", 0.0 * rows, half_widths, rows - 0.3, rows + 0.3, opacity=0.85)
+    for row, width in enumerate(half_widths.tolist()):
+        text = share(found.share_of_uncertainty(width), least=0.001)
+        right.add("text", "muted", min(width, widest / 1.3), row, label=text)
+    for each in found.statements:
+        if (boundary := each.n_shells - 0.5) < len(shells) - 0.5:
+            for panel in (left, right):
+                panel.add("line", "muted", [0.0, panel.x.high], [boundary] * 2, dash=DASHED, width=1.0)
+            left.add("text", "muted", limit, boundary, label=f"outside {each.boundary} ({each.name}) ↓")
+    source, open_question = _source(found), _open_question(found, names, half_widths.tolist())
+    alt = (
+        f"Bars per shell from {shells[0].shell} to {shells[-1].shell}: contribution to the crash rate with limits, and "
+        f"half-width. {source} {open_question}"
+    )
+    caption = (
+        "From careful (top) to careless. The rate: what each shell adds, with its limits (orange outside every "
+        f"boundary). {source} The uncertainty: probability × half-width of the crash share, and its share of the sum "
+        f"of squares, which makes the interval. {open_question}"
+    )
+    return Plot("shells", [left, right], alt, caption)
+
+
+def _source(found: ShownShells) -> str:
+    if found.rate == 0.0:
+        return "No shell contributes: no crash was sampled."
+    most = max(found.shells, key=lambda shell: shell.contribution)
+    return f"Most of the rate comes from {most.shell} ({share(most.contribution / found.rate)})."
+
+
+def _open_question(found: ShownShells, names: tuple[str, ...], half_widths: list[float]) -> str:
+    widest = max(half_widths)
+    name, most = names[half_widths.index(widest)], share(found.share_of_uncertainty(widest))
+    if name == POOL:
+        return f"Most of what is not known is the pool’s own error ({most}): only a pool of more paths would narrow it."
+    return f"Most of what is not known lies in {name} ({most}): further tests do most there."
+
+
+def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | None:
+    """Map of the share of cut-ins that crash, over gap and closing speed, and what others avoid; None without any.
+
+    ``environment`` is that in which others can be driven, None where that is not known any more.
+    """
+    rows = summary.rows
+    cut_in = np.isfinite(rows["cut_in_r2_m"]) & np.isfinite(rows["cut_in_r2dot_mps"]) & (rows["outcome"] != FAILED)
+    if not cut_in.any():
+        return None
+    gap, closing = rows["cut_in_r2_m"][cut_in], np.maximum(-rows["cut_in_r2dot_mps"][cut_in], 0.0)
+    weight, crash = rows["weight"][cut_in], rows["outcome"][cut_in] == CRASH
+    of = crash if crash.any() else np.ones_like(crash)
+    far, fast = 1.4 * float(np.quantile(gap[of], 0.98)) + 1.0, 1.15 * float(np.quantile(closing[of], 0.98)) + 1.0
+    cells = int(np.clip(0.7 * math.sqrt(gap.size), 12, 40))  # with few cut-ins each in one of its own
+    x, y = np.linspace(0.0, far, cells + 1), np.linspace(0.0, fast, cells // 2 + 1)
+    every, crashed = (np.histogram2d(gap, closing, (x, y), weights=w)[0].T for w in (weight, weight * crash))
+    shares = np.divide(crashed, every, out=np.full_like(every, -1.0), where=every > 0.0)
+    axes = Axis("gap at the cut-in, m", 0.0, far), Axis("closing speed, m/s", 0.0, fast)
+    panel = Panel("Share of cut-ins that crash", *axes, height=300.0)
+    for low, (high, colour) in zip((-0.5, *SHARES), SHARES.items(), strict=False):
+        if ((shares > low) & (shares <= high)).any():
+            row, column = np.nonzero((shares > low) & (shares <= high))
+            label = f"≤ {share(high)}" if high else "tested, none"
+            panel.add("boxes", colour, x[column], x[column + 1], y[row], y[row + 1], label=label)
+    known = environment is not None and not environment.lateral.present
+    lines = limits_of_others(environment, summary, fast) if environment is not None and known else {}
+    for (name, (speeds, gaps)), colour, dash in zip(lines.items(), ("ink", "blue"), ("", DASHED), strict=False):
+        panel.add("line", colour, gaps, speeds, dash=dash, label=f"{name}’s limit")
+    text = (
+        f"Each of {count(cut_in.sum())} cut-ins by its gap and closing speed; {count(crash.sum())} of them crashed. "
+        "White: not tested."
+    )
+    if lines:
+        text += (
+            " Left of its line the competent driver (r157-cc), or the best of brakes (8 m/s² at once), crashes in the "
+            "vehicle’s place, too, if the car that cuts in keeps its speed."
+        )
+    return Plot("where", [panel], text, text)
+
+
+def limits_of_others(
+    environment: Environment, summary: RunSummary, fastest_mps: float
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Closing speeds (m/s), and the smallest gap (m) at which each of `OTHERS` avoids a crash, BV keeping its speed."""
+    speeds, gaps = np.linspace(0.5, fastest_mps, 40), np.linspace(0.25, 60.0, 240)
+    speed, gap = (each.ravel() for each in np.meshgrid(speeds, gaps, indexing="ij"))
+    n, draws = speed.size, int(environment.numbers["max_steps"] // environment.numbers["hold_steps"]) + 1
+    v_bv = np.full(n, float(np.median(summary.rows["v_bv_mps"])))
+    state = states_from((v_bv, np.full(n, 200.0), np.zeros(n), gap, -speed))
+    maneuvers = np.full((n, draws + 1), KEEPS_SPEED, np.int8)
+    bv = maneuvers.copy()
+    bv[:, 1] = CUT_IN
+    used, none = np.full(n, draws), np.zeros(n, np.int64)
+    script = Script(maneuvers, bv, used, used + 1, none)
+    stored = StoredPaths(0, none, state, none, none, script)
+    end, start = np.zeros((n, len(OTHERS)), np.int64), np.full((n, 2), np.nan)
+    drivers = library_records([driver for _, driver in OTHERS.values()], see_onset=False)
+    path = unboxed(empty_trajectory(environment))
+    drive_others(unboxed(stored), start, unboxed(environment), drivers, path, end, np.zeros((0, 0, 0)))
+    crashes = (end >= 0).reshape(speeds.size, gaps.size, len(OTHERS))
+    last = np.where(crashes.any(1), gaps[gaps.size - 1 - np.argmax(crashes[:, ::-1], axis=1)], 0.0)
+    return {name: (speeds, last[:, d]) for d, name in enumerate(OTHERS)}
+
+
+def pairs_plot(who: IntArray, weight: FloatArray, gap_m: FloatArray, closing_mps: FloatArray) -> Plot | None:
+    """Map of the cut-ins (n,) on which a vehicle crashes, by ``who`` of `WHO`; None without any."""
+    if not who.size:
+        return None
+    cells = np.stack((who, gap_m // CELL_M, closing_mps // CELL_MPS))
+    (kind, *_), place = np.unique(cells, axis=1, return_inverse=True)
+    adds = np.bincount(place, weight)
+    gap, closing = (np.bincount(place, weight * x) / adds for x in (gap_m, closing_mps))
+    axes = Axis("gap at the cut-in, m", 0.0, 1.1 * gap.max()), Axis("closing speed, m/s", 0.0, 1.1 * closing.max())
+    panel = Panel("Cut-ins that crash, by who crashes", *axes, height=300.0)
+    told = []
+    for code, (name, colour) in enumerate(WHO.items()):
+        of, n = kind == code, count(int(np.count_nonzero(who == code)))
+        radius = LARGEST * np.sqrt(adds[of] / adds.max())
+        panel.add("dots", colour, gap[of], closing[of], radius, opacity=0.7, label=f"{name} ({n})")
+        told.append(f"{name} on {n}")
+    text = (
+        f"Cut-ins on which a vehicle crashes: {', '.join(told)}. A disc’s area is what cut-ins within {CELL_M:g} m "
+        f"and {CELL_MPS:g} m/s add to the rate, {number(float(adds.max()))} per test for the largest."
+    )
+    return Plot("pairs", [panel], text, text)
