@@ -4,7 +4,7 @@
 
 The vehicle crashes as the default IDM does inside the boundary, and in a small share of the cut-ins outside. Shell
 probabilities are those of the pool and taken as exact; allocation, rounds, stop rule and estimator are those of a
-campaign; the tests of a shell are replaced by a binomial number. Prints the table of docs/estimators.md.
+campaign; the tests of a shell are replaced by a binomial number. Prints the numbers of docs/estimators.md.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python -m benchmarks.stopping_looks [REPLICATIONS]
 
 Naturalistic tests with a crash probability of 0.01 stop at RHW 0.1 (90 %), through the real rule and estimator.
-Prints the table of docs/estimators.md.
+Prints the numbers of docs/estimators.md.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     python -m benchmarks.weighted_intervals [REPLICATIONS]
 
-Drives large samples in the twin once, and draws campaigns from them: their own means are the truth. Prints the two
-tables of docs/estimators.md, with the normal interval, Hall's, and the reported one; the stop rule with the known
+Drives large samples in the twin once, and draws campaigns from them: their own means are the truth. Prints the
+numbers of docs/estimators.md, with the normal interval, Hall's, and the reported one; the stop rule with the known
 weight cap, and with the largest weight seen in its place.
 """
 
