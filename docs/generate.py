@@ -26,9 +26,7 @@ from pydantic.fields import FieldInfo
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import PARAMETERS
-from harness.campaign.sections import EnvironmentSettings
 from harness.records.schemas import baseline_schema, episodes_schema, moments_schema, traces_schema
-from harness.traffic.loading import load_parameters
 
 FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -146,22 +144,6 @@ def _column_rows(schema: pa.Schema) -> list[tuple[str, ...]]:
     return rows
 
 
-def environment_table() -> str:
-    """Numbers of the shipped environment, by section and source."""
-    parameters = load_parameters(EnvironmentSettings(parameters="ndd-overtaking-1-lateral"))
-    rows = []
-    for section, numbers in parameters:
-        if not isinstance(numbers, BaseModel):
-            continue
-        by_source: dict[str, list[str]] = {}
-        for name, number in numbers:
-            if number is None:
-                continue
-            by_source.setdefault(number.source, []).append(f"`{name}` {number.value:g}")
-        rows += [(f"`{section}`", f"[{source}]", ", ".join(found)) for source, found in by_source.items()]
-    return _table(("section", "source", "numbers"), rows)
-
-
 def _result(name: str) -> dict[str, Any]:
     path = _ELSEWHERE.get(name, FOLDER / "validation" / f"{name}.json")
     return dict(json.loads(path.read_text(encoding="utf-8")))
@@ -259,24 +241,29 @@ def validated_table(name: str) -> str:
 FORMER = ", by the former rule"
 
 
-def decisions_table() -> str:
-    """Per cent of campaigns that accept / reject at the truth, by rule; tests for other limits; command."""
+def decisions() -> str:
+    """What campaigns decided about limits at the rate itself, by rule, and in how many tests about others; command."""
     content = _result("gate")
     budget = content["experiment"]["campaign"]["stop"]["episodes"]
-    rows = []
-    for subject, of in _by_result(content["judgements"]).items():
-        ways = ("2 x rate, rejected", "0.5 x rate, accepted")
-        at_last = [of[f"limit {way} within {budget:,} tests"] for way in ways]
-        tests = (f"{one['tests_median']:,.0f}" if one["reached"] > 0.5 else "undecided" for one in at_last)
-        wrong = (_wrong(of, budget, by) for by in ("", FORMER))
-        rows.append((f"`{subject}`", f"{at_last[0]['truth']:.2g}", *wrong, *tests))
-    head = ("vehicle", "crash rate", "accept / reject", "former rule", "tests at twice the rate", "at half")
-    return _table(head, rows) + f"\n{at_last[0]['replications']} campaigns each: {_command('gate')}\n"
+    by_vehicle = _by_result(content["judgements"])
 
+    def most(verdict: str, by: str = "") -> str:
+        name = f"limit 1 x rate, {verdict} within {budget:,} tests{by}"
+        return f"{max(100.0 * (1.0 - of[name]['coverage']) for of in by_vehicle.values()):.1f} %"
 
-def _wrong(of: dict[str, dict[str, Any]], budget: int, by: str = "") -> str:
-    verdicts = [of[f"limit 1 x rate, {verdict} within {budget:,} tests{by}"] for verdict in ("accepted", "rejected")]
-    return " / ".join(f"{100.0 * (1.0 - one['coverage']):.1f}" for one in verdicts)
+    def tests(way: str) -> str:
+        found = {name: of[f"limit {way} within {budget:,} tests"] for name, of in by_vehicle.items()}
+        medians = [one["tests_median"] for one in found.values() if one["reached"] > 0.5]
+        usual = found["idm"]["tests_median"]
+        return f"{min(medians):,.0f} to {max(medians):,.0f} tests (median; {usual:,.0f} of the default vehicle)"
+
+    return (
+        f"Of {len(by_vehicle)} vehicles, {content['judgements'][0]['replications']} campaigns each, at most "
+        f"{most('accepted')} accepted and {most('rejected')} rejected; by the former rule "
+        f"{most('accepted', FORMER)} and {most('rejected', FORMER)}. A limit of twice the rate was decided after "
+        f"{tests('2 x rate, rejected')}, one of half the rate after {tests('0.5 x rate, accepted')}. "
+        f"{_command('gate')}; each vehicle is in [gate.json](validation/gate.json).\n"
+    )
 
 
 def _by_result(judgements: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
@@ -390,14 +377,13 @@ def _method_cells(one: dict[str, Any]) -> tuple[str, ...]:
 
 PARTS: dict[str, Callable[[], str]] = {
     "settings": settings_reference,
-    "environment": environment_table,
     "validated-methods": methods_table,
     "limits": limits_table,
     **{f"columns-{name}": partial(columns_table, name) for name in SCHEMAS},
     **{f"results-{name}": partial(results_table, results) for name, results in RESULTS.items()},
     **{f"validated-{name}": partial(validated_table, name) for name in VALIDATED},
     "coverage": coverage_table,
-    "decisions": decisions_table,
+    "decisions": decisions,
     "bounds": bounds_table,
 }
 """All generated parts by name."""
