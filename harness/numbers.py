@@ -85,8 +85,10 @@ def tenths(value: float) -> str:
     return MISSING if math.isnan(value) else f"{value:,.1f}".replace("-", MINUS)
 
 
-def plain(value: float) -> str:
-    """A number that somebody has chosen, with all its digits: ``0.5``, ``100``, ``2,000,000``, ``3 × 10⁻⁷``."""
+def plain(value: float | str) -> str:
+    """A number that somebody has chosen, with all its digits, ``0.5``, ``2,000,000``, ``3 × 10⁻⁷``; a text as it is."""
+    if isinstance(value, str):
+        return value
     if 0.0 < abs(value) < 1e-4:
         power = exponent_of(value * (1.0 + 1e-12))
         return f"{plain(float(f'{value / 10.0**power:.10g}'))} × {power_of_ten(power)}"

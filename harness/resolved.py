@@ -63,6 +63,8 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
     resolved = resolve(campaign, command, controller_sha256=controller_sha256)
     if campaign.sampling.strata:
         resolved.library.require_statement(campaign.testing.shells.statement)
+        if campaign.accept is not None and (beside := campaign.accept.times_reference) is not None:
+            resolved.library.require_reference(beside.driver)
     return resolved
 
 

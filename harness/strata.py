@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, AliasChoices, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 
-from harness.vocabulary import FloatArray
+from harness.vocabulary import BoolArray, FloatArray
 
 OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
@@ -114,6 +114,10 @@ class ShellDesign:
     def n_within(self, statement: str) -> int:
         """Strata up to the boundary of a statement; all where it has none."""
         return next((each.n_inside for each in self.statements if each.name == statement), len(self.strata))
+
+    def crashes_too(self, r: int) -> BoolArray:
+        """In which cells a reference crashes, shape (C,)."""
+        return np.asarray((np.array(self.cell_references) >> r) & 1, np.bool_)
 
     @property
     def n_independent(self) -> float:

@@ -217,12 +217,37 @@ class Stop(Section):
     )
 
 
+class TimesReference(Section):
+    """A limit as a multiple of a reference driver's crash rate in the same traffic."""
+
+    driver: str = Field(description="reference driver of the surrogate library, such as r157-cc")
+    at_most: Positive = Field(1.0, le=1e6, description="times its crash rate: accepted below, rejected above")
+
+
 class Accept(Section):
     """A limit: a run of shells ends when it is known on which side of it the rate of testing.shells.statement lies."""
 
     gone = {"statement": (None,)}
 
-    crash_rate_below: float = Field(gt=0.0, lt=1.0, description="crashes per test: accepted below it, rejected above")
+    crash_rate_below: float | None = Field(
+        None, gt=0.0, lt=1.0, description="crashes per test: accepted below it, rejected above"
+    )
+    times_reference: TimesReference | None = Field(None, description="the same beside a reference driver")
+
+    @property
+    def asked(self) -> tuple[str, float, str | None]:
+        """The key that is given, its limit, and the reference driver of whose crash rate that is a multiple."""
+        if (beside := self.times_reference) is not None:
+            return "times_reference", beside.at_most, beside.driver
+        return "crash_rate_below", self.crash_rate_below or math.nan, None
+
+    @model_validator(mode="after")
+    def _one_limit(self) -> Self:
+        if (self.crash_rate_below is None) == (self.times_reference is None):
+            found = "neither" if self.times_reference is None else "both"
+            mend = "Write crash_rate_below: 3e-7, or times_reference: {driver: r157-cc}."
+            raise broken_rule("", found, "one of crash_rate_below and times_reference", mend)
+        return self
 
 
 class Resources(Section):

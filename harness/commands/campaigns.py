@@ -85,6 +85,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
         "harness run scenarios/smoke.yaml --out runs/smoke --resume --set stop.rhw=0.03",
         "harness run scenarios/smoke.yaml --out runs/mine --set av.controller=my_av.py:MyClass",
         "harness run scenarios/smoke.yaml --out runs/gate --accept 3e-7 --junit gate.xml",
+        "harness run my_av.py:MyClass --accept r157-cc       # better than a competent driver?",
         "harness run scenarios/smoke.yaml --out runs/cluster --executor ray",
     ),
 )
@@ -95,9 +96,9 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
 @click.option(
     "--accept",
-    type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
-    metavar="RATE",
-    help="Run until it is known whether the crash rate is below so many per test, instead of to stop.rhw.",
+    metavar="RATE|DRIVER",
+    help="Run until it is known whether the crash rate is below so many per test, or below that of a reference driver "
+    "such as r157-cc, instead of to stop.rhw.",
 )
 @junit_option
 @quiet_option
@@ -114,7 +115,7 @@ def run(
     workers: int | None,
     executor: str | None,
     resume: bool,
-    accept: float | None,
+    accept: str | None,
     junit: Path | None,
     quiet: bool,
     verbose: bool,
@@ -134,7 +135,7 @@ def run(
     Exit code 4 says that stop.episodes or the pool was spent before stop.rhw was reached, or --accept decided; the
     results are there all the same. With --accept 0 means accepted, 5 rejected.
     """
-    limit = [] if accept is None else [f"accept.crash_rate_below={accept!r}"]
+    limit = [] if accept is None else accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
     campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
     if folder is None:
@@ -163,6 +164,15 @@ def run(
             say(result.ending, result.folder / "estimates.json", "")
         print_answer(content, folder, result.report)
     ctx.exit(result.exit_code)
+
+
+def accepting(limit: str) -> list[str]:
+    """What ``--accept`` sets: crashes per test, or a reference driver by its name."""
+    try:
+        keys, value = ("crash_rate_below", "times_reference"), f"{float(limit)!r}"
+    except ValueError:
+        keys, value = ("times_reference", "crash_rate_below"), f"{{driver: {limit}}}"
+    return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
 
 
 def _run_folder(name: str, *, resume: bool) -> Path:

@@ -267,6 +267,16 @@ class Shells:
         """Rate and limits of a statement, or of all strata."""
         return self._limits(self._design.n_within(statement), level)
 
+    def beside(self, driver: str, statement: str, level: Level) -> tuple[float, float]:
+        """Limits of a statement's rate over that of a reference driver; any where crashes lie on too few paths."""
+        design = self._design
+        r = [each.name for each in design.references].index(driver)
+        if design.reference_rate[r] <= 0.0 or paths_that_count(design.p, self.tally) < FEWEST_PATHS:
+            return 0.0, math.inf
+        cells, n = self._cells, design.n_within(statement)
+        low, high = (_beside(design, tests, r, n, level) for tests in (cells, cells.failed_as_crashes()))
+        return low[0], high[1]
+
     def more_tests(self, statement: str, level: Level, rhw: float, more_runs: float) -> float:
         """How many times as many tests of each stratum, crashing as often, would leave a relative half-width.
 
@@ -395,25 +405,24 @@ def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideRef
     """The vehicle beside each reference of a design; ``cells`` are its tests by the design's cells."""
     found, own, worst = [], float(design.p @ cells.joined(design.joined).share), cells.failed_as_crashes()
     for r, reference in enumerate(design.references):
-        crashes_too = ((np.array(design.cell_references) >> r) & 1).astype(np.bool_)
+        crashes_too = design.crashes_too(r)
         rate, square = float(design.reference_rate[r]), float(design.reference_square[r])
-        low, high = (
-            rate_ratio_limits(
-                design.p,
-                tests.joined(design.joined),
-                design.joined.T @ (tests.crash_mass @ crashes_too),
-                (rate, square),
-                design.n_independent,
-                level,
-            )
-            for tests in (cells, worst)
-        )
+        low, high = (_beside(design, tests, r, design.p.size, level) for tests in (cells, worst))
         ratio = own / rate if rate > 0.0 else math.nan, low[0], high[1]
         preventable = preventable_share(design.cell_p, cells, ~crashes_too, design.n_independent, level)
         error = math.sqrt(max(square - rate * rate, 0.0) / design.n_independent)
         who = reference.name, reference.described, reference.delay_s
         found.append(BesideReference(*who, rate, error, *ratio, *preventable))
     return tuple(found)
+
+
+def _beside(design: ShellDesign, cells: Tally, r: int, n_strata: int, level: Level) -> tuple[float, float]:
+    """Limits of the rate of the first strata over that of a reference."""
+    strata = slice(0, n_strata)
+    with_reference = design.joined.T @ (cells.crash_mass @ design.crashes_too(r))
+    moments = float(design.reference_rate[r]), float(design.reference_square[r])
+    own = cells.joined(design.joined).part(strata)
+    return rate_ratio_limits(design.p[strata], own, with_reference[strata], moments, design.n_independent, level)
 
 
 def rate_ratio_limits(

@@ -140,14 +140,14 @@ def _rows(
 
 
 def _decided(decision: Mapping[str, Any]) -> Row:
-    limit, verdict = plain(decision["crash_rate_below"]), decision["verdict"]
-    value = {"accepted": f"below {limit} per test", "rejected": f"above {limit} per test"}.get(
-        verdict, f"limit {limit} per test"
-    )
+    driver, verdict = decision.get("driver"), decision["verdict"]
+    asked = plain(decision["limit" if "limit" in decision else "crash_rate_below"])
+    limit, shown = (f"{asked} × {driver}", ratio) if driver else (f"{asked} per test", number)
+    value = {"accepted": f"below {limit}", "rejected": f"above {limit}"}.get(verdict, f"limit {limit}")
     ends = {
-        "accepted": f"upper limit {number(decision['high'])}",
-        "rejected": f"lower limit {number(decision['low'])}",
-    }.get(verdict, f"it may be {interval(decision['low'], decision['high'])}")
+        "accepted": f"upper limit {shown(decision['high'])}",
+        "rejected": f"lower limit {shown(decision['low'])}",
+    }.get(verdict, f"it may be {shown(decision['low'])} to {shown(decision['high'])}")
     given = "" if decision["statement"] == ASSUMPTION_FREE else f", given {decision['statement']}"
     return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
 

@@ -24,12 +24,12 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import Stop
+from harness.campaign.sections import Accept, Stop
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import MarginDecision, PairCounts
 from harness.estimators.shells import Shells
-from harness.numbers import number, plain
+from harness.numbers import number, plain, ratio
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import SAMPLING, EstimatorName, Method
 
@@ -66,66 +66,74 @@ def decision_level(n: int, confidence: float) -> Level:
     return Level(threshold, math.sqrt(2.0 * threshold))
 
 
+def limit_words(limit: float, driver: str | None) -> str:
+    """``3 × 10⁻⁷ per test``, or ``1 times that of r157-cc``."""
+    return f"{plain(limit)} times that of {driver}" if driver else f"{plain(limit)} per test"
+
+
 @dataclass(frozen=True)
 class Decision:
-    """What is known about a limit, by limits of the rate that allow for every look.
+    """What is known about a limit of the crash rate, by an interval that allows for every look.
 
-    ``statement`` is the one that decides about ``crash_rate_below``, per test, by the limits from ``low`` to ``high``
-    after ``n_episodes`` tests. ``confidence`` is that the crash rate lies on the side which is said, whatever the
-    budget: a campaign is wrong in at most 1 - ``confidence`` of cases even where the limit is the rate itself.
+    ``limit`` is in crashes per test, or in crash rates of a reference ``driver``, as are ``low`` and ``high``, between
+    which the rate lies after ``n_episodes`` tests. ``statement`` is the one that decides. ``confidence`` is that the
+    crash rate lies on the side which is said, whatever the budget: a campaign is wrong in at most 1 - ``confidence`` of
+    cases even where the limit is the rate itself.
     ``contradicted`` says whether a test has shown that the vehicle does not do what the statement assumes: its upper
     limit then says nothing, while what crashed, crashed. ``asked_before`` are other limits that were asked of the same
     tests: who asks until an answer pleases errs more often.
     """
 
-    crash_rate_below: float
+    limit: float
     statement: str
     confidence: float
     low: float
     high: float
     contradicted: bool = False
     n_episodes: int = 0
-    asked_before: Sequence[float] = ()
+    asked_before: Sequence[float | str] = ()
+    driver: str | None = None
 
     @property
     def verdict(self) -> Verdict:
         """On which side of the limit the interval lies, if that can be said."""
-        if self.low > self.crash_rate_below:
+        if self.low > self.limit:
             return "rejected"
-        return "accepted" if self.high < self.crash_rate_below and not self.contradicted else "undecided"
+        return "accepted" if self.high < self.limit and not self.contradicted else "undecided"
 
     @property
     def is_final(self) -> bool:
         """Whether further tests would change nothing."""
-        return self.verdict != "undecided" or self.high < self.crash_rate_below
+        return self.verdict != "undecided" or self.high < self.limit
 
     @property
     def sentence(self) -> str:
         """The verdict in words, and which limits were asked before."""
         given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
-        limit, before = plain(self.crash_rate_below), self.asked_before
-        side = f"below {limit} per test (upper limit {number(self.high)})"
+        limit, before = limit_words(self.limit, self.driver), self.asked_before
+        shown = ratio if self.driver else number
+        side = f"below {limit} (upper limit {shown(self.high)})"
         if self.verdict == "rejected":
-            side = f"above {limit} per test (lower limit {number(self.low)})"
+            side = f"above {limit} (lower limit {shown(self.low)})"
         text = f"{self.verdict.upper()}: with confidence {plain(self.confidence)} the crash rate{given} is {side}."
         if self.verdict == "undecided" and self.contradicted:
             text = (
-                f"UNDECIDED: whether the crash rate is below {limit} per test is not known: the vehicle does not do "
-                f"what statement {self.statement} assumes. Ask for testing.shells.statement: "
-                f"{ASSUMPTION_FREE}, and use a new folder."
+                f"UNDECIDED: whether the crash rate is below {limit} is not known: the vehicle does not do what "
+                f"statement {self.statement} assumes. Ask for testing.shells.statement: {ASSUMPTION_FREE}, and use a "
+                "new folder."
             )
         elif self.verdict == "undecided":
-            between = f"it may be {number(self.low)} as well as {number(self.high)}"
-            text = f"UNDECIDED: whether the crash rate{given} is below {limit} per test is not known; {between}."
+            between = f"it may be {shown(self.low)} as well as {shown(self.high)}"
+            text = f"UNDECIDED: whether the crash rate{given} is below {limit} is not known; {between}."
         if not before:
             return text
         place = ("second", "third")[len(before) - 1] if len(before) < 3 else f"{len(before) + 1}th"
-        limits = ", ".join(map(plain, before))
-        return f"{text} This is the {place} limit asked of these tests (before: {limits})."
+        return f"{text} This is the {place} limit asked of these tests (before: {', '.join(map(plain, before))})."
 
     def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return {"verdict": self.verdict, **asdict(self), "sentence": self.sentence}
+        """All of it; a limit per test also by its key in the campaign."""
+        of_rate = {} if self.driver else {"crash_rate_below": self.limit}
+        return {"verdict": self.verdict, **of_rate, **asdict(self), "sentence": self.sentence}
 
 
 @dataclass(frozen=True)
@@ -275,7 +283,7 @@ class RoundRule(Rule):
         """Whether to stop at the end of a round, with all tests so far."""
         self._seen = seen
         if self._accept is not None:
-            return self._decided(seen, self._accept.crash_rate_below)
+            return self._decided(seen, self._accept)
         limits, tally = seen.limits_of(self._statement, Level.two_sided(self._confidence)), seen.tally
         n_crashes, also = int(tally.crashes.sum()), FIRST_TESTS if self.of_first_tests else None
         pool = limits.from_pool_relative() if n_crashes >= self._min_crashes else (0.0, 0.0)
@@ -286,14 +294,16 @@ class RoundRule(Rule):
         """How many times as many tests are expected to reach a relative half-width, see `Shells.more_tests`."""
         return self._seen.more_tests(self._statement, Level.two_sided(self._confidence), target, more_runs)
 
-    def _decided(self, seen: Shells, limit: float) -> bool:
+    def _decided(self, seen: Shells, accept: Accept) -> bool:
         """Look at a limit until it is decided; that answer stays, also while the folder holds further tests."""
         n, found = int(seen.tally.tests.sum()), self.look.decision
         if found is None or not found.is_final:
-            limits = seen.limits_of(self._statement, self.level_at(n, self._confidence))
+            level, (key, limit, driver) = self.level_at(n, self._confidence), accept.asked
+            limits = seen.limits_of(self._statement, level)
+            ends = limits[1:3] if driver is None else seen.beside(driver, self._statement, level)
             confidence, contradicted = (1.0 + self._confidence) / 2.0, seen.contradicts(self._statement)
-            found = Decision(limit, self._statement, confidence, limits.low, limits.high, contradicted, n)
-            unmet = (f"accept.crash_rate_below ({limit:g})",)
+            found = Decision(limit, self._statement, confidence, *ends, contradicted, n, driver=driver)
+            unmet = (f"accept.{key} ({limit:g})",)
             self.look = Look(limits.rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
         return found.is_final and n >= self._held
 

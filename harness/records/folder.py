@@ -354,7 +354,7 @@ class StoredManifest(Stored):
     distance_per_test_m: float | None = None
     ending: str | None = None
     decision: dict[str, Any] | None = None
-    limits: list[float] = []
+    limits: list[float | str] = []
     retraced: Retraced | None = None
     repeated: Repeated | None = None
     shadow_runs: dict[str, Count] | None = None

@@ -18,7 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from harness.campaign.files import dump_campaign
+from harness.campaign.sections import Accept
 from harness.errors import RunFolderError, TooManyFailedError
+from harness.estimators.stopping import limit_words
 from harness.pool.replay import Retracing
 from harness.records.folder import (
     CAMPAIGN,
@@ -81,6 +83,12 @@ def require_few_failed(
         )
 
 
+def _asked(accept: Accept) -> float | str:
+    """A limit as the manifest lists it: per test a number, else in words."""
+    _, limit, driver = accept.asked
+    return limit if driver is None else limit_words(limit, driver)
+
+
 class Manifest:
     """Finished shards in order, from the first on, and counts over them: keeps ``manifest.json`` and its campaign true.
 
@@ -99,7 +107,7 @@ class Manifest:
         self._repeated: Repeated | None = None
         self._causes: Counter[str] = Counter()
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
-        asked = [] if campaign.accept is None else [campaign.accept.crash_rate_below]
+        asked = [] if campaign.accept is None else [_asked(campaign.accept)]
         self.listed_baseline: list[int] = earlier.get("baseline_crc32", [])
         earlier_limits = earlier.get("limits", []) if earlier["n_episodes"] else []
         self.limits_before = [limit for limit in earlier_limits if limit not in asked]

@@ -119,6 +119,13 @@ class Library(Section):
             mend = did_you_mean(asked, known) or "Name one of them, or add it to a library of your own (pool.library)."
             raise CampaignError("testing.shells.statement", f"'{asked}'", expected, mend)
 
+    def require_reference(self, asked: str) -> None:
+        """Refuse (`CampaignError`) a limit beside a reference driver that is not there."""
+        if asked not in self.references:
+            expected = f"a reference driver of the surrogate library: {listed(self.references)}"
+            mend = did_you_mean(asked, list(self.references)) or "Name one of them, or add it to a library of your own."
+            raise CampaignError("accept.times_reference.driver", f"'{asked}'", expected, mend)
+
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
         places = {f"statements.{name}.boundary": each.boundary for name, each in self.statements.items()}

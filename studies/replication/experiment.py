@@ -89,6 +89,9 @@ class Experiment(Section):
         description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate "
         "in the super-population; at 1 both verdicts are wrong, and each is judged",
     )
+    beside: str | None = Field(
+        None, description="decide limits beside this reference driver, as `accept.times_reference` does"
+    )
     budgets: list[Whole] = Field(
         default_factory=list,
         description="numbers of tests within which limits are judged, besides stop.episodes: a campaign's budget is "

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import Accept
+from harness.campaign.sections import Accept, TimesReference
 from harness.errors import CampaignError
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level, likelihood_limit
@@ -233,13 +233,14 @@ class ShellCampaign(_Drawn):
 
     Judged are all statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
     crash rate, all of these are decided instead, as by ``accept``, and judged within each of the ``budgets``; what is
-    tested next depends on neither. ``siblings`` see `FORMER`; and intervals of vehicles that act before the cut-in are
-    made by pairs of tests alone, see `OnRuns`.
+    tested next depends on neither. They may be multiples of the rate of a reference driver, ``beside``. ``siblings``
+    see `FORMER`; and intervals of vehicles that act before the cut-in are made by pairs of tests alone, see `OnRuns`.
     """
 
     limits: Mapping[float, float] = field(default_factory=dict)
     budgets: Sequence[int] = ()
     siblings: bool = False
+    beside: str | None = None
 
     def _replicate(self, replication: int, drawn: Sequence[DrawnPool], rng: np.random.Generator) -> Iterator[Row]:
         return (self._decide if self.limits else self._estimate)(replication, drawn[0], rng)
@@ -247,7 +248,9 @@ class ShellCampaign(_Drawn):
     def _decide(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
         rules: dict[tuple[float, str], RoundRule] = {}
         for factor, limit in self.limits.items():
-            asked = self.campaign.model_copy(update={"accept": Accept(crash_rate_below=limit)})
+            beside = self.beside and TimesReference(driver=self.beside, at_most=limit)
+            accept = Accept(times_reference=beside) if beside else Accept(crash_rate_below=limit)
+            asked = self.campaign.model_copy(update={"accept": accept})
             rules[factor, ""] = RoundRule(asked)
             if self.siblings and factor == 1.0:
                 rules[factor, FORMER] = FormerRule(asked)
@@ -395,6 +398,12 @@ class OvertakingShells:
     def crash_rate(self) -> float:
         """That of the vehicle in the super-population."""
         return float(self.crashing[0].sum()) / len(self.mass)
+
+    def reference_rate(self, name: str) -> float:
+        """Crash rate of a reference driver in the super-population."""
+        r = list(self.template.library.references).index(name)
+        crashes = ((self.template.cell_references >> r) & 1).astype(np.bool_)
+        return float(self.mass[:, crashes].sum()) / len(self.mass)
 
     def crashes_outside(self, crashing: FloatArray) -> dict[str, float]:
         """Share of a crash mass by cell (n, C) that lies beyond the boundary of each statement; 0 of no crash."""

@@ -115,7 +115,8 @@ def _vehicle(experiment: Experiment, name: str, source: OvertakingShells, known:
     of = experiment.adversaries[name].of if name in experiment.adversaries else name
     outside, boundary = source.crashes_outside(source.crashing[0]), source.template.library.boundary
     own = experiment.subject(of), name, source.draw, _seed(experiment, of), known, source.crash_rate, outside
-    return _of_shells(experiment, *own, left_out=source.left_out, boundary=boundary)
+    unit = 1.0 if experiment.beside is None else source.reference_rate(experiment.beside)
+    return _of_shells(experiment, *own, unit, left_out=source.left_out, boundary=boundary)
 
 
 def _of_shells(
@@ -127,13 +128,14 @@ def _of_shells(
     known: Mapping[str, Known],
     own_rate: float,
     beyond: Mapping[str, float],
+    unit: float = 1.0,
     **more: Any,
 ) -> Tested:
     """A subject whose bounds and limits are judged by its own rate, that of the population which pools are drawn from.
 
-    ``beyond`` is the share of that rate beyond the boundary of each statement.
+    ``beyond`` is the share of that rate beyond the boundary of each statement, ``unit`` what limits are multiples of.
     """
-    limits, budgets = {factor: factor * own_rate for factor in experiment.limits}, experiment.all_budgets
+    limits, budgets = {factor: factor * own_rate / unit for factor in experiment.limits}, experiment.all_budgets
     decisions = [result for pair in product(limits, budgets) for result in limit_at(*pair)]
     outside = {result_of(each): share for each, share in beyond.items()}
     outside |= dict.fromkeys(decisions, outside.get(result_of(campaign.testing.shells.statement), 0.0))
@@ -141,7 +143,7 @@ def _of_shells(
     others |= dict.fromkeys([BOUND, *decisions], Known.exactly(own_rate))
     others |= {bound_outside(each): Known(share * own_rate, 0.0, own_rate) for each, share in beyond.items()}
     subject = Subject(name, known[RATE], others, outside, **more)
-    return subject, ShellCampaign(campaign, draw, seed, limits, budgets, siblings=experiment.siblings)
+    return subject, ShellCampaign(campaign, draw, seed, limits, budgets, experiment.siblings, experiment.beside)
 
 
 def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:

@@ -85,13 +85,16 @@ def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campa
         (("accept.crash_rate_below=5e-8",), 5, "rejected"),
         (("accept.crash_rate_below=1.4e-7", "stop.episodes=300"), 4, "undecided"),
         (("testing.shells.statement=library", "accept.crash_rate_below=4e-7"), 0, "accepted"),
+        (("accept.times_reference={driver: r157-cc, at_most: 2}",), 0, "accepted"),
+        (("accept.times_reference={driver: r157-cc, at_most: 0.3}",), 5, "rejected"),
     ],
 )
 def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, code, verdict):
     decided = run_here(campaign(*SHELLS, "world.engine=twin", *changes), tmp_path / "run")
     found = decided.estimates["decision"]
     assert (decided.exit_code, found["verdict"]) == (code, verdict)
-    assert "accept.crash_rate_below" in decided.ending
+    assert ("accept.times_reference" if "r157-cc" in changes[0] else "accept.crash_rate_below") in decided.ending
+    assert (found["driver"] == "r157-cc") == ("r157-cc" in found["sentence"]) == ("r157-cc" in changes[0])
     assert (decided.stopped_by == "accept") == (code != 4)
     assert estimate(decided.folder)["decision"] == found
     if code == 5:
@@ -130,6 +133,9 @@ def test_nothing_is_accepted_given_what_the_vehicle_does_not_do(campaign, run_he
         (("accept={crash_rate_below: 1e-7, statement: library}",), "'statement' belongs under testing.shells"),
         (("accept.crash_rate_below=0",), "accept.crash_rate_below"),
         (("testing.shells.statement=nobody", "accept.crash_rate_below=1e-7"), "nobody"),
+        (("accept.times_reference={driver: r157-c}",), "Did you mean 'r157-cc'"),
+        (("accept={crash_rate_below: 1e-7, times_reference: {driver: r157-cc}}",), "both"),
+        (("accept={}",), "neither"),
     ],
 )
 def test_limits_that_cannot_be_decided_are_refused(campaign, run_here, tmp_path, changes, where):
