@@ -12,7 +12,7 @@ import pytest
 from junitparser import JUnitXml
 
 from harness.errors import RunFolderError
-from harness.report.junit import Case, outcome_of, statement_cases, write_junit
+from harness.report.junit import statement_cases, write_junit
 from harness.report.page import run_notes, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
@@ -185,9 +185,3 @@ def test_a_gate_never_passes_because_nothing_was_asked():
     """A method without shells may still carry a statement's name in its settings."""
     cases = statement_cases({**CONTENT, "decision": None, "boundary_statements": {}}, "library", 4)
     assert [(case.name, case.outcome) for case in cases] == [("assumption_free", "error")]
-
-
-def test_a_comparison_is_one_case(tmp_path):
-    write_junit(tmp_path / "c.xml", "a and b", [Case("difference", "B is worse.", outcome_of(5))], [])
-    (suite,) = JUnitXml.fromfile(str(tmp_path / "c.xml"))
-    assert (suite.failures, [case.name for case in suite]) == (1, ["difference"])

@@ -1,6 +1,5 @@
 """The look of all plots, scales of axes, intervals where they are, and names that no line can hide."""
 
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,6 @@ import pyarrow.parquet as pq
 import pytest
 
 import harness.report
-from harness.estimators.severity import weighted_quantiles
 from harness.numbers import number
 from harness.report import crashes
 from harness.report.crashes import CANDIDATES, crash_gallery, environment_of, worst_crashes
@@ -142,13 +140,6 @@ def test_counts_and_weights_by_outcome(summary, table):
         assert summary.weight[k] == pytest.approx(np.exp(rows.log_weight).sum(), rel=1e-12)
 
 
-def test_of_plain_driving_tests_without_a_cut_in_are_counted_and_not_kept(runs):
-    summary = summarise(runs["nde"])
-    assert summary.all_weights_one
-    assert summary.weight.tolist() == summary.count.tolist()
-    assert summary.rows["weight"].size < summary.n_episodes == 240
-
-
 @pytest.mark.parametrize(("ranking", "key"), [("impact_speed_mps", "impact_speed_mps"), ("weight", "log_weight")])
 def test_worst_crashes_are_the_worst(summary, table, ranking, key):
     crash = table[(table.outcome == "crash") & (table.episode % 3 > 0)]
@@ -182,12 +173,6 @@ def test_gallery_prefers_traced_crashes_where_few_are_traced(run_folder, summary
     assert any(row.scene is None for row in rows)
 
 
-def test_weighted_quantiles():
-    values, weights = np.array([9.0, 1.0, 2.0]), np.array([8.0, 1.0, 1.0])
-    assert weighted_quantiles(values, weights, (0.5, 0.15)) == [9.0, 2.0]
-    assert math.isnan(weighted_quantiles(values, 0.0 * weights, (0.5,))[0])
-
-
 def test_crashes_that_do_not_count_are_none_on_the_page_either(runs):
     run = runs["weighted"]
     harder = replace(run, campaign=run.campaign.replaced(("crash", "counts_above_mps"), 5.0))
@@ -204,10 +189,3 @@ def test_weights_of_a_shells_run_add_up_to_the_rate(runs, name):
     run, summary = runs[name], summarise(runs[name])
     assert summary.per_test(float(summary.weight[CRASH])) == pytest.approx(run.headline.crash_rate, rel=1e-12)
     assert summary.crashes["weight"].sum() == pytest.approx(run.headline.crash_rate, rel=1e-12)
-    if name == "shells_refuted":
-        tested = math.fsum(shell.p for shell in run.shells.shells if shell.n_episodes)
-        assert summary.weight.sum() == pytest.approx(tested, rel=1e-12)
-        last = max(k for k, shell in enumerate(run.shells.shells) if shell.n_crashes)
-        outside, component = run.shells.shells[last], summary.crashes["component"]
-        assert component.max() == last
-        assert summary.crashes["weight"][component == last] == pytest.approx(outside.p / outside.n_episodes, rel=1e-12)

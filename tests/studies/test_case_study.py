@@ -7,14 +7,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from harness.estimators.scv import Scv
 from studies.__main__ import main
 from studies.case_study import repeated, tested
-from studies.case_study.counted import KnownMeans
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
 from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
-from studies.chains.sampler import with_optimal_function
 from tests.stored_runs import SCENARIOS
 
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
@@ -183,16 +180,6 @@ def test_replicated_tests_are_a_lower_limit_where_the_rate_is_missed():
     missed = repeated.true_tests(np.array([0.2, 0.21, 0.22]), 1.0, 100.0)
     assert (missed["value"], missed["low"]) == (None, pytest.approx(62.4, rel=0.01))
     assert repeated.true_tests(np.array([1.0, 1.0]), None, 100.0) == figure(None)
-
-
-def test_known_means_gain_what_theorem_3_promises():
-    """In the theorem's world nothing is left of the variance of tests that the fit has not seen."""
-    world, rng, scv = with_optimal_function(), np.random.default_rng(1), Scv()
-    scv.add(world.block("step_mixture", world.maneuvers(2_000, rng)))
-    known = KnownMeans(scv)
-    for _ in range(5):
-        known.add(world.block("step_mixture", world.maneuvers(500, rng)))
-    assert known.gain(0.9)["value"] > 1e6
 
 
 def test_relative_variance_of_known_weights():
