@@ -5,13 +5,12 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.block import Block, joined
+from harness.estimators.block import Block
 from harness.estimators.estimate import Unavailable, finite_json
 from harness.estimators.one_pass import ACCUMULATORS, Diagnostics, accumulator, one_pass
 from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, FAILED, SAMPLING, TIMEOUT
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
-from studies.rnot import Procedure, plain_rhw, scv_rhw
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import block, fed, in_shells
 
@@ -85,14 +84,6 @@ def test_each_estimator_gets_what_it_would_get_alone_and_convergence_is_the_head
     assert done.estimates[SAMPLING[method].headline] == prefixes[-1]
 
 
-def test_convergence_points_are_thinned_but_end_at_the_end():
-    parts = list(blocks(SHORT, "nde", [10] * 400, SEED))
-    numbers = np.array([point.n for point in one_pass(parts).convergence])
-    assert numbers[-1] == 4_000
-    assert np.all(numbers[1:-1] >= 1.01 * numbers[:-2])
-    assert len(numbers) < 300
-
-
 def diagnosed(*parts, names=()) -> dict:
     return fed(Diagnostics(), parts).result(names)
 
@@ -162,15 +153,3 @@ def test_a_failed_test_has_the_weight_that_it_had():
     assert one_pass([some], ("nade",)).headline_estimate.details["crash_rate_if_failed_had_crashed"] == pytest.approx(
         (np.exp(-2.0) + np.exp(-1.0)) / 3.0
     )
-
-
-def test_required_numbers_of_tests_grow_with_failures():
-    whole = joined(some_failed(list(blocks(SHORT, "step_mixture", [500] * 4, SEED)), first=0))
-    counted = whole.crash | whole.failed
-    weights = np.exp(whole.log_weight[counted])
-    procedure = Procedure(n_shuffles=3, first=200, ratio=2.0)
-    with_failed = plain_rhw(weights, len(whole), procedure, failed=whole.failed[counted])
-    without = plain_rhw(np.where(whole.failed[counted], 0.0, weights), len(whole), procedure)
-    assert np.all(with_failed[:, -1] > 1.5 * without[:, -1])
-    forgotten = whole.ending(whole.failed, TIMEOUT)
-    assert np.all(scv_rhw(whole, procedure)[:, -1] > scv_rhw(forgotten, procedure)[:, -1])

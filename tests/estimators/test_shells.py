@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness.estimators.answer import boundary_statements, statement
+from harness.estimators.answer import boundary_statements
 from harness.estimators.block import Drawn
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
@@ -25,7 +25,6 @@ from harness.estimators.tally import (
     paths_that_count,
     pool_variance,
 )
-from harness.numbers import interval
 from harness.strata import Statement
 from tests.estimators.small_blocks import EXACT, SHELLS, in_shells, tally
 
@@ -113,13 +112,6 @@ def test_crash_shares_and_moments_alone_would_be_too_small_for_the_heaviest_path
     assert former < 0.8 * rate.var()
 
 
-def test_what_lies_outside_nothing_is_said_to_be_nothing():
-    all_inside = replace(SHELLS, statements=(Statement("library", "outermost", "keeps to outermost", 3),))
-    estimate = shells_estimate((0, 9, 0, 0), (1, 0, 0, 9), (2, 0, 0, 9), shells=all_inside)
-    assert boundary_statements(estimate)["library"].endswith("Nothing lies outside.")
-    assert within(estimate)["rhw"] == estimate.rhw
-
-
 def test_failed_tests_outside_are_not_taken_for_safe_ones():
     estimate = shells_estimate((0, 8, 2, 0), (2, 0, 4, 396))
     conditional = within(estimate)
@@ -129,16 +121,6 @@ def test_failed_tests_outside_are_not_taken_for_safe_ones():
     assert conditional["upper_bound_outside"] >= without_pool
     text = boundary_statements(estimate)["library"]
     assert "no crash in 400 tests outside, but 4 of them FAILED and are counted as crashes here: with" in text
-
-
-def test_a_half_width_far_wider_than_the_rate_is_no_number():
-    """Nothing was tested outside: all of its probability may be crashes."""
-    estimate = shells_estimate((0, 10, 0, 0), (1, 0, 0, 20))
-    assert estimate.rhw > 10.0
-    text = statement(estimate, 1.0, None)
-    assert f"{interval(estimate.ci_low, estimate.ci_high)}, still open upwards: far wider than the rate)" in text
-    assert "half-width" not in text
-    assert "relative half-width 50 %)" in statement(replace(estimate, rhw=0.5), 1.0, None)
 
 
 def test_a_crash_outside_refutes_the_assumption():

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import IDMParameters
 from harness.importance import tables as cache
-from harness.importance.functions import build_importance
 from harness.importance.tables import Tables, build_tables, table_path, tables_hash
 from harness.vehicles.drivers import MODEL_FIELDS, driver_records
 from tests.kernels import environment
@@ -61,18 +59,6 @@ def test_a_truncated_file_is_built_again(folder, built, damage):
     assert equal(build_tables(environment(), DRIVER, "immediate"), first)
     assert equal(build_tables(environment(), DRIVER, "immediate"), first)
     assert len(built) == 2
-
-
-def test_tables_are_mapped_and_nobody_can_write_to_them(folder, built):
-    """Also those that have just been built: the process that built them shares them with its workers."""
-    for _ in range(2):
-        for table in build_tables(environment(), DRIVER, "immediate"):
-            assert type(table) is np.ndarray
-            assert table.flags.c_contiguous
-            assert not table.flags.writeable
-            assert isinstance(table.base, np.memmap) or isinstance(table.base.base, np.memmap)
-    naturalistic = build_importance(Campaign(name="nde", testing={"method": "nde"}), None)
-    assert not naturalistic.value.flags.writeable  # or kernels would be compiled again: it would be another type
 
 
 def test_what_the_hash_depends_on():

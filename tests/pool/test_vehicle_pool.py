@@ -12,8 +12,7 @@ from harness.errors import HarnessError
 from harness.estimators.tally import CrashedTests, OnRuns, Tally
 from harness.pool.shells import CANDIDATES
 from harness.pool.vehicle_pool import EVENLY, chances, vehicle_pool
-from harness.pool.walk import BaselineRuns, Enumerator, enumerate_cut_ins
-from harness.progress import Progress
+from harness.pool.walk import BaselineRuns, enumerate_cut_ins
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline, without_cut_in
@@ -48,25 +47,6 @@ def prepared_after(campaign):
 @pytest.fixture(scope="module")
 def speeds():
     return prepared_after(acting("Speeds"))
-
-
-def test_a_vehicle_that_holds_its_speed_has_the_cut_ins_of_one_that_holds(environment, campaign):
-    """Every bit: same hazards, same probabilities, same crashes, on naturalistic paths."""
-    followers = resolve(campaign).library.followers(environment.lateral.present)
-    held = Enumerator(environment, followers, 5, stride=1).run(0, N, Progress())
-    steps = np.arange(int(environment.numbers["max_steps"]) + 1)
-    v = np.repeat((held.state["v_bv_mps"] - held.state["r2dot_mps"])[:, None], steps.size, 1)
-    x = np.full(v.shape, 100.0)
-    for step in steps[1:]:
-        x[:, step] = x[:, step - 1] + v[:, step] * 0.1
-    runs = BaselineRuns(np.full(N, steps[-1]), np.zeros(N, np.bool_), x, v)
-    probability, crashes, unknown = enumerate_cut_ins(5, held.index, held.state, environment, followers, runs)
-    asked = held.mass > 0.0
-    assert asked.sum() > 10_000
-    np.testing.assert_array_equal(probability[asked], held.mass[asked])
-    np.testing.assert_array_equal(crashes[asked], held.crashes[asked])
-    assert probability[~asked].sum() < 1e-6 * probability.sum()  # BV that falls back behind the AV's front again
-    assert np.all(unknown == 0.0)
 
 
 def test_probabilities_are_those_of_the_states_that_were_driven(speeds):

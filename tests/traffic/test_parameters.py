@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from harness.campaign.files import read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
@@ -13,7 +12,7 @@ from harness.pool.cut_ins import environment_hash
 from harness.traffic import lateral as of_lateral
 from harness.traffic.lateral import constant_lead, lateral_position, log_normal_speed, perceived_in
 from harness.traffic.loading import load_environment, load_parameters
-from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
+from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.kernels import alone
 
 SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
@@ -172,17 +171,6 @@ def test_an_onset_before_the_test_is_seen_in_its_first_step_with_what_has_come_o
     assert perceived_in(0.0, 4, 20, 1.7) == (1, 0.0)
     assert perceived_in(0.375, 4, 20, 1.7) == (1, 0.0)  # 1.275 m have come over
     assert perceived_in(1.5, 4, 20, 1.7)[0] == 3
-
-
-def test_the_shipped_environment_is_the_papers_with_a_section_more():
-    paper, lateral = (read_model(SHIPPED_FOLDER / f"{name}.yaml", EnvironmentParameters) for name in (PAPER, LATERAL))
-    assert lateral.model_copy(update={"lateral": None}) == paper
-    assert {name for name in lateral.values() if name not in paper.values()} == {
-        f"lateral__{name}" for name in ("distance_m", "speed_median_mps", "speed_log_sd", "longest_lead_s")
-    }
-    numbers = [load_environment(EnvironmentSettings(parameters=name)).numbers for name in (PAPER, LATERAL)]
-    assert numbers[0].dtype == numbers[1].dtype  # kernels are compiled once for both
-    assert numbers[0] == numbers[1]
 
 
 @pytest.mark.parametrize(
