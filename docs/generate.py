@@ -209,12 +209,7 @@ def limits_table() -> str:
     )
 
 
-VALIDATED = (
-    "shells_adversaries",
-    "shells_acting",
-    "shells_acting_room",
-    "lateral",
-)
+VALIDATED = ("shells_acting", "shells_acting_room", "lateral")
 """Replication experiments with a table of their vehicles."""
 METHODS = {
     "twin_nde": "NDE, level 10,000",
