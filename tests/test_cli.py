@@ -79,19 +79,6 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     assert json.loads(capsys.readouterr().out) == content
 
 
-def test_wrong_campaign_leaves_nothing_behind(capsys, tmp_path):
-    (tmp_path / "bad.yaml").write_text("name: bad\ntestin: {}\n")
-    assert main(["check", str(tmp_path / "bad.yaml")]) == 2
-    assert capsys.readouterr().err.startswith(f"error: testin ({tmp_path / 'bad.yaml'}:2)\n")
-    assert main(["run", SMOKE, "--out", str(tmp_path / "out"), "--set", "testing.epsilom=1"]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.splitlines()[0] == "error: --set testing.epsilom=1"
-    assert [line.split()[0] for line in err.splitlines()[1:]] == ["found:", "expected:", "mend:"]
-    assert "Did you mean 'epsilon'?" in err
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -209,24 +196,6 @@ def test_estimate_writes_only_when_asked(folder, capsys):
     assert main(["estimate", str(folder), "--confidence", "0.5", "--write", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == in_folder(estimates(folder), folder)
     assert estimates(folder)["confidence"] == 0.5
-
-
-@pytest.mark.parametrize(
-    ("name", "episode", "said"),
-    [
-        ("shells-twin", "17", "; bit for bit as stored\n"),
-        ("forced-lateral-twin", "44", "  BV comes over 1.8 s, "),
-    ],
-)
-def test_replay_says_how_it_compares_and_when_the_cut_in_began(stored_run, capsys, tmp_path, name, episode, said):
-    """A replay that differs is in tests/runner/test_stored.py."""
-    command, page = ["replay", str(stored_run(name)), episode], tmp_path / "a.html"
-    assert main(command) == 0
-    out = capsys.readouterr().out
-    assert out.startswith(f"episode {episode}: ")
-    assert said in out
-    assert main([*command, "--html", str(page), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["files"] == [str(page)]
 
 
 @pytest.mark.parametrize("option", ["--html", "--fcd"])

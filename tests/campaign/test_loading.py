@@ -367,7 +367,6 @@ def test_a_mistake_in_a_panel_names_its_place(panel, entries, where, words):
 @pytest.mark.parametrize(
     ("av", "override", "said"),
     [
-        ("late-60ms", [], r"--av late-60ms: found no vehicle.*Did you mean 'late-600ms'"),
         ("{}:idm", [], r"mine.yaml; expected one of a"),
         ("sumo-acc", ["world.engine=twin"], r"^--set world\.engine=twin"),
         ("sumo-acc", ["av.reaction.delay_s=0.1"], "sumo-acc"),

@@ -50,15 +50,6 @@ def test_anchors_and_merges(read):
     assert [lines.line_of(path) for path in (["d", "c"], ["d", "b"], ["e", "c"])] == [4, 2, 1]
 
 
-def test_lines_fall_back_to_the_nearest_ancestor(read):
-    _, lines = read("a: 1\nb:\n  c:\n    - 1\n    - {d: 2}\n")
-    assert lines.line_of([]) == 1
-    assert lines.line_of(["b", "c", 1, "d"]) == 5
-    assert lines.line_of(["b", "missing", "deeper"]) == 2
-    assert lines(["b", "c"]).startswith("b.c (")
-    assert lines(["b", "c"]).endswith("some.yaml:3)")
-
-
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [

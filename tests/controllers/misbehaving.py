@@ -71,7 +71,6 @@ FAULTS = {
     "raises_what_is_no_utf_8": lambda: raises(FileNotFoundError("no file \udce9.csv")),
     "exits": lambda: sys.exit(5),
     "interrupts": lambda: raises(KeyboardInterrupt()),
-    "generator_exit": lambda: raises(GeneratorExit()),
     "copies_the_process": lambda: 0.0 * os.fork(),
     "copies_the_process_for_good": copies_the_process,
     "copies_and_ends_the_process": lambda: os._exit(7 + int(copies_the_process())),

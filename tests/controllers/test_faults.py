@@ -79,7 +79,6 @@ IN_PROCESS = {
     "raises_what_is_no_utf_8": "step: FileNotFoundError: no file \\udce9.csv",
     "exits": "step: SystemExit: 5",
     "interrupts": "step: KeyboardInterrupt: ",
-    "generator_exit": "step: GeneratorExit: ",
     "copies_the_process": "step: copied the process (os.fork); start programs with subprocess",
     "copies_the_process_for_good": "step: copied the process (os.fork); start programs with subprocess",
     "hangs": f"step: StepTimeoutError: {LATE}",

@@ -21,7 +21,6 @@ from harness.errors import HarnessError, RunFolderError
 from harness.records.folder import (
     encoded,
     read_as,
-    read_table,
     shard_file,
     write_atomically,
     write_json,
@@ -116,16 +115,6 @@ def test_json_is_strict(tmp_path):
     assert files_below(tmp_path) == set()
     write_json(tmp_path / "file.json", {"rate": 0.1, "σ": [1, None]})
     assert read_as(dict, tmp_path / "file.json", mend="") == {"rate": 0.1, "σ": [1, None]}
-
-
-@pytest.mark.parametrize("damage", [lambda content: content[:-30], lambda content: b"", lambda content: content[::-1]])
-def test_a_damaged_table_is_named(damage, tmp_path, tables):
-    path = tmp_path / write_shard(tmp_path, 0, encoded(tables))["episodes"]
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(RunFolderError, match="a file that cannot be read") as raised:
-        read_table(path)
-    assert raised.value.where == str(path)
-    assert "--resume" in raised.value.mend
 
 
 # -- a bit that flips, or a file of another run, changes no number without a word --

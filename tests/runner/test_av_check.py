@@ -12,9 +12,10 @@ from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import CampaignError
 from harness.records.folder import read_manifest
-from harness.runner.look import check_av
+from harness.runner.look import check_av, plan_campaign
 from harness.runner.stored import replay_episode, suspects
-from tests.stored_runs import copy_of, edit
+from tests.pool.test_vehicle_pool import ACTING
+from tests.stored_runs import copy_of, edit, golden
 from tests.worlds.running import EXAMPLE, ROOT
 
 MIXTURE_FILE, FORCED = (str(ROOT / f"scenarios/overtaking_{name}.yaml") for name in ("mixture", "forced"))
@@ -210,3 +211,28 @@ def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
     assert "the vehicle does not do the same again" in suspects(manifest, campaign)
     assert "source file has been changed" in suspects({**manifest, "controller_sha256": "0"}, campaign)
     assert "CPU Z80 (here" in suspects({**manifest, "cpu": "Z80"}, campaign)
+
+
+# -- where cut-ins take time --
+
+
+LEAD = "environment.cut_in_lead_s=0.5"
+
+
+def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_refuses_one_that_acts_before(campaign):
+    with_lead, without = (check_av(campaign("world.engine=twin", *lead), 48) for lead in ((LEAD,), ()))
+    assert with_lead.exit_code == 0
+    assert with_lead.behaviour.n_crashes <= without.behaviour.n_crashes
+    with pytest.raises(CampaignError, match="baseline runs"):
+        check_av(campaign(LEAD, "testing.method=forced", f"av={ACTING.format('Speeds')}"), 4)
+
+
+def test_check_says_how_many_tests_are_expected():
+    def plan(*more: str):
+        return plan_campaign(golden("shells-lateral-twin", "stop.rhw=0.5", "stop.episodes=4000", *more))
+
+    asked = plan()
+    assert 0 < asked["expected_tests"] < asked["most_tests"]
+    assert asked["expected_seconds"] <= asked["most_seconds"]
+    assert "until the limit is decided" in plan("accept.crash_rate_below=1e-7")["expected_tests"]
+    assert plan("stop.rhw=null")["expected_tests"] == asked["most_tests"]

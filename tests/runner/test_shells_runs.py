@@ -183,14 +183,6 @@ def test_failed_tests_draw_further_tests_to_their_shell():
     assert undecided.next_round(tally(few, all_of_a, np.array([0, 20, 0])), 10**6)[2] == 0
 
 
-def test_first_tests_that_are_enough_are_what_decided(campaign, run_here, tmp_path):
-    many = ("testing.shells.statement=library", "testing.shells.first_tests=100")
-    found = run_here(campaign(*SHELLS, "world.engine=twin", *many), tmp_path)
-    last = "the first tests of each shell (testing.shells.first_tests)"
-    assert found.ending.endswith(f": the last condition to be met was {last}.")
-    assert manifest(tmp_path)["ending"] == found.estimates["ending"] == found.ending
-
-
 def test_a_round_is_divided_into_shards_without_gap():
     specs = round_requests(np.array([12, 12, 100]), np.array([70, 0, 300]), 5, 124, 100)
     assert [spec.index for spec in specs] == list(range(5, 5 + len(specs)))

@@ -20,6 +20,7 @@ from harness.pool.replay import Retracing
 from harness.resolved import resolve
 from harness.runner import stored
 from harness.runner.stored import estimate_run, replay_episode, stored_blocks
+from studies.alarm import alarm_of_run
 from tests.golden.record import column_hash
 from tests.in_process import run_here
 from tests.stored_runs import ROOT, copy_of, edit, estimates, golden, manifest, of_before, shard_files, stored_table
@@ -242,3 +243,9 @@ def test_a_stored_shard_is_retraced_when_a_run_goes_on(sumo_run, tmp_path):
     pq.write_table(changed(pq.read_table(path, partitioning=None), "cut_in_r2_m", one_bit), path)
     with pytest.raises(WorldDisagreementError, match=r"episode \d+"):
         run_here(golden("mixture-seven"), folder, resume=True)
+
+
+def test_stored_forced_tests_can_be_asked_what_surrogates_would_have_done(tmp_path):
+    lateral = ("pool.library=ladder-lateral-1", "environment.lane_change_level=1", "stop.episodes=800")
+    run_here(golden("forced-lateral-twin", *lateral, "records.traces=none"), tmp_path / "run")
+    assert alarm_of_run(tmp_path / "run")["p_value"] > 1e-3  # seed fixed; fails once in a thousand

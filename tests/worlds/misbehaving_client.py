@@ -32,7 +32,6 @@ FAULTS = {
     "is_killed": lambda traci: os.kill(os.getpid(), signal.SIGKILL),
     "hangs": lambda traci: time.sleep(600),
     "closes": lambda traci: (traci.close(), time.sleep(600)),
-    "drops": lambda traci: (traci._socket.close(), time.sleep(600)),
     "moves_bv": lambda traci: traci.vehicle.moveTo("BV1", "cell1_1", 500.0),
     "slows_lv": slows_lv,
     "changes_lane": changes_lane,
