@@ -14,7 +14,7 @@ from harness.resolved import resolve
 from harness.runner.resume import require_own_folder
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import run_here
-from tests.stored_runs import copy_of, edit, golden, manifest, sets, shard_files, truncate, unlike_columns
+from tests.stored_runs import copy_of, edit, golden, manifest, of_before, sets, shard_files, truncate, unlike_columns
 
 NAME = "mixture-twin"
 RUN = ("run", BASE, *sets(*RUNS[NAME]), "--out")
@@ -131,6 +131,11 @@ def written(file: str, text: str | None):
         (lambda run: run.rename(run.parent / "gone"), READERS, "run"),
         (lambda run: None, [("replay", 400)], "from 0 to 239"),
         (lambda run: truncate(shard_files(run)[1]), READERS, "episodes/shard-000001.parquet"),
+        (
+            lambda run: truncate(shard_files(of_before(run))[1]),
+            READERS,
+            "shard-000001.parquet found: a file that cannot",
+        ),
         (lambda run: shard_files(run)[1].unlink(), READERS, "episodes/shard-000001.parquet found: no such file"),
         (lambda run: shard_files(run, "traces")[1].unlink(), READERS[1:], "traces/shard-000001.parquet found: no such"),
         (lambda run: (run / "estimates.json").unlink(), READERS[1:2], "`harness estimate"),
