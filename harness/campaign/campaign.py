@@ -127,8 +127,6 @@ class Campaign(Section):
 # -- what does not go with what: one table of methods, vehicles, cut-ins, engines and commands --
 
 Command = Literal["run", "compare", "av-check"]
-MOST_SUMO_CELLS = 256
-"""Roads of the largest committed network."""
 
 
 class Use(NamedTuple):
@@ -166,9 +164,19 @@ REFUSED = (
     # -- vehicles that act before the cut-in --
     Combination(
         "av.before_cut_in",
-        lambda c, _: c.av.acts_before_cut_in and c.sampling.holds_speed,
+        lambda c, use: use.takes_time and c.av.acts_before_cut_in and use.command == "av-check",
+        "controller, " + _TAKES_TIME,
+        "hold_speed, or cut-ins of one step: a look at a vehicle makes no baseline runs, without which nobody knows "
+        "the onset in time",
+        "Add --set av.before_cut_in=hold_speed, or --set environment.parameters=ndd-overtaking-1.",
+    ),
+    Combination(
+        "av.before_cut_in",
+        lambda c, use: (
+            c.av.acts_before_cut_in and (c.sampling.holds_speed or (use.takes_time and not c.sampling.baseline_runs))
+        ),
         "controller, with testing.method {testing.method}",
-        "hold_speed: the method draws LV's and BV's path ahead, which needs to know the AV's",
+        "hold_speed: the method draws the cut-in, or its onset, ahead, which needs to know the AV's path",
         "Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths first.",
     ),
     Combination(
@@ -185,13 +193,6 @@ REFUSED = (
         "twin, with an AV that SUMO moves (av.{av.source})",
         "sumo",
         "Write engine: sumo.",
-    ),
-    Combination(
-        "world.cells",
-        lambda c, _: c.world.engine == "sumo" and c.world.cells > MOST_SUMO_CELLS,
-        "{world.cells}, with engine sumo",
-        f"at most {MOST_SUMO_CELLS}: so many roads has the largest network",
-        "Lower it; about 64 is fastest. It never changes a result.",
     ),
     # -- what methods need and allow --
     Combination(
@@ -211,27 +212,12 @@ REFUSED = (
     ),
     # -- cut-ins that take time --
     Combination(
-        "av.before_cut_in",
-        lambda c, use: use.takes_time and c.av.acts_before_cut_in and use.command == "av-check",
-        "controller, " + _TAKES_TIME,
-        "hold_speed, or cut-ins of one step: a look at a vehicle makes no baseline runs, without which nobody knows "
-        "the onset in time",
-        "Add --set av.before_cut_in=hold_speed, or --set environment.parameters=ndd-overtaking-1.",
-    ),
-    Combination(
         "testing.method",
         lambda c, use: use.takes_time and c.sampling.mixes,
         "{testing.method}, " + _TAKES_TIME,
         "shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at those that an "
         "attentive vehicle avoids",
         "Choose shells, or an environment without that section.",
-    ),
-    Combination(
-        "av.before_cut_in",
-        lambda c, use: use.takes_time and c.av.acts_before_cut_in and not c.sampling.baseline_runs,
-        "controller, with testing.method {testing.method}, " + _TAKES_TIME,
-        "a method that drives the AV along its paths first: only then the onset is known in time",
-        "Choose testing.method shells or forced, or hold_speed.",
     ),
     # -- comparisons --
     Combination(

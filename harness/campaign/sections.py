@@ -187,7 +187,9 @@ class World(Section):
     """Where episodes are simulated."""
 
     engine: Literal["sumo", "twin"] = Field("sumo", description="sumo, or twin: the same motion without SUMO")
-    cells: Whole = Field(64, ge=1, le=4096, description="episodes simulated side by side; never changes a result")
+    cells: Whole = Field(
+        64, ge=1, le=4096, description="episodes side by side, in SUMO at most 256; never changes a result"
+    )
 
 
 class Records(Section):

@@ -13,7 +13,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from inspect import Parameter, Signature, isfunction, signature
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar, get_type_hints
 
 from harness.campaign.problems import did_you_mean
@@ -27,7 +27,6 @@ from harness.controllers.hosts import (
     cause_of,
     death_cause,
 )
-from harness.controllers.protocol import Observation
 from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.processes import CONSTRUCTOR, Apart, ForkServer, WorkerDeath, first_to_answer, tell
@@ -129,17 +128,6 @@ def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
     return lambda: make(**deepcopy(parameters))
 
 
-class StepFunction:
-    """A function ``step(seen, **parameters)`` as a controller; it remembers nothing."""
-
-    def __init__(self, function: Callable[..., float], **parameters: Any) -> None:
-        self._function, self._parameters = function, parameters
-
-    def step(self, observation: Observation) -> float:
-        """Acceleration (m/s²) for the coming step."""
-        return self._function(observation, **self._parameters)
-
-
 def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
     """What is called with the parameters to make a controller; and what else ``found`` is handed, by name.
 
@@ -150,7 +138,7 @@ def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any],
     first = next(iter(takes.values()), None)
     made = _what_it_makes(found)
     if isfunction(found) and not _is_controller(made) and first is not None and first.default is Parameter.empty:
-        return partial(StepFunction, found), {first.name: None}
+        return lambda **parameters: SimpleNamespace(step=partial(found, **parameters)), {first.name: None}
     _require_controller(made, name)
     if isinstance(found, type) and "traci" in takes and not _is_batch(found):
         return partial(StepListenerController, found), {"traci": None}

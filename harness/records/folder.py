@@ -329,35 +329,22 @@ class Repeated:
 
 
 class StoredManifest(Stored):
-    """What ``manifest.json`` of a run may hold.
+    """What ``manifest.json`` of a run must hold, and of what it may hold that which answers rest on.
 
-    A key that is not named here is let through: later versions add some. One that is missing, as in older folders, is
-    no error, but for the three without which nothing can be read.
+    Any other key is let through: the file's checksum says that it is as a run has written it.
     """
 
     campaign_hash: str
     n_episodes: Count
     shards: list[StoredShard]
     campaign_crc32: Count | None = None
-    name: str | None = None
-    created: str | None = None
-    seed: Count | None = None
-    engine: str | None = None
-    reproducible: bool | None = None
     versions: dict[str, str] = {}
-    cpu: str | None = None
-    controller_sha256: str | None = None
-    workers: Count | None = None
-    status: str | None = None
     stopped_by: StoppedBy | Literal["two_phase"] | None = None
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
-    ending: str | None = None
-    decision: dict[str, Any] | None = None
     limits: list[float | str] = []
     retraced: Retraced | None = None
     repeated: Repeated | None = None
-    shadow_runs: dict[str, Count] | None = None
     baseline_crc32: list[Count] = []
 
 

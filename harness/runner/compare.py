@@ -21,6 +21,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import conditional_paired_statement, paired_statement
 from harness.estimators.pairs import MarginVerdict, PairedEstimate, PairedShells, paired_estimate
 from harness.estimators.stopping import PairRule
+from harness.numbers import leaves
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import read_manifest, sole_use, write_json
@@ -198,22 +199,13 @@ def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
 def require_comparable(a: Campaign, b: Campaign) -> None:
     """Refuse campaigns that differ in more than the vehicle, by a `CampaignError` that names every key that differs."""
     keys = set(MAY_DIFFER)
-    if apart := list(_differing("", a.model_dump(exclude=keys), b.model_dump(exclude=keys))):
-        where, of_a, of_b = apart[0]
-        more = f"; also {', '.join(key for key, _, _ in apart[1:])}" if len(apart) > 1 else ""
+    of_a, of_b = (dict(leaves(each.model_dump(exclude=keys))) for each in (a, b))
+    if apart := [key for key in of_a | of_b if of_a.get(key) != of_b.get(key)]:
+        where = apart[0]
+        more = f"; also {', '.join(apart[1:])}" if len(apart) > 1 else ""
         expected = f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of episodes need equal settings"
         mend = f"Make them equal, e.g. with --set {where}=…, which holds for both."
-        raise CampaignError(where, f"{of_a} in A and {of_b} in B{more}", expected, mend)
-
-
-def _differing(prefix: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
-    if isinstance(a, dict) and isinstance(b, dict):
-        for key in dict.fromkeys([*a, *b]):
-            yield from _differing(f"{prefix}.{key}" if prefix else str(key), a.get(key), b.get(key))
-        if a == b and list(a) != list(b):
-            yield prefix, f"the order {', '.join(a)}", f"{', '.join(b)}"
-    elif a != b:
-        yield prefix, a, b
+        raise CampaignError(where, f"{of_a.get(where)} in A and {of_b.get(where)} in B{more}", expected, mend)
 
 
 def require_same_shells(sides: Both) -> None:

@@ -258,25 +258,19 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
 
 
 def plan_campaign(campaign: Campaign) -> dict[str, Any]:
-    """Cost of a campaign: what it is expected to take, and at most.
+    """Most that a campaign may cost: ``most_tests`` and ``most_seconds``, the budget, and what is left to build.
 
-    That is ``expected_tests`` and ``expected_seconds`` (to within a factor of three; in words where nobody can tell),
-    ``most_tests`` and ``most_seconds``, the budget; ``tests_per_second`` (all cores, without what an AV of one's own
-    takes) and ``tables`` (in words).
+    ``tests_per_second`` (all cores) is without what an AV of one's own takes; ``tables`` is in words.
 
     Raises `CampaignError`: a run would refuse the campaign before it starts.
     """
     resolved, source = require_ready(campaign), source_of(campaign)
     engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
     rate = float(f"{EPISODES_PER_S[campaign.testing.method][engine] * (os.cpu_count() or 1):.2g}")
-    most, expected = campaign.stop.episodes, source.expected_tests(resolved)
-    until = "the limit is decided" if campaign.accept is not None else "stop.rhw is reached"
     own = {} if campaign.av.model else {"av": "its own time comes on top: `harness av-check` measures it"}
     return {
-        "expected_tests": int(float(f"{expected:.2g}")) if expected else f"not known beforehand: until {until}",
-        **({"expected_seconds": round(expected / rate)} if expected else {}),
-        "most_tests": most,
-        "most_seconds": round(most / rate),
+        "most_tests": campaign.stop.episodes,
+        "most_seconds": round(campaign.stop.episodes / rate),
         "tests_per_second": rate,
         "tables": source.building(resolved),
         **own,

@@ -50,13 +50,7 @@ _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarr
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on."""
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+    return {"python": platform.python_version(), **{package: metadata.version(package) for package in _PACKAGES}}
 
 
 def cpu_name() -> str:

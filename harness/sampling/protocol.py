@@ -130,12 +130,6 @@ class Source:
         return f"to build (about {per_driver_s * len(resolved.campaign.surrogates)} s of one core)"
 
     @classmethod
-    def expected_tests(cls, resolved: Resolved) -> int | None:
-        """About how many tests a campaign takes until it stops; None where that is not known beforehand."""
-        stop = resolved.campaign.stop
-        return stop.episodes if stop.rhw is None and resolved.campaign.accept is None else None
-
-    @classmethod
     def stored_design(cls, folder: Path) -> ShellDesign | None:  # noqa: ARG003 - there is none
         """Strata of a stored run."""
         return None

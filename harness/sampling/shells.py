@@ -8,7 +8,6 @@ boundary are tested until what is stated about them is roughly known; then those
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from functools import partial
 from itertools import pairwise
@@ -19,20 +18,19 @@ import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
 from harness.episode.loop import EpisodeLoop, Shard
-from harness.errors import RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts
 from harness.estimators.shells import Shells as SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
-from harness.pool.build import cached_pool, campaign_pool, campaign_pool_key, pool_path
+from harness.pool.build import campaign_pool, campaign_pool_key, pool_path
 from harness.pool.cut_ins import Pool
-from harness.pool.shells import Draw, PrescribedEpisodes, acceleration_limit, checked_boundary, design_shells
+from harness.pool.shells import Draw, PrescribedEpisodes, checked_boundary
 from harness.pool.vehicle_pool import baseline_paths_file, campaign_baseline_paths, vehicle_pool
 from harness.pool.walk import BaselineRuns
 from harness.progress import Progress
-from harness.records.folder import SHELLS, read_as, read_manifest
+from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
 from harness.sampling.allocation import CONFIDENCE, Allocation
 from harness.sampling.protocol import Rounds, ShardRequest, Source
@@ -41,10 +39,8 @@ from harness.vocabulary import IntArray
 
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
-_FINISH = "Run `harness run` with --resume, which makes missing shards."
+_FINISH = "Run `harness run` with --resume, which makes what is missing; one of an earlier version into a new folder."
 POOL_S = "about 15 s"
-OVER_BOUND = 1.6
-"""Tests that a rate takes, over the lower bound (measured: medians of the panel, 1.5 to 1.75)."""
 
 
 class Shells(Source):
@@ -79,32 +75,8 @@ class Shells(Source):
         return f"{what}: " + ("cached" if cached else f"to {make} ({POOL_S} on two cores)")
 
     @classmethod
-    def expected_tests(cls, resolved: Resolved) -> int | None:
-        """See `Source`: those of a vehicle that crashes as often as the first reference driver.
-
-        At least ln(1/α) p/(2 r μ), for a rate μ to within ± r of itself where cut-ins of probability p are at stake.
-        """
-        campaign = resolved.campaign
-        rhw, asked = campaign.stop.rhw, campaign.testing.shells.statement
-        if rhw is None or campaign.accept is not None or campaign.has_baseline_runs:
-            return super().expected_tests(resolved)
-        if (pool := cached_pool(resolved)) is None or not pool.reference_rate.any():
-            return None
-        design = design_shells(pool, acceleration_limit(campaign.av))
-        at_stake = float(design.p[: design.n_within(asked)].sum())
-        n = OVER_BOUND * -math.log1p(-campaign.stop.confidence) * at_stake / (2.0 * rhw * float(pool.reference_rate[0]))
-        return min(max(round(n), campaign.min_crashes), campaign.stop.episodes)
-
-    @classmethod
     def stored_design(cls, folder: Path) -> ShellDesign:
         """Strata of a stored run; a `RunFolderError` where they are missing, damaged, or of a too early version."""
-        content = read_as(dict[str, object], folder / SHELLS, mend=_FINISH)
-        if "n_inside" in content and "statements" not in content:
-            version = read_manifest(folder).get("versions", {}).get("harness", "that made it")
-            found = "shells of an earlier version, without statements and reference drivers"
-            expected = "a run of this version: its tests say what those rest on"
-            mend = f"Run the campaign again into a new folder, or estimate this one with version {version}."
-            raise RunFolderError(str(folder / SHELLS), found, expected, mend)
         return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
 
     def begin_after(self, runs: BaselineRuns) -> None:

@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from harness.campaign.campaign import Campaign
 
 
+MOST_SUMO_CELLS = 256
+"""Roads of the largest committed network."""
+
+
 class World(Protocol):
     """K cells, each with LV, BV and AV on a two-lane road of its own.
 
@@ -81,7 +85,7 @@ def build_world(
         from harness.worlds.twin import TwinWorld  # noqa: PLC0415
 
         return TwinWorld(cells)
-    early = av.acts_before_cut_in
+    cells, early = min(cells, MOST_SUMO_CELLS), av.acts_before_cut_in
     if av.traci is not None:
         from harness.worlds.program import TraciWorld  # noqa: PLC0415
 

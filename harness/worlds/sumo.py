@@ -23,9 +23,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from harness.campaign.campaign import MOST_SUMO_CELLS
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.vocabulary import AV, BV, LV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
+from harness.worlds import MOST_SUMO_CELLS
 from harness.worlds.shim import Shim, open_shim
 from harness.worlds.system_libraries import not_importable
 from harness.worlds.twin import advance
@@ -114,7 +114,7 @@ class SumoCells:
 
 
 def network_file(n_cells: int) -> Path:
-    """Smallest committed network with at least ``n_cells`` roads; a campaign asks for at most `MOST_SUMO_CELLS`."""
+    """Smallest committed network with at least ``n_cells`` roads, of which there are at most `MOST_SUMO_CELLS`."""
     return committed_file("highway-1.net.xml" if n_cells == 1 else f"highway-{MOST_SUMO_CELLS}.net.xml")
 
 

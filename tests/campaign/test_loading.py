@@ -71,7 +71,6 @@ BROKEN_RULES = (
     ("av:\n  traci: {command: 'x {host}'}", "av.traci.command", 3, "Double a brace"),
     ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "hold_speed"),
     ("stop:\n  rhw: 1\n  rhw: 2", "stop.rhw", 4, "again, first written on line 3"),
-    ("world: {cells: 257}", "world.cells", 2, "at most 256"),
     ("testing: {method: step_mixture}\nstop:\n  rhw: 0.3", "stop.rhw", 4, "a fixed number of tests"),
     ("testing: {method: forced}\naccept: {crash_rate_below: 0.1}", "accept", 3, "testing.method shells"),
 )

@@ -134,7 +134,7 @@ def test_a_controller_acts_from_the_first_step(method):
 
 
 def test_a_method_that_draws_the_path_ahead_refuses_it():
-    with pytest.raises(CampaignError, match=r"draws LV's and BV's path ahead.*shells \(or forced\)"):
+    with pytest.raises(CampaignError, match=r"draws the cut-in.*shells \(or forced\)"):
         forced(EARLY, "testing={method: episode_mixture}")
 
 
