@@ -105,7 +105,7 @@ def settings_reference() -> str:
     for name, field in fields.items():
         if below := _sections(field.annotation):
             key = f"{name}.NAME" if get_origin(field.annotation) is dict else name
-            text.append(f"### `{key}`\n\n{_own_words(below[0])}\n\n{_listed(_settings_rows(below[0]))}\n")
+            text.append(f"### `{key}`\n\n{_listed(_settings_rows(below[0]))}\n")
     model_of: dict[tuple[str, ...], str] = {}
     for model, section in PARAMETERS.items():
         rows = _settings_rows(section)
@@ -209,7 +209,7 @@ def limits_table() -> str:
     )
 
 
-VALIDATED = ("shells_acting", "shells_acting_room", "lateral")
+VALIDATED = ("shells_acting", "shells_acting_room")
 """Replication experiments with a table of their vehicles."""
 METHODS = {
     "twin_nde": "NDE, level 10,000",
@@ -224,6 +224,20 @@ METHODS = {
 
 def _command(name: str) -> str:
     return f"`python -m studies validate scenarios/validate/{name}.yaml --out DIR`"
+
+
+def validated_range(name: str) -> str:
+    """What a replication experiment found without an assumption, over its vehicles; its command."""
+    of = [one for one in _result(name)["judgements"] if _is_headline(one)]
+
+    def span(key: str, form: str) -> str:
+        return " to ".join(f"{end(one[key] for one in of):{form}}" for end in (min, max))
+
+    return (
+        f"Of {len(of)} vehicles with true rates of {span('truth', '.3g')}: coverage {span('coverage', '.3f')}, bias "
+        f"{span('bias', '+.1%')}, {span('tests_median', ',.0f')} tests (medians). {_command(name)}; each vehicle is in "
+        f"[{name}.json](validation/{name}.json).\n"
+    )
 
 
 def validated_table(name: str) -> str:
@@ -377,6 +391,7 @@ PARTS: dict[str, Callable[[], str]] = {
     **{f"columns-{name}": partial(columns_table, name) for name in SCHEMAS},
     **{f"results-{name}": partial(results_table, results) for name, results in RESULTS.items()},
     **{f"validated-{name}": partial(validated_table, name) for name in VALIDATED},
+    "validated-lateral": partial(validated_range, "lateral"),
     "coverage": coverage_table,
     "decisions": decisions,
     "bounds": bounds_table,
