@@ -282,17 +282,6 @@ def _by_result(judgements: list[dict[str, Any]]) -> dict[str, dict[str, dict[str
     return found
 
 
-def bounds_table() -> str:
-    """Share of campaigns in which bounds hold, beside the former ones; command."""
-    names = "shells, upper bound", "shells, upper bound beyond library"
-    rows = []
-    for subject, of in _by_result(_result("shells_bounds")["judgements"]).items():
-        held = (f"{of[name + by]['coverage']:.3f}" for name in names for by in ("", FORMER))
-        rows.append((f"`{subject}`", *held, f"{of['shells']['tests_median']:,.0f}"))
-    head = ("vehicle", "`upper_bound`", "former", "`upper_bound_outside`", "former", "tests")
-    return _table(head, rows) + f"\n{of['shells']['replications']} campaigns each: {_command('shells_bounds')}\n"
-
-
 def coverage_table() -> str:
     """Lowest coverage over the vehicles that meet the assumption, by experiment, its variants, and kind of result."""
     kinds = ("assumption-free", "given a statement", "ratio to a reference", "preventable")
@@ -394,7 +383,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "validated-lateral": partial(validated_range, "lateral"),
     "coverage": coverage_table,
     "decisions": decisions,
-    "bounds": bounds_table,
 }
 """All generated parts by name."""
 
