@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
         claims=claims,
         steps=steps,
         plots=plots,
+        claim_rows=claim_rows,
         remarks=_remarks(claims),
         answers=dict(Counter(claim["verdict"] for claim in claims)),
         UNSETTLED=UNSETTLED,
@@ -129,7 +131,26 @@ def count(value: float | None) -> str:
     return numbers.count(value) if value is None or abs(value) < 1e6 else numbers.number(value)
 
 
-def spans(of: list[int]) -> str:
+def claim_rows(claims: list[dict[str, Any]], answer: Verdict) -> Iterator[tuple[str, str, str, str]]:
+    """Numbers, words, the paper's and our number; neighbours share a row if but the last word and the former differ."""
+    of = [(number, claim) for number, claim in enumerate(claims, start=1) if claim["verdict"] == answer]
+    for (_, here), group in groupby(of, lambda each: (each[1]["says"].rpartition(" ")[0], shown(each[1]["found"]))):
+        numbered, same = zip(*group, strict=True)
+        ends = (claim["says"].rpartition(" ")[2] for claim in same[1:])
+        yield spans(numbered), cell(", ".join([same[0]["says"], *ends])), ", ".join(map(_asked_for, same)), here
+
+
+def _asked_for(claim: dict[str, Any]) -> str:
+    """The paper's number, and what counts as the same where it is not a factor of 2."""
+    paper = count(claim["paper"]) if float(claim["paper"]).is_integer() else numbers.number(claim["paper"])
+    if claim["at_most"]:
+        return f"≤ {paper}"
+    if claim["tolerance"]:
+        return f"{paper} ± {claim['tolerance']:.0e}"
+    return paper if claim["within"] == 2.0 else f"{paper} (factor {claim['within']:g})"
+
+
+def spans(of: Sequence[int]) -> str:
     """Rising numbers with a dash for neighbours, such as 13, 20–31."""
     first = [n for n in of if n - 1 not in of]
     last = [n for n in of if n + 1 not in of]
