@@ -32,21 +32,13 @@ def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
 
 
 def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
-    """A vehicle that crashes often: after some thousand tests the pool's own error is most of the interval.
-
-    A run that goes on to such a precision ends where one in one go does, or at once where it has gone beyond.
-    """
+    """A vehicle that crashes often: after some thousand tests the pool's own error is most of the interval."""
     often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin")
     settings = (*SHELLS, *often, "stop.episodes=100000", "pool.cut_ins_per_shell=5000")
     fresh = run_here(campaign(*settings, "stop.rhw=0.05"), tmp_path / "fresh")
     assert (fresh.exit_code, fresh.stopped_by) == (4, "pool_error")
-    found, n = fresh.estimates["estimates"]["shells"], fresh.estimates["n_episodes"]
+    found = fresh.estimates["estimates"]["shells"]
     assert found["rhw"] > found["details"]["rhw_from_pool"] > 0.05
-    for rhw, beyond in ((0.3, False), (0.14, True)):
-        held = run_here(campaign(*settings, f"stop.rhw={rhw}"), tmp_path / str(rhw)).estimates["n_episodes"]
-        assert (held > n) == beyond
-        again = run_here(campaign(*settings, "stop.rhw=0.05"), tmp_path / str(rhw), resume=True)
-        assert (again.stopped_by, again.estimates["n_episodes"]) == ("pool_error", max(n, held))
 
 
 SPENT, MORE = "stop.episodes=150", "stop.episodes=400"
