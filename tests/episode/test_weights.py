@@ -90,13 +90,6 @@ def test_martingale_sums_have_mean_zero(method):
         assert Mean.of(martingale[:, j]).errors_from(0.0) < 4.0
 
 
-def test_forced_episodes_weigh_what_their_path_says():
-    done = run("forced", n=100_000)
-    assert done.cut_in.all()
-    np.testing.assert_array_equal(done.log_weight, done.episode["log_p_cut_in"])
-    np.testing.assert_allclose(done.log_q[:, 0], -done.log_weight, rtol=0, atol=1e-12)
-
-
 def test_without_control_the_weight_is_exactly_one():
     assert (run("nde", level=1e6, n=100_000).log_weight == 0.0).all()
     published = run("step_mixture", "immediate", n=4_000, moments="all", surrogates="two")

@@ -17,7 +17,7 @@ from harness.importance.tables import Tables
 from harness.vehicles.kinematics import CONTACT_M
 from harness.vocabulary import CUT_IN, STATE_COLUMNS, STAY
 from tests.episode.twin_runs import prepared, run
-from tests.kernels import accumulated, after_cut_in, before_cut_in, drawn, tabulated
+from tests.kernels import accumulated, after_cut_in, before_cut_in, drawn
 
 CHALLENGES = {"immediate": "two", "recursive": "default"}  # and the surrogates
 EPSILONS = (0.0, 0.1, 1.0)
@@ -146,24 +146,6 @@ def test_harmless_cells_are_those_without_a_challenge_wherever_they_are_read(rec
     challenging = np.any(table[0] > 0.0 if recursive else table[0] < CONTACT_M, axis=-1)
     for i, g, k in np.ndindex(harmless.shape[1:]):
         assert harmless[0, i, g, k] == (not challenging[i : i + 2, g : g + 2, k : k + 2].any())
-
-
-@pytest.mark.parametrize("challenge", ["recursive", "immediate"])
-def test_after_a_cut_in_nothing_is_controlled_that_could_end_in_a_crash_only_after_the_test(challenge):
-    """Of every control step some surrogate has a challenge in the time that remains, rounded up to a second."""
-    found = run("step_mixture", challenge, n=3_000, surrogates="two", epsilon=0.9, moments="all")
-    tables, moment = found.prepared.tables, found.moment
-    rows = np.flatnonzero(moment["step"] > found.episode["cut_in_step"][moment["row"]])
-    rows = rows[found.cut_in[moment["row"][rows]]]
-    level = np.minimum(-(-(200 - moment["step"][rows]) // 10), 12)
-    states = np.column_stack([moment[name][rows] for name in (STATE_COLUMNS[0], *STATE_COLUMNS[3:])])
-    challenged = tables.value > 0.0 if challenge == "recursive" else tables.least < CONTACT_M + 1e-6
-    seen = np.zeros(len(rows))
-    for j, each in np.ndindex(2, 12):  # with the longest time the table of maneuvers decides
-        at = level == each
-        seen[at] += tabulated(challenged[j, each].astype(np.float32), states[at])
-    assert np.count_nonzero(level < 6) > 20
-    assert np.all(seen[level < 12] > 0.0)
 
 
 # -- likelihood ratios: the predictive mixture telescopes to the mixture over whole episodes; fixed weights do not --

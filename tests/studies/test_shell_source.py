@@ -80,18 +80,6 @@ def test_equals_are_found_and_left_out(drivers, population):
     assert equals(LIBRARY, population, np.zeros_like(vehicle)) == set()  # one that never crashes is nobody's equal
 
 
-def test_drawn_pools_scatter_around_the_population(drivers, population):
-    _, source = shells_of(drivers, population)
-    assert source.mass.sum() == pytest.approx(population.cut_in.sum(), rel=1e-12)
-    assert source.crashing[0].sum() == pytest.approx(population.crash_mass(drivers.vehicles["own"]).sum(), rel=1e-12)
-    drawn = [source.draw(np.random.default_rng([1, k]))[0] for k in range(300)]
-    rates = np.array([each.design.p @ each.share for each in drawn])
-    exact = source.crashing[0].sum() / population.cut_in.size
-    assert abs(rates.mean() - exact) < 4.0 * rates.std() / np.sqrt(len(rates))
-    assert all(each.design.strata[-1] == "outside" for each in drawn)
-    assert all(each.design.statements[-1].boundary == LIBRARY.boundary for each in drawn)
-
-
 @pytest.mark.parametrize("made", [{"crashes": "on_heaviest_paths", "share": 0.3}, {"hole": 0.01}], ids=str)
 def test_adversaries_crash_on_few_paths_inside_or_in_a_share_of_all_outside(made, drivers, population):
     division, source = shells_of(drivers, population)
@@ -192,18 +180,6 @@ def as_tree(estimate: Estimate) -> dict[str, object]:
         named = enumerate(found["details"][rows])
         found["details"][rows] = {k: {key: row[key] for key in row if key != "refuted_by"} for k, row in named}
     return found
-
-
-def test_a_raised_budget_is_looked_at_where_it_ends_and_goes_on_as_without(with_references):
-    def tests(episodes, budgets=()):
-        found = looks(campaign_of(episodes), with_references[0], np.random.default_rng(8), budgets)
-        return [seen.tally.tests.tolist() for seen, *_ in found]
-
-    raised, alone = tests(2_000, (300, 900, 2_000)), tests(300)
-    assert [n for n in map(sum, raised) if n in (300, 900, 2_000)] == [300, 900, 2_000]
-    assert raised[: len(alone)] == alone
-    sizes = sorted(set(map(sum, raised)) - {300, 900})
-    assert sizes[:12] == list(map(sum, tests(2_000)))[:12]
 
 
 def test_pairs_are_divided_into_both_only_a_and_only_b(drivers, population):

@@ -97,12 +97,6 @@ def test_what_does_not_fit_together_names_the_place(mine, changes, named):
     assert section.parameters in said
 
 
-def test_the_level_of_lane_changing_is_part_of_the_laws(mine):
-    rare = mine(changed(("cut_in", "intercept", "-440")))  # e^-440 is 1e-191
-    assert refusal(rare) is None
-    assert "a wish to change lanes" in refusal(rare.model_copy(update={"lane_change_level": 1e-10}))
-
-
 @pytest.mark.parametrize(
     ("numbers", "found"),
     [
