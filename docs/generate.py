@@ -129,7 +129,8 @@ def _own_words(section: type[BaseModel]) -> str:
 def columns_table(name: str) -> str:
     """A schema's columns; those that episodes have as well are only named."""
     rows = _column_rows(SCHEMAS[name])
-    known = [row for row in rows if name != "episodes" and row in _column_rows(SCHEMAS["episodes"])]
+    of_tests = {(key, text.removeprefix("initial ")) for key, text in _column_rows(SCHEMAS["episodes"])}
+    known = [row for row in rows if name != "episodes" and (row[0], row[1].removeprefix("initial ")) in of_tests]
     shared = f"As in `episodes`: {', '.join(row[0] for row in known)}.\n\n" if known else ""
     return shared + _listed([row for row in rows if row not in known])
 
