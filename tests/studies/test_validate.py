@@ -91,6 +91,35 @@ def test_weighted_methods_run_in_the_twin(tmp_path, capsys, monkeypatch):
     assert abs(found["bias"]) < 5.0 * found["bias_std_error"]
 
 
+ENUMERATED = """
+format: validation-experiment
+version: 1
+name: enumerated
+replications: 8
+campaign: {testing: {method: shells}, stop: {rhw: 0.5, episodes: 2000}}
+super_population: {paths: 1024, reference_paths: 1024, pool_paths: 256}
+avs: {idm: {}}
+adversaries: {hole: {of: idm, hole: 0.3}}
+"""
+
+
+def test_enumerated_vehicles_alone_and_compared(tmp_path, monkeypatch):
+    """A hole outside the boundary: the library's statement knows nothing of it, alone and in a comparison."""
+    monkeypatch.setattr(run, "worker_processes", lambda workers: Here())
+    found = {}
+    for more in ("", "pairs: {pair: {a: idm, b: hole}}"):
+        (tmp_path / "x.yaml").write_text(ENUMERATED + more)
+        judgements = run.validate(load_experiment(tmp_path / "x.yaml"), tmp_path)
+        found |= {(one["subject"], one["result"]): one for one in judgements}
+    assert all(one["covered"] >= 6 for one in found.values() if one["assumption_met"])
+    wrong = {"shells, library", "shells, need-based", "difference, conditional"}
+    assert {(one["result"], one["covered"]) for one in found.values() if not one["assumption_met"]} == {
+        (w, 0) for w in wrong
+    }
+    beyond = found["hole", "shells, upper bound beyond library"]["truth"]
+    assert found["pair", "difference"]["truth"] == pytest.approx(-beyond) != 0.0
+
+
 PARENT = """
 import os, time
 from studies.work import worker_processes
