@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 from scipy.special import logsumexp
 
@@ -76,8 +77,7 @@ def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, follo
 
     Raises `RunFolderError`: an episode's maneuvers do not fit its steps.
     """
-    stored = stored_paths(episodes, seed)
-    bits = np.zeros(episodes.num_rows, np.int64)
+    stored, bits = stored_paths(episodes, seed), np.zeros(episodes.num_rows, np.int64)
     room = empty_trajectory(environment)
     wrong = replay_surrogates(unboxed(stored), unboxed(environment), unboxed(followers), unboxed(room), bits)
     if wrong >= 0:
@@ -156,11 +156,11 @@ class Alarm:
             no_verdict = f"{self._n_lost} {lost}"
         columns = {
             "surrogate": known.names,
-            "n_crashes": self._hits.astype(int).tolist(),
-            "n_effective": (self._sum**2 / np.where(self._squares > 0.0, self._squares, np.inf)).tolist(),
-            "mean": (self._sum / self._n).tolist(),
-            "mu": known.mu.tolist(),
-            "mu_std_error": known.std_error.tolist(),
+            "n_crashes": self._hits.astype(int),
+            "n_effective": self._sum**2 / np.where(self._squares > 0.0, self._squares, np.inf),
+            "mean": self._sum / self._n,
+            "mu": known.mu,
+            "mu_std_error": known.std_error,
             "p_value": list(map(_p_value, log_capital.tolist())),
         }
         return {
@@ -168,7 +168,7 @@ class Alarm:
             "no_verdict": no_verdict,
             "n_episodes": self._n,
             "p_value": p_value,
-            "surrogates": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
+            "surrogates": pd.DataFrame(columns).to_dict("records"),
         }
 
     def _log_capital(self) -> FloatArray:
@@ -203,12 +203,9 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
     progress, manifest = progress or Progress(), read_manifest(folder)
     resolved = resolve(load_campaign(folder / "campaign.yaml", check_files=False))
     campaign = resolved.campaign
-    shells = campaign.testing.method == "shells"
-    if shells or campaign.av.acts_before_cut_in:
+    if (shells := campaign.testing.method == "shells") or campaign.av.acts_before_cut_in:
         found = "tests drawn from shells" if shells else "an AV that acted before the cut-in"
-        expected = (
-            "weighted tests of an AV that keeps its speed until the cut-in: then pools know the surrogates' rates"
-        )
+        expected = "weighted tests of an AV that keeps its speed until the cut-in: pools know rates of surrogates then"
         mend = "Choose another run; that SUMO and the twin agree is checked in each by retracing."
         raise HarnessError(str(folder), found, expected, mend)
     pool = campaign_pool(resolved, progress)
@@ -225,5 +222,4 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
     for block, crashes in made_ahead(replayed, manifest["shards"]):
         alarm.add(block, crashes)
         progress.advance(len(block))
-    content: dict[str, Any] = finite_json({"run": str(folder), "pool": pool.key, **alarm.result()})
-    return content
+    return finite_json({"run": str(folder), "pool": pool.key, **alarm.result()})

@@ -60,8 +60,7 @@ class Procedure:
 
     def grid(self, n_tests: int) -> IntArray:
         """Prefixes to look at, shape (g,): rising, the last one being the total."""
-        total = n_tests if self.total is None else min(self.total, n_tests)
-        sizes, n = [], self.first
+        total, sizes, n = min(self.total or n_tests, n_tests), list[int](), self.first
         while n < total:
             sizes.append(n)
             n = max(n + 1, int(n * self.ratio))
@@ -180,8 +179,7 @@ def required_tests(rhw: FloatArray, grid: IntArray, threshold: float) -> Require
     """
     above = ~(rhw <= threshold)
     never_above = np.asarray(~above.any(axis=1))
-    behind_last_above = above.shape[1] - np.argmax(above[:, ::-1], axis=1)
-    settled = np.minimum(behind_last_above, above.shape[1] - 1)
+    settled = np.minimum(above.shape[1] - np.argmax(above[:, ::-1], axis=1), above.shape[1] - 1)
     at = np.where(never_above, np.argmax(rhw, axis=1), settled)
     return RequiredTests(grid[at], above[:, -1], never_above)
 

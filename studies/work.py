@@ -50,12 +50,8 @@ def worker_processes(workers: int | None) -> Iterator[ProcessPoolExecutor]:
 def _end_with_parent() -> None:
     """Let this worker process end when its parent is killed."""
     leave_signals_to_parent()
-    threading.Thread(target=_end_after, args=(parent_process(),), daemon=True).start()
-
-
-def _end_after(parent: Any) -> None:
-    parent.join()
-    os._exit(1)
+    parent: Any = parent_process()
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
 def results_of(

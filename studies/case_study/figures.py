@@ -12,7 +12,7 @@ from scipy.stats import t as student
 
 from harness.estimators.limits import normal_half_width
 from harness.estimators.one_pass import LOW_MEAN_WEIGHT
-from harness.vocabulary import Method
+from harness.vocabulary import FloatArray, Method
 
 Verdict = Literal["reproduced", "not reproduced", "cannot be told", "ours to choose"]
 
@@ -48,7 +48,7 @@ def mean_of(values: Iterable[float | None], confidence: float) -> dict[str, Any]
     known = np.array([x for x in values if x is not None and math.isfinite(x)])
     if len(known) < 2:
         return figure(known[0] if len(known) else None)
-    half = student.isf((1.0 - confidence) / 2.0, len(known) - 1) * known.std(ddof=1) / math.sqrt(len(known))
+    half = _t_half_width(known, confidence)
     return figure(known.mean(), max(known.mean() - half, 0.0), known.mean() + half)
 
 
@@ -71,11 +71,15 @@ def ratio_of_means(above: ArrayLike, below: ArrayLike, confidence: float) -> dic
     if not (pairs.size and np.all(means := pairs.mean(axis=1))):
         return figure(None)
     value, apart = means[0] / means[1], pairs[0] / means[0] - pairs[1] / means[1]
-    n = len(apart)
-    if n < 2:
+    if apart.size < 2:
         return figure(value)
-    half = float(student.isf((1.0 - confidence) / 2.0, n - 1)) * apart.std(ddof=1) / math.sqrt(n)
+    half = _t_half_width(apart, confidence)
     return figure(value, value * math.exp(-half), value * math.exp(half))
+
+
+def _t_half_width(values: FloatArray, confidence: float) -> float:
+    n = len(values)
+    return float(student.isf((1.0 - confidence) / 2.0, n - 1) * values.std(ddof=1)) / math.sqrt(n)
 
 
 def ratio_of_variances(above: ArrayLike, below: ArrayLike, confidence: float) -> dict[str, Any]:

@@ -114,12 +114,11 @@ class SmallWorld:
 
     def draw(self, proposals: Proposal, n: int, rng: np.random.Generator) -> Block:
         """Tests under the step mixture, as the estimators see those of any world."""
-        n_surrogates = self.surrogates.shape[-1]
+        j, running = self.surrogates.shape[-1], np.arange(n)
         begun = rng.choice(self.first.size, n, p=self.first.ravel() / self.first.sum())
         course = np.array([*np.unravel_index(begun, self.first.shape), np.zeros(n, np.int64)])
-        log_weight, steps, ratios = np.zeros(n), np.zeros(n, np.int64), np.ones((n, MAX_CONTROL_STEPS, n_surrogates))
-        crash, cut_in, running = np.zeros(n, bool), np.zeros(n, bool), np.arange(n)
-        log_q = np.zeros((n, n_surrogates))
+        log_weight, steps, ratios = np.zeros(n), np.zeros(n, np.int64), np.ones((n, MAX_CONTROL_STEPS, j))
+        crash, cut_in, log_q = np.zeros(n, bool), np.zeros(n, bool), np.zeros((n, j))
         for t in range(len(self.p)):
             if t:
                 u = rng.random(len(running))
@@ -140,7 +139,7 @@ class SmallWorld:
             crash[running], cut_in[running] = cut & (self.crash[here] > 0.0), cut
             running = running[~cut]
         columns = {"cut_in": cut_in, "log_q": log_q, "n_control_steps": steps, "first_ratios": ratios}
-        drawn = Drawn("step_mixture", np.full(n_surrogates, 1.0 / n_surrogates))
+        drawn = Drawn("step_mixture", np.full(j, 1.0 / j))
         return Block(0, np.where(crash, CRASH, TIMEOUT).astype(np.int8), log_weight, columns, drawn)
 
 
@@ -183,12 +182,9 @@ def _laws(
     speed: FloatArray, r1: FloatArray, approaches: FloatArray, environment: Environment
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """BV's distribution over accelerations behind LV (m, 31), its wish to change lanes (m,), and acceptance."""
-    n = len(speed)
+    n, accepted, behind_lv = len(speed), np.empty(len(approaches)), np.column_stack([speed, r1, LV_MPS - speed])
     pmf, scale, chance = np.empty((2, n, N_ACCELERATIONS)), np.empty((2, n)), np.empty(n)
-    accepted = np.empty(len(approaches))
-    evaluate_laws(
-        np.column_stack([speed, r1, LV_MPS - speed]), approaches, unboxed(environment), pmf, scale, chance, accepted
-    )
+    evaluate_laws(behind_lv, approaches, unboxed(environment), pmf, scale, chance, accepted)
     return pmf[1], chance, accepted
 
 
@@ -199,8 +195,10 @@ def _crashes(drivers: Sequence[RecordArray], speed: FloatArray, r2: FloatArray, 
     for row, (v, gap) in enumerate(states):
         points = GridPoints(np.array([v]), np.array([gap]), np.array([v - AV_MPS]))
         for k, driver in enumerate(drivers):
-            smallest = np.empty((2, 1, 1, 1), np.float32)
-            of_maneuvers = np.empty((1, 1, 1, N_ACCELERATIONS), np.float32)
+            smallest, of_maneuvers = (
+                np.empty((2, 1, 1, 1), np.float32),
+                np.empty((1, 1, 1, N_ACCELERATIONS), np.float32),
+            )
             roll_out(driver, 0, max(steps, 1), points, smallest, of_maneuvers, np.empty_like(smallest))
             found[row, k] = gap < CONTACT_M or (steps > 0 and smallest[1, 0, 0, 0] < CONTACT_M)
     return found[back.ravel()]
@@ -222,18 +220,8 @@ def answer_small_case(step: SmallCase, context: Context) -> dict[str, Any]:
     for name, wanted in step.reported.items():  # NADE's exact numbers, or what SCV claims: the nearest first
         found = [exactly(row["nade_exact"]) if name == "nade" else row["scv_claimed"] for row in rows]
         known = [one for one in found if one["value"] and is_settled(one)]
-        figures[f"{name}_range"] = range_of(sorted(known, key=partial(_apart, wanted)))
-    return {
-        "crash_rate": world.crash_rate,
-        "rhw": step.rhw,
-        "steps": len(world.p),
-        "settings": rows,
-        "figures": figures,
-    }
-
-
-def _apart(wanted: float, found: dict[str, Any]) -> float:
-    return abs(math.log(found["value"] / wanted))
+        figures[f"{name}_range"] = range_of(sorted(known, key=lambda one: abs(math.log(one["value"] / wanted))))
+    return {"crash_rate": world.crash_rate, "settings": rows, "figures": figures}
 
 
 def claims_of_setting(

@@ -18,7 +18,7 @@ from studies.work import results_of, worker_processes
 _Result = TypeVar("_Result")
 StepName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Overrides = list[str]
-_OVERRIDES: Any = Field(default_factory=list, description="values laid over the file's, such as testing.epsilon=0.2")
+_OVERRIDES: Any = Field([], description="values laid over the file's, such as testing.epsilon=0.2")
 
 
 class TwinTests(Section):
@@ -80,14 +80,14 @@ class Variants(Section):
     set: Overrides = _OVERRIDES
     tests: Whole = Field(ge=2, le=100_000_000, description="of each campaign")
     replications: Whole = Field(1, ge=1, le=10_000, description="campaigns with each of them")
-    avs: list[str] = Field(default_factory=list, description="vehicles of the shipped panel")
+    avs: list[str] = Field([], description="vehicles of the shipped panel")
     settings: dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides] = Field(
-        default_factory=dict, description="values laid over the campaign's, by a name for the table"
+        {}, description="values laid over the campaign's, by a name for the table"
     )
     each_of: list[dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides]] = Field(
-        default_factory=list, description="lists of such settings, of which every combination is another variant"
+        [], description="lists of such settings, of which every combination is another variant"
     )
-    epsilons: list[Probability] = Field(default_factory=list, description="values of testing.epsilon, a variant each")
+    epsilons: list[Probability] = Field([], description="values of testing.epsilon, a variant each")
     reference: StepName | None = Field(None, description="step with the crash rate of all, for tests by replication")
     shuffles: Whole = Field(0, ge=0, le=10_000, description="orderings of all tests of a variant, for their RNoT")
     means: Whole = Field(0, ge=0, le=100_000_000, description="other tests of each, whose means of columns are known")
@@ -113,7 +113,7 @@ class SmallCase(Section):
     draws: Whole = Field(200, ge=2, le=100_000, description="campaigns that are repeated to see the true spread")
     tests_of_draw: Whole = Field(1_000, ge=10)
     reported: dict[Literal["nade", "scv"], Positive] = Field(
-        default_factory=dict, description="numbers of tests that are looked for among the settings"
+        {}, description="numbers of tests that are looked for among the settings"
     )
 
 
@@ -155,12 +155,10 @@ class Study(Section):
     rhw: Positive = Field(0.3, description="relative half-width that required numbers of tests are for")
     confidence: float = Field(0.9, gt=0.0, lt=1.0)
     steps: dict[StepName, Step] = Field(min_length=1, description="in the order in which they are made")
-    quick: dict[StepName, dict[str, Any]] = Field(
-        default_factory=dict, description="what --quick lays over steps, by step and key"
-    )
+    quick: dict[StepName, dict[str, Any]] = Field({}, description="what --quick lays over steps, by step and key")
     claims: list[Claim] = Field(default_factory=list)
     conclusive: bool = Field(True, description="whether the sizes allow verdicts; those of --quick never do")
-    picture: dict[str, Line] = Field(default_factory=dict, description="numbers of tests, by a label for each line")
+    picture: dict[str, Line] = Field({}, description="numbers of tests, by a label for each line")
 
     @model_validator(mode="after")
     def _asks_steps_that_are_there(self) -> Self:

@@ -14,7 +14,7 @@ from harness.errors import HarnessError
 from harness.estimators.limits import clopper_pearson, normal_half_width
 from harness.records.folder import read_table
 from harness.resolved import resolve
-from harness.runner.run import RunResult, run_campaign
+from harness.runner.run import run_campaign
 from harness.sampling import prepare
 from harness.vocabulary import FloatArray, Method
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in
@@ -68,46 +68,31 @@ def keep_run(step: Run, context: Context) -> dict[str, Any]:
     campaign, run = campaign_of(step), context.folder / "run"
     done = run_campaign(campaign, run, workers=context.workers, resume=True, progress=context.progress)
     method, engine = campaign.testing.method, {"engine": campaign.world.engine}
-    if method == "shells":
-        return {**engine, "figures": figures_of_shells(done, context.rhw)}
-    return {**engine, **_kept(context, method, read_run(run)[0])}
-
-
-def figures_of_shells(done: RunResult, rhw: float) -> dict[str, Any]:
-    """What a run of shells says."""
+    if method != "shells":
+        return {**engine, **_kept(context, method, read_run(run)[0])}
     found = done.estimates["estimates"]["shells"]
-    known = found["rhw"] is not None
+    needed = None if found["rhw"] is None else found["n_episodes"] * (found["rhw"] / context.rhw) ** 2
+    rate = figure(found["crash_rate"], found["ci_low"], found["ci_high"])
     return {
-        "tests": exactly(found["n_episodes"]),
-        "crashes": exactly(found["n_crashes"]),
-        "crash_rate": figure(found["crash_rate"], found["ci_low"], found["ci_high"]),
-        "tests_for_rhw": figure(found["n_episodes"] * (found["rhw"] / rhw) ** 2 if known else None),
+        **engine,
+        "figures": {"tests": exactly(found["n_episodes"]), "crash_rate": rate, "tests_for_rhw": figure(needed)},
     }
 
 
 def _kept(context: Context, method: Method, tests: Tests) -> dict[str, Any]:
     write_table(context.folder / CRASHES, pa.table(dict(zip(Tests._fields[2:], tests[2:], strict=True))))
-    mean_weight, n_failed = tests.sum_of_weights / tests.n, int(np.count_nonzero(tests.failed))
-    is_in, relvar = weights_are_in(method, mean_weight), relative_variance(tests)
+    mean_weight, rate = tests.sum_of_weights / tests.n, crash_rate(tests, context.confidence)
     per_relvar = tests_for(1.0, context.rhw, context.confidence)
-    needed = figure(*(None if x is None else x * per_relvar for x in relvar.values()))
+    plain, most, least = (per_relvar * (1.0 / x - 1.0) if x else None for x in rate.values())
     figures = {
-        "tests": exactly(tests.n),
-        "crashes": exactly(len(tests.episode) - n_failed),
-        "failed": exactly(n_failed),
-        "crash_rate": marked(crash_rate(tests, context.confidence), settled=is_in),
-        "relvar": marked(relvar, settled=is_in),
-        "tests_for_rhw": marked(needed, settled=is_in),
-        "mean_weight": exactly(mean_weight),
-        "plain_tests": marked(_plain_tests(crash_rate(tests, context.confidence), per_relvar), settled=is_in),
+        "crash_rate": rate,
+        "tests_for_rhw": figure(*(None if x is None else x * per_relvar for x in relative_variance(tests).values())),
+        "plain_tests": figure(plain, least, most),  # of plain simulation at this crash rate: z²(1 - μ)/(RHW² μ)
     }
-    return {"n": tests.n, "figures": figures}
-
-
-def _plain_tests(rate: dict[str, Any], per_relvar: float) -> dict[str, Any]:
-    """Tests that plain simulation would need at this crash rate: z²(1 - μ)/(RHW² μ)."""
-    value, high, low = (per_relvar * (1.0 / x - 1.0) if x else None for x in rate.values())
-    return figure(value, low, high)
+    is_in = weights_are_in(method, mean_weight)
+    counts: dict[str, float] = {"tests": tests.n, "crashes": int(np.sum(~tests.failed)), "mean_weight": mean_weight}
+    figures = {name: marked(each, settled=is_in) for name, each in figures.items()}
+    return {"n": tests.n, "figures": {**figures, **{name: exactly(each) for name, each in counts.items()}}}
 
 
 def tests_of(made: Made) -> Tests:
@@ -152,7 +137,7 @@ def relative_variance(tests: Tests) -> dict[str, Any]:
     if value is None:
         return figure(None)
     left = [_relvar(sums.sum(axis=1) - sums[:, k], tests.n * (GROUPS - 1) / GROUPS) for k in range(GROUPS)]
-    if any(each is None for each in left):
+    if None in left:
         return figure(value)
     error = float(np.std(np.array(left, dtype=np.float64))) * np.sqrt(GROUPS - 1)
     return figure(value, max(value - 2.0 * error, 0.0), value + 2.0 * error)

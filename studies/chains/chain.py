@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -167,44 +168,31 @@ _Row = tuple[float, list[FloatArray], bool]
 
 def enumerate_episodes(chain: Chain) -> Episodes:
     """All episodes of the chain."""
-    rows = [row for path, p in _paths(chain) for row in _episodes(chain, path, p)]
-    (p, controlled, crash), forced = zip(*(row for row, _ in rows), strict=True), [forced for _, forced in rows]
-    ratios = np.ones((len(p), max(map(len, controlled)), chain.n_surrogates))
-    for row, steps in enumerate(controlled):
-        for t, step in enumerate(steps):
-            ratios[row, t] = step
+    p, controlled, crash, forced = zip(*_episodes(chain), strict=True)
     n_control_steps = np.array([len(steps) for steps in controlled])
+    ratios = np.ones((len(p), n_control_steps.max(), chain.n_surrogates))
+    ratios[np.arange(ratios.shape[1]) < n_control_steps[:, None]] = [step for steps in controlled for step in steps]
     return Episodes(np.array(p), ratios, n_control_steps, np.array(forced), np.array(crash))
 
 
-def _paths(chain: Chain) -> list[tuple[list[int], float]]:
-    """Staying paths with their probabilities."""
-    paths = [([g], float(p)) for g, p in enumerate(chain.start) if p > 0.0]
-    for _ in range(chain.horizon - 1):
-        paths = [
-            ([*path, g], p * float(step))
-            for path, p in paths
-            for g, step in enumerate(chain.approach[path[-1]])
-            if step > 0.0
-        ]
-    return paths
-
-
-def _episodes(chain: Chain, path: list[int], p: float) -> Iterator[tuple[_Row, float]]:
-    """On one staying path: no cut-in, or a cut-in at each step with everything that can follow."""
-    p_cut = 1.0 - float(np.prod(1.0 - chain.hazard[path]))
-    before: list[FloatArray] = []
-    for t, g in enumerate(path):
-        hazard, q = float(chain.hazard[g]), chain.proposals.cut[:, t, g]
-        critical = bool(chain.proposals.critical_before[t, g])
-        if hazard > 0.0:
-            here = [*before, q / hazard] if critical else before
-            for d in np.flatnonzero(chain.entry[g]):
-                for row in _after(chain, t + 1, p * hazard * float(chain.entry[g, d]), here, int(d)):
-                    yield row, 1.0 / p_cut
-        p *= 1.0 - hazard
-        before = [*before, (1.0 - q) / (1.0 - hazard)] if critical else before
-    yield (p, before, False), 0.0
+def _episodes(chain: Chain) -> Iterator[tuple[float, list[FloatArray], bool, float]]:
+    """On each staying path no cut-in, or a cut-in at each step with everything that can follow; with forced over p."""
+    for path in product(*[range(len(chain.start))] * chain.horizon):
+        p = float(chain.start[path[0]] * np.prod(chain.approach[path[:-1], path[1:]]))
+        if p == 0.0:
+            continue
+        p_cut, before = 1.0 - float(np.prod(1.0 - chain.hazard[[*path]])), list[FloatArray]()
+        for t, g in enumerate(path):
+            hazard, q = float(chain.hazard[g]), chain.proposals.cut[:, t, g]
+            critical = bool(chain.proposals.critical_before[t, g])
+            if hazard > 0.0:
+                here = [*before, q / hazard] if critical else before
+                for d in np.flatnonzero(chain.entry[g]).tolist():
+                    for row in _after(chain, t + 1, p * hazard * float(chain.entry[g, d]), here, d):
+                        yield *row, 1.0 / p_cut
+            p *= 1.0 - hazard
+            before = [*before, (1.0 - q) / (1.0 - hazard)] if critical else before
+        yield p, before, False, 0.0
 
 
 def _after(chain: Chain, t: int, p: float, before: list[FloatArray], d: int) -> Iterator[_Row]:
@@ -214,9 +202,9 @@ def _after(chain: Chain, t: int, p: float, before: list[FloatArray], d: int) -> 
     critical = bool(chain.proposals.critical_after[t, d])
     for a, exposure in enumerate(chain.exposure[d]):
         here = [*before, chain.proposals.maneuver[:, t, d, a] / exposure] if critical else before
-        for following in np.flatnonzero(chain.response[d, a]):
+        for following in np.flatnonzero(chain.response[d, a]).tolist():
             weight = p * float(exposure) * float(chain.response[d, a, following])
-            yield from _after(chain, t + 1, weight, here, int(following))
+            yield from _after(chain, t + 1, weight, here, following)
 
 
 N_APPROACH = 6

@@ -40,13 +40,10 @@ class Adversary(Section):
 
     of: AvName = Field(description="vehicle of avs whose crashes it has")
     crashes: Literal["everywhere", "on_heaviest_paths", "on_lightest_paths"] = Field(
-        "everywhere",
-        description="which of its crashes inside the boundary it has: those on the paths that weigh most, or least",
+        "everywhere", description="those inside the boundary that it has: on paths that weigh most, or least"
     )
     share: float = Field(0.1, gt=0.0, le=1.0, description="share of its crash rate that these paths hold")
-    hole: float = Field(
-        0.0, ge=0.0, le=1.0, description="share of cut-ins outside the boundary on which it crashes besides"
-    )
+    hole: float = Field(0.0, ge=0.0, le=1.0, description="share of cut-ins outside on which it crashes besides")
     failing: float = Field(0.0, ge=0.0, lt=1.0, description="share of its crashes that end as failed tests instead")
     failing_tests: float = Field(0.0, ge=0.0, lt=1.0, description="share of all tests that fail, crash or not")
 
@@ -69,38 +66,20 @@ class Experiment(Section):
     replications: Whole = Field(2000, ge=2, le=1_000_000, description="independent repetitions for each vehicle")
     campaign: Campaign = Field(description="what is repeated; its own av is replaced, stop.rhw null means a fixed n")
     avs: dict[AvName, AutomatedVehicle] = Field(
-        default_factory=dict,
-        description="vehicles, overtaking in the twin: built-in models, and for testing.method shells controllers with "
-        "before_cut_in controller",
+        {}, description="built-in models; under shells controllers that act, too"
     )
-    adversaries: dict[AvName, Adversary] = Field(
-        default_factory=dict, description="made of some of avs; testing.method shells alone"
-    )
-    pairs: dict[AvName, Pair] = Field(
-        default_factory=dict,
-        description="comparisons to repeat instead of campaigns of single vehicles; testing.method shells alone",
-    )
-    chains: list[str] = Field(default_factory=list, description="exact Markov chains, instead of avs")
-    estimators: list[EstimatorName] = Field(
-        default_factory=list, description="whose results are judged; the method's own when left out"
-    )
+    adversaries: dict[AvName, Adversary] = Field({}, description="made of some of avs; under shells alone")
+    pairs: dict[AvName, Pair] = Field({}, description="comparisons, instead of single vehicles; under shells alone")
+    chains: list[str] = Field([], description="exact Markov chains, instead of avs")
+    estimators: list[EstimatorName] = Field([], description="whose results are judged; the method's own when left out")
     limits: list[Positive] = Field(
-        default_factory=list,
+        [],
         description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate "
         "in the super-population; at 1 both verdicts are wrong, and each is judged",
     )
-    beside: str | None = Field(
-        None, description="decide limits beside this reference driver, as `accept.times_reference` does"
-    )
-    budgets: list[Whole] = Field(
-        default_factory=list,
-        description="numbers of tests within which limits are judged, besides stop.episodes: a campaign's budget is "
-        "raised from one to the next",
-    )
-    siblings: bool = Field(
-        False,
-        description="also judge the rules that those of limits and bounds took the place of, which err more often",
-    )
+    beside: str | None = Field(None, description="decide limits beside this reference driver: accept.times_reference")
+    budgets: list[Whole] = Field([], description="numbers of tests within which limits are judged, and stop.episodes")
+    siblings: bool = Field(False, description="also judge former rules of limits and bounds, which err more often")
     super_population: SuperPopulation = SuperPopulation()
 
     @property
@@ -125,9 +104,9 @@ class Experiment(Section):
         return self.campaign.model_copy(update={"av": self.avs[name]})
 
     @property
-    def acting(self) -> dict[str, AutomatedVehicle]:
+    def acting(self) -> list[str]:
         """Vehicles that act before the cut-in."""
-        return {name: av for name, av in self.avs.items() if av.acts_before_cut_in}
+        return [name for name, av in self.avs.items() if av.acts_before_cut_in]
 
     @property
     def holding(self) -> dict[str, AutomatedVehicle]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import product
 
 import numpy as np
 
@@ -77,22 +78,18 @@ class WeightedCampaign:
             return [row for r in replications for row in self._online(r)]
         rows, each = [], self.campaign.stop.episodes
         at_once = max(1, CHUNK // each)
-        for first in range(replications.start, replications.stop, at_once):
-            n = min(at_once, replications.stop - first)
-            block = self.source(first * each, n * each)
-            for k in range(n):
-                rows += self._results(first + k, [block.take(slice(k * each, (k + 1) * each))])
+        for some in (replications[k : k + at_once] for k in range(0, len(replications), at_once)):
+            block = self.source(some.start * each, len(some) * each)
+            for k, replication in enumerate(some):
+                rows += self._results(replication, [block.take(slice(k * each, (k + 1) * each))])
         return rows
 
     def _results(self, replication: int, blocks: Sequence[Block], *, reached: bool = False) -> list[Row]:
-        rows = []
-        for name in self.estimators:
-            state = accumulator(name)
-            for block in blocks:
-                state.add(block)
-            result = state.result(self.campaign.stop.confidence)
-            rows.append(estimate_row(name, replication, result, reached=reached))
-        return rows
+        states = {name: accumulator(name) for name in self.estimators}
+        for state, block in product(states.values(), blocks):
+            state.add(block)
+        results = {name: state.result(self.campaign.stop.confidence) for name, state in states.items()}
+        return [estimate_row(name, replication, result, reached=reached) for name, result in results.items()]
 
     def _online(self, replication: int) -> list[Row]:
         campaign = self.campaign
