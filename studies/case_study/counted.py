@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
@@ -41,9 +42,6 @@ from studies.rnot import (
     total_and_half_width,
 )
 from studies.work import write_table
-
-CORRECTED = ("degrees_of_freedom", "leave_one_out")
-"""Of the gains that `scv` reports, those without what its fit explains by chance."""
 
 
 class Claims:
@@ -88,11 +86,11 @@ class Claims:
             row[f"{name}_rate"] = marked(interval, settled=settled)
             row[f"{name}_rhw"] = half / rate if rate > 0.0 else None
             row[f"{name}_tests"] = tests_for(self._n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
-        beside = scv if scv is not None and scv.std_error > 0.0 < nade.crash_rate else None
-        row["gain_claimed"] = None if beside is None else (nade.std_error / beside.std_error) ** 2
-        for key in CORRECTED:
-            row[f"gain_{key}"] = None if beside is None else beside.details["gain"][key]
-        row["difference"] = None if beside is None else abs(beside.crash_rate / nade.crash_rate - 1.0)
+        row |= dict.fromkeys(("gain_claimed", "gain_degrees_of_freedom", "gain_leave_one_out", "difference"))
+        if scv is not None and scv.std_error > 0.0 < nade.crash_rate:
+            row |= {f"gain_{key}": scv.details["gain"][key] for key in ("degrees_of_freedom", "leave_one_out")}
+            row["gain_claimed"] = (nade.std_error / scv.std_error) ** 2
+            row["difference"] = abs(scv.crash_rate / nade.crash_rate - 1.0)
         return row
 
 
@@ -141,19 +139,6 @@ def gain_of_parts(run: Path, size: int, n: int, parts: int, confidence: float) -
     return ratio_of_variances([nade for nade, _ in rates], [scv for _, scv in rates], confidence)
 
 
-def explained_by(block: Block, fits: Sequence[tuple[int, StratumFit]]) -> FloatArray:
-    """What regressions say of each test: η_l, and η_l + (h - means)·β with each β, (1 + k, n); 0 where l has none."""
-    found = np.zeros((1 + len(fits[0][1].beta), len(block)))
-    for level, fit in fits:
-        at = np.flatnonzero(block.n_control_steps == level)
-        for rows in (at[start : start + CHUNK] for start in range(0, len(at), CHUNK)):
-            columns = np.empty((len(rows), fit.n_columns), order="F")
-            fill_product_columns(block.first_ratios[rows], level, columns)
-            found[:, rows] = fit.intercept
-            found[1:, rows] += fit.beta @ (columns - fit.means).T
-    return found
-
-
 TESTS_EACH = (1, 5, 20, 100, 1_000)
 """Tests for each principal component of columns that is used: of few, coefficients are worse than none elsewhere."""
 
@@ -168,9 +153,16 @@ class KnownMeans:
         self._fits, self._of_campaigns = others.fits(TESTS_EACH), list[FloatArray]()
 
     def add(self, block: Block) -> None:
-        """Add a campaign: variances of Y, and of Y adjusted."""
+        """Add a campaign: variances of Y, and of Y less η_l + (h - means)·β with each β, 0 where l has none."""
         y = block.weighted_crashes()
-        self._of_campaigns.append(np.vstack([y, y - explained_by(block, self._fits)[1:]]).var(axis=1))
+        left = np.tile(y, (1 + len(TESTS_EACH), 1))
+        for level, fit in self._fits:
+            at = np.flatnonzero(block.n_control_steps == level)
+            for rows in (at[start : start + CHUNK] for start in range(0, len(at), CHUNK)):
+                columns = np.empty((len(rows), fit.n_columns), order="F")
+                fill_product_columns(block.first_ratios[rows], level, columns)
+                left[1:, rows] -= fit.intercept + fit.beta @ (columns - fit.means).T
+        self._of_campaigns.append(left.var(axis=1))
 
     def gain(self, confidence: float) -> dict[str, Any]:
         """NADE's variance over what is left of it."""
@@ -193,14 +185,13 @@ CURVES = "curves.parquet"
 def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
     """Curves as Parquet; how many tests each needed in the order in which it was tested; rates over the reference's."""
     procedure = Procedure(context.rhw, context.confidence)
-    tables, figures = list[pa.Table](), dict[str, Any]()
+    curves, figures = list[pd.DataFrame](), dict[str, Any]()
     reference = context.made[step.reference].result["figures"]["crash_rate"]
     for name in step.of:
         tests = tests_of(context.made[name])
         n = procedure.grid(tests.n)
         total, half = total_and_half_width(tests.y, np.searchsorted(tests.episode, n), n, procedure.z)
-        curve = {"step": [name] * len(n), "n": n, "crash_rate": total / n, "half_width": half / n}
-        tables.append(pa.table(curve))
+        curves.append(pd.DataFrame({"step": name, "n": n, "crash_rate": total / n, "half_width": half / n}))
         rhw = np.divide(half / n, total / n, out=np.full(len(n), np.inf), where=total > 0.0)
         required = required_tests(rhw[None, :], n, procedure.rhw)
         found = {
@@ -209,7 +200,7 @@ def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
         }
         is_in = settled(context.made[name])
         figures |= {f"{name}.{key}": marked(each, settled=is_in) for key, each in found.items()}
-    write_table(context.folder / CURVES, pa.concat_tables(tables))
+    write_table(context.folder / CURVES, pa.Table.from_pandas(pd.concat(curves), preserve_index=False))
     return {"figures": figures}
 
 
@@ -228,13 +219,14 @@ class Counted(NamedTuple):
 
     def over(self, other: Counted, confidence: float) -> dict[str, Any]:
         """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
-        found = ratio_of_means(self.rnot.n.tolist(), other.rnot.n.tolist(), confidence)
-        side = acceleration(self.rnot, other.rnot)[1]
-        if side == "at least":
-            found = figure(found["value"], found["low"] or found["value"])
-        elif side == "at most":
-            found = figure(found["value"], None, found["high"] or found["value"])
-        return marked(figure(None) if side == "unknown" else found, settled=self.settled and other.settled)
+        value, low, high = ratio_of_means(self.rnot.n, other.rnot.n, confidence).values()
+        found = {
+            "equal": figure(value, low, high),
+            "at least": figure(value, low or value),
+            "at most": figure(value, None, high or value),
+            "unknown": figure(None),
+        }[acceleration(self.rnot, other.rnot)[1]]
+        return marked(found, settled=self.settled and other.settled)
 
 
 def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, Any]:

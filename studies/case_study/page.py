@@ -9,7 +9,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import matplotlib.style
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from harness import numbers
@@ -19,7 +18,6 @@ from harness.records.folder import write_bytes
 from studies.case_study.figures import Verdict, is_settled, verdict
 from studies.case_study.plots import plots_of
 from studies.case_study.study import Made, Study
-from studies.case_study.style import RC, png
 
 UNSETTLED = "†"
 PAGE, CLAIMS = "case_study.md", "claims.json"
@@ -33,10 +31,9 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
     Raises `HarnessError`: a claim or the picture asks for a figure that its step does not have.
     """
     claims = [_answered(claim.model_dump(), made, conclusive=study.conclusive) for claim in study.claims]
-    with matplotlib.style.context(["default", RC]):
-        plots = plots_of(study, made, {label: asked(line.ours, made) for label, line in study.picture.items()})
-        for plot in plots.values():
-            _write(folder / "plots" / f"{plot.name}.png", png(plot))
+    plots = plots_of(study, made, {label: asked(line.ours, made) for label, line in study.picture.items()})
+    for name, plot in plots.items():
+        _write(folder / "plots" / f"{name}.png", plot.png)
     environment = Environment(
         loader=PackageLoader("studies.case_study", "."),
         autoescape=False,  # noqa: S701 - Markdown, of our own results

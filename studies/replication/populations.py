@@ -18,12 +18,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import cast
 
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.drivers import BuiltInParameters, Reflexes
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.find import build_host
 from harness.episode.cells import PrescribedTraffic
@@ -39,7 +37,7 @@ from harness.progress import Progress
 from harness.resolved import resolve
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.traffic.laws import Environment
-from harness.vehicles.drivers import Followers, driver_records
+from harness.vehicles.drivers import Followers, av_records
 from harness.vehicles.library import Library
 from harness.vocabulary import CRASH, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds.twin import TwinWorld
@@ -102,23 +100,17 @@ class Drivers:
 
         The envelope is the library's, unless a vehicle accelerates harder; ``see_onset`` is that of `driver_records`.
         """
-        models = [*library.surrogates.values(), *library.references.values()]
-        parameters: list[BuiltInParameters] = [model.parameters for model in models]
-        reactions: list[Reflexes] = [model.reaction for model in models]
-        vehicles = {}
+        (records, envelope, *_), vehicles = library.followers(see_onset), dict[str, Mixed]()
         for name, av in avs.items():
-            reflexes, shares = zip(*_reactions(av), strict=True)
-            vehicles[name] = dict(enumerate(shares, start=len(parameters)))
-            parameters += [cast(BuiltInParameters, av.parameters)] * len(shares)
-            reactions += reflexes
-        if len(parameters) > MOST_DRIVERS:
-            found = f"{len(parameters)} drivers with the library's {len(models)}"
+            of_av, shares = _reactions(av, see_onset)
+            vehicles[name] = dict(enumerate(shares, start=records.size))
+            records = np.concatenate([records, of_av])
+        if records.size > MOST_DRIVERS:
+            found = f"{records.size} drivers with the library's {library.n_drivers}"
             mend = "Divide the experiment; an inattentive vehicle counts as two."
             raise CampaignError("avs", found, f"at most {MOST_DRIVERS}", mend)
         enclosed = all(acceleration_limit(av) <= library.envelope_mps2 for av in avs.values())
-        envelope = list(library.surrogates).index(library.envelope) if enclosed else NO_ENVELOPE
-        records = driver_records(parameters, reactions, see_onset=see_onset)
-        return cls(records, envelope, vehicles, reference_drivers(library))
+        return cls(records, envelope if enclosed else NO_ENVELOPE, vehicles, reference_drivers(library))
 
     def only(self, names: set[str]) -> Drivers:
         """The envelope, the references and the drivers of some vehicles."""
@@ -135,12 +127,14 @@ def reference_drivers(library: Library) -> dict[str, int]:
     return {name: len(library.surrogates) + r for r, name in enumerate(library.references)}
 
 
-def _reactions(av: AutomatedVehicle) -> list[tuple[Reflexes, float]]:
-    """The reflexes that a vehicle can have in an episode, and how probable each is."""
-    own, late = av.reaction, av.reaction.inattention_probability * (av.reaction.inattention_delay_s > 0.0)
-    reflexes = Reflexes(**own.model_dump(include=set(Reflexes.model_fields)))
-    delayed = reflexes.model_copy(update={"delay_s": own.delay_s + own.inattention_delay_s})
-    return [(reflexes, 1.0 - late), (delayed, late)][: 1 + (late > 0.0)]
+def _reactions(av: AutomatedVehicle, see_onset: bool) -> tuple[RecordArray, list[float]]:
+    """The drivers that a vehicle can be in an episode, attentive or not, and how probable each is."""
+    own = av_records(av, see_onset=see_onset)
+    late = float(own["inattention_probability"][0] * (own["inattention_steps"][0] > 0.0))
+    found = np.repeat(own, 1 + (late > 0.0))
+    found["delay_steps"][1:] += found["inattention_steps"][1:]
+    found["inattention_probability"] = found["inattention_steps"] = 0.0
+    return found, [1.0 - late, late][: found.size]
 
 
 def enumerate_paths(
