@@ -106,22 +106,15 @@ class Chain:
     @cached_property
     def proposals(self) -> Proposals:
         """q_j at every time and state."""
-        shape = self.n_surrogates, self.horizon
-        cut, maneuver = np.empty((*shape, len(self.start))), np.empty((*shape, *self.exposure.shape))
-        critical_before = np.zeros(cut.shape[1:], dtype=bool)
-        critical_after = np.zeros(maneuver.shape[1:3], dtype=bool)
-        p = np.stack([1.0 - self.hazard, self.hazard], axis=1)
-        for j, response in enumerate(self.surrogate_responses):
-            before, after = self.values(response)
-            for t in range(self.horizon):
-                stay = self.approach @ before[t + 1] * (self.challenge == "recursive")
-                challenge = np.stack([stay, self.entry @ after[t + 1]], axis=1)
-                q, v = importance_function(p, challenge, self.epsilon)
-                cut[j, t] = q[:, 1]
-                critical_before[t] |= v > 0.0
-                maneuver[j, t], v = importance_function(self.exposure, response @ after[t + 1], self.epsilon)
-                critical_after[t] |= v > 0.0
-        return Proposals(cut, maneuver, critical_before, critical_after)
+        p, found = np.stack([1.0 - self.hazard, self.hazard], axis=1), list[tuple[FloatArray, ...]]()
+        for response in self.surrogate_responses:
+            before, after = (each[1:] for each in self.values(response))
+            stay = before @ self.approach.T * (self.challenge == "recursive")
+            q, v = importance_function(p, np.stack([stay, after @ self.entry.T], axis=-1), self.epsilon)
+            afterwards = importance_function(self.exposure, np.einsum("dae,te->tda", response, after), self.epsilon)
+            found.append((q[..., 1], v, *afterwards))
+        cut, before, maneuver, after = (np.stack(each) for each in zip(*found, strict=True))
+        return Proposals(cut, maneuver, np.any(before > 0.0, axis=0), np.any(after > 0.0, axis=0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -96,12 +96,10 @@ class WeightedCampaign:
         stop = campaign.stop.model_copy(update={"estimator": self.estimators[0]})
         ends = campaign.run.shard_ends(stop.episodes)
         rule = StopRule(stop, campaign.testing.method, ends, min_crashes=campaign.min_crashes)
-        watched, blocks, n = accumulator(rule.estimator), [], 0
-        for look in rule.looks:
-            block = self.source(replication * stop.episodes + n, look - n)
-            watched.add(block)
-            blocks.append(block)
-            n = look
-            if rule.observe(n, watched.result(stop.confidence)):
+        watched, blocks = accumulator(rule.estimator), list[Block]()
+        for n, look in pairwise([0, *rule.looks]):
+            blocks.append(self.source(replication * stop.episodes + n, look - n))
+            watched.add(blocks[-1])
+            if rule.observe(look, watched.result(stop.confidence)):
                 break
         return self._results(replication, blocks, reached=rule.look.stopped)
