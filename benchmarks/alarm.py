@@ -78,7 +78,7 @@ def by_sample_variance(found: Asked) -> float:
     squares, error = (h * h).sum(axis=0), h.std(axis=0) / np.sqrt(len(h))
     many = h.sum(axis=0) ** 2 >= 100.0 * np.maximum(squares, 1e-300)
     z = (h.mean(axis=0) - found.known.mu)[many] / error[many]
-    return float(np.min(2.0 * ndtr(-np.abs(z)), initial=1.0)) * h.shape[1]
+    return float(np.min(2.0 * ndtr(-np.abs(z)), initial=1.0) * h.shape[1])
 
 
 def false_alarms(found: Asked, n: int, replications: int) -> str:

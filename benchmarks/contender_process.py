@@ -64,10 +64,10 @@ class ContenderProcess:
 
     def measure(self, first: int, n: int) -> Measurement:
         """Run n episodes."""
-        others_s = descendants_cpu_s(self._process.pid)
+        others_s = descendants_cpu_s(self._process.pid or 0)
         self._pipe.send((first, n))
         work, wall, cpu = self._answer()
-        cpu += descendants_cpu_s(self._process.pid) - others_s
+        cpu += descendants_cpu_s(self._process.pid or 0) - others_s
         wall, cpu = work.timed_s or (wall, cpu)
         return Measurement(work.episodes, work.cell_steps, wall, cpu, work.bytes_written, work.part_s)
 

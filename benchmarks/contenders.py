@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from harness.episode.loop import Shard
 from harness.records.folder import encoded, write_shard
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
-from harness.runner.workers import LocalWorkers
+from harness.runner.workers import LocalWorkers, ShardResult
 from harness.sampling import prepare
 from harness.sampling.protocol import ShardRequest, Source
 from harness.worlds import World
@@ -113,8 +113,8 @@ class WithParts(Recorded):
         self._time(self.world, "place", "refill")
         self._time(self.world, "_contacts", "collisions")
         self._time(self, "write", "recording")
-        if self.world._shim is not None:
-            self._time(self.world._shim, "step", "SUMO: set, step, get in one call")
+        if shim := getattr(self.world, "_shim", None):
+            self._time(shim, "step", "SUMO: set, step, get in one call")
         else:
             self._time(self.world, "_simulation_step", "SUMO step")
             self._time(self.world, "_tell", "set")
@@ -215,7 +215,8 @@ class Workers(Contender):
         # As many shards of 2,500 episodes for every worker.
         n_shards = max(2, n // SHARD)
         specs = [ShardRequest(i, first + i * SHARD, SHARD) for i in range(n_shards)]
-        for done in self._pool.run(iter(specs), lambda _: None):
+        results: Iterator[ShardResult] = self._pool.run(iter(specs), lambda _: None)
+        for done in results:
             write_shard(self._folder, done.request.index, done.parquet)
         return Work(n_shards * SHARD, 0)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -61,9 +62,19 @@ def plot(found: dict[str, tuple[np.ndarray, np.ndarray]], names: list[str], file
         for place, driver in enumerate(COMPARED):
             value, error = ratio(mean, covariance, names.index(driver), names.index(COMPETENT))
             label = labels[name] if place == 0 else None
-            style = {"color": colour, "marker": marker, "markersize": 7, "capsize": 3, "linestyle": "none"}
+            style: dict[str, Any] = {
+                "color": colour,
+                "marker": marker,
+                "markersize": 7,
+                "capsize": 3,
+                "linestyle": "none",
+            }
             axes.errorbar(value, place + shift, xerr=1.645 * error, label=label, **style)
-            where = {"xytext": (0, 7 if shift < 0.0 else -17), "textcoords": "offset points", "ha": "center"}
+            where: dict[str, Any] = {
+                "xytext": (0, 7 if shift < 0.0 else -17),
+                "textcoords": "offset points",
+                "ha": "center",
+            }
             axes.annotate(f"{value:.2g}", (value, place + shift), **where)
     axes.axvline(1.0, color="#444444", linewidth=0.9, linestyle=(0, (4, 3)))
     axes.set_xscale("log")

@@ -35,7 +35,8 @@ def stopped(sums: FloatArray, squares: FloatArray, aim: Aim, error: float, rng: 
     mean = sums[drawn].cumsum(0) / n
     variance = squares[drawn].cumsum(0) / n - mean * mean
     enough = np.all(np.sqrt(variance / n) <= wanted * mean, axis=1)
-    return mean[np.argmax(enough)]
+    found: FloatArray = mean[np.argmax(enough)]
+    return found
 
 
 def main() -> None:

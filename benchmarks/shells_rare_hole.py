@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -29,6 +30,10 @@ ASKED = ((0.3, 0.9), (0.3, 0.95), (0.3, 0.99), (2.0, 0.9))
 SEED = 20_240
 
 
+def _same(drawn: list[DrawnPool], _: np.random.Generator) -> list[DrawnPool]:
+    return drawn
+
+
 def main(replications: int, overrides: list[str]) -> None:
     """Print the table."""
     settings = ["stop.min_crashes=null", "testing.shells.first_tests=null", "stop.episodes=1e6", *overrides]
@@ -45,7 +50,7 @@ def main(replications: int, overrides: list[str]) -> None:
             share[-1] = hole
             truth, one_path = float(design.p @ share), design.p[None]
             drawn = [DrawnPool(design, one_path, one_path * share)]  # the same each time, without error of its own
-            repeated = ShellCampaign(campaign, lambda _, drawn=drawn: drawn, SEED)
+            repeated = ShellCampaign(campaign, partial(_same, drawn), SEED)
             rows = [row for row in repeated.run(range(replications)) if row.result == FREE]
             rate = np.array([row.crash_rate for row in rows])
             error = rate.std(ddof=1) / truth / np.sqrt(replications)

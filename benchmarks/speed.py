@@ -106,15 +106,13 @@ def ratio(found: dict[str, list[Measurement]], wanted: Ratio) -> float | None:
     if wanted.of not in found or wanted.to not in found:
         return None
     pairs = zip(found[wanted.of], found[wanted.to], strict=True)
-    return median(getattr(a, wanted.quantity) / getattr(b, wanted.quantity) for a, b in pairs)
+    return float(median(getattr(a, wanted.quantity) / getattr(b, wanted.quantity) for a, b in pairs))
 
 
 def _verdict(value: float, least: float | None, most: float | None) -> str:
-    if least is None and most is None:
-        return ""
-    bound = f">= {least:,g}" if least is not None else f"<= {most:,g}"
-    met = value >= least if least is not None else value <= most
-    return f"asked {bound}: {'met' if met else 'MISSED'}"
+    asked = [(f">= {least:,g}", value >= least)] if least is not None else []
+    asked += [(f"<= {most:,g}", value <= most)] if most is not None else []
+    return ", ".join(f"asked {bound}: {'met' if met else 'MISSED'}" for bound, met in asked)
 
 
 def show(found: dict[str, list[Measurement]], starts: dict[str, tuple[Start, list[Start]]]) -> None:
@@ -147,12 +145,13 @@ def show(found: dict[str, list[Measurement]], starts: dict[str, tuple[Start, lis
 
 def _show_parts(found: dict[str, list[Measurement]]) -> None:
     for name, rounds in found.items():
-        if rounds[0].part_s is None:
+        parts = [one.part_s for one in rounds if one.part_s is not None]
+        if not parts:
             continue
         print(f"\n{name}: wall time in ns per cell-step, stopwatch included")
-        for part in sorted(rounds[0].part_s, key=lambda part: -rounds[0].part_s[part]):
-            share = median(one.part_s[part] / sum(one.part_s.values()) for one in rounds)
-            each = median(1e9 * one.part_s[part] / one.cell_steps for one in rounds)
+        for part in sorted(parts[0], key=parts[0].__getitem__, reverse=True):
+            share = median(part_s[part] / sum(part_s.values()) for part_s in parts)
+            each = median(1e9 * part_s[part] / one.cell_steps for part_s, one in zip(parts, rounds, strict=True))
             print(f"  {part:<32}{each:>8.0f}{share:>7.0%}")
 
 

@@ -41,7 +41,7 @@ def start_up(name: str, cache: Path) -> Start:
             return Start(first_s, time.perf_counter() - started)
 
 
-def _wait_for_first_shard(process: subprocess.Popen, out: Path, started: float) -> float | None:
+def _wait_for_first_shard(process: subprocess.Popen[bytes], out: Path, started: float) -> float | None:
     while process.poll() is None:
         if any((out / "episodes").glob("shard-*.parquet")):
             return time.perf_counter() - started
