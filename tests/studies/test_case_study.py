@@ -10,6 +10,7 @@ import pytest
 from studies.__main__ import main
 from studies.case_study import repeated, tested
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
+from studies.case_study.page import claim_rows
 from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
 from tests.stored_runs import SCENARIOS
@@ -145,6 +146,15 @@ def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
         study = load_study(SHIPPED, quick=quick)
         assert set(step_keys(study)) == set(study.steps)
     assert len(study.claims) >= 15
+
+
+def test_neighbours_with_equal_answers_share_a_row():
+    says = {"gain for α 0.5": 1.0, "gain for α 1.0": 1.0, "gain for α 1.5": 2.0, "rate for α 2.0": 2.0}
+    rest = {"paper": 11.5, "at_most": False, "tolerance": None, "within": 2.0, "verdict": "not reproduced"}
+    claims = [{"says": words, "found": exactly(value), **rest} for words, value in says.items()]
+    rows = list(claim_rows([{**claims[0], "verdict": "reproduced"}, *claims], "not reproduced"))
+    assert rows[0] == ("2–3", "gain for α 0.5, 1.0", "11.5, 11.5", "1")
+    assert [row[0] for row in rows[1:]] == ["4", "5"]
 
 
 @pytest.mark.parametrize(
