@@ -28,10 +28,14 @@ class HoldsThenIdm(IDM):
 
 
 class Speeds(Noisy):
-    """Without the noise, if none is asked for."""
+    """Without the noise, if none is asked for, and braking no harder than it is told."""
 
-    def __init__(self, noise_mps2: float = 0.0) -> None:
+    def __init__(self, noise_mps2: float = 0.0, min_acceleration_mps2: float = -4.0) -> None:
         super().__init__(noise_mps2)
+        self.hardest = min_acceleration_mps2
+
+    def step(self, seen):
+        return max(super().step(seen), self.hardest)
 
 
 class SpeedsTraci(TraciStyleController):
