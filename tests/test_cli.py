@@ -83,7 +83,6 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     "arguments",
     [
         ["run"],
-        ["run", SMOKE, "--out", "x", "--workers", "0"],
         ["nothing"],
         ["check", SMOKE, "--nothing"],
         ["estimate", "no-such-folder"],

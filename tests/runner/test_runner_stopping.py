@@ -129,9 +129,7 @@ def test_nothing_is_accepted_given_what_the_vehicle_does_not_do(campaign, run_he
 @pytest.mark.parametrize(
     ("changes", "where"),
     [
-        (("testing.method=forced", "accept.crash_rate_below=1e-7"), "accept"),
         (("accept={crash_rate_below: 1e-7, statement: library}",), "'statement' belongs under testing.shells"),
-        (("accept.crash_rate_below=0",), "accept.crash_rate_below"),
         (("testing.shells.statement=nobody", "accept.crash_rate_below=1e-7"), "nobody"),
         (("accept.times_reference={driver: r157-c}",), "Did you mean 'r157-cc'"),
         (("accept={crash_rate_below: 1e-7, times_reference: {driver: r157-cc}}",), "both"),

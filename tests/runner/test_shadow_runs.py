@@ -57,9 +57,7 @@ NOISY = "parameters: {noise_mps2: 0.2}"
 
 
 @pytest.mark.parametrize("method", [SHELLS, FORCED], ids=["shells", "forced"])
-def test_a_vehicle_with_noise_of_its_own_is_refused_and_one_with_the_given_noise_is_not(
-    method, campaign, run_here, tmp_path
-):
+def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(method, campaign, run_here, tmp_path):
     asked = (*method, SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
         run_here(campaign(*asked, f"av={of('FreshNoise', NOISY)}"), tmp_path / "fresh")

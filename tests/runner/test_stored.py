@@ -125,16 +125,26 @@ def test_stored_rows_and_traces_come_out_again(name, stored_run):
             assert all(column_hash(result.trace[name]) == column_hash(stored[name]) for name in stored.column_names)
 
 
+def with_value(table: pa.Table, name: str, row: int, value) -> pa.Table:
+    """The table with another value in a row."""
+    at, values = table.column_names.index(name), table.column(name).to_pylist()
+    values[row] = value(values[row])
+    type_of = pa.string() if name == "outcome" else table.schema.field(at).type
+    column = pa.array(values, type_of)
+    return table.set_column(at, name, column.dictionary_encode() if name == "outcome" else column)
+
+
+def one_bit(value: float) -> float:
+    return float(np.nextafter(value, np.inf))
+
+
 @pytest.mark.parametrize(("table", "column"), [("traces", "x_m"), ("traces", "v_mps"), ("episodes", "log_weight")])
 def test_a_record_that_was_tampered_with_is_noticed(table, column, twin_run, tmp_path, capsys):
     """By one unit in the last place."""
     folder = of_before(copy_of(twin_run, tmp_path / "run"))
     path = shard_files(folder, table)[1]
     rows = pq.read_table(path, partitioning=None)
-    values = rows[column].to_numpy().copy()
-    values[30] = np.nextafter(values[30], -1e9)
-    index = rows.column_names.index(column)
-    pq.write_table(rows.set_column(index, rows.schema.field(column), [values]), path)
+    pq.write_table(with_value(rows, column, 30, one_bit), path)
     episode = rows["episode"][30].as_py()
     assert replay_episode(folder, episode).bit_equal is False
     assert main(["replay", str(folder), str(episode)]) == 3
@@ -190,17 +200,7 @@ def test_every_episode_of_a_built_in_av_is_retraced(name, stored_run):
 
 def changed(table: pa.Table, name: str, value) -> pa.Table:
     """The table with another value in the first row that has a crash."""
-    row = table.column("outcome").to_pylist().index("crash")
-    values = table.column(name).to_pylist()
-    values[row] = value(values[row])
-    at = table.column_names.index(name)
-    field = table.schema.field(at)
-    column = pa.array(values, pa.string()).dictionary_encode() if name == "outcome" else pa.array(values, field.type)
-    return table.set_column(at, name, column)
-
-
-def one_bit(value: float) -> float:
-    return float(np.nextafter(value, np.inf))
+    return with_value(table, name, table.column("outcome").to_pylist().index("crash"), value)
 
 
 @pytest.fixture

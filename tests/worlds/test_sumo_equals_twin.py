@@ -171,9 +171,6 @@ JOBS = {
     **METHODS,
     "vanilla": Job(("seed=3",), 250, 1, vanilla=True),
     "vanilla_bv_into_lv": Job((NDE,), 16, 1, vanilla=True, states=HOPELESS),
-    # Fewer episodes than cells: the other cells stay parked, where nothing may be compared with where they are not.
-    "five_in_64_cells": Job((FORCED,), 5, 64),
-    "five_in_64_cells_without_shim": Job((FORCED,), 5, 64, shim=False),
     "late_under_step_mixture": Job((STEP, f"av={AVS['late']}"), 60, 16),
     **{name: Job((FORCED, f"av={av}"), EPISODES, 32) for name, av in AVS.items()},
     # Cut-ins that take time; before some that take long the AV has passed BV.

@@ -84,9 +84,7 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize(("command", "options"), [(command, options) for command, *options in COMMANDS])
-def test_every_command_that_opens_sumo_names_what_is_missing(
-    command, options, bare_machine, tmp_path, monkeypatch, capsys
-):
+def test_commands_that_open_sumo_name_what_is_missing(command, options, bare_machine, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main([command, SMOKE, *options]) == EXIT_BAD_INPUT
     said = capsys.readouterr()
@@ -132,9 +130,8 @@ USERS = [
 
 
 @pytest.mark.parametrize(("manager", "user", "terminal", "sudo"), USERS)
-def test_root_installs_and_others_by_sudo_which_asks_only_at_a_terminal(
-    manager, user, terminal, sudo, bare_machine, programs, capsys
-):
+def test_root_installs_and_others_by_sudo(manager, user, terminal, sudo, bare_machine, programs, capsys):
+    """Which asks only at a terminal."""
     programs(manager)
     programs("sudo", f'while [ "$1" != {manager} ]; do shift; done; exec "$@"')
     programs.user(user, terminal=terminal)
