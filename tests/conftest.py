@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,15 @@ def stored_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
         return out
 
     return of
+
+
+@pytest.fixture
+def open_world() -> Iterator[Callable]:
+    """Make SUMO worlds, of which a process may have one, that are closed after the test whatever happens in it."""
+    from harness.worlds.sumo import SumoWorld
+
+    with ExitStack() as worlds:
+        yield lambda *arguments, **options: worlds.enter_context(closing(SumoWorld(*arguments, **options)))
 
 
 @pytest.fixture(scope="session")

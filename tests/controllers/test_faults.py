@@ -11,9 +11,9 @@ from harness.cli import main
 from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.runner.workers import LocalWorkers
-from tests.controllers.driving import drive, forced
 from tests.controllers.misbehaving import ChangesItsParameters
 from tests.stored_runs import sets, stored_table
+from tests.worlds.running import drive, forced
 
 SMALL = """\
 name: faults

@@ -13,7 +13,7 @@ from harness.controllers.hosts import BatchHost, Guard
 from harness.controllers.protocol import Observation
 from harness.errors import CampaignError
 from harness.vocabulary import PASSED
-from tests.controllers.driving import LATERAL, drive, fmu_av, forced, motion
+from tests.worlds.running import LATERAL, drive, fmu_av, forced, motion
 
 FORMS = {
     "per vehicle": "av={controller: 'examples.idm:IDM'}",

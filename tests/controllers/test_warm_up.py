@@ -16,8 +16,8 @@ from harness.campaign.files import load_campaign
 from harness.controllers.protocol import BatchObservation
 from harness.controllers.traci_style import TraciStyleController
 from harness.worlds.sumo import SumoWorld
-from tests.controllers.driving import LATERAL, drive, motion
 from tests.stored_runs import ROOT
+from tests.worlds.running import LATERAL, drive, motion
 
 HERE = "tests.controllers.test_warm_up"
 SHOWN = 300

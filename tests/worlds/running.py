@@ -1,4 +1,4 @@
-"""Campaigns and episodes in worlds of SUMO, and the same episodes with the built-in IDM in the twin."""
+"""Campaigns and episodes in worlds of SUMO and in the twin: AVs that others drive, and controllers plugged in."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from harness.campaign.vehicle import AutomatedVehicle, Limits, TraciProcess
 from harness.episode.loop import Shard
 from harness.resolved import resolve
 from harness.sampling import prepare
-from harness.worlds import build_world
+from harness.worlds import World, build_world
 from harness.worlds.twin import TwinWorld
 from tests.stored_runs import ROOT
 
@@ -61,3 +61,34 @@ def run_idm(first: int, n: int) -> Shard:
 
 def bits(shard: Shard, row: int) -> bytes:
     return shard.results.episode[row].tobytes() + shard.traces[row].tobytes()
+
+
+# -- controllers plugged in, in the twin --
+
+
+LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
+
+
+def forced(*overrides: str) -> Campaign:
+    """Forced cut-ins."""
+    return smoke("testing={method: forced}", "world.engine=twin", *overrides)
+
+
+def drive(*overrides: str, cells: int = 32, first: int = 0, n: int = 150, world: World | None = None) -> Shard:
+    """Run episodes from the first on, all of them traced, in the twin or in another world."""
+    ready = prepare(resolve(forced(*overrides)))
+    with closing(ready.loop(world or TwinWorld(cells), traces="all")) as loop:
+        return loop.run(first, ready.states(first, n))
+
+
+def motion(*overrides: str, **options) -> tuple[bytes, list[bytes]]:
+    """Every bit of episodes that do not fail, and of their traces."""
+    shard = drive(*overrides, **options)
+    assert shard.failures == {}
+    return shard.results.episode.tobytes(), [shard.traces[row].tobytes() for row in sorted(shard.traces)]
+
+
+def fmu_av(file: str | Path, more: str = "") -> str:
+    """YAML of the FMU of the examples, with further keys."""
+    inputs = "{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap}"
+    return f"{{fmu: {{file: '{file}', inputs: {inputs}, output: a}}{more}}}"

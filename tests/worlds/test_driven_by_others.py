@@ -20,11 +20,22 @@ from harness.vocabulary import AV, BV, CRASH, FAILED, LV
 from harness.worlds import build_world, sumo_driven
 from harness.worlds.program import TraciWorld, own_addresses, require_neighbour
 from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld, recyclable
-from tests.controllers.driving import fmu_av
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.stored_runs import manifest
 from tests.worlds.misbehaving_client import FAULT_STEP
-from tests.worlds.running import EXAMPLE, MISBEHAVING, bits, campaign, program, run, run_idm, run_in, smoke, sumo_av
+from tests.worlds.running import (
+    EXAMPLE,
+    MISBEHAVING,
+    bits,
+    campaign,
+    fmu_av,
+    program,
+    run,
+    run_idm,
+    run_in,
+    smoke,
+    sumo_av,
+)
 
 
 def in_one_simulation(av, ranges, *, cells=4, **options):

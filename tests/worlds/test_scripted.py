@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from harness.campaign.vehicle import AutomatedVehicle
 from harness.compiled import unboxed
 from harness.episode.cells import PrescribedTraffic, drawn_traffic
-from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
+from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.episode.path import empty_trajectory
+from harness.importance.functions import build_importance
 from harness.pool.replay import Retracing, stored_paths
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
@@ -19,7 +19,7 @@ from harness.vehicles.library import load_library
 from harness.vocabulary import BV_LV_CONTACT, CRASH, CUT_IN, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
 from studies.alarm import replay_surrogates
-from tests.episode.test_lateral import BESIDE, NEVER, beside, policy_of
+from tests.episode.test_lateral import BESIDE, beside
 from tests.worlds.running import smoke
 
 KEEP_SPEED, BRAKE = 20, 0
@@ -44,9 +44,14 @@ def cut_in_at_once() -> PrescribedTraffic:
     return drawn_traffic()._replace(lv=lv, bv=bv, cut_step=zeros, stratum=zeros, log_weight=np.zeros(n), lead=zeros)
 
 
+def loop_in(world, model: str) -> EpisodeLoop:
+    resolved = resolve(one := smoke("testing.method=shells", f"av={{model: {model}}}"))
+    policy = Drawing(1, resolved.environment, build_importance(one, None), resolved.av)
+    return EpisodeLoop(world, policy, RecordPolicy(0, "all", 0.0))
+
+
 def run(world) -> Shard:
-    loop = EpisodeLoop(world, policy_of(AutomatedVehicle(), 0.0), RecordPolicy(0, "all", 0.0))
-    return loop.run(0, STATES, cut_in_at_once())
+    return loop_in(world, "idm").run(0, STATES, cut_in_at_once())
 
 
 def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes():
@@ -80,8 +85,7 @@ def test_sumo_flags_vehicles_beside_each_other_by_the_rule_of_the_first_overlap(
     states, traffic = beside([r2_m for r2_m, _ in BESIDE])
     episode = {}
     for name, world in (("twin", TwinWorld(4)), ("sumo", open_world(4))):
-        loop = EpisodeLoop(world, policy_of(NEVER, 0.0), RecordPolicy(0, "none", 0.0))
-        episode[name] = loop.run(0, states, traffic).results.episode
+        episode[name] = loop_in(world, "constant").run(0, states, traffic).results.episode
     assert episode["sumo"].tobytes() == episode["twin"].tobytes()
     for row, (_, outcome) in zip(episode["sumo"], BESIDE, strict=True):
         assert (row["n_steps"] > 1) if outcome is None else (row["outcome"], row["n_steps"]) == (outcome, 1)
