@@ -39,6 +39,11 @@ LATERAL = ("lead_steps", "onset_step", "onset_r2_m", "onset_ttc_s", "overlap_ttc
 )
 @click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
+@click.option(
+    "--environment",
+    metavar="NAME|FILE",
+    help="Answer for other traffic from the same tests (testing.method shells): a shipped environment, or a file.",
+)
 @verbose_option
 @json_option
 @click.pass_context
@@ -49,6 +54,7 @@ def estimate(
     estimators: Sequence[EstimatorName],
     confidence: float | None,
     write: bool,
+    environment: str | None,
     verbose: bool,
     as_json: bool,
 ) -> None:
@@ -56,10 +62,23 @@ def estimate(
 
     Nothing is simulated in SUMO. Estimators that are asked for, and with -v all, are shown in a table; one that the
     records do not allow with the reason. The exit code is 2 if they allow none of those asked for.
-    """
-    from harness.runner.stored import estimate_run  # noqa: PLC0415 - keeps --help fast
 
-    content = estimate_run(folder, estimators=estimators or None, confidence=confidence)
+    With --environment the shells' probabilities in other traffic are found in the twin (15 s), and crash shares within
+    shells are taken to be the same there. Traffic in which they cannot be is refused.
+    """
+    if environment is not None:
+        if write or estimators:
+            raise click.UsageError("--environment goes with neither --write nor -e: the folder keeps its own answer.")
+        from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+
+        with shown_progress() as bar:
+            from harness.runner.other_traffic import estimate_in_other_traffic  # noqa: PLC0415 - keeps --help fast
+
+            content = estimate_in_other_traffic(folder, environment, confidence=confidence, progress=bar)
+    else:
+        from harness.runner.stored import estimate_run  # noqa: PLC0415 - keeps --help fast
+
+        content = estimate_run(folder, estimators=estimators or None, confidence=confidence)
     if write:
         from harness.records.folder import write_sealed  # noqa: PLC0415 - keeps --help fast
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -63,23 +64,30 @@ def pool_path(key: str) -> Path:
     return cache_root() / "pools" / f"{key}.parquet"
 
 
-def campaign_pool(resolved: Resolved, progress: Progress | None = None) -> Pool:
+def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: Sequence[str] = ()) -> Pool:
     """The pool of a campaign's environment and library, from the cache or built and cached.
+
+    Surrogates are in the ``order`` of their rates, or of those in other traffic.
 
     Raises `RunFolderError`: the pool could not be kept.
     """
-    key = campaign_pool_key(resolved)
-    if (cached := cached_pool(resolved)) is not None:
+    key = _key(resolved, order)
+    if (cached := cached_pool(resolved, order)) is not None:
         return cached
     require_place(pool_path(key).parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
-    pool = build_pool(resolved.environment, resolved.library, resolved.campaign.pool, key, progress)
+    pool = build_pool(resolved.environment, resolved.library, resolved.campaign.pool, key, progress, order)
     write_pool(pool_path(key), pool)
     return pool
 
 
-def cached_pool(resolved: Resolved) -> Pool | None:
-    """The pool of a campaign; None if none has been built on this machine, or its file is damaged or another's."""
+def _key(resolved: Resolved, order: Sequence[str]) -> str:
     key = campaign_pool_key(resolved)
+    return hashlib.sha256(json.dumps([key, *order]).encode()).hexdigest()[:24] if order else key
+
+
+def cached_pool(resolved: Resolved, order: Sequence[str] = ()) -> Pool | None:
+    """The pool of a campaign; None if none has been built on this machine, or its file is damaged or another's."""
+    key = _key(resolved, order)
     try:
         pool = read_pool(pool_path(key)) if pool_path(key).is_file() else None
     except RunFolderError:
@@ -89,15 +97,21 @@ def cached_pool(resolved: Resolved) -> Pool | None:
 
 
 def build_pool(
-    environment: Environment, library: Library, settings: PoolSettings, key: str, progress: Progress | None = None
+    environment: Environment,
+    library: Library,
+    settings: PoolSettings,
+    key: str,
+    progress: Progress | None = None,
+    order: Sequence[str] = (),
 ) -> Pool:
-    """Build a pool in the twin, which will carry the content hash ``key``."""
+    """Build a pool in the twin, which will carry the content hash ``key``; for ``order`` see `campaign_pool`."""
     progress = progress or Progress()
     aim = take_aim(environment, library, settings, progress)
     n = planned_number(aim, settings)
     progress.stage("pool of cut-ins", n)
     paths = aim.enumerator.run(PILOT_PATHS, n, progress)
-    return pool_of(paths, settings.seed ^ POOL_SEED, None, environment, library, settings, key)
+    places = np.array([list(library.surrogates).index(name) for name in order], np.int64) if order else None
+    return pool_of(paths, settings.seed ^ POOL_SEED, places, environment, library, settings, key)
 
 
 @dataclass(frozen=True, eq=False)

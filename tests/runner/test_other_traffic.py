@@ -1,0 +1,66 @@
+"""Stored tests answered for other traffic: equal where it is the same, in proportion where rates are, else refused."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from harness.errors import CampaignError
+from harness.runner.other_traffic import estimate_in_other_traffic
+from harness.traffic.parameters import SHIPPED_FOLDER
+from tests.stored_runs import estimates
+
+SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
+
+
+def environment(folder: Path, **values: float) -> str:
+    """The shipped environment with other numbers."""
+    text = SHIPPED
+    for name, value in values.items():
+        text, n = re.subn(rf"(\n  {name}: {{value: )[-0-9.]+", rf"\g<1>{value}", text)
+        assert n == 1
+    (folder / "mine.yaml").write_text(text)
+    return str(folder / "mine.yaml")
+
+
+def answer(folder: Path, where: str) -> dict:
+    return estimate_in_other_traffic(folder, where)["estimates"]["shells"]
+
+
+def test_the_same_traffic_under_another_name_gives_the_same_answer(stored_run, tmp_path):
+    folder = stored_run("shells-twin")
+    told, stored = answer(folder, environment(tmp_path)), estimates(folder)["estimates"]["shells"]
+    for key in ("crash_rate", "ci_low", "ci_high", "n_crashes"):
+        assert told[key] == pytest.approx(stored[key], rel=1e-9)
+    assert told["details"]["references"][0]["ratio"] == pytest.approx(stored["details"]["references"][0]["ratio"])
+
+
+def test_the_rate_is_proportional_to_the_share_that_does_not_look(stored_run, tmp_path):
+    """And the ratio to a driver in the same traffic does not move. The pool's error is 5 %, mostly of equal paths."""
+    folder = stored_run("shells-twin")
+    told, stored = answer(folder, environment(tmp_path, ignore_share=0.02)), estimates(folder)["estimates"]["shells"]
+    assert told["crash_rate"] == pytest.approx(2.0 * stored["crash_rate"], rel=0.05)
+    ratios = [each["details"]["references"][0]["ratio"] for each in (told, stored)]
+    assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
+    assert "as there" in estimate_in_other_traffic(folder, str(tmp_path / "mine.yaml"))["answer"]["scope"]
+
+
+def test_cut_ins_that_no_test_stands_for_are_refused(stored_run, tmp_path):
+    with pytest.raises(CampaignError, match="unlike any that was tested"):
+        answer(stored_run("shells-twin"), environment(tmp_path, r2dot_min_mps=-16.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "where", "found"),
+    [
+        ("shells-twin", "ndd-overtaking-1-lateral", "in which cut-ins take another time"),
+        ("forced-twin", "ndd-overtaking-1", "tests by forced"),
+        ("shells-acting-twin", "ndd-overtaking-1", "acts before the cut-in"),
+        ("shells-twin", "nowhere", "which is not shipped"),
+    ],
+)
+def test_what_cannot_be_answered_is_refused(stored_run, name, where, found):
+    with pytest.raises(CampaignError, match=found):
+        answer(stored_run(name), where)
