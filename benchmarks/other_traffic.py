@@ -1,0 +1,84 @@
+"""How far crash shares within shells stay the same in other traffic, by drivers whose rates are known in both.
+
+    python -m benchmarks.other_traffic                        # eleven environments, six drivers: 8 minutes
+    python -m benchmarks.other_traffic --relative-error 0.03  # rougher, in two
+
+Each driver is a reference driver of the library, of which no shell is made. Its rate in the other traffic is known by
+the pool that is built there, and predicted as `harness estimate --environment` does: new probabilities, old shares.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from harness.campaign.files import load_campaign
+from harness.pool.build import campaign_pool
+from harness.pool.shells import design_shells
+from harness.resolved import Resolved, resolve
+from harness.runner.other_traffic import Moved
+from harness.traffic.parameters import SHIPPED_FOLDER
+from harness.vehicles.library import SHIPPED_FOLDER as LIBRARIES
+
+IDM = {"model": "idm"}
+DRIVERS = {
+    "idm": IDM,
+    "late-600ms": {**IDM, "reaction": {"delay_s": 0.6}},
+    "brakes-6": {**IDM, "parameters": {"min_acceleration_mps2": -6.0}},
+    "fvdm-6": {"model": "fvdm", "parameters": {"min_acceleration_mps2": -6.0}},
+}
+TRAFFIC = {
+    "ignore_share 0.05": {"ignore_share": 0.05},
+    "accept_ttc_s 5.1": {"accept_ttc_s": 5.1},
+    "ignore_share 0.1, accept_ttc_s 3": {"ignore_share": 0.1, "accept_ttc_s": 3.0},
+    "R1 by a quarter wider": {"r1_log_mean": 3.5},
+    "R1dot 1.2 times as wide": {"r1dot_log_scale": 0.17},
+    "hazard: rate 1.0": {"rate": 1.0},
+    "hazard: log_gap -1.5": {"log_gap": -1.5},
+    "hard braking 6 times as often": {"brake_logit": -3.0},
+    "noise of car following": {"log_scale_rate": 0.448},
+    "closing at 6 to 9 m/s": {"r2dot_min_mps": -9.0, "r2dot_max_mps": -6.0},
+    "v_BV 4 m/s slower": {"v_location_mps": 30.0},
+}
+ENVELOPE_MPS2 = 2.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--relative-error", type=float, default=0.01, help="of the pools (default: %(default)s)")
+    error = parser.parse_args().relative_error
+    shipped = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text(encoding="utf-8")
+    with tempfile.TemporaryDirectory() as name:
+        library, environment = Path(name, "library.yaml"), Path(name, "environment.yaml")
+        content = yaml.safe_load((LIBRARIES / "ladder-2.yaml").read_text(encoding="utf-8"))
+        content["references"] |= DRIVERS
+        library.write_text(yaml.safe_dump(content), encoding="utf-8")
+
+        def resolved(*more: str) -> Resolved:
+            changes = f"pool={{library: {library}, relative_error: {error}}}", *more
+            return resolve(load_campaign("scenarios/smoke.yaml", changes))
+
+        here = campaign_pool(resolved())
+        tested = design_shells(here, ENVELOPE_MPS2)
+        print(f"{'traffic':34}" + "".join(f"{each.name:>12}" for each in tested.references), flush=True)
+        for words, values in TRAFFIC.items():
+            text = shipped
+            for key, value in values.items():
+                text = re.sub(rf"(\n  {key}: {{value: )[-0-9.]+", rf"\g<1>{value}", text, count=1)
+            environment.write_text(text, encoding="utf-8")
+            pool = campaign_pool(resolved(f"environment.parameters={environment}"), order=here.names)
+            there = Moved.of(tested, design_shells(pool, ENVELOPE_MPS2), words).there
+            off = []
+            for r, rate in enumerate(there.reference_rate):
+                shares = ((tested.cell_p * tested.crashes_too(r)) @ tested.joined) / np.where(tested.p > 0, tested.p, 1)
+                off.append(float(there.p @ shares) / rate - 1.0)
+            print(f"{words:34}" + "".join(f"{each:12.1%}" for each in off), flush=True)
+
+
+if __name__ == "__main__":
+    main()
