@@ -36,7 +36,7 @@ MOST_BEYOND = 0.01
 """Share of the probability in a shell, counted as it crashes, that may lie where no cut-in of the old pool does."""
 SAME_POOL = 0.05
 """How far a pool that another version has built may differ."""
-MOST_OFF = 0.25
+MOST_OFF = 0.1
 """How far the rate of a reference driver may come out wrong."""
 _OPTION = "--environment"
 
