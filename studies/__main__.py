@@ -126,9 +126,9 @@ def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, q
     with (bar := shown_progress(quiet=quiet)):
         done = run_study(asked, folder, workers=workers, progress=bar, told=told)
     if as_json:
-        print_json({"page": str(done.page), "claims": done.claims, "seconds": done.seconds})
+        print_json(done)
     else:
-        click.echo(str(done.page))
+        click.echo(done["page"])
 
 
 _SHARE = click.FloatRange(0, 1, min_open=True, max_open=True)

@@ -208,7 +208,7 @@ def plain_rhw(
     """
     grid, z = procedure.grid(n_tests), procedure.z
     # A unit that makes equal weights 1, whose sums are exact; the smallest squares would underflow besides.
-    worst = weights / np.max(weights, initial=0.0) if len(weights) else weights
+    worst = weights / np.max(weights, initial=0.0)
     y = np.where(failed, 0.0, worst) if np.any(failed) else worst
     rhw = np.empty((procedure.n_shuffles, len(grid)))
     for shuffle in range(procedure.n_shuffles):
@@ -295,8 +295,7 @@ def required_tests_of_runs(
         plain: RnotEstimator = "nde" if block.drawn.method == "nde" else "nade"
         grid, n_crashes = procedure.grid(tests.n), int(np.count_nonzero(~tests.failed))
         for name in dict.fromkeys(estimators or [plain]):
-            row = {"run": str(folder), "estimator": name, "n_episodes": tests.n, "n_crashes": n_crashes}
-            rows.append(row)
+            rows.append(row := {"run": str(folder), "estimator": name, "n_episodes": tests.n, "n_crashes": n_crashes})
             if reason := block.refusal(name):
                 row |= {"mean": None, "reason": reason}
                 continue

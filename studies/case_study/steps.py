@@ -12,7 +12,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from harness.campaign.files import load_campaign
 from harness.compiled import WORLD_SOURCES, source_hash
@@ -42,14 +42,6 @@ _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
 }
 
 
-class StudyResult(NamedTuple):
-    """Outcome of a study: its page, its claims with verdicts, and seconds of each step, None if it was there before."""
-
-    page: Path
-    claims: list[dict[str, Any]]
-    seconds: dict[str, float | None]
-
-
 def run_study(
     study: Study,
     folder: Path,
@@ -57,11 +49,12 @@ def run_study(
     workers: int | None = None,
     progress: Progress | None = None,
     told: Callable[[str, float | None], None] = lambda _name, _seconds: None,
-) -> StudyResult:
+) -> dict[str, Any]:
     """Make what is missing, and the page, in a folder that is new, empty, or that of an earlier study.
 
     Worker processes, one per core by default, change no result. ``told`` receives each step's name and seconds when it
-    is finished, None for one that was there before.
+    is finished, None for one that was there before. Returned are the place of the page, all claims with verdicts, and
+    the seconds.
 
     Raises `HarnessError`: a file that a step names is wrong, which shows before any step is made; or the folder cannot
     be used.
@@ -81,7 +74,8 @@ def run_study(
             result = read_as(dict[str, Any], place / RESULT, mend="Delete the folder of this step; it is made again.")
             made[name] = Made(place, result)
             told(name, seconds[name])
-        return StudyResult(*write_page(study, folder, made), seconds)
+        page, claims = write_page(study, folder, made)
+        return {"page": str(page), "claims": claims, "seconds": seconds}
 
 
 def step_keys(study: Study) -> dict[str, str]:

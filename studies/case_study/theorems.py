@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from harness.estimators.scv import MixtureCv, Scv
-from harness.vocabulary import FloatArray
+from harness.vocabulary import BoolArray, FloatArray
 from studies.case_study.figures import exactly
 from studies.case_study.study import Context, Theorems
 from studies.chains.chain import DECISIVE, Chain, Episodes, enumerate_episodes, overtaking
@@ -64,7 +64,8 @@ def _chain(chain: Chain) -> dict[str, Any]:
     y = episodes.crash / episodes.mixture
     mean = float(sampled @ y)
     plain = float(sampled @ (y - mean) ** 2)
-    columns = np.column_stack(list(_columns(episodes)))
+    products = [within * each for within, ratios in _products(episodes) for each in ratios]
+    columns = np.column_stack(products) / episodes.mixture[:, None]  # of every stratum, 0 outside of it
     columns -= sampled @ columns  # θ, exactly
     root = np.sqrt(sampled)[:, None]
     beta = np.linalg.lstsq(root * columns, root[:, 0] * (y - mean))[0]
@@ -81,33 +82,22 @@ def _chain(chain: Chain) -> dict[str, Any]:
     }
 
 
-def _columns(episodes: Episodes) -> Iterator[FloatArray]:
-    """Columns q_{j1…jl}/q_alpha of every stratum l ≥ 1, zero outside of it."""
-    for level in range(1, int(episodes.n_control_steps.max()) + 1):
-        within = episodes.n_control_steps == level
-        for chosen in product(range(episodes.ratios.shape[2]), repeat=level):
-            yield np.where(within, _ratio(episodes, chosen) / episodes.mixture, 0.0)
-
-
-def _ratio(episodes: Episodes, chosen: tuple[int, ...]) -> FloatArray:
-    """q_{j1…jl}/p, shape (k,)."""
-    return np.asarray(np.prod([episodes.ratios[:, t, j] for t, j in enumerate(chosen)], axis=0))
+def _products(episodes: Episodes) -> Iterator[tuple[BoolArray, FloatArray]]:
+    """By number of steps l ≥ 1, which episodes have so many (k,), and q_{j1…jl}/p of all choices (J^l, k)."""
+    steps = [episodes.ratios[:, t].T for t in range(episodes.ratios.shape[1])]
+    for level in range(1, len(steps) + 1):
+        chosen = (np.prod(one, axis=0) for one in product(*steps[:level]))
+        yield episodes.n_control_steps == level, np.array(list(chosen))
 
 
 def bound(episodes: Episodes) -> float:
     """Right-hand side of Theorem 2 with equal weights."""
-    levels, n_surrogates = episodes.n_control_steps, episodes.ratios.shape[2]
-    uncontrolled = episodes.crash * (levels == 0)
+    uncontrolled = episodes.crash * (episodes.n_control_steps == 0)
     mean = float(episodes.p @ uncontrolled)
     total = float(episodes.p @ (uncontrolled - mean) ** 2)
-    for level in range(1, int(levels.max()) + 1):
-        within, inverse = levels == level, float(n_surrogates) ** level
-        p, crash = episodes.p[within], episodes.crash[within]
-        mu = float(p @ crash)
-        terms = []
-        for chosen in product(range(n_surrogates), repeat=level):
-            ratio = _ratio(episodes, chosen)[within]
-            variance = float((p * ratio) @ (crash / ratio - mu) ** 2)
-            terms.append(variance * inverse + 3.0 * (mu * inverse) ** 2)
-        total += min(terms)
-    return total * (int(levels.max()) + 1)
+    for within, ratios in _products(episodes):
+        p, crash, ratio = episodes.p[within], episodes.crash[within], ratios[:, within]
+        mu, inverse = float(p @ crash), float(len(ratios))  # 1/α of each choice
+        variances = np.sum(p * ratio * (crash / ratio - mu) ** 2, axis=1)
+        total += float(variances.min()) * inverse + 3.0 * (mu * inverse) ** 2
+    return total * (int(episodes.n_control_steps.max()) + 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -206,42 +206,34 @@ P_BRAKE = 0.05
 NOISE = 0.02
 
 
-def overtaking(name: str, *, level: float, **settings: Any) -> Chain:
+def overtaking(
+    name: str, *, level: float, skill: float, surrogates: list[float], brake: float = P_BRAKE, **settings: Any
+) -> Chain:
     """Chain of a vehicle with a ``skill`` in (0, 1), tested with ``surrogates`` of other skills.
 
     A skilled vehicle leaves danger fast. ``level`` is the probability of a cut-in per step at the closest approach.
     """
-    hazard = level * np.array([0.0, 1.0, 0.9, 0.7, 0.4, 0.2])
-    approach = _approach(closer=0.5, wait=0.35, back=0.15)
-    return _chain(name, _skilled, start=[0.2, 0.3, 0.5], approach=approach, hazard=hazard, **settings)
+    tables: dict[str, Any] = {
+        "start": np.array([0.0, 0.0, 0.0, 0.2, 0.3, 0.5]),
+        "hazard": level * np.array([0.0, 1.0, 0.9, 0.7, 0.4, 0.2]),
+        "approach": _approach(closer=0.5, wait=0.35, back=0.15),
+        "exposure": np.tile([1.0 - brake, brake], (N_DANGER, 1)),
+        "response": _skilled(skill),
+        "surrogate_responses": np.stack(list(map(_skilled, surrogates))),
+    }
+    return Chain(name=name, entry=_entry(), **tables | settings)
 
 
-def decisive(name: str, *, level: float, **settings: Any) -> Chain:
+def decisive(name: str, *, level: float, skill: float, surrogates: list[float], **settings: Any) -> Chain:
     """Chain in which maneuvers decide nearly everything: little noise, hard braking after a certain approach."""
-    hazard = level * np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])
-    approach = _approach(closer=0.9, wait=0.1, back=0.0)
-    return _chain(name, _decisive, start=[1.0, 0.0, 0.0], approach=approach, hazard=hazard, **settings)
-
-
-def _chain(
-    name: str,
-    response: Callable[[float], FloatArray],
-    *,
-    skill: float,
-    surrogates: list[float],
-    start: list[float],
-    brake: float = P_BRAKE,
-    **tables: Any,
-) -> Chain:
-    return Chain(
-        name=name,
-        start=np.array([0.0, 0.0, 0.0, *start]),
-        entry=_entry(),
-        exposure=np.tile([1.0 - brake, brake], (N_DANGER, 1)),
-        response=response(skill),
-        surrogate_responses=np.stack([response(s) for s in surrogates]),
-        **tables,
-    )
+    tables: dict[str, Any] = {
+        "start": np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
+        "hazard": level * np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]),
+        "approach": _approach(closer=0.9, wait=0.1, back=0.0),
+        "response": _decisive(skill),
+        "surrogate_responses": np.stack(list(map(_decisive, surrogates))),
+    }
+    return overtaking(name, level=level, skill=skill, surrogates=surrogates, **tables | settings)
 
 
 def _approach(closer: float, wait: float, back: float) -> FloatArray:
