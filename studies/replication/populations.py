@@ -16,8 +16,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,8 +51,7 @@ Mixed = dict[int, float]
 """A vehicle as drivers of an enumeration: the share of episodes in which it is each."""
 
 
-@dataclass(frozen=True, eq=False)
-class SuperPopulation:
+class SuperPopulation(NamedTuple):
     """Cut-ins of n paths on which at least one driver crashes.
 
     ``cut_in`` (n,) is the weighted probability of a cut-in, by path; ``path`` and ``mass`` (m,) are the path of each
@@ -154,8 +154,7 @@ def enumerate_paths(
 
 def joined(parts: Sequence[SuperPopulation]) -> SuperPopulation:
     """All in one; each part knows the numbers that its paths have in the whole."""
-    columns = (field.name for field in fields(SuperPopulation))
-    return SuperPopulation(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
+    return SuperPopulation(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 LARGEST_ERROR = 0.005
