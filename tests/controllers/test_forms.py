@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-import math
-
 import numpy as np
 import pytest
 
 from examples.idm import IDM
 from harness.controllers.hosts import BatchHost, Guard
-from harness.controllers.protocol import Observation
 from harness.errors import CampaignError
 from harness.vocabulary import PASSED
 from tests.worlds.running import LATERAL, drive, fmu_av, forced, motion
@@ -45,55 +41,14 @@ def test_an_fmu_gives_the_same_motion_and_gets_its_start_values_in_every_episode
     assert braking[0] == -1.5 > braking[1]
 
 
-# -- what is seen of a BV that comes over --
-
-
-HERE = "tests.controllers.test_forms"
-SEEN: list[Observation] = []
-"""What `Notes` has seen: of this module as the campaign imports it, which is another one than pytest's."""
-
-
-def episodes(*overrides: str) -> np.ndarray:
-    shard = drive(*overrides, n=400)
-    assert shard.failures == {}
-    return shard.results.episode
-
-
-class Notes(IDM):
-    """Keeps its speed and writes down what it sees."""
-
-    def step(self, seen):
-        SEEN.append(seen)
-        return 0.0
-
-
-@pytest.fixture(scope="module")
-def built_in():
-    return episodes(LATERAL)
-
-
-def test_a_controller_that_sees_it_is_the_built_in_model_to_the_last_bit(built_in):
-    yields = episodes(LATERAL, "av={controller: 'examples.sees_lateral:Yields'}")
-    assert yields.tobytes() == built_in.tobytes()
-
-
-def test_one_that_waits_for_the_overlap_is_another_vehicle(built_in):
-    """The sibling that must fail; it is the built-in model that is blind until then."""
-    waits = episodes(LATERAL, "av={controller: 'examples.sees_lateral:Yields', parameters: {perceives_m: 2.0}}")
-    assert waits.tobytes() != built_in.tobytes()
-    blind = episodes(LATERAL, "av.reaction.perceives_lateral_m=2.0")
-    assert waits.tobytes() == blind.tobytes()
-
-
-@pytest.mark.parametrize("lead_s", [0.0, 1.0])
-def test_what_is_seen_of_a_lead(lead_s):
-    SEEN = importlib.import_module(HERE).SEEN  # noqa: N806 - the other one
-    SEEN.clear()
-    episodes(f"environment.cut_in_lead_s={lead_s}", f"av={{controller: '{HERE}:Notes', warm_up_s: 0}}", "world.cells=1")
-    assert len(SEEN) > 10_000
-    assert all(seen.bv_overlaps == (seen.bv.lane == 0) == math.isfinite(seen.gap_m) for seen in SEEN)
-    assert all((seen.bv_lateral_m == 1.7) and (seen.bv_lateral_speed_mps == 0.0) for seen in SEEN if seen.bv_overlaps)
-    assert {seen.bv_lateral_speed_mps for seen in SEEN if not seen.bv_overlaps} == ({1.7} if lead_s else set())
+def test_one_that_sees_bv_come_over_is_the_built_in_model_and_one_that_waits_for_the_overlap_is_not():
+    """To the last bit; the sibling is the built-in model that is blind until then."""
+    yields = "controller: 'examples.sees_lateral:Yields'"
+    avs = "model: idm", yields, f"{yields}, parameters: {{perceives_m: 2.0}}", "reaction: {perceives_lateral_m: 2.0}"
+    built_in, sees, waits, blind = (motion(LATERAL, f"av={{{av}}}", n=400) for av in avs)
+    assert built_in == sees
+    assert built_in != waits
+    assert waits == blind
 
 
 # -- one that acts from the start meets the methods that do not need to know the AV's speed --

@@ -125,6 +125,11 @@ def test_what_is_shown_is_what_was_and_before_the_test_nobody_changed_speed(epis
         vehicles = (each.lv.position_m, each.bv.position_m, each.position_m)
         np.testing.assert_allclose(vehicles, there[:, 0] - ago_s * there[:, 1], rtol=1e-12)
         assert (each.lv.speed_mps, each.bv.speed_mps, each.speed_mps) == tuple(there[:, 1])
+    lead_s = shard.results.episode["lead_steps"][0] * 0.1
+    for each in seen[SHOWN:]:
+        assert each.bv_overlaps == (each.bv.lane == 0) == math.isfinite(each.gap_m)
+        assert each.bv_lateral_speed_mps == pytest.approx(0.0 if each.bv_overlaps else 1.7 / lead_s)
+        assert (each.bv_lateral_m < 1.7) != each.bv_overlaps
     for each in seen[:SHOWN]:
         assert (each.gap_m, each.bv.lane, each.lv.lane, each.acceleration_mps2) == (math.inf, 1, 1, 0.0)
         assert (each.bv_lateral_m, each.bv_lateral_speed_mps, each.bv_overlaps) == (0.0, 0.0, False)
