@@ -41,23 +41,13 @@ _texts = st.text(st.characters(codec="utf-8", exclude_categories=["C"]), max_siz
 _lists = st.lists(st.integers(), max_size=2) | st.just({"a": 1})
 
 
-def _paths(value, above=()):
-    for key, item in value.items():
-        yield (*above, key)
-        if isinstance(item, dict):
-            yield from _paths(item, (*above, key))
-
-
-def _get(data, path):
-    for key in path:
-        data = data[key]
-    return data
-
-
-def _with(data, path, value):
-    data = copy.deepcopy(data)
-    _get(data, path[:-1])[path[-1]] = value
-    return data
+def _leaves(section, above=""):
+    """Section, key and dotted path of each value that is no section."""
+    for key, value in section.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{above}{key}.")
+        else:
+            yield section, key, f"{above}{key}"
 
 
 @pytest.fixture(scope="module")
@@ -121,12 +111,13 @@ def test_texts_that_other_readers_misread_are_quoted(load, text):
 @settings(max_examples=150, deadline=None)
 @given(data=st.sampled_from(CONTENTS), draw=st.data())
 def test_a_wrong_type_is_an_error_that_names_it(load, data, draw):
-    leaves = [path for path in _paths(data) if not isinstance(_get(data, path), dict)]
-    path = draw.draw(st.sampled_from(leaves))
-    wrong = st.integers() | st.floats() if isinstance(_get(data, path), str) else _texts
+    leaves = [*_leaves(data := copy.deepcopy(data))]
+    section, key, path = leaves[draw.draw(st.integers(0, len(leaves) - 1))]
+    wrong = st.integers() | st.floats() if isinstance(section[key], str) else _texts
+    section[key] = draw.draw(wrong | st.booleans() | _lists)
     with pytest.raises(CampaignError) as caught:
-        load(_with(data, path, draw.draw(wrong | st.booleans() | _lists)))
-    assert ".".join(path) in str(caught.value)
+        load(data)
+    assert path in str(caught.value)
     assert "mutated.yaml:" in str(caught.value)
 
 

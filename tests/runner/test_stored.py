@@ -68,8 +68,7 @@ def test_shards_are_read_in_groups_without_changing_a_bit(most, sizes, twin_run,
 
 def test_shards_with_columns_of_other_types_are_refused(twin_run, tmp_path, monkeypatch):
     folder = of_before(copy_of(twin_run, tmp_path / "run"))
-    path = folder / "episodes" / sorted(path.name for path in (folder / "episodes").iterdir())[2]
-    table = pq.read_table(path)
+    table = pq.read_table(path := shard_files(folder)[2])
     column = table.schema.get_field_index("cut_in_step")
     pq.write_table(table.set_column(column, "cut_in_step", table.column(column).cast("float64")), path)
     monkeypatch.setattr(stored, "SPACING", 100.0)
