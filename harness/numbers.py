@@ -9,7 +9,7 @@ MISSING, MINUS = "–", "−"
 WIDEST_RHW = 10.0
 """Relative half-widths above are not given as a number: next to nothing is known, and the digits would mean nothing."""
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_LISTED = 12
+_LISTED, FAR_APART = 12, 100.0
 
 
 def power_of_ten(exponent: int) -> str:
@@ -45,11 +45,16 @@ def number(value: float | None, digits: int = 3, *, exponent: int | None = None,
 
 
 def interval(low: float | None, high: float | None, point: float | None = None) -> str:
-    """``(1.17 to 1.29) × 10⁻⁷``, or ``1.23 (1.17 to 1.29) × 10⁻⁷``: in one power of ten, with the same decimals."""
+    """``(1.17 to 1.29) × 10⁻⁷``, or ``1.23 (1.17 to 1.29) × 10⁻⁷``: in one power of ten, with the same decimals.
+
+    Ends that are far apart have each their own power of ten.
+    """
     if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
         return f"{number(low)} to {number(high)}"
     like = point or max(abs(low), abs(high))
     exponent = exponent_of(like)
+    if exponent and 0.0 < abs(low) * FAR_APART <= abs(high):
+        return f"{number(low)} to {number(high)}" if point is None else f"{number(point)} ({number(low)} to {number(high)})"
     ends = " to ".join(number(end, exponent=exponent, like=like) for end in (low, high))
     if point is not None:
         ends = f"{number(point, exponent=exponent)} ({ends})"

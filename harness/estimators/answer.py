@@ -226,7 +226,7 @@ def boundary_statements(estimate: Estimate) -> dict[str, str]:
 def _within(found: Mapping[str, Any], n_shells: int, level: str) -> str:
     if found["refuted"]:
         return (
-            f"REFUTED: it is not so that this vehicle {found['assumes']}. It crashed in "
+            f"It is NOT so that this vehicle {found['assumes']}: it crashed in "
             f"{found['n_crashes_outside']:,} of {found['n_episodes_outside']:,} tests beyond {found['boundary']}, "
             f"first in {_replayed(found['refuted_by'])}."
         )
@@ -271,7 +271,7 @@ def _ahead(found: Mapping[str, Any]) -> str:
 
 def _replayed(episodes: Sequence[int]) -> str:
     """The first of some tests, and how to see it."""
-    return f"episode {episodes[0]} (`harness replay {RUN_FOLDER} {episodes[0]}`)"
+    return f"episode {episodes[0]} (harness replay {RUN_FOLDER} {episodes[0]})"
 
 
 def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[StoppedBy, str]:

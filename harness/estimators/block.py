@@ -38,8 +38,9 @@ MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
 EPISODE_COLUMNS = (
     "episode", "outcome", "cut_in_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_cut_in", "log_q",
+    "n_steps", "min_ttc_s",
 )  # fmt: skip
-SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step", "min_ttc_s")
+SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step")
 BASELINE_COLUMNS = ("shadow", "cut_in_mass")
 """Of vehicles that act before the cut-in, where `ShellDesign.candidates` says that they are on record."""
 DANGER_TTC_S = 4.0
@@ -49,6 +50,8 @@ No crash slips through: each has such a moment. And a driver who is put in the v
 brakes with 3 m/s² after half a second, as of the statement ``need-based``, stays clear at closing speeds up to 21 m/s;
 the fastest cut-ins of `ndd-overtaking-1` close with 16.
 """
+CUT_OFF_STEPS = 40
+"""A test whose time was up so soon after a cut-in, and closer to a collision than `DANGER_TTC_S`, was cut off."""
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 Column = NDArray[Any]
 NEEDS: dict[EstimatorName, str] = {
@@ -102,7 +105,8 @@ class Block:
         log p(x_c) - log q_sampled(x_c); exactly 0 without control.
     columns : mapping of str to array, a row for each episode
         What else the method records, also as attributes; those that it does not record are left out. ``cut_in`` (n,)
-        bool. ``impact_mps`` (n,): closing speed at contact, NaN without a crash. ``log_q`` (n, M): per importance
+        bool. ``impact_mps`` (n,): closing speed at contact, NaN without a crash. ``cut_off`` (n,) bool: see
+        `CUT_OFF_STEPS`. ``log_q`` (n, M): per importance
         function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode. ``n_control_steps``
         (n,): stratum l of each episode. ``first_ratios`` (n, 9, J): q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine
         control steps, 1 beyond the last one. ``log_p_cut_in`` (n,): log P(cut-in | path), where the method draws the
@@ -233,6 +237,10 @@ def block_from_tables(
     }
     if "impact_speed_mps" in episodes.column_names:
         columns["impact_mps"] = np.asarray(episodes.column("impact_speed_mps").to_numpy(), dtype=np.float64)
+    if "n_steps" in episodes.column_names:
+        left = pc.subtract(episodes.column("n_steps"), episodes.column("cut_in_step"))
+        close = pc.and_(pc.less(left, CUT_OFF_STEPS), pc.less(episodes.column("min_ttc_s"), DANGER_TTC_S))
+        columns["cut_off"] = (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy()
     if moments is not None and SAMPLING[method].mixes_steps:
         columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     if np.all(_known(episodes, "log_p_cut_in") | failed):

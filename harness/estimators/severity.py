@@ -43,8 +43,9 @@ class Severity:
     """Impact speeds of the crashes, each counted by what it adds to the rate; nothing of them without a crash.
 
     ``median_mps`` and ``p95_mps`` are quantiles of the impact speed (m/s), ``share_below_1_mps`` and
-    ``share_above_5_mps`` shares of the rate; ``exceedance`` has a row for each of `SPEEDS_MPS` above what is counted,
-    and ``unavoidable`` what not even the most careful driver of the library avoids, of shells.
+    ``share_above_5_mps`` shares of the rate, of shells with ``limits``; ``exceedance`` has a row for each of
+    `SPEEDS_MPS` above what is counted, and ``unavoidable`` what not even the most careful driver of the library avoids,
+    of shells. ``cut_off`` is the rate of tests that ended with the AV about to crash (`Block`, column ``cut_off``).
     """
 
     median_mps: float
@@ -53,6 +54,9 @@ class Severity:
     share_above_5_mps: float
     exceedance: tuple[Exceedance, ...]
     unavoidable: Unavoidable | None
+    limits_below_1_mps: tuple[float, float] | None = None
+    limits_above_5_mps: tuple[float, float] | None = None
+    cut_off: float = 0.0
 
 
 class Impacts:
@@ -66,12 +70,15 @@ class Impacts:
         self._above = {speed: empty() for speed in speeds}
         self._first = counts_above_mps
         self._crashes: list[tuple[FloatArray, FloatArray]] = []
+        self._cut_off: list[FloatArray] = []
+        self._n = 0
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""
-        crash = block.crash
-        weight = block.stratum[crash] if block.drawn.shells is not None else np.exp(block.log_weight[crash])
-        self._crashes.append((block.impact_mps[crash], np.asarray(weight, np.float64)))
+        crash, self._n = block.crash, self._n + len(block)
+        weight = np.asarray(block.stratum if block.drawn.shells is not None else np.exp(block.log_weight), np.float64)
+        self._crashes.append((block.impact_mps[crash], weight[crash]))
+        self._cut_off.append(weight[block.columns.get("cut_off", np.zeros(len(block), np.bool_))])
         for speed, state in self._above.items():
             state.add(block if speed == self._first else block.harder_than(speed))
 
@@ -80,16 +87,21 @@ class Impacts:
         impact, weight = (np.concatenate(column) for column in zip(*self._crashes, strict=True))
         if not impact.size:
             return None
-        every, unavoidable = self._above[self._first], None
+        every, unavoidable, cut_off = self._above[self._first], None, np.concatenate(self._cut_off) / self._n
+        limits: list[tuple[float, float] | None] = [None, None]
         if isinstance(every, Shells):
-            weight = every.weight_of_a_crash()[weight.astype(np.int64)]
-            unavoidable = every.unavoidable(Level.two_sided(confidence))
+            level, each = Level.two_sided(confidence), every.weight_of_a_crash()
+            weight, cut_off = each[weight.astype(np.int64)], each[np.concatenate(self._cut_off).astype(np.int64)]
+            unavoidable = every.unavoidable(level)
+            for k, (speed, softer) in enumerate(((TOUCH_MPS, True), (HARD_MPS, False))):
+                if isinstance(harder := self._above.get(speed), Shells):
+                    limits[k] = every.share_of_crashes(harder, level, of_the_others=softer)
         if not weight.any():  # too small for a number
             return None
         total, median, high = float(weight.sum()), *weighted_quantiles(impact, weight, (0.5, 0.95))
         below, above = (float(weight[rows].sum()) / total for rows in (impact <= TOUCH_MPS, impact > HARD_MPS))
         rows = tuple(_exceedance(speed, state, confidence) for speed, state in self._above.items())
-        return Severity(median, high, below, above, rows, unavoidable)
+        return Severity(median, high, below, above, rows, unavoidable, *limits, float(cut_off.sum()))
 
 
 def _exceedance(speed: float, state: Accumulator, confidence: float) -> Exceedance:

@@ -263,6 +263,25 @@ class Shells:
         share, low, high = preventable_share(design.cell_p, self._cells, avoids, design.n_independent, level)
         return Unavoidable(design.strata[0], 1.0 - share, 1.0 - high, 1.0 - low)
 
+    def share_of_crashes(self, some: Shells, level: Level, *, of_the_others: bool) -> tuple[float, float]:
+        """Limits of the share of the rate that is of ``some`` of its crashes, or of the others, of the same tests.
+
+        A path's parts in both are taken to exclude each other, which makes the variance no smaller.
+        """
+        p, every, first = self._design.p, self.tally, some.tally
+        second = every._replace(crashes=every.crashes - first.crashes, crash_mass=every.crash_mass - first.crash_mass)
+        first, second = (second, first) if of_the_others else (first, second)
+        rates = [float(p @ each.share) for each in (first, second)]
+        of_paths = [pool_variance(p, each, self._design.n_independent) for each in (first, second)]
+        counts = np.stack((first.crashes, second.crashes, every.tests - every.crashes), axis=1)
+
+        def variance(x: float) -> float:
+            both = 2.0 * x * (1.0 - x) * rates[0] * rates[1] / self._design.n_independent
+            return max((1.0 - x) ** 2 * of_paths[0] + x * x * of_paths[1] + both, 0.0)
+
+        limits = ratio_limits(np.outer(p, (1.0, 0.0, 0.0)), np.outer(p, (1.0, 1.0, 0.0)), counts, level, variance)
+        return min(limits[0], 1.0), min(limits[1], 1.0)
+
     def limits_of(self, statement: str, level: Level) -> RateLimits:
         """Rate and limits of a statement, or of all strata."""
         return self._limits(self._design.n_within(statement), level)

@@ -14,11 +14,26 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.estimate import Estimate
 from harness.estimators.severity import HARD_MPS, TOUCH_MPS, Severity
-from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, ratio, share, tenths, words
+from harness.numbers import (
+    WIDEST_RHW,
+    count,
+    duration,
+    interval,
+    leaves,
+    number,
+    plain,
+    ratio,
+    share,
+    tenths,
+    two_digits_up,
+    words,
+)
 from harness.strata import ASSUMPTION_FREE
 
 WIDTH, LINES = 100, 9
 MOST_WARNINGS = 3
+CUT_OFF_SHARE = 0.2
+"""Weight, relative to the rate, from which tests that were cut off are warned of."""
 _BRAKES_HARDEST = "brakes-8"
 ENDED = {
     "rhw": "precision reached",
@@ -27,6 +42,7 @@ ENDED = {
     "pool": "no cut-in of the pool is left",
     "contradicted": "vehicle does not do what the statement assumes",
     "pool_error": "the pool’s own error is too wide",
+    "open": "budget spent before the margin was decided",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
 
@@ -115,28 +131,34 @@ def _rows(
     if not best.n_crashes:
         shown, ends, value = best.upper_bound, "no crash seen", f"< {number(best.upper_bound)} per test"
     per_km = "" if not distance_km else f"{number(shown * 1e6 / distance_km)} per million km"
-    if best.n_crashes and any(each["p"] > 0.0 and not each["n_episodes"] for each in best.details.get("shells", ())):
+    untested = any(each["p"] > 0.0 and not each["n_episodes"] for each in best.details.get("shells", ()))
+    if untested and best.n_crashes:
         value, per_km = f"≥ {value}", "counts none where not tested"
     yield Row("rate", counted, value, ends, per_km)
     for each in best.details.get("references", ())[:1]:
         if each["crash_rate"] > 0.0:
-            yield _beside(each)
+            yield _beside(each, at_least="≥ " if untested else "")
     if severity is not None:
-        below, above = share(severity.share_below_1_mps), share(severity.share_above_5_mps)
-        value = f"median {tenths(severity.median_mps)} m/s"
-        yield Row(
-            "impact", "impact", value, f"{below} below {plain(TOUCH_MPS)} m/s", f"{above} above {plain(HARD_MPS)} m/s"
-        )
+        there = " where tested" if untested else ""
+        above = _share_within(severity.share_above_5_mps, severity.limits_above_5_mps)
+        below = _share_within(severity.share_below_1_mps, severity.limits_below_1_mps)
+        value = f"median {tenths(severity.median_mps)} m/s{there}"
+        yield Row("impact", "impact", value, f"{above} > {plain(HARD_MPS)} m/s", f"{below} < {plain(TOUCH_MPS)} m/s")
         if (of := severity.unavoidable) is not None:
             hardest = of.driver == _BRAKES_HARDEST
             why = "not even 8 m/s² avoids it" if hardest else f"{of.driver} crashes there, too"
             ends = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}"
-            yield Row("unavoidable", "unavoidable", f"{share(of.share)} of the rate", ends, why)
+            yield Row("unavoidable", "unavoidable", f"{share(of.share)} of the rate{there}", ends, why)
     asked = campaign.testing.shells.statement
     statements = best.details.get("statements", ())
     chosen = [each for each in statements if each["name"] == asked] or statements
     for each in chosen[:1]:
         yield _within(each)
+
+
+def _share_within(value: float, limits: tuple[float, float] | None) -> str:
+    """A share with its interval in whole per cent, where there is one."""
+    return share(value) + (f" ({100.0 * limits[0]:.0f}–{100.0 * limits[1]:.0f} %)" if limits else "")
 
 
 def _decided(decision: Mapping[str, Any]) -> Row:
@@ -152,22 +174,21 @@ def _decided(decision: Mapping[str, Any]) -> Row:
     return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
 
 
-def _beside(found: Mapping[str, Any]) -> Row:
+def _beside(found: Mapping[str, Any], at_least: str) -> Row:
     low, high = found["ratio_low"], found["ratio_high"]
     who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
     if not found["ratio"]:
         return Row("ratio", "× competent driver", f"< {ratio(high)}", "no crash seen", who)
     apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
-    return Row(
-        "ratio", "× competent driver", f"{ratio(found['ratio'])} ({apart})", f"{ratio(low)} to {ratio(high)}", who
-    )
+    value = f"{at_least}{ratio(found['ratio'])} ({apart})"
+    return Row("ratio", "× competent driver", value, f"{ratio(low)} to {ratio(high)}", who)
 
 
 def _within(found: Mapping[str, Any]) -> Row:
     name, n, outside = found["name"], found["n_crashes_outside"], count(found["n_episodes_outside"])
     what = f"keeping to {name}"
     if found["refuted"]:
-        return Row("within", what, "REFUTED", "", f"{count(n)} crashes in {outside} tests beyond")
+        return Row("within", what, "does NOT keep to it", "", f"{count(n)} of {outside} tests beyond it crashed")
     beyond = f"no crash in {outside} beyond it" if found["n_episodes_outside"] else "nothing was tested beyond"
     if found["n_ahead"]:
         beyond = f"NOT KEPT TO in {count(found['n_ahead'])} of {count(found['n_checked'])} tests"
@@ -194,6 +215,9 @@ def _warnings(
         yield f"the vehicle does not do what statement {decision['statement']} assumes: ask without it"
     if decision is not None and (before := decision["asked_before"]):
         yield f"these tests were asked about {len(before)} other limits before: {', '.join(map(plain, before))}"
+    if severity is not None and severity.cut_off > CUT_OFF_SHARE * best.crash_rate:
+        worst = number(best.crash_rate + severity.cut_off)
+        yield f"tests that ended while it closed in count as no crash: had all of them crashed, {worst} per test"
     if (level := campaign.environment.lane_change_level) != 1.0:
         yield f"lane-change level {plain(level)}: never compare with rates of other levels"
 

@@ -128,8 +128,8 @@ def test_a_crash_outside_refutes_the_assumption():
     assert within(estimate)["refuted"]
     assert within(estimate)["refuted_by"] == (2,)
     text = boundary_statements(estimate)["library"]
-    assert text.startswith("REFUTED: it is not so that this vehicle keeps to careless.")
-    assert "in 1 of 2 tests beyond careless, first in episode 2 (`harness replay FOLDER 2`)" in text
+    assert text.startswith("It is NOT so that this vehicle keeps to careless: it crashed")
+    assert "in 1 of 2 tests beyond careless, first in episode 2 (harness replay FOLDER 2)" in text
     assert any("does not hold" in warning for warning in estimate.warnings)
 
 
