@@ -60,7 +60,7 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     assert main([*command, "-v"]) == 0
     out, content = capsys.readouterr().out, in_folder(estimates(folder), folder)
     said = [f"Statement {name}: {sentence}" for name, sentence in content["boundary_statements"].items()]
-    assert f"`harness replay '{folder}'" in said[0]
+    assert f"(harness replay '{folder}'" in said[0]
     short = lines(content["answer"], manifest(folder)["wall_time_s"], folder / "report.html")
     assert out.splitlines() == [
         content["statement"],
@@ -133,6 +133,13 @@ def raising(monkeypatch, tmp_path):
         return main([*command, str(tmp_path), *more])
 
     return call
+
+
+def test_a_run_folder_that_was_not_made_is_not_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_av.py").write_text("class Mine:\n    def step(self, seen):\n        return 0.0\n")
+    assert main(["run", "my_av.py:Min"]) == 2
+    assert capsys.readouterr().err.startswith("error: av.controller\n")
 
 
 WRONG = "episodes/0.parquet", "half a file", "a whole one", "Delete it."

@@ -6,6 +6,7 @@ How YAML is read stands in `harness.campaign.yaml_text`, what is wrong with a va
 from __future__ import annotations
 
 import ast
+import difflib
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -194,6 +195,7 @@ class Places:
 
 # -- vehicles by name --
 
+FEW_NAMES = 6
 _OTHER_FORMS = "my_av.py:MyClass, package.module:MyClass, my_av.fmu, sumo:MODEL, PANEL.yaml:NAME, or "
 
 
@@ -233,11 +235,13 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     models = () if colon else get_args(ModelName)
     if name in models:
         return {"model": name}
-    known = sorted({*panel, *models})
+    known = list(dict.fromkeys((*models, *sorted(panel))))
     files = [] if colon else [str(file) for file in Path().glob("*.y*ml")]
     found = f"no vehicle '{name}' in {place}" if colon else f"no {'' if option else 'campaign file, and no '}vehicle"
-    expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(known)}"
-    mend = did_you_mean(name, [*files, *known]) or _in_python_file(text) or "Name one of them."
+    few = difflib.get_close_matches(name, known, FEW_NAMES, cutoff=0.3) or known[:FEW_NAMES]
+    more = f" … ({len(known)} names)" if len(few) < len(known) else ""
+    expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(few)}{more}"
+    mend = _in_python_file(text) or did_you_mean(name, [*files, *known]) or "Name one of them."
     raise CampaignError(f"{option}{text}", found, expected, mend)
 
 
@@ -246,8 +250,10 @@ def _in_python_file(text: str) -> str:
     if not text.endswith(".py") or not Path(text).is_file():
         return ""
     tree = ast.parse(read_text(Path(text)))
-    names = [each.name for each in tree.body if isinstance(each, ast.ClassDef | ast.FunctionDef)]
-    return f"Name its class or function: {' or '.join(f'{text}:{name}' for name in names)}."
+    found = {each.name: each for each in tree.body if isinstance(each, ast.ClassDef | ast.FunctionDef)}
+    drive = [name for name, each in found.items() if isinstance(each, ast.FunctionDef) or "step" in ast.dump(each)]
+    shown = ([name for name in drive if name[0] != "_"] or list(found))[:FEW_NAMES]
+    return f"Name its class or function: {' or '.join(f'{text}:{name}' for name in shown)}." if shown else ""
 
 
 class Panel(Section):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -138,15 +138,17 @@ def run(
     limit = [] if accept is None else accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
     campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
-    if folder is None:
-        folder = _run_folder(campaign.name, resume=resume)
-        say(f"Run folder: {folder}", err=True)
+    chosen, folder = folder is None, folder or _run_folder(campaign.name, resume=resume)
     from harness.processes import imports_ahead, worker_modules  # noqa: PLC0415 - keeps --help fast
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
     is_local = campaign.run.executor == "local"
     ahead = imports_ahead(*worker_modules(campaign.world.engine)) if is_local else nullcontext()
-    with ahead, shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar:
+    with (
+        named_if_written(folder, chosen=chosen),
+        ahead,
+        shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar,
+    ):
         from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: the bar is there meanwhile
 
         result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
@@ -173,6 +175,17 @@ def accepting(limit: str) -> list[str]:
     except ValueError:
         keys, value = ("times_reference", "crash_rate_below"), f"{{driver: {limit}}}"
     return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
+
+
+@contextmanager
+def named_if_written(folder: Path, *, chosen: bool) -> Iterator[None]:
+    """Say where a run is that was not finished, if its folder was ``chosen`` here and there is something."""
+    try:
+        yield
+    except BaseException:
+        if chosen and folder.exists():
+            say(f"Run folder: {folder}", err=True)
+        raise
 
 
 def _run_folder(name: str, *, resume: bool) -> Path:
@@ -218,6 +231,7 @@ def av_check(
         of_idm = {name: values.pop(f"idm_{name}", "") for name in tuple(values) if not name.startswith("idm_")}
         rows = [{"what": name, "found": value, "built-in IDM": of_idm[name]} for name, value in values.items()]
         print_table("What the AV is like", rows)
+        say(found.verdict)
     ctx.exit(found.exit_code)
 
 
@@ -248,6 +262,7 @@ def av_check(
 @workers_option
 @junit_option
 @quiet_option
+@verbose_option
 @av_option
 @set_option
 @json_option
@@ -264,6 +279,7 @@ def compare(
     workers: int | None,
     junit: Path | None,
     quiet: bool,
+    verbose: bool,
     av: str | None,
     overrides: Sequence[str],
     as_json: bool,
@@ -290,10 +306,9 @@ def compare(
 
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     labels = (a.name, label_b) if a.name != label_b else (str(source_a), str(file_b))
-    if folder is None:
+    if chosen := folder is None:
         folder = RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b.removeprefix(f'{a.name}, '))}"
-        say(f"Folder: {folder}", err=True)
-    with shown_progress(a.stop.rhw, a.min_crashes, quiet=quiet) as bar:
+    with named_if_written(folder, chosen=chosen), shown_progress(a.stop.rhw, a.min_crashes, quiet=quiet) as bar:
         from harness.runner.compare import compare_campaigns  # noqa: PLC0415 - slow to import: the bar is there meanwhile
 
         found = compare_campaigns(
@@ -307,8 +322,12 @@ def compare(
     if as_json:
         print_json(found.content)
     else:
-        remarks = [f"note: {remark}" for remark in found.content["warnings"]]
-        say(*found.content["statements"], *remarks, folder / "compare.json", found.report)
+        from harness.estimators.short_answer import pair_lines  # noqa: PLC0415 - keeps --help fast
+
+        if verbose:
+            remarks = [f"note: {remark}" for remark in found.content["warnings"]]
+            say(*found.content["statements"], *remarks, folder / "compare.json", "")
+        say(*pair_lines(found.content, a.crash.counts_above_mps, found.report))
     ctx.exit(found.exit_code)
 
 

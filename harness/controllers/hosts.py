@@ -192,7 +192,8 @@ class Guard:
     def acceleration(self, answer: Any) -> tuple[float, str | None]:
         """An answer as a number, and what is wrong with it: a subclass may compare as it likes."""
         if not isinstance(answer, int | float | np.floating | np.integer) or isinstance(answer, bool):
-            return math.nan, f"returned {type(answer).__name__}, expected an acceleration in m/s2 as a number"
+            what = "None (is a return missing?)" if answer is None else type(answer).__name__
+            return math.nan, f"returned {what}, expected an acceleration in m/s2 as a number"
         value = float(answer)
         if not math.isfinite(value):
             return value, f"returned {value}, expected a finite acceleration in m/s2"

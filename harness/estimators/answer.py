@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.campaign.campaign import Campaign
-from harness.estimators.block import DANGER_TTC_S, Block
+from harness.estimators.block import CUT_OFF_STEPS, DANGER_TTC_S, Block
 from harness.estimators.estimate import Estimate, Number, Point, Unavailable, finite_json
 from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import PairedEstimate
@@ -18,6 +18,7 @@ from harness.estimators.stopping import RoundRule, Rule
 from harness.importance.functions import importance_names
 from harness.numbers import WIDEST_RHW, interval, number, plain, ratio, share, two_digits_up
 from harness.records.folder import StoppedBy
+from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ESTIMATORS, RUN_FOLDER, EstimatorName
 
 _PER_KM = 1e6
@@ -90,6 +91,8 @@ def estimate_blocks(
     repeated = manifest.get("repeated")
     about = level, distance_km, campaign.crash.counts_above_mps
     statements: dict[str, str] = {name: _answer(of, repeated, *about) for name, of in estimates.items()}
+    cut_off = 0.0 if done.severity is None else done.severity.cut_off
+    statements[done.headline] = _answer(best, repeated, *about, cut_off)
     return finite_json(
         Estimates(
             campaign=campaign.name,
@@ -123,15 +126,23 @@ def _answer(
     level: float,
     distance_km: float | None,
     counts_above_mps: float,
+    cut_off: float = 0.0,
 ) -> str:
     """What an estimator says, led by what it must be warned of and the first reference driver; or why it cannot.
 
-    ``repeated`` is what tests that ran twice have come to, where some did.
+    ``repeated`` is what tests that ran twice have come to, where some did; ``cut_off`` the rate of those that ended too
+    soon.
     """
     if isinstance(found, Unavailable):
         return f"No crash rate from these records: {found.reason.rstrip('.')}."
     text = " ".join([*reference_statements(found)[:1], statement(found, level, distance_km, counts_above_mps)])
     text += failed_statement(found.details)
+    if cut_off > 0.0:
+        text += (
+            f" Tests that ended within {STEP_S * CUT_OFF_STEPS:g} s of a cut-in, less than {DANGER_TTC_S:g} s from a "
+            "collision, count as no crash: had they all crashed, the rate would be "
+            f"{number(found.crash_rate + cut_off)}."
+        )
     if repeated is None or not (n := repeated["n_episodes"]):
         return text
     if not (n_differing := len(repeated["differing"])):
@@ -304,18 +315,27 @@ def _runs_or_tests(rule: Rule, campaign: Campaign, n_tests: int) -> str | None:
 
     What the runs leave may be all that is asked over √2; what the tests then do is expected from their limits.
     """
+    n_runs, pool = campaign.pool.shadow_paths, rule.look.rhw_from_pool
+    if (needed := expected_for(rule, campaign, n_tests)) is None:
+        return None
+    runs, tests = needed["runs"], needed["tests"]
+    found = f"{n_runs:,} baseline runs alone leave ±{share(pool)} of the rate, of ±{share(rule.look.rhw)} in all"
+    if runs == n_runs:
+        return f"{found}: tests are too few; raise stop.episodes to about {tests:,} and go on with --resume"
+    what = "baseline runs" if tests == n_tests else "both"
+    return f"{found}: {what} are too few; some {runs:,} (pool.shadow_paths) and {tests:,} tests may do, in a new folder"
+
+
+def expected_for(rule: Rule, campaign: Campaign, n_tests: int) -> dict[str, int] | None:
+    """How many baseline ``runs`` and ``tests`` in all the asked precision may take; None where nobody can tell."""
     target, n_runs, pool = campaign.stop.rhw, campaign.pool.shadow_paths, rule.look.rhw_from_pool
-    if not isinstance(rule, RoundRule) or target is None or not 0.0 < pool < math.inf:
+    if not campaign.has_baseline_runs or not isinstance(rule, RoundRule) or target is None or not 0.0 < pool < math.inf:
         return None
     more_runs = max(2.0 * (pool / target) ** 2, 1.0)
     if math.isinf(more_tests := rule.more_tests(target, more_runs)):
         return None  # a stratum that cannot be tested: nothing will do
-    found = f"{n_runs:,} baseline runs alone leave ±{share(pool)} of the rate, of ±{share(rule.look.rhw)} in all"
     runs, tests = two_digits_up(n_runs * more_runs), two_digits_up(n_tests * more_tests)
-    if more_runs == 1.0:
-        return f"{found}: tests are too few; raise stop.episodes to about {tests:,} and go on with --resume"
-    what = "baseline runs" if more_tests <= 1.0 else "both"
-    return f"{found}: {what} are too few; some {runs:,} (pool.shadow_paths) and {tests:,} tests may do, in a new folder"
+    return {"runs": n_runs if more_runs == 1.0 else runs, "tests": n_tests if more_tests <= 1.0 else tests}
 
 
 def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:

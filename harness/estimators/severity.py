@@ -101,7 +101,8 @@ class Impacts:
         total, median, high = float(weight.sum()), *weighted_quantiles(impact, weight, (0.5, 0.95))
         below, above = (float(weight[rows].sum()) / total for rows in (impact <= TOUCH_MPS, impact > HARD_MPS))
         rows = tuple(_exceedance(speed, state, confidence) for speed, state in self._above.items())
-        return Severity(median, high, below, above, rows, unavoidable, *limits, float(cut_off.sum()))
+        of_all = median, high, below, above, rows, unavoidable
+        return Severity(*of_all, limits[0], limits[1], float(cut_off.sum()))
 
 
 def _exceedance(speed: float, state: Accumulator, confidence: float) -> Exceedance:

@@ -273,14 +273,18 @@ class Shells:
         first, second = (second, first) if of_the_others else (first, second)
         rates = [float(p @ each.share) for each in (first, second)]
         of_paths = [pool_variance(p, each, self._design.n_independent) for each in (first, second)]
-        counts = np.stack((first.crashes, second.crashes, every.tests - every.crashes), axis=1)
 
         def variance(x: float) -> float:
             both = 2.0 * x * (1.0 - x) * rates[0] * rates[1] / self._design.n_independent
             return max((1.0 - x) ** 2 * of_paths[0] + x * x * of_paths[1] + both, 0.0)
 
-        limits = ratio_limits(np.outer(p, (1.0, 0.0, 0.0)), np.outer(p, (1.0, 1.0, 0.0)), counts, level, variance)
-        return min(limits[0], 1.0), min(limits[1], 1.0)
+        def limits(failed_first: int) -> tuple[float, float]:
+            """Failed tests may have been crashes of either kind."""
+            a, b = first.crashes + failed_first * every.failed, second.crashes + (1 - failed_first) * every.failed
+            counts = np.stack((a, b, every.tests - a - b), axis=1)
+            return ratio_limits(np.outer(p, (1.0, 0.0, 0.0)), np.outer(p, (1.0, 1.0, 0.0)), counts, level, variance)
+
+        return min(limits(0)[0], 1.0), min(limits(1)[1], 1.0)
 
     def limits_of(self, statement: str, level: Level) -> RateLimits:
         """Rate and limits of a statement, or of all strata."""

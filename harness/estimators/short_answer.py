@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,11 @@ from harness.numbers import (
     ratio,
     share,
     tenths,
-    two_digits_up,
     words,
 )
 from harness.strata import ASSUMPTION_FREE
 
-WIDTH, LINES = 100, 9
+WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
 CUT_OFF_SHARE = 0.2
 """Weight, relative to the rate, from which tests that were cut off are warned of."""
@@ -87,7 +87,7 @@ def short_answer(
         vehicle=vehicle,
         parameters=tuple(parameters),
         tests=f"{count(best.n_episodes)} tests in {engine}",
-        rows=tuple(_rows(campaign, best, severity, manifest.get("decision"), distance_km)),
+        rows=tuple(_rows(campaign, best, severity, manifest, distance_km)),
         warnings=tuple(_warnings(campaign, best, severity, manifest)),
         scope=_scope(campaign, best, manifest.get("stopped_by")),
     )
@@ -119,10 +119,10 @@ def _rows(
     campaign: Campaign,
     best: Estimate,
     severity: Severity | None,
-    decision: Mapping[str, Any] | None,
+    manifest: Mapping[str, Any],
     distance_km: float | None,
 ) -> Iterator[Row]:
-    if decision is not None:
+    if (decision := manifest.get("decision")) is not None:
         yield _decided(decision)
     from_mps = campaign.crash.counts_above_mps
     counted = f"crash rate > {plain(from_mps)} m/s" if from_mps else "crash rate"
@@ -138,6 +138,8 @@ def _rows(
     for each in best.details.get("references", ())[:1]:
         if each["crash_rate"] > 0.0:
             yield _beside(each, at_least="≥ " if untested else "")
+    if campaign.has_baseline_runs and best.n_crashes:
+        yield from _whence(campaign, best, manifest.get("expected"))
     if severity is not None:
         there = " where tested" if untested else ""
         above = _share_within(severity.share_above_5_mps, severity.limits_above_5_mps)
@@ -154,6 +156,17 @@ def _rows(
     chosen = [each for each in statements if each["name"] == asked] or statements
     for each in chosen[:1]:
         yield _within(each)
+
+
+def _whence(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | None) -> Iterator[Row]:
+    """Which of baseline runs and tests makes the interval as wide as it is, and how many of both may do."""
+    whole, runs = best.rhw, best.details.get("rhw_from_pool", math.inf)
+    if not (math.isfinite(whole) and math.isfinite(runs)):
+        return
+    which = "baseline runs" if 2.0 * runs * runs > whole * whole else "tests"
+    remark = "" if expected is None else f"try {count(expected['runs'])} runs, {count(expected['tests'])} tests"
+    alone = f"{count(campaign.pool.shadow_paths)} runs alone ± {share(runs)}"
+    yield Row("width", "half-width", f"± {share(whole)}, most by {which}", alone, remark)
 
 
 def _share_within(value: float, limits: tuple[float, float] | None) -> str:
@@ -188,7 +201,7 @@ def _within(found: Mapping[str, Any]) -> Row:
     name, n, outside = found["name"], found["n_crashes_outside"], count(found["n_episodes_outside"])
     what = f"keeping to {name}"
     if found["refuted"]:
-        return Row("within", what, "does NOT keep to it", "", f"{count(n)} of {outside} tests beyond it crashed")
+        return Row("within", what, "does NOT keep to it", "", f"{count(n)} crashes in {outside} beyond it")
     beyond = f"no crash in {outside} beyond it" if found["n_episodes_outside"] else "nothing was tested beyond"
     if found["n_ahead"]:
         beyond = f"NOT KEPT TO in {count(found['n_ahead'])} of {count(found['n_checked'])} tests"
@@ -217,7 +230,7 @@ def _warnings(
         yield f"these tests were asked about {len(before)} other limits before: {', '.join(map(plain, before))}"
     if severity is not None and severity.cut_off > CUT_OFF_SHARE * best.crash_rate:
         worst = number(best.crash_rate + severity.cut_off)
-        yield f"tests that ended while it closed in count as no crash: had all of them crashed, {worst} per test"
+        yield f"time was up while it closed in: had all these tests crashed, {worst} per test"
     if (level := campaign.environment.lane_change_level) != 1.0:
         yield f"lane-change level {plain(level)}: never compare with rates of other levels"
 
@@ -250,15 +263,68 @@ def lines(answer: Mapping[str, Any], took_s: float | None, report: Path | None =
     if parameters:
         room = WIDTH - len(" · ".join(head)) - 3
         head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
-    keys = "what", "value", "interval"
-    widths = [max(len(row[key]) for row in rows) for key in keys]
-    table = [
-        "  ".join([*(row[key].ljust(width) for key, width in zip(keys, widths, strict=True)), row["remark"]])
-        for row in rows
-    ]
-    shown = [*table, *warnings, ends[0]]
-    return [" · ".join(head), *_cut(f"  {line.rstrip()}" for line in shown), *(f"  {line}" for line in ends[1:])]
+    table = _columns([(row["what"], row["value"], row["interval"], row["remark"]) for row in rows])
+    return [" · ".join(head), *_cut([*table, *warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of equally many texts, each column as wide as its widest."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
 
 
 def _cut(texts: Iterable[str]) -> Iterator[str]:
-    return (text if len(text) <= WIDTH else f"{text[: WIDTH - 2]} …" for text in texts)
+    lines = (f"  {text.rstrip()}" for text in texts)
+    return (line if len(line) <= WIDTH else f"{line[: WIDTH - 2]} …" for line in lines)
+
+
+def verdict_of_pair(found: Mapping[str, Any], margin: Mapping[str, Any] | None) -> str:
+    """The answer of a comparison in one line, given what lies between A and B."""
+    if margin is not None:
+        most = share(margin["margin"])
+        told = {"proven": f"B is at most {most} worse than A", "refuted": f"B is more than {most} worse than A"}
+        return told.get(margin["verdict"], f"Open whether B is more than {most} worse than A")
+    if found["n_differing"] and found["ci_low"] > 0.0:
+        return "B crashes less often than A"
+    return "B crashes more often than A" if found["n_differing"] and found["ci_high"] < 0.0 else "Not told apart"
+
+
+def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What lies between A and B under the statement that the comparison (``compare.json``) was asked for."""
+    given = content.get("asked") == "library" and not content["conditional"].get("refuted")
+    asked: Mapping[str, Any] = content["conditional"] if given else content
+    return asked
+
+
+def pair_lines(content: Mapping[str, Any], counts_above_mps: float, report: Path) -> list[str]:
+    """A comparison (``compare.json``) for a terminal, as short as `lines`."""
+    asked = pair_asked(content)
+    rows = []
+    for name in "AB":
+        of, label = content[name.lower()], content["campaigns"][name.lower()]["label"]
+        rate, ends = number(of["crash_rate"]), interval(of["ci_low"], of["ci_high"])
+        if not of["n_crashes"]:
+            rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
+        rows.append(
+            (
+                f"{name} {label if len(label) <= LABEL else f'{label[: LABEL - 2]} …'}",
+                rate,
+                ends,
+                f"{count(of['n_crashes'])} crashes",
+            )
+        )
+    if asked["ratio"] is not None:
+        most = "no limit" if asked["ratio_high"] is None else ratio(asked["ratio_high"])
+        rows.append(("A / B", ratio(asked["ratio"]), f"{ratio(asked['ratio_low'])} to {most}", ""))
+    rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), ""))
+    remarks = [f"! {text}" for text in content["warnings"]]
+    if asked is not content:
+        remarks.insert(
+            0, f"A / B and A − B are given that both crash only where {asked['boundary']} of the library does"
+        )
+    ended = ENDED.get(content.get("ended", ""), "interrupted")
+    scope = f"sampling error in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"
+    counted = f" above {plain(counts_above_mps)} m/s" if counts_above_mps else ""
+    pairs = f"{count(content['n_pairs'])} pairs on the same cut-ins"
+    head = f"{verdict_of_pair(asked, content['margin'])} · {pairs} · crashes{counted} per test"
+    return [head, *_cut([*_columns(rows), *remarks[:2], scope]), f"  report  {report}"]

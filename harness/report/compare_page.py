@@ -15,8 +15,8 @@ from pydantic import BaseModel
 
 from harness import numbers
 from harness.errors import HarnessError, RunFolderError, printable
-from harness.estimators.short_answer import vehicle_words
-from harness.numbers import count, share, tenths
+from harness.estimators.short_answer import vehicle_words, verdict_of_pair
+from harness.numbers import count, tenths
 from harness.pool.replay import LEAD, PATH_COLUMNS
 from harness.records.folder import read_as, write_bytes
 from harness.records.reader import read_traces, stored_columns
@@ -63,6 +63,7 @@ def write_comparison(folder: str | Path) -> Path:
         if (found := run.manifest["campaign_hash"]) != of["campaign_hash"]:
             expected = f"campaign {of['campaign_hash']} ({COMPARISON})"
             raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, MEND)
+    counted = runs[0].campaign.crash.counts_above_mps
     pairs, inside = crashing_pairs(runs, stored.shells), stored.conditional
     given = runs[0].campaign.testing.shells.statement == "library" and not inside.refuted
     asked = inside if given else stored
@@ -70,10 +71,10 @@ def write_comparison(folder: str | Path) -> Path:
     environment = templates()
     environment.filters.update(getmembers(numbers, isfunction), sentence=sentence, vehicle=vehicle_words)
     page = environment.get_template("compare.html.j2").render(
-        compared=stored, asked=asked, given=given, verdict=verdict(asked, stored.margin),
+        compared=stored, asked=asked, given=given, above=counted,
+        verdict=verdict_of_pair(asked.model_dump(), stored.margin),
         sides=list(zip("AB", runs, stored.campaigns.values(), strict=True)),
-        plot=plot,
-        scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
+        plot=plot, scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
     )  # fmt: skip
     write_bytes(folder / "report.html", printable(page).encode("utf-8"))
     return folder / "report.html"
@@ -112,8 +113,10 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
         tests, outcome = rows.take(np.concatenate(first)), rows["outcome"].cast(pa.string())
         outcome = outcome.take(np.concatenate(first)).to_numpy()
         values = {name: floats(tests[name]) for name in columns}
+        above = run.campaign.crash.counts_above_mps  # what is no harder is none here, as in the rates
+        hard = (values["impact_speed_mps"] > above) | (above == 0.0)
         episode = np.where(outcome == "failed", -1.0, values["episode"])
-        found.append({**values, "episode": episode, "crash": outcome == "crash"})
+        found.append({**values, "episode": episode, "crash": (outcome == "crash") & hard})
     a, b = (each["crash"] for each in found)
     weight = np.repeat([shell["p"] / max(n, 1) for shell, n in zip(shells, n_pairs, strict=True)], n_pairs)
     kept = a | b
@@ -121,17 +124,6 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
     episode, impact = (np.stack([of[name][kept] for of in found]) for name in ("episode", "impact_speed_mps"))
     who = np.where(a & b, 0, np.where(a, 1, 2))[kept]
     return Pairs(who, weight[kept], gap, -rate, episode.astype(np.int64), impact)
-
-
-def verdict(found: Contrast, margin: dict[str, Any] | None) -> str:
-    """The answer in one line."""
-    if margin is not None:
-        most = share(margin["margin"])
-        told = {"proven": f"B is at most {most} worse than A", "refuted": f"B is more than {most} worse than A"}
-        return told.get(margin["verdict"], f"Open whether B is more than {most} worse than A")
-    if found.n_differing and found.ci_low > 0.0:
-        return "B crashes less often than A"
-    return "B crashes more often than A" if found.n_differing and found.ci_high < 0.0 else "Not told apart"
 
 
 def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:

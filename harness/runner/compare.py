@@ -31,6 +31,7 @@ from harness.runner.resume import require_own_folder
 from harness.runner.run import Run
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import PairRounds, Shells, round_requests
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import COMPARISON
 
 SIDES = ("a", "b")
@@ -105,11 +106,15 @@ def compare_campaigns(
         **found.to_json(),
         "margin": None if rule.margin is None else asdict(rule.margin),
         "statement": statements[0],
+        "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
+        "ended": "rhw" if rule.margin is None else "accept",
         "statements": statements,
     }
-    write_json(out / COMPARISON, content)
     missed = a.stop.rhw is not None and not rule.look.stopped
     code = (EXIT_BUDGET_SPENT if missed else EXIT_DONE) if rule.margin is None else EXIT_OF[rule.margin.verdict]
+    if code == EXIT_BUDGET_SPENT:
+        content["ended"] = "episodes" if rule.margin is None else "open"
+    write_json(out / COMPARISON, content)
     from harness.report.compare_page import write_comparison  # noqa: PLC0415
 
     return Comparison(out, found, content, code, write_comparison(out))

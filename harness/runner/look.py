@@ -94,6 +94,22 @@ class AvCheck:
         """0 when all is well, 3 when episodes failed or were not reproduced."""
         return EXIT_TOO_MANY_FAILED if self.failures or self.differing else EXIT_DONE
 
+    @property
+    def verdict(self) -> str:
+        """What is to be done next, in a sentence."""
+        n, seen = self.n_episodes, self.behaviour
+        if self.failures:
+            return f"NOT READY: {sum(self.failures.values())} of {n} tests failed: {next(iter(self.failures))}."
+        if self.differing:
+            return f"NOT REPRODUCIBLE: {len(self.differing)} of {n} tests came out otherwise. {self.likely_cause}"
+        if not seen.n_cut_ins or not seen.braking_share > 0.0:
+            return f"LOOK AGAIN: it braked after none of {seen.n_cut_ins} cut-ins. Does it see BV?"
+        slower = self.speed.us_per_step / self.idm_speed.us_per_step
+        return (
+            f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_cut_ins} "
+            f"cut-ins, {seen.reaction_s:.1f} s after they began (median); a step takes {slower:.1f} times that of IDM."
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Plain JSON content; undefined numbers become null."""
         return finite_json({**asdict(self), "deterministic": not self.differing, "exit_code": self.exit_code})

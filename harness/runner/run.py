@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
-from harness.estimators.answer import conclusion
+from harness.estimators.answer import conclusion, expected_for
 from harness.estimators.stopping import Rule, Verdict
 from harness.pool.replay import Retracing
 from harness.pool.vehicle_pool import BaselinePaths
@@ -233,6 +233,7 @@ class Run:
         for path in {path for table in TABLES for path in shards_on_disk(self.out, table)} - counted:
             path.unlink()
         stopped_by, said = conclusion(self.campaign, rule, manifest.n_episodes)
+        expected = expected_for(rule, self.campaign, manifest.n_episodes) if stopped_by != "rhw" else None
         missed = self.campaign.stop.rhw is not None and stopped_by != "rhw"
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
         if decision is not None:
@@ -241,7 +242,7 @@ class Run:
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         retraced = self._retracing.summary(manifest.n_retraced)
-        manifest.write("done", stopped_by=stopped_by, ending=said, retraced=retraced, **decided)
+        manifest.write("done", stopped_by=stopped_by, ending=said, retraced=retraced, expected=expected, **decided)
         self._progress.stage("writing estimates and report", None)
         estimates = estimate_run(self.out)
         write_sealed(self.out / ESTIMATES, estimates)

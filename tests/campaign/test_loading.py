@@ -278,7 +278,7 @@ def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, ow
         ("my_aw.py:MyAV", "no file .*my_aw.py.* Did you mean 'my_av.py'"),
         ("mine", "no campaign file, and no vehicle.* Did you mean 'mine.yaml'"),
         ("mime.yaml", "no such file.* Did you mean 'mine.yaml'"),
-        ("late-60ms", "Did you mean 'late-600ms'"),
+        ("late-60ms", r"or one of late-600ms, [^;]{9,99} … \(\d+ names\).* Did you mean 'late-600ms'"),
         ("mine.yaml:idm", "format"),  # which is no panel
     ],
 )

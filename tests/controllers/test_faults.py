@@ -67,7 +67,7 @@ def undisturbed(tmp_path_factory):
 
 IN_PROCESS = {
     "raises": "step: ZeroDivisionError: no such thing",
-    "none": "step: returned NoneType, expected an acceleration in m/s2 as a number",
+    "none": "step: returned None (is a return missing?), expected an acceleration in m/s2 as a number",
     "nan": "step: returned nan, expected a finite acceleration in m/s2",
     "inf": "step: returned inf, expected a finite acceleration in m/s2",
     "string": "step: returned str, expected an acceleration in m/s2 as a number",

@@ -12,6 +12,7 @@ from harness.estimators.block import Drawn
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
+from harness.estimators.shells import Shells
 from harness.estimators.tally import (
     FEWEST_PATHS,
     ROOM,
@@ -131,6 +132,21 @@ def test_a_crash_outside_refutes_the_assumption():
     assert text.startswith("It is NOT so that this vehicle keeps to careless: it crashed")
     assert "in 1 of 2 tests beyond careless, first in episode 2 (harness replay FOLDER 2)" in text
     assert any("does not hold" in warning for warning in estimate.warnings)
+
+
+def test_shares_of_the_crashes_have_the_limits_of_a_binomial_share():
+    """In one stratum, of a pool without error: Σ n KL(seen, limit) is a level's threshold."""
+    one = replace(SHELLS, strata=("a",), cell_stratum=(0,), cell_references=(0,), cell_p=P[:1], statements=())
+    every, some = (Shells.of(one, tally(0.0 * P[:1], (crashes,), (500,))) for crashes in (40, 10))
+    low, high = every.share_of_crashes(some, LEVEL, of_the_others=False)
+    for limit in (low, high):
+        distance = 10 * math.log(0.25 / limit) + 30 * math.log(0.75 / (1.0 - limit))
+        assert LEVEL.z**2 / 2.0 < distance < LEVEL.threshold  # which are those for many crashes and for few
+    others = every.share_of_crashes(some, LEVEL, of_the_others=True)
+    assert others == pytest.approx((1.0 - high, 1.0 - low), rel=1e-6)
+    assert every.share_of_crashes(every, LEVEL, of_the_others=False)[1] == 1.0
+    uncertain = Shells.of(replace(one, n_paths=30), tally(P[:1], (40,), (500,)))
+    assert uncertain.share_of_crashes(Shells.of(one, tally(P[:1], (10,), (500,))), LEVEL, of_the_others=False)[0] < low
 
 
 TWO = (Statement("library", "careful", "keeps to careful", 1), Statement("need", "careless", "brakes", 2, checked=True))

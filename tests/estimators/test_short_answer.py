@@ -3,12 +3,13 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
 from harness.campaign.files import load_campaign
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.short_answer import LINES, WIDTH, lines, vehicle_words
+from harness.estimators.short_answer import LINES, WIDTH, _whence, lines, pair_lines, vehicle_words
 from harness.records.folder import read_manifest
 from harness.runner.stored import stored_blocks
 from tests.golden.campaigns import BASE, RUNS
@@ -25,7 +26,12 @@ SAID = {
         "keeping to library ",
     ],
     "shells-accepted": ["ACCEPTED ", "below 4 × 10⁻⁷ per test", "confidence 0.95", "ended by: decision reached"],
-    "shells-refuted": ["138 (crashes more)", "103 crashes in 120 tests beyond", "ended by: all tests done"],
+    "shells-refuted": [
+        "138 (crashes more)",
+        "does NOT keep to it",
+        "103 crashes in 120 beyond it",
+        "ended by: all tests done",
+    ],
     "shells-need-based": ["need-based · ", "keeping to need-based "],
     "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin"],
     "forced-inattentive": ["fvdm (reaction.delay_s 0.2, "],
@@ -92,7 +98,10 @@ def test_a_vehicle_that_only_touches_is_said_so(stored_run):
     ]
     content = estimate_blocks(blocks, campaign, read_manifest(folder))
     text = lines(content["answer"], 1.0)
-    assert any(re.match(r"  impact +median 0.1 m/s +100 % below 1 m/s +0 % above 5 m/s", line) for line in text)
+    assert any(
+        re.match(r"  impact +median 0.1 m/s +0 % \(0–\d+ %\) > 5 m/s +100 % \(\d+–100 %\) < 1 m/s", line)
+        for line in text
+    )
     assert "  ! 100 % of this rate are touches below 1 m/s" in text
     assert content["answer"]["rows"][0] == estimates(folder)["answer"]["rows"][0]
 
@@ -127,3 +136,43 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
     assert any(not each["n_episodes"] for each in shells) == untested
     assert rate["value"].startswith("≥ ") == untested
     assert (rate["remark"] == "counts none where not tested") == untested
+    others = {row["key"]: row["value"] for row in content["answer"]["rows"]}
+    assert others["ratio"].startswith("≥ ") == untested
+    assert others["unavoidable"].endswith("where tested") == untested
+
+
+@pytest.mark.parametrize(
+    ("alone", "expected", "row"),
+    [
+        (0.4, {"runs": 1300, "tests": 240}, ("± 50 %, most by baseline runs", "± 40 %", "try 1,300 runs, 240 tests")),
+        (0.1, None, ("± 50 %, most by tests", "± 10 %", "")),
+    ],
+)
+def test_of_a_vehicle_that_acts_it_says_whether_runs_or_tests_are_missing(alone, expected, row):
+    campaign = golden("shells-acting-twin")
+    [found] = _whence(campaign, SimpleNamespace(rhw=0.5, details={"rhw_from_pool": alone}), expected)
+    runs = f"{campaign.pool.shadow_paths:,} runs alone {row[1]}"
+    assert (found.value, found.interval, found.remark) == (row[0], runs, row[2])
+
+
+def test_a_comparison_is_as_short():
+    """With what makes it long: names, far limits, warnings, a margin."""
+    side = {"crash_rate": 1.4e-7, "ci_low": 1e-10, "ci_high": 2e-7, "n_crashes": 93, "upper_bound": 1e-6}
+    inside = {
+        "ratio": 138.0, "ratio_low": 0.1, "ratio_high": None, "difference": -2e-7, "ci_low": -3e-7, "ci_high": -1e-7,
+        "n_differing": 9, "boundary": "brakes-2-late-1s",
+    }  # fmt: skip
+    content = {
+        **inside, "conditional": inside, "a": side, "b": {**side, "n_crashes": 0}, "n_pairs": 1234, "confidence": 0.9,
+        "campaigns": {"a": {"label": "a" * 40}, "b": {"label": "b c " * 20}}, "warnings": ["w" * 120] * 4,
+        "margin": None, "asked": "library", "ended": "rhw",
+    }  # fmt: skip
+    text = pair_lines(content, 2.0, "runs/ab/report.html")
+    assert len(text) <= LINES
+    assert max(map(len, text)) <= WIDTH
+    assert text[0].startswith("B crashes more often than A · 1,234 pairs on the same cut-ins")
+    assert text[0].endswith(" · crashes above 2 m/s per test")
+    shown = "\n".join(text)
+    assert "1.00 × 10⁻¹⁰ to 2.00 × 10⁻⁷" in shown
+    for said in ("0.10 to no limit", "no crash seen", "only where brakes-2-late-1s of", "by: precision reached"):
+        assert said in shown

@@ -2,15 +2,18 @@
 
 import json
 import re
+from dataclasses import replace
 
+import numpy as np
 import pyarrow.compute as pc
 import pytest
 
 import harness
 from harness.cli import main
 from harness.errors import RunFolderError
+from harness.estimators.short_answer import verdict_of_pair
 from harness.numbers import interval, number, ratio
-from harness.report.compare_page import Contrast, crashing_pairs, verdict, write_comparison
+from harness.report.compare_page import crashing_pairs, write_comparison
 from harness.report.plots import WHO
 from harness.report.summary import read_run_folder
 from tests.golden.campaigns import SHELLS
@@ -57,6 +60,9 @@ def test_the_map_holds_each_pair_with_a_crash(compared, page):
     assert min(counts.values()) > 0
     for place, side in ((1, "only_a"), (2, "only_b")):
         assert pairs.weight[pairs.who == place].sum() == pytest.approx(found[side]["value"])
+    impact = np.nanmax(np.where(pairs.who == [[2], [1]], np.nan, pairs.impact_mps), axis=0)
+    harder = [replace(run, campaign=run.campaign.replaced(("crash", "counts_above_mps"), 5.0)) for run in runs]
+    assert 0 < crashing_pairs(harder, found["shells"]).who.size == (impact > 5.0).sum() < impact.size
     for who, n in counts.items():
         assert f"{who} on {n}" in page.words
         assert f">{who} ({n})</text>" in page.html
@@ -123,7 +129,7 @@ def test_without_a_pair_on_which_they_differ_the_page_says_so(tmp_path):
 )
 def test_the_verdict(low, n, margin, said):
     decision = margin and {"margin": 0.1, "verdict": margin, "confidence": 0.98, "given_the_library": False}
-    assert verdict(Contrast(ci_low=low, ci_high=low + 2e-9, n_differing=n), decision) == said
+    assert verdict_of_pair({"ci_low": low, "ci_high": low + 2e-9, "n_differing": n}, decision) == said
 
 
 def test_runs_of_another_comparison_are_refused(compared, tmp_path):

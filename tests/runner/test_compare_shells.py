@@ -155,7 +155,10 @@ def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
     call = ["compare", str(copy), "--against", HARDER, "--out", str(tmp_path / "out"), "--workers", "1"]
     assert main([*call, "--set", "stop.rhw=0.15"]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("If A and B crash only where the surrogate")
+    assert out.startswith("B crashes less often than A · ")
+    assert len(out.splitlines()) <= 9
+    assert main([*call, "--set", "stop.rhw=0.15", "-v"]) == 0
+    assert capsys.readouterr().out.startswith("If A and B crash only where the surrogate")
     again = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert again["shells"] == done.content["shells"]
     assert main(["compare", str(MIXTURE_FILE), str(MIXTURE_FILE), "--out", str(tmp_path / "x"), "--margin", "0.1"]) == 2
