@@ -32,7 +32,7 @@ from harness.traffic.laws import Environment
 from harness.vehicles.drivers import driver_records
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
-from harness.worlds import AVLostError, DrivingWorld, World
+from harness.worlds import AVLostError, World
 
 NOBODY = driver_records([])
 MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}
@@ -117,7 +117,6 @@ class EpisodeLoop:
         self._policy = policy
         self._keep = keep
         self._av = av
-        self._driving: DrivingWorld | None = world if isinstance(world, DrivingWorld) else None
         self._scratch = empty_scratch(environment, importance)
         self._observation = empty_observation(world.n_cells)
         self._past = Past(0 if av is None else av.warm_up_steps, world.n_cells)
@@ -169,8 +168,7 @@ class EpisodeLoop:
 
     def _kernel_state(self, shard: Shard) -> KernelState:
         """All that kernels need for a shard, in the form that they need it in."""
-        policy, controlled = self._policy, self._av or self._driving
-        early = controlled is not None and controlled.acts_before_cut_in
+        policy, early = self._policy, (self._av or self._world).acts_before_cut_in
         return unboxed(
             KernelState(
                 seed=policy.seed,
@@ -225,8 +223,8 @@ class EpisodeLoop:
         try:
             if placed:
                 refilled = cells.placed[:placed]
-                if self._driving is not None:
-                    self._driving.announce(refilled, cells.cell["announced_index"][refilled])
+                if world.drives_av:
+                    world.announce(refilled, cells.cell["announced_index"][refilled])
                 world.place(refilled, world.x, world.v)
             contact = world.step(cells.speed, cells.cut_in)
         except AVLostError as lost:
@@ -244,8 +242,7 @@ class EpisodeLoop:
         """Fail all running episodes and begin again; returns their number."""
         running = np.flatnonzero(self._cells.cell["row"] >= 0)
         lost = self._fail(dict.fromkeys(running.tolist(), cause), kernel, shard)
-        if self._driving is not None:
-            self._driving.restart()
+        self._world.restart()
         return lost
 
     def _fail(self, failures: Mapping[int, str], kernel: KernelState, shard: Shard) -> int:
@@ -269,7 +266,7 @@ class EpisodeLoop:
             episode = shard.results.episode[row]
             if shard.traced[row] or self._keep.wants(int(episode["outcome"]), int(episode["n_control_steps"])):
                 trace = shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
-                if self._driving is not None:  # nobody commanded what the AV did: its speeds say it
+                if self._world.drives_av:  # nobody commanded what the AV did: its speeds say it
                     trace[:-1, AV, 2] = np.diff(trace[:, AV, 1]) / STEP_S
 
 

@@ -12,51 +12,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from itertools import chain
+from typing import NamedTuple, get_args
 
 import numpy as np
 
-from harness.campaign.drivers import (
-    BuiltInParameters,
-    CarefulCompetentParameters,
-    ConstantParameters,
-    FuzzySafetyParameters,
-    FVDMParameters,
-    IDMParameters,
-    NeedBasedParameters,
-    Reaction,
-    Reference,
-    Reflexes,
-)
+from harness.campaign.drivers import BuiltInParameters, FVDMParameters, IDMParameters, Reaction, Reference, Reflexes
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.compiled import compiled_inline
 from harness.vocabulary import Record, RecordArray
 
-IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
-CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = -1, -2, -3
+KINDS = dict(zip(get_args(BuiltInParameters), (0, 1, 2, -1, -2, -3), strict=True))
 """Below zero: those that remember a danger."""
+IDM_KIND, FVDM_KIND, CONSTANT_KIND, CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = KINDS.values()
 SMALLEST_GAP_M = 0.1
 """Gap below which the models see this gap: they divide by it."""
 
 MOST_FOLLOWERS = 62
 """Whether they crash are bits of one integer."""
 
-_COMMON = ("min_acceleration_mps2", "max_acceleration_mps2")
-_IDM = ("acceleration_mps2", "comfortable_deceleration_mps2", "time_headway_s", "minimum_gap_m", "desired_speed_mps")
-_FVDM = ("kappa_per_s", "lambda_per_s", "max_speed_mps", "v1", "v2", "c1_per_m", "c2")
-_REFERENCE = ("used_up_steps", "braking_jerk_mps3", "following_min_acceleration_mps2")
-_CAREFUL_COMPETENT = ("critical_ttc_s", "coasting_mps2")
-_FUZZY_SAFETY = ("comfortable_braking_mps2", "hard_braking_mps2", "leader_braking_mps2", "safe_margin_m")
-_NEED_BASED = ("reaction_steps", "needed_mps2", "standstill_gap_m")
-_REACTION = ("max_jerk_mps3", "inattention_probability", "perceives_lateral_m")
-_STEPS = ("delay_steps", "inattention_steps")
-MODEL_FIELDS = ("kind", *_COMMON, *_IDM, *_FVDM)
-"""What decides a driver's acceleration once it has reacted; the other fields say how it lags behind."""
+MODEL_FIELDS = tuple(dict.fromkeys(("kind", *IDMParameters.model_fields, *FVDMParameters.model_fields)))
+"""What decides the acceleration of one without a memory once it has reacted."""
+_DERIVED = ("reaction_steps", "used_up_steps", "max_jerk_mps3", "inattention_probability", "perceives_lateral_m")
+_NUMBERS = dict.fromkeys(chain(*(kind.model_fields for kind in KINDS), _DERIVED))
 DRIVER_DTYPE = np.dtype(
-    [(name, np.int64) for name in ("kind", *_STEPS)]
-    + [(name, np.float64) for name in (*_COMMON, *_IDM, *_FVDM, *_REACTION)]
-    + [(name, np.float64) for name in (*_REFERENCE, *_CAREFUL_COMPETENT, *_FUZZY_SAFETY, *_NEED_BASED)]
+    [(name, np.int64) for name in ("kind", "delay_steps", "inattention_steps")]
+    + [(name, np.float64) for name in _NUMBERS]
 )
+"""All parameters of all models (properties among them, and how a driver lags behind), 0 where one has no such."""
 
 
 class Followers(NamedTuple):
@@ -79,17 +62,9 @@ def driver_records(
     ``see_onset`` says that cut-ins take time: reference drivers then perceive and evaluate them, and none of their
     delay has been used up before.
     """
-    kinds: dict[type[BuiltInParameters], int] = {
-        IDMParameters: IDM_KIND,
-        FVDMParameters: FVDM_KIND,
-        ConstantParameters: CONSTANT_KIND,
-        CarefulCompetentParameters: CAREFUL_COMPETENT_KIND,
-        FuzzySafetyParameters: FUZZY_SAFETY_KIND,
-        NeedBasedParameters: NEED_BASED_KIND,
-    }
     records = np.zeros(len(drivers), dtype=DRIVER_DTYPE)
     for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
-        record["kind"] = kinds[type(driver)]
+        record["kind"] = KINDS[type(driver)]
         for name in DRIVER_DTYPE.names or ():
             record[name] = getattr(driver, name, record[name])
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3

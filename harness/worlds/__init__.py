@@ -1,12 +1,11 @@
-"""What simulates the vehicles: SUMO in batches, or its twin in compiled code; the only importer of libsumo.
-
-Both implement one small protocol over K cells.
-"""
+"""What simulates the vehicles: SUMO in batches, or its twin in compiled code; the only importer of libsumo."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 
@@ -18,24 +17,35 @@ MOST_SUMO_CELLS = 256
 """Roads of the largest committed network."""
 
 
-class World(Protocol):
+class World:
     """K cells, each with LV, BV and AV on a two-lane road of its own.
 
-    ``x``, ``v`` (K, 3) are front bumpers' positions (m) and speeds (m/s) of LV, BV, AV, as the world reports them.
+    ``x``, ``v`` (K, 3) are front bumpers' positions (m) and speeds (m/s) of LV, BV, AV, as the world reports them. One
+    that ``drives_av`` itself (SUMO's own models, or a program connected to SUMO) does so from the start of an episode
+    if it ``acts_before_cut_in``, else from the step after the cut-in.
     """
 
-    x: FloatArray
-    v: FloatArray
+    drives_av = acts_before_cut_in = False
+
+    def __init__(self, n_cells: int) -> None:
+        self.x: FloatArray = np.zeros((n_cells, 3))
+        self.v: FloatArray = np.zeros((n_cells, 3))
+        self._contact: BoolArray = np.zeros(n_cells, np.bool_)
 
     @property
     def n_cells(self) -> int:
         """K."""
+        return len(self.x)
+
+    def announce(self, cells: IntArray, episodes: IntArray) -> None:
+        """Episodes (n,) of the given cells (n,), told before they are placed."""
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
         """Put the vehicles of the given cells (n,) at ``x[cells]``, ``v[cells]``; LV and BV left, AV right.
 
         ``x`` and ``v`` (K, 3) may be the world's own arrays, already overwritten.
         """
+        raise NotImplementedError
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
         """Advance all cells to the speeds (m/s, shape (K, 3)) at the end of the step.
@@ -43,24 +53,13 @@ class World(Protocol):
         ``cut_in`` (K,) says whose BV moves to the right lane in this step. Returns the cells (K,) in which vehicles on
         the same lane have come into contact in it.
         """
-
-    def close(self) -> None:
-        """Release what the world holds."""
-
-
-@runtime_checkable
-class DrivingWorld(Protocol):
-    """A world that drives the AV itself: SUMO's own models, or a program connected to SUMO."""
-
-    @property
-    def acts_before_cut_in(self) -> bool:
-        """Whether it drives from the start of an episode, or from the step after the cut-in."""
-
-    def announce(self, cells: IntArray, episodes: IntArray) -> None:
-        """Episodes (n,) of the given cells (n,), told before they are placed."""
+        raise NotImplementedError
 
     def restart(self) -> None:
         """Begin again with all cells idle, after an `AVLostError`."""
+
+    def close(self) -> None:
+        """Release what the world holds."""
 
 
 class AVLostError(Exception):

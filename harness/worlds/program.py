@@ -234,10 +234,9 @@ def _exit_words(code: int) -> str:
 
 
 class TraciWorld(SumoCells):
-    """World whose AVs are driven by a connected program, after the cut-in or from the start of an episode.
+    """World whose AVs are driven by a connected program, after the cut-in or from the start of an episode."""
 
-    See `World` and `DrivingWorld` in `harness.worlds`.
-    """
+    drives_av = True
 
     def __init__(self, n_cells: int, av: TraciProcess, step_time_s: float, *, acts_before_cut_in: bool = False) -> None:
         super().__init__(n_cells)
@@ -250,7 +249,7 @@ class TraciWorld(SumoCells):
         atexit.register(self.close)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - the program is not told
-        """See `harness.worlds.DrivingWorld`; SUMO and the program are started with the first episodes.
+        """Start SUMO and the program with the first episodes.
 
         An `AVLostError` says that the program does not connect, or has been started as often as the campaign allows.
         """
@@ -279,7 +278,7 @@ class TraciWorld(SumoCells):
         super()._move(to, k, vehicle, x, v)
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.worlds.World`; the AVs of these cells are taken back under command."""
+        """Take the AVs of these cells back under command."""
         program = self._running()
         to = program.connection.vehicle
         for k in cells.tolist():
@@ -290,7 +289,7 @@ class TraciWorld(SumoCells):
         self._on_right[cells] = False
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.worlds.World`; speeds of released AVs are ignored.
+        """Speeds of released AVs are ignored.
 
         Raises an `AVLostError` where the program did not take part in this step, a `WorldDisagreementError` where a
         vehicle that the harness commands is not where it should be.
@@ -343,7 +342,7 @@ class TraciWorld(SumoCells):
             raise _meddled(where, repr(float(found[k, vehicle])), f"{float(wanted[k, vehicle])!r}, as commanded")
 
     def restart(self) -> None:
-        """See `harness.worlds.DrivingWorld`; once the restarts are used up, all further episodes fail."""
+        """Begin again; once the restarts are used up, all further episodes fail."""
         self._end_program()
         if self._restarts_left == 0:
             restarts = f"av.traci.restarts: {self._av.restarts}"

@@ -25,7 +25,7 @@ import numpy as np
 
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.vocabulary import AV, BV, LV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
-from harness.worlds import MOST_SUMO_CELLS
+from harness.worlds import MOST_SUMO_CELLS, World
 from harness.worlds.shim import Shim, open_shim
 from harness.worlds.system_libraries import not_importable
 from harness.worlds.twin import advance
@@ -46,25 +46,15 @@ PARKED_M = {LV: 300.0, BV: 200.0, AV: 100.0}
 """Where the vehicles of a cell stand that has not been given an episode."""
 
 
-class SumoCells:
-    """K roads in a SUMO, each with LV, BV and AV.
-
-    ``x``, ``v`` (K, 3) are as of `harness.worlds.World`.
-    """
+class SumoCells(World):
+    """K roads in a SUMO, each with LV, BV and AV."""
 
     def __init__(self, n_cells: int) -> None:
-        self.x: FloatArray = np.zeros((n_cells, 3))
-        self.v: FloatArray = np.zeros((n_cells, 3))
+        super().__init__(n_cells)
         self._park(np.arange(n_cells))
         self._names = [[f"{vehicle}{k}" for vehicle in VEHICLES] for k in range(n_cells)]
         self._flat = [name for cell in self._names for name in cell]
         self._cell_of = {name: k for k, cell in enumerate(self._names) for name in cell}
-        self._contact: BoolArray = np.zeros(n_cells, np.bool_)
-
-    @property
-    def n_cells(self) -> int:
-        """K."""
-        return int(self.x.shape[0])
 
     def _park(self, cells: Any) -> None:
         self.x[cells], self.v[cells] = [PARKED_M[LV], PARKED_M[BV], PARKED_M[AV]], 0.0
@@ -194,7 +184,7 @@ class SumoWorld(SumoCells):
             self._shim.find_vehicles()
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.worlds.World`; positions and speeds are read back and compared."""
+        """Positions and speeds are read back and compared."""
         positions, speeds = x[cells], v[cells]
         for k, at, driving in zip(cells.tolist(), positions.tolist(), speeds.tolist(), strict=True):
             for vehicle in (LV, BV, AV):

@@ -150,6 +150,8 @@ def _wrong(name: str, found: str | float, expected: str, mend: str) -> CampaignE
 class SumoAvWorld(SumoWorld):
     """`SumoWorld` whose AVs (see `av_type`) are driven by SUMO after the cut-in, or from the start of an episode."""
 
+    drives_av = True
+
     def __init__(
         self, n_cells: int, av: Mapping[str, str | float], *, acts_before_cut_in: bool = False, **options: Any
     ) -> None:
@@ -183,14 +185,8 @@ class SumoAvWorld(SumoWorld):
     def _type_of(self, vehicle: int) -> str:
         return TYPE_NAME if vehicle == AV else super()._type_of(vehicle)
 
-    def announce(self, cells: IntArray, episodes: IntArray) -> None:
-        """See `harness.worlds.DrivingWorld`; vehicles are recycled, whatever the episode."""
-
-    def restart(self) -> None:
-        """See `harness.worlds.DrivingWorld`; SUMO's models are never lost."""
-
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.worlds.World`; the AVs of these cells are taken back under command."""
+        """Take the AVs of these cells back under command."""
         for k in cells.tolist():
             self._api.vehicle.setSpeedMode(self._names[k][AV], OBEY)
         super().place(cells, x, v)
@@ -199,7 +195,7 @@ class SumoAvWorld(SumoWorld):
             self._let_go(cells)
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.worlds.World`; speeds of released AVs are ignored."""
+        """Speeds of released AVs are ignored."""
         self._wanted[:] = speed
         self._wanted[self._released, AV] = RELEASE
         contact = super().step(self._wanted, cut_in)

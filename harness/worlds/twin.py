@@ -7,6 +7,7 @@ import numpy as np
 from harness.compiled import compiled
 from harness.vehicles.kinematics import CONTACT_M, gap, next_position, overlaps
 from harness.vocabulary import AV, BV, LV, BoolArray, FloatArray, Int8Array, IntArray
+from harness.worlds import World
 
 
 @compiled
@@ -33,32 +34,20 @@ def contacts(x: FloatArray, on_right: Int8Array, cut_in: Int8Array, out: BoolArr
             out[k] = out[k] or gap(x[k, LV], x[k, BV]) < CONTACT_M
 
 
-class TwinWorld:
+class TwinWorld(World):
     """World without SUMO."""
 
     def __init__(self, n_cells: int) -> None:
-        self.x: FloatArray = np.zeros((n_cells, 3))
-        self.v: FloatArray = np.zeros((n_cells, 3))
+        super().__init__(n_cells)
         self._on_right: Int8Array = np.zeros(n_cells, np.int8)
-        self._contact: BoolArray = np.zeros(n_cells, np.bool_)
-
-    @property
-    def n_cells(self) -> int:
-        """K."""
-        return int(self.x.shape[0])
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """See `harness.worlds.World`."""
         self.x[cells] = x[cells]
         self.v[cells] = v[cells]
         self._on_right[cells] = 0
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """See `harness.worlds.World`."""
         self._on_right |= cut_in
         advance(self.x, self.v, speed)
         contacts(self.x, self._on_right, cut_in, self._contact)
         return self._contact
-
-    def close(self) -> None:
-        """Nothing to release."""
