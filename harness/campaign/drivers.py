@@ -105,11 +105,6 @@ class Reference(Following):
     following_min_acceleration_mps2: Braking = Field(-4.0, description="hardest braking of that IDM [assumed]")
 
     @property
-    def reaction_steps(self) -> float:
-        """Its reaction time, in steps."""
-        return 10.0 * self.reaction_time_s
-
-    @property
     def used_up_steps(self) -> float:
         """How much of its reaction time has passed by the cut-in, if that is the danger; in steps."""
         return 10.0 * self.evaluated_at_m / self.lateral_speed_mps
@@ -117,7 +112,7 @@ class Reference(Following):
     @property
     def delay_after_cut_in_s(self) -> float:
         """How long after the cut-in it begins to brake (s); not before it, however slowly BV comes over."""
-        return max(0.0, self.reaction_steps - self.used_up_steps) / 10.0
+        return max(0.0, 10.0 * self.reaction_time_s - self.used_up_steps) / 10.0
 
 
 class CarefulCompetentParameters(Reference):
@@ -155,11 +150,6 @@ class NeedBasedParameters(Section):
     reaction_time_s: Delay = Field(0.5, description="from the first need to the brakes [assumed]")
     needed_mps2: Strength = Field(1.0, description="braking that must be needed to prevent a collision [assumed]")
     standstill_gap_m: Gap = Field(2.0, description="gap that is to remain [assumed]")
-
-    @property
-    def reaction_steps(self) -> float:
-        """Its reaction time, in steps."""
-        return 10.0 * self.reaction_time_s
 
     @property
     def min_acceleration_mps2(self) -> float:

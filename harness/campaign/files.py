@@ -280,21 +280,15 @@ def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
 # -- a file as a model, or every problem by its place --
 
 
-class InvalidFileError(CampaignError):
-    """A file with one or more problems, each with its own place."""
-
-    def __init__(self, path: str, problems: Sequence[CampaignError]) -> None:
-        first, *more = self.problems = tuple(problems)
-        super().__init__(first.where, first.found, first.expected, first.mend)
-        if more:
-            at_least = "at least " if len(self.problems) == MOST_SHOWN else ""
-            super().__init__(path, f"{at_least}{len(self.problems)} problems", "none", "")
-            # Not shortened: each of its lines is short.
-            self.mend = "Mend each:\n" + "\n".join(f"  {problem}" for problem in self.problems)
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.path, self.problems)
+def _one_error(path: str, problems: Sequence[CampaignError]) -> CampaignError:
+    """That of a file with one or more problems, each with its own place."""
+    if len(problems) == 1:
+        return problems[0]
+    at_least = "at least " if len(problems) == MOST_SHOWN else ""
+    error = CampaignError(path, f"{at_least}{len(problems)} problems", "none", "")
+    # Not shortened: each of its lines is short.
+    error.mend = "Mend each:\n" + "\n".join(f"  {problem}" for problem in problems)
+    return error
 
 
 def read_model(path: str | Path, model: type[Model], overrides: Sequence[Override] = ()) -> Model:
@@ -308,7 +302,7 @@ def _checked(data: dict[str, Any], model: type[Model], places: Places) -> Model:
 
 
 def validated(data: Any, model: type[Model], path: str, place: Places) -> Model:
-    """Data of a file as a model; an `InvalidFileError` names every place where they do not fit."""
+    """Data of a file as a model; a `CampaignError` names every place where they do not fit."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -323,7 +317,7 @@ def validated(data: Any, model: type[Model], path: str, place: Places) -> Model:
                 expected = f"{alike.expected} or {expected}"
             mend = parts["mend"] or _where_it_belongs(str(where[-1]), model)
             problems[where, parts["found"]] = CampaignError(place(where), parts["found"], expected, mend)
-        raise InvalidFileError(path, list(problems.values())) from None
+        raise _one_error(path, list(problems.values())) from None
 
 
 def _path_of(loc: Sequence[str | int], data: Any) -> tuple[str | int, ...]:

@@ -67,6 +67,7 @@ def driver_records(
         record["kind"] = KINDS[type(driver)]
         for name in DRIVER_DTYPE.names or ():
             record[name] = getattr(driver, name, record[name])
+        record["reaction_steps"] = 10.0 * record["reaction_time_s"]
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3
         record["perceives_lateral_m"] = reaction.perceives_lateral_m
         record["delay_steps"] = round(reaction.delay_s * 10.0)

@@ -101,12 +101,6 @@ class Library(Section):
         """Acceleration of the envelope (m/s²)."""
         return self.surrogates[self.envelope].parameters.max_acceleration_mps2
 
-    def without(self, names: set[str]) -> Library:
-        """The library with some surrogates left out, and statements with them; never its boundary or envelope."""
-        kept = {name: model for name, model in self.surrogates.items() if name not in names}
-        statements = {name: each for name, each in self.statements.items() if each.boundary not in names}
-        return Library.model_validate({**dict(self), "surrogates": kept, "statements": statements})
-
     @property
     def all_statements(self) -> dict[str, StatementSettings]:
         """The statement `library`, with the library's own boundary, and the further ones."""

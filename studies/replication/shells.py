@@ -548,4 +548,6 @@ def leave_out(library: Library, names: set[str], conservative_first: tuple[str, 
             mend = "Add a surrogate to the library, or leave this vehicle out of the experiment."
             raise CampaignError("campaign.pool.library", found, "one that can be the boundary", mend)
         library = library.model_copy(update={"boundary": boundary})
-    return library.without(names)
+    kept = {name: model for name, model in library.surrogates.items() if name not in names}
+    statements = {name: each for name, each in library.statements.items() if each.boundary not in names}
+    return Library.model_validate({**dict(library), "surrogates": kept, "statements": statements})
