@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import libsumo
-import numpy as np
 import traci
 from sumolib.miscutils import getFreeSocketPort
 
 from harness.vocabulary import AV, BV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
+from harness.worlds import World
 from harness.worlds.sumo import EXACT_OPTIONS, committed_file, network_file
 
 LEFT, RIGHT = 1, 0
@@ -29,18 +29,14 @@ def sumo_arguments() -> list[str]:
     return ["-n", str(network_file(1)), "-a", str(committed_file("vehicles.add.xml")), *EXACT_OPTIONS]
 
 
-class OneAtATime:
-    """World of one cell over either API of SUMO; see `harness.worlds.World`."""
-
-    n_cells = 1
+class OneAtATime(World):
+    """World of one cell over either API of SUMO."""
 
     def __init__(self, api: Any) -> None:
-        self.x: FloatArray = np.zeros((1, 3))
-        self.v: FloatArray = np.zeros((1, 3))
+        super().__init__(1)
         self._api = api
         self._n_placed = 0
         self._names: list[str] = []
-        self._contact: BoolArray = np.zeros(1, np.bool_)
         api.route.add("cell0", ["cell0"])
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:  # noqa: ARG002 - there is one cell
