@@ -1,25 +1,23 @@
 import threading
+from functools import partial
 
 import pytest
 
 from harness.processes import made_ahead, side_by_side
 
 
-@pytest.mark.parametrize("worthwhile", [True, False])
-def test_results_come_in_the_order_of_the_items(worthwhile):
-    assert side_by_side(lambda i: i * i, range(100), worthwhile=worthwhile) == [i * i for i in range(100)]
+@pytest.mark.parametrize(
+    "work",
+    [
+        *(partial(side_by_side, worthwhile=worthwhile) for worthwhile in (True, False)),
+        *(partial(made_ahead, n_threads=n_threads) for n_threads in (None, 1, 3)),
+    ],
+)
+def test_results_come_in_the_order_of_the_items_and_errors_where_they_are_raised(work):
+    assert list(work(lambda i: i * i, range(100))) == [i * i for i in range(100)]
+    assert list(work(str, [])) == []
     with pytest.raises(ZeroDivisionError):
-        side_by_side(lambda i: 1 // i, [1, 0, 1], worthwhile=worthwhile)
-
-
-@pytest.mark.parametrize("n_threads", [None, 1, 3])
-def test_what_is_made_ahead_comes_in_the_order_of_the_items(n_threads):
-    assert list(made_ahead(lambda i: i * i, range(20), n_threads)) == [i * i for i in range(20)]
-    assert list(made_ahead(str, [], n_threads)) == []
-    ahead = made_ahead(lambda i: 1 // i, [1, 0, 1], n_threads)
-    assert next(ahead) == 1
-    with pytest.raises(ZeroDivisionError):
-        next(ahead)
+        list(work(lambda i: 1 // i, [1, 0, 1]))
 
 
 def test_the_next_item_is_made_while_the_present_one_is_in_use():

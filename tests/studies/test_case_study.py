@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from studies.__main__ import main
-from studies.case_study import repeated, tested
+from studies.case_study import tested
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
 from studies.case_study.page import claim_rows
 from studies.case_study.steps import step_keys
@@ -183,13 +183,6 @@ def test_ratios_of_paired_repetitions():
     rates = [1.0, 2.0, 4.0]
     assert ratio_of_variances(rates, rates, 0.9) == exactly(1.0)
     assert ratio_of_variances(rates, [1.0, 1.0, 1.0], 0.9) == figure(None)
-
-
-def test_replicated_tests_are_a_lower_limit_where_the_rate_is_missed():
-    assert repeated.true_tests(np.array([0.9, 1.1]), 1.0, 100.0)["value"] == pytest.approx(1.0)
-    missed = repeated.true_tests(np.array([0.2, 0.21, 0.22]), 1.0, 100.0)
-    assert (missed["value"], missed["low"]) == (None, pytest.approx(62.4, rel=0.01))
-    assert repeated.true_tests(np.array([1.0, 1.0]), None, 100.0) == figure(None)
 
 
 def test_relative_variance_of_known_weights():

@@ -17,8 +17,6 @@ from harness.errors import CampaignError
 from studies.__main__ import main
 from studies.replication import run
 from studies.replication.experiment import load_experiment
-from studies.replication.judgement import Row, Subject, corrected, judge
-from studies.replication.populations import Known
 from studies.work import worker_processes
 from tests.studies.here import Here
 
@@ -69,16 +67,6 @@ def test_workers_change_no_bit_and_the_online_rule_is_followed(tmp_path, monkeyp
             continue
         rhw = (row["ci_high"] - row["ci_low"]) / 2.0 / row["crash_rate"] if row["crash_rate"] else float("inf")
         assert row["reached"] == (rhw <= 0.5 and row["n_crashes"] > 0)
-
-
-def test_what_never_crashes_has_results_too(tmp_path):
-    (tmp_path / "x.yaml").write_text(CHAINS)
-    never, rows = Subject("never", Known.exactly(0.0)), [Row("x", k, 9, 0, 0.0, 0.0, 0.0, 0.1, False) for k in range(5)]
-    experiment = load_experiment(tmp_path / "x.yaml")
-    run.write_results(tmp_path, experiment, corrected([judge(never, "x", rows, 0.9)]), {never: rows})
-    content = json.loads((tmp_path / "results.json").read_text())
-    assert content["largest_relative_error_of_truth"] is None
-    assert [(one["bias"], one["coverage"]) for one in content["judgements"]] == [(None, 1.0)]
 
 
 def test_weighted_methods_run_in_the_twin(tmp_path, capsys, monkeypatch):

@@ -8,7 +8,6 @@ import pytest
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
-from harness.pool.cut_ins import environment_hash
 from harness.traffic import lateral as of_lateral
 from harness.traffic.lateral import constant_lead, lateral_position, log_normal_speed, perceived_in
 from harness.traffic.loading import load_environment, load_parameters
@@ -165,13 +164,3 @@ def test_an_onset_before_the_test_is_seen_in_its_first_step_with_what_has_come_o
     assert perceived_in(0.0, 4, 20, 1.7) == (1, 0.0)
     assert perceived_in(0.375, 4, 20, 1.7) == (1, 0.0)  # 1.275 m have come over
     assert perceived_in(1.5, 4, 20, 1.7)[0] == 3
-
-
-@pytest.mark.parametrize(
-    ("settings", "of_before"),
-    [({}, True), ({"cut_in_lead_s": 0.0}, True), ({"cut_in_lead_s": 0.5}, False), ({"parameters": LATERAL}, False)],
-)
-def test_what_says_nothing_of_leads_has_the_hash_of_before(settings, of_before):
-    """Written down before cut-ins could take time; those of campaigns are in tests/campaign."""
-    found = environment_hash(load_environment(EnvironmentSettings(**settings)))
-    assert (found == "e5b943592be3f1b7d3db2db8") == of_before
