@@ -14,6 +14,7 @@ from harness.campaign.drivers import IDMParameters
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads
 from harness.episode import likelihood_ratio
+from harness.episode.decide import draw_from
 from harness.importance import functions
 from harness.importance.challenge import remaining_level
 from harness.importance.grid import AFTER, interpolate, locate
@@ -218,6 +219,12 @@ def _before(states, maneuvers, steps, environment, importance, cut, stay, p, q, 
 
 
 @compiled_threads
+def _draws(u, component, alpha, q, out):
+    for i in range(u.size):
+        out[i] = draw_from(u[i], component, alpha, q)
+
+
+@compiled_threads
 def _accumulate(importance, ratios, v, log_ratio, martingale, sampled):
     log_sampled = 0.0
     for t in range(ratios.shape[0]):
@@ -242,6 +249,13 @@ def before_cut_in(states, maneuvers, steps, environment, importance) -> Proposal
     indices, times = np.asarray(maneuvers, np.int64), np.asarray(steps, np.int64)
     _before(np.ascontiguousarray(states, float), indices, times, environment, importance, cut, stay, p, q, v, critical)
     return Proposals(np.stack([p, 1.0 - p], axis=-1), np.stack([q, 1.0 - q], axis=-1), v, critical)
+
+
+def drawn(u, component, alpha, q):
+    """Indices (n,) that uniforms are turned into, under importance functions q (J, 31)."""
+    out = np.empty(u.size, np.int64)
+    _draws(u, component, alpha, np.ascontiguousarray(q), out)
+    return out
 
 
 def accumulated(of_episodes, alpha, ratios, v):

@@ -17,7 +17,7 @@ from harness.importance.tables import Tables
 from harness.vehicles.kinematics import CONTACT_M
 from harness.vocabulary import CUT_IN, STATE_COLUMNS, STAY
 from tests.episode.twin_runs import prepared, run
-from tests.kernels import accumulated, after_cut_in, before_cut_in
+from tests.kernels import accumulated, after_cut_in, before_cut_in, drawn
 
 CHALLENGES = {"immediate": "two", "recursive": "default"}  # and the surrogates
 EPSILONS = (0.0, 0.1, 1.0)
@@ -98,6 +98,21 @@ def test_records_hold_what_was_drawn_from(challenge):
     np.testing.assert_array_equal(done.moment_q[after], found.q[each, :, rows["maneuver"]])
     np.testing.assert_array_equal(rows["p"], found.p[each, rows["maneuver"]])
     np.testing.assert_allclose(done.moment_q @ done.alpha, done.moment["q_sampled"], rtol=1e-12)
+
+
+@pytest.mark.parametrize("component", [1, 2, 3])
+def test_draws_follow_the_mixture_or_the_component(component):
+    """Equal steps of the uniform give every acceleration its probability to within one step."""
+    policy = prepared("step_mixture", "recursive").policy
+    found = after_cut_in([(30.0, 40.0, 0.0, 11.0, -8.0)], policy.environment, policy.importance)
+    q, alpha = found.q[0], np.array([0.5, 0.3, 0.2])
+    assert found.critical[0]
+    u = (np.arange(100_000) + 0.5) / 100_000
+    by_step = np.bincount(drawn(u, -1, alpha, q), minlength=31) / u.size
+    np.testing.assert_allclose(by_step, alpha @ q, rtol=0, atol=1.001e-5)
+    by_component = np.bincount(drawn(u, component, alpha, q), minlength=31) / u.size
+    np.testing.assert_allclose(by_component, q[component - 1], rtol=0, atol=1.001e-5)
+    assert np.abs(by_step - by_component).max() > 1e-3
 
 
 # -- grid cells that are skipped: those, and only those, in which interpolation could find no challenge --
