@@ -145,7 +145,7 @@ def test_results_that_columns_do_not_explain_have_no_gain_once_corrected():
     assert (fit.rank, fit.is_saturated, fit.is_rank_deficient) == (512, False, False)
     assert 1.7 < claimed < 2.4
     assert 0.7 < fair < 1.35
-    assert unseen < 0.7  # what is estimated from so few costs more than it gains
+    assert 0.43 < unseen < 0.55  # what is estimated from so few costs more than it gains: 1 - 513/1000
 
 
 def test_saturated_strata_are_warned_of_and_deficient_ones_named():
