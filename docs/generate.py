@@ -251,18 +251,18 @@ def validated_table(name: str) -> str:
 FORMER = ", by the former rule"
 
 
-def decisions() -> str:
+def decisions(name: str = "gate") -> str:
     """What campaigns decided about limits at the rate itself, by rule, and in how many tests about others; command."""
-    content = _result("gate")
+    content = _result(name)
     budget = content["experiment"]["campaign"]["stop"]["episodes"]
     by_vehicle = _by_result(content["judgements"])
 
     def most(verdict: str, by: str = "") -> str:
-        name = f"limit 1 x rate, {verdict} within {budget:,} tests{by}"
-        return f"{max(100.0 * (1.0 - of[name]['coverage']) for of in by_vehicle.values()):.1f} %"
+        result = f"limit 1 x rate, {verdict} within {budget:,} tests{by}"
+        return f"{max(100.0 * (1.0 - of[result]['coverage']) for of in by_vehicle.values()):.1f} %"
 
     def tests(way: str) -> str:
-        found = {name: of[f"limit {way} within {budget:,} tests"] for name, of in by_vehicle.items()}
+        found = {each: of[f"limit {way} within {budget:,} tests"] for each, of in by_vehicle.items()}
         medians = [one["tests_median"] for one in found.values() if one["reached"] > 0.5]
         usual = found["idm"]["tests_median"]
         return f"{min(medians):,.0f} to {max(medians):,.0f} tests (median; {usual:,.0f} of the default vehicle)"
@@ -272,7 +272,7 @@ def decisions() -> str:
         f"{most('accepted')} accepted and {most('rejected')} rejected; by the former rule "
         f"{most('accepted', FORMER)} and {most('rejected', FORMER)}. A limit of twice the rate was decided after "
         f"{tests('2 x rate, rejected')}, one of half the rate after {tests('0.5 x rate, accepted')}. "
-        f"{_command('gate')}; each vehicle is in [gate.json](validation/gate.json).\n"
+        f"{_command(name)}; each vehicle is in [{name}.json](validation/{name}.json).\n"
     )
 
 
@@ -384,6 +384,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "validated-lateral": partial(validated_range, "lateral"),
     "coverage": coverage_table,
     "decisions": decisions,
+    "decisions-beside": partial(decisions, "gate_beside"),
 }
 """All generated parts by name."""
 
