@@ -243,9 +243,7 @@ REFUSED = (
     ),
     Combination(
         "testing.shells.statement",
-        lambda c, use: (
-            use.command == "compare" and c.testing.shells.statement not in (ASSUMPTION_FREE, LIBRARY_STATEMENT)
-        ),
+        lambda c, use: use.command == "compare" and c.testing.shells.statement not in _COMPARED,
         "{testing.shells.statement}",
         f"{' or '.join(_COMPARED)}: a comparison has these two",
         "Choose one of them.",
