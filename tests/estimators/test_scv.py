@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from harness.estimators.block import Block
+from harness.estimators.limits import normal_half_width, skewed_distances
 from harness.estimators.scv import (
     CHUNK_ROWS,
     MixtureCv,
@@ -121,6 +122,18 @@ def test_mixture_cv_is_the_intercept_of_least_squares():
     assert estimate.crash_rate == pytest.approx(coefficients[0], rel=1e-11)
     assert estimate.std_error == pytest.approx(np.sqrt(variance), rel=1e-9)
     assert estimate.crash_rate != estimate.details["plain_mean"]
+
+
+def test_the_interval_is_as_skewed_as_the_residuals():
+    parts = list(blocks(MANY, "episode_mixture", [400, 100], SEED))
+    estimate = fed(MixtureCv(), parts).result(0.9)
+    y = np.concatenate([part.weighted_crashes() for part in parts])
+    h = np.concatenate([part.mixture_ratios() for part in parts]) - 1.0
+    residuals = y - estimate.crash_rate - h @ estimate.details["beta"]
+    below, above = skewed_distances(estimate.std_error, np.sum(residuals**3) / len(y) ** 3, 0.05)
+    assert estimate.ci_high - estimate.crash_rate == pytest.approx(above, rel=1e-9)
+    assert estimate.crash_rate - estimate.ci_low == pytest.approx(min(below, estimate.crash_rate), rel=1e-9)
+    assert above > 1.01 * normal_half_width(estimate.std_error, 0.9)
 
 
 def test_control_that_never_acted_leaves_the_plain_mean():
