@@ -26,7 +26,7 @@ from pydantic.fields import FieldInfo
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import PARAMETERS
-from harness.records.schemas import baseline_schema, episodes_schema, moments_schema, traces_schema
+from harness.records.schemas import baseline_schema, episodes_schema, moments_schema, pilot_schema, traces_schema
 
 FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -36,6 +36,7 @@ SCHEMAS = {
     "moments": moments_schema(3),
     "traces": traces_schema(takes_time=True),
     "shadow": baseline_schema(),
+    "pilot": pilot_schema(),
 }
 RESULTS = {
     "level_1": ("nde_1", "forced_1", "step_recursive_1", "episode_recursive_1"),

@@ -18,11 +18,15 @@ class Holds(IDM):
 
     def step_batch(self, seen: Any) -> Any:
         """Accelerations (m/s²)."""
-        return np.where(np.isinf(seen.gap_m), self.before(seen), super().step_batch(seen))
+        return np.where(np.isinf(seen.gap_m), self.before(seen), self.after(seen))
 
     def before(self, seen: Any) -> Any:
         """What it does until the cut-in (m/s²)."""
         return np.zeros(seen.cell.size)
+
+    def after(self, seen: Any) -> Any:
+        """What it does from the cut-in on (m/s²)."""
+        return IDM.step_batch(self, seen)
 
 
 class DrivesFreely(Holds):
@@ -134,6 +138,23 @@ class Yields(Holds):
         gap = seen.bv_position_m - _LENGTH_M - seen.position_m
         behind = seen._replace(gap_m=np.maximum(gap, 0.1), lead_speed_mps=seen.bv_speed_mps)
         return np.where(gap > 0.0, np.maximum(IDM.step_batch(self, behind), -self._deceleration), 0.0)
+
+
+class AsNeeded(Holds):
+    """After the cut-in brakes as hard as it takes to come to rest one metre behind BV: mild ones it brakes for late."""
+
+    def after(self, seen: Any) -> Any:
+        """What it does from the cut-in on (m/s²)."""
+        closing = np.fmax(seen.speed_mps - seen.lead_speed_mps, 0.0)
+        return -np.minimum(closing * closing / (2.0 * np.maximum(seen.gap_m - 1.0, 0.1)), 6.0)
+
+
+class CarefulAsNeeded(AsNeeded, Careful):
+    """Makes room, and brakes as needed."""
+
+
+class YieldsAsNeeded(AsNeeded, Yields):
+    """Follows BV while that is still on the other lane, and brakes as needed."""
 
 
 def _with_room(values: Any, cells: Any) -> Any:

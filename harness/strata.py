@@ -18,6 +18,8 @@ OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
 ASSUMPTION_FREE, LIBRARY_STATEMENT = "assumption_free", "library"
 """Names of the statement that has no boundary, and of the one whose boundary is the library's own."""
+LEARNED = "learned"
+"""Name of the stratum outside on which a surrogate that was learned from the vehicle crashes."""
 FAILED_BASELINE = "failed shadow runs"
 """Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
 
@@ -86,6 +88,8 @@ class ShellDesign:
         Cut-ins that the pool has kept of each; empty if that is no limit.
     shadow_runs : bool
         Whether the pool's paths are the few that the vehicle has walked itself.
+    learned : str
+        How that surrogate was learned, in words; empty if there is none.
     candidates : int
         Of how many paths these were chosen; 0 in runs of earlier days, whose tests do not say which runs they repeat.
     """
@@ -105,6 +109,7 @@ class ShellDesign:
     available: tuple[int, ...] = ()
     shadow_runs: bool = False
     candidates: int = 0
+    learned: str = ""
 
     @cached_property
     def p(self) -> FloatArray:

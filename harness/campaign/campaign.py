@@ -107,7 +107,9 @@ class Campaign(Section):
         if testing["shells"]["smallest_round"] == 1:
             del testing["shells"]["smallest_round"]
         testing["shells"] |= {key: usual for key, (usual, *_) in ShellSettings.gone.items()}  # nor does what went
-        unused = {"shadow_paths"} if not self.av.acts_before_cut_in else set()
+        acts, usual = self.av.acts_before_cut_in, PoolSettings().pilot_tests
+        unused = {"shadow_paths"} if not acts else set()
+        unused |= {"pilot_tests"} if not acts or self.pool.pilot_tests == usual else set()
         content = {
             **({"crash": self.crash.model_dump()} if self.crash != CrashSettings() else {}),
             "seed": self.seed,

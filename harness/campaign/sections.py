@@ -180,6 +180,12 @@ class PoolSettings(Section):
         le=100_000,
         description="baseline runs of a vehicle that acts before the cut-in",
     )
+    pilot_tests: Whole = Field(
+        300,
+        ge=0,
+        le=100_000,
+        description="its tests that do not count, from which a surrogate is learned; 0: none",
+    )
     seed: Whole = Field(1, ge=0, lt=2**63, description="of the pool's random numbers")
 
 

@@ -143,6 +143,8 @@ def _answer(
             "collision, count as no crash: had they all crashed, the rate would be "
             f"{number(found.crash_rate + cut_off)}."
         )
+    if learned := found.details.get("learned"):
+        text += f" The stratum learned is where a surrogate of this vehicle crashes, learned from {learned}."
     if repeated is None or not (n := repeated["n_episodes"]):
         return text
     if not (n_differing := len(repeated["differing"])):

@@ -137,6 +137,7 @@ class ShellDetails:
     rhw_from_pool_at_least: float
     p_cut_in: float
     p_impossible: float
+    learned: str
     references: tuple[BesideReference, ...]
     statements: tuple[Within, ...]
     shells: tuple[Shell, ...]
@@ -237,6 +238,7 @@ class Shells:
                     *free.from_pool_relative(),
                     design.p_cut_in,
                     design.p_unreachable,
+                    design.learned,
                     references=() if cautions else compared(design, self._cells, Level.two_sided(confidence)),
                     statements=tuple(self.within(each.name, confidence) for each in design.statements),
                     shells=self._shells(tally, (1.0 - confidence) / 2.0),

@@ -53,7 +53,7 @@ def campaign_pool_key(resolved: Resolved) -> str:
         {name: model.model_dump() for name, model in library.surrogates.items()},
         [(name, model.model_dump()) for name, model in library.references.items()],
         [sorted(boundaries), library.boundary, library.envelope],
-        resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths"}),
+        resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths", "pilot_tests"}),
         resolved.campaign.crash.counts_above_mps,
     ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
@@ -174,12 +174,15 @@ def pool_of(
     library: Library,
     settings: PoolSettings,
     key: str,
+    more: Sequence[str] = (),
 ) -> Pool:
     """Sort the cut-ins of paths into shells, by surrogates in this order, and cells; keep a sample of each shell.
 
-    ``seed`` is that of the paths; without an order surrogates are put into that of their rates.
+    ``seed`` is that of the paths; without an order surrogates are put into that of their rates. ``more`` are surrogates
+    that come after those of the library.
     """
-    n_surrogates, n_references = len(library.surrogates), len(library.references)
+    names, n_references = np.array([*library.surrogates, *more]), len(library.references)
+    n_surrogates = names.size
     rates, mass = paths.rates(n_surrogates), paths.mass
     order = conservative_first(rates) if order is None else order
     n = len(rates)
@@ -197,7 +200,7 @@ def pool_of(
         key=key,
         environment=environment_hash(environment),
         library=library,
-        names=tuple(np.array(list(library.surrogates))[order].tolist()),
+        names=tuple(names[order].tolist()),
         n_paths=n,
         p_cut_in=float(rates[:, -1].mean()),
         p_cut_in_se=float(rates[:, -1].std() / np.sqrt(n)),

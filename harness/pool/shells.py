@@ -10,6 +10,8 @@ even the full-throttle envelope crashes is left out, with crash probability 0, i
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +21,7 @@ from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
-from harness.strata import FAILED_BASELINE, OUTSIDE, Reference, ShellDesign, Statement
+from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign, Statement
 from harness.traffic.laws import Environment
 from harness.vehicles.library import Library, StatementSettings, library_records
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
@@ -27,6 +29,8 @@ from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 CANDIDATES = 32_768
 """Paths of an AV that holds its speed, of which baseline runs are chosen: they cost milliseconds each, and save two of
 three runs."""
+PILOT_KEY = 0x70696C6F74
+"""Keeps the choice of pilot tests apart from the order of strata."""
 _REFERENCES = {"r157-cc": "a careful and competent driver", "r157-fsm": "a driver by the fuzzy safety model"}
 """Drivers of UN Regulation No. 157 in plain words."""
 
@@ -80,12 +84,24 @@ def shells_in_strata(pool: Pool, limit_mps2: float) -> list[list[int]]:
     tested = present if limit_mps2 > pool.library.envelope_mps2 else [s for s in present if s < len(pool.names)]
     inside = [[s] for s in tested if s <= boundary]
     outside = [s for s in tested if s > boundary]
-    return [*inside, outside] if outside else inside
+    learned = [s for s in outside if _name(pool, s) == LEARNED]
+    return [*inside, *(group for group in (learned, [s for s in outside if s not in learned]) if group)]
+
+
+def _name(pool: Pool, shell: int) -> str:
+    """Of the stratum that begins with a shell."""
+    beyond = shell > outermost(pool)
+    return pool.names[shell] if not beyond or LEARNED in pool.names[shell : shell + 1] else OUTSIDE
 
 
 def outermost(pool: Pool) -> int:
     """Index of the shell up to which strata are shells: the widest boundary of the library's statements."""
-    return max(pool.names.index(each.boundary) for each in pool.library.all_statements.values())
+    return widest(pool.names, pool.library)
+
+
+def widest(names: Sequence[str], library: Library) -> int:
+    """Place of the widest boundary among surrogates in their order."""
+    return max(names.index(each.boundary) for each in library.all_statements.values())
 
 
 def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
@@ -93,11 +109,11 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
     groups = shells_in_strata(pool, limit_mps2)
     statements = _statements(pool, groups)
     cells, stratum, references = cells_in_strata(pool, groups)
-    n_inside, takes_time = statements[-1].n_inside, bool(pool.cut_ins.lead.any())
+    takes_time = bool(pool.cut_ins.lead.any())
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
     design = ShellDesign(
         pool=pool.key,
-        strata=(*(pool.names[group[0]] for group in groups[:n_inside]), *([OUTSIDE] * (len(groups) - n_inside))),
+        strata=tuple(_name(pool, group[0]) for group in groups),
         cell_stratum=tuple(stratum.tolist()),
         cell_p=p,
         cell_references=tuple(references.tolist()),
@@ -182,7 +198,8 @@ class PrescribedEpisodes:
     def __init__(self, campaign: Campaign, pool: Pool) -> None:
         limit = acceleration_limit(campaign.av)
         design, groups = design_shells(pool, limit), shells_in_strata(pool, limit)
-        self._cut_ins = pool.cut_ins
+        self._cut_ins, self._shell, self._shell_p = pool.cut_ins, pool.shell, pool.shell_p
+        self._n_inside = outermost(pool) + 1
         self._cells = cells_in_strata(pool, groups)[0]
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
         self._order += [np.zeros(0, np.int64)] * (len(design.strata) - len(groups))
@@ -192,6 +209,19 @@ class PrescribedEpisodes:
     def available(self) -> IntArray:
         """How many draws each stratum allows, shape (S,)."""
         return np.array(self.design.available, np.int64)
+
+    def pilot(self, n: int, seed: int) -> tuple[RecordArray, PrescribedTraffic]:
+        """Some n cut-ins to learn the vehicle from: half of them inside the boundaries, half evenly of shells beyond.
+
+        Inside they are drawn by probability.
+        """
+        rng = np.random.Generator(np.random.Philox(key=np.array([seed, PILOT_KEY], np.uint64)))
+        p = self._shell_p
+        shells, inside = np.flatnonzero(p[:-1]), p[: self._n_inside].sum()
+        share = [p[s] / inside if s < self._n_inside else 1.0 / (shells >= self._n_inside).sum() for s in shells]
+        kept = [rng.permutation(np.flatnonzero(self._shell == s)) for s in shells]
+        rows = np.concatenate([of[: math.ceil(0.5 * n * part)] for of, part in zip(kept, share, strict=True)])
+        return self.of_rows(rows, np.zeros(rows.size, np.int64))
 
     def rows(self, draws: tuple[Draw, ...]) -> tuple[IntArray, IntArray]:
         """Rows of the pool's cut-ins, and their strata, shape (n,) each; IndexError beyond what a stratum allows."""

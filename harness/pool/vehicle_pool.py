@@ -26,18 +26,22 @@ from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.cut_ins import Pool
-from harness.pool.shells import CANDIDATES, conservative_first
+from harness.pool.learned import Learned, learned_crashes
+from harness.pool.shells import CANDIDATES, conservative_first, shells_of, widest
 from harness.pool.walk import PILOT_PATHS, BaselineRuns, EnumeratedPaths, contributions, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.records.folder import require_place, write_atomically
 from harness.resolved import Resolved
+from harness.strata import LEARNED
 from harness.traffic.laws import Environment
 from harness.vehicles.library import Library
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 EVENLY = 0.1
 """Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
+LEAST_LEARNED = 0.05
+"""Share of the learned surrogate's crash rate beyond the boundaries from which on it has a shell there."""
 CHOICE_DRAW = 2
 """Draw of a baseline run within the diagnostic stream."""
 
@@ -147,8 +151,10 @@ def _cached(path: Path, key: str) -> Candidates | None:
         return None
 
 
-def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns) -> Pool:
+def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, learned: Learned | None = None) -> Pool:
     """Pool of the vehicle that was driven along the paths.
+
+    A surrogate that was ``learned`` from it has a shell beyond the boundaries, if a share of its crashes lies there.
 
     Raises `HarnessError`: no cut-in was found on which even the envelope crashes.
     """
@@ -163,9 +169,22 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns) -
         )
         raise HarnessError("baseline runs", none, "some: the crash rate is estimated from them", mend)
     mass = found.probability * paths.weight[:, None]
-    enumerated = EnumeratedPaths(paths.index, paths.state, paths.weight, mass, found.crashes)
-    key = hashlib.sha256(" ".join((paths.key, resolved.content_hash, runs.digest())).encode()).hexdigest()[:24]
-    pool = pool_of(enumerated, paths.seed, paths.order, environment, library, resolved.campaign.pool, key)
+    known, more = [paths.key, resolved.content_hash, runs.digest()], list[str]()
+    order, crashes = paths.order, found.crashes
+    if learned is not None:
+        asked = (crashes != 0) & (mass > 0.0)
+        given = paths.seed, paths.index, paths.state, environment, runs, asked, followers.counts_above_mps
+        place = widest([list(library.surrogates)[d] for d in order], library) + 1
+        beyond = shells_of(crashes, order) >= place
+        own = learned_crashes(learned, *given)
+        if mass[own & beyond].sum() > LEAST_LEARNED * mass[own].sum():
+            n, more, known = order.size, [LEARNED], [*known, learned.digest()]
+            of_library = crashes & ((1 << n) - 1)
+            crashes = of_library | ((own & beyond).astype(np.int64) << n) | ((crashes >> n) << (n + 1))
+            order = np.insert(order, place, n)
+    enumerated = EnumeratedPaths(paths.index, paths.state, paths.weight, mass, crashes)
+    key = hashlib.sha256(" ".join(known).encode()).hexdigest()[:24]
+    pool = pool_of(enumerated, paths.seed, order, environment, library, resolved.campaign.pool, key, more)
     hashes = motion_hashes(runs.x_m, runs.v_mps)
     row, step, onset = pool.cut_ins.row, pool.cut_ins.step, pool.cut_ins.onset
     # A kept cut-in stands for its like nearby, too, where these are too improbable to be kept one by one.

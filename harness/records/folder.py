@@ -346,6 +346,8 @@ class StoredManifest(Stored):
     retraced: Retraced | None = None
     repeated: Repeated | None = None
     baseline_crc32: list[Count] = []
+    pilot_tests: dict[str, Count] | None = None
+    pilot_crc32: list[Count] = []
 
 
 def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:

@@ -177,6 +177,25 @@ def baseline_schema() -> pa.Schema:
     )
 
 
+def pilot_schema() -> pa.Schema:
+    """Schema of the ``pilot`` table: one row per test from which the vehicle was learned."""
+    positions, speeds = "front bumper, initially and after each step", "initially and after each step"
+    return pa.schema(
+        [
+            _field("shadow", _I8, "1", "baseline run that the test repeats"),
+            _field("cut_in_step", _I2, "0.1 s", "step of the cut-in"),
+            _field("onset_step", _I2, "0.1 s", "step from which on the vehicle may have seen it"),
+            _field("outcome", _NAME, "", "crash, timeout, bv_lv_contact or failed"),
+            *(
+                _field(f"{who}_{what}", pa.list_(_F8), unit, doc)
+                for who in ("av", "bv")
+                for what, unit, doc in (("position_m", "m", positions), ("speed_mps", "m/s", speeds))
+            ),
+            _or_null("failure", pa.string(), "", "cause, for failed tests"),
+        ]
+    )
+
+
 class ShardTables(NamedTuple):
     """The tables of a shard; ``moments`` and ``traces`` are None when the campaign keeps none."""
 
@@ -332,3 +351,19 @@ def baseline_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table
         "av_speed_mps": pa.array([trace[:, AV, 1] for trace in traces], pa.list_(pa.float64())),
     }
     return _table(baseline_schema(), columns, e)
+
+
+def pilot_table(shard: Shard) -> pa.Table:
+    """One row per pilot test of a shard that has kept all motion."""
+    e, traces = shard.results.episode, [shard.traces[row] for row in range(shard.results.episode.size)]
+    columns: dict[str, Any] = {
+        "shadow": shard.traffic.announced_index,
+        "cut_in_step": shard.traffic.cut_step.astype(np.int16),
+        "onset_step": np.maximum(shard.traffic.cut_step - shard.traffic.lead, 0).astype(np.int16),
+        "outcome": _names(e["outcome"], OUTCOMES),
+        "failure": pa.array([shard.failures.get(row) for row in range(e.size)], pa.string()),
+    }
+    for who, vehicle in (("av", AV), ("bv", BV)):
+        for what, column in (("position_m", 0), ("speed_mps", 1)):
+            columns[f"{who}_{what}"] = pa.array([trace[:, vehicle, column] for trace in traces], pa.list_(pa.float64()))
+    return _table(pilot_schema(), columns, e)

@@ -88,7 +88,7 @@ class Manifest:
 
     ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are
     more keys. ``limits_before`` are other limits that have been asked of the folder's tests, ``listed_baseline``
-    the checksums of its baseline runs.
+    the checksums of its baseline runs, ``listed_pilot`` those of its pilot tests.
     """
 
     def __init__(
@@ -103,6 +103,7 @@ class Manifest:
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
         asked = [] if campaign.accept is None else [_asked(campaign.accept)]
         self.listed_baseline: list[int] = earlier.get("baseline_crc32", [])
+        self.listed_pilot: list[int] = earlier.get("pilot_crc32", [])
         earlier_limits = earlier.get("limits", []) if earlier["n_episodes"] else []
         self.limits_before = [limit for limit in earlier_limits if limit not in asked]
         self._content: dict[str, Any] = {

@@ -46,7 +46,7 @@ from harness.records.folder import Repeated, encoded, read_table
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.sampling import prepare
-from harness.sampling.baseline import BaselineResult, as_recorded, run_baseline
+from harness.sampling.baseline import BaselineResult, as_recorded, learned_in, run_baseline
 from harness.sampling.protocol import ShardRequest, Source
 from harness.vocabulary import FAILED
 from harness.worlds import build_world
@@ -147,7 +147,8 @@ class ShardRunner:
             return run_baseline(self._loop, paths, source.resolved.environment, request)
         if paths is not None and not self._begun:
             self._begun = True
-            source.begin_after(as_recorded(read_table(self._baseline), source.resolved.environment))
+            table = read_table(self._baseline)
+            source.begin_after(as_recorded(table, source.resolved.environment), learned_in(table))
             self._loop = self._loop.beside(drawing=source.policy)
         return self._tests(request)
 

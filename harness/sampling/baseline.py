@@ -1,4 +1,6 @@
-"""Baseline runs: a vehicle that acts before the cut-in is driven along each path without one, to know where it is.
+"""Before tests that count: baseline runs, and the pilot tests that a surrogate is learned from.
+
+A vehicle that acts before the cut-in is driven along each path without one, to know where it is.
 
 A test repeats the path with a cut-in, and tells the vehicle the index of the baseline run, so that both see the same
 random stream. What the vehicle did through the step of the cut-in must be the same to the last bit, or the test fails.
@@ -6,6 +8,7 @@ random stream. What the vehicle did through the step of the cut-in must be the s
 
 from __future__ import annotations
 
+import pickle
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,14 +18,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from harness.episode.cells import drawn_traffic
+from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import RunFolderError
 from harness.pool.cut_ins import padded
+from harness.pool.learned import Following, Learned, learn
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.pool.walk import BaselineRuns, write_script
 from harness.records.folder import parquet, read_table
-from harness.records.schemas import baseline_table
+from harness.records.schemas import baseline_table, pilot_table
 from harness.sampling.protocol import ShardRequest
 from harness.traffic.laws import Environment
 from harness.vocabulary import AV, FAILED, IntArray, RecordArray
@@ -31,6 +35,10 @@ SHADOW = "shadow"
 """Folder of the baseline runs within a run folder; it keeps its first name."""
 SHARD_RUNS = 50
 """Baseline runs of one file and one task: half a second of a slow controller."""
+PILOT = "pilot"
+"""Folder of the pilot tests."""
+LEARNED = b"harness.learned"
+"""Key in the metadata of the baseline runs as workers get them."""
 ALL_MOTION = RecordPolicy(0, "all", 0.0)
 _MEND = "Delete this file and run again with --resume: the same baseline runs are made anew."
 
@@ -51,15 +59,27 @@ def baseline_requests(n: int) -> Iterator[ShardRequest]:
     return (ShardRequest(index, first, min(SHARD_RUNS, n - first), baseline=True) for index, first in firsts)
 
 
+def pilot_requests(prescribed: tuple[RecordArray, PrescribedTraffic]) -> Iterator[ShardRequest]:
+    """All pilot tests, in order."""
+    states, traffic = prescribed
+    for index, first in enumerate(range(0, states.size, SHARD_RUNS)):
+        rows = slice(first, first + SHARD_RUNS)
+        of_rows = states[rows], PrescribedTraffic._make(column[rows] for column in traffic)
+        yield ShardRequest(index, first, of_rows[0].size, baseline=True, prescribed=of_rows)
+
+
 def baseline_file(folder: Path, request: ShardRequest) -> Path:
-    """Where a range of baseline runs is kept."""
-    return folder / SHADOW / f"shard-{request.index:06d}.parquet"
+    """Where a range of baseline runs, or of pilot tests, is kept."""
+    return folder / (PILOT if request.prescribed else SHADOW) / f"shard-{request.index:06d}.parquet"
 
 
 def run_baseline(
     loop: EpisodeLoop, paths: BaselinePaths, environment: Environment, request: ShardRequest
 ) -> BaselineResult:
-    """Drive the loop's vehicle along a range of paths."""
+    """Drive the loop's vehicle along a range of paths, or in pilot tests."""
+    if request.prescribed is not None:
+        table = pilot_table(loop.beside(keep=ALL_MOTION).run(request.first_episode, *request.prescribed))
+        return BaselineResult(request, table, parquet(table), _causes(table))
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     shard = without_cut_in(loop, paths.seed, request.first_episode, paths.index[rows], paths.state[rows], environment)
     table = baseline_table(shard, paths.index[rows], paths.weight[rows])
@@ -79,7 +99,10 @@ def stored_baseline(
     crc32 = listed[request.index] if request.index < len(listed) else None
     table = read_table(file, crc32=crc32, mend=_MEND)
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
-    if not np.array_equal(table.column("path").to_numpy(), paths.index[rows]):
+    name, wanted = "path", paths.index[rows]
+    if request.prescribed is not None:
+        name, wanted = "shadow", request.prescribed[1].announced_index
+    if not np.array_equal(table.column(name).to_numpy(), wanted):
         expected = "those of this campaign and this version of the harness"
         mend = "Use a new folder, or the version that the run was begun with (manifest.json)."
         raise RunFolderError(str(file), "baseline runs on other paths", expected, mend)
@@ -94,12 +117,51 @@ def read_baseline(
     folder: Path, paths: BaselinePaths, environment: Environment, listed: Sequence[int] = ()
 ) -> BaselineRuns:
     """All baseline runs of a run folder; a `RunFolderError` if some are missing or damaged."""
-    found = [stored_baseline(folder, paths, listed, request) for request in baseline_requests(len(paths))]
+    return as_recorded(_read(folder, paths, listed, list(baseline_requests(len(paths)))), environment)
+
+
+def read_pilot(
+    folder: Path,
+    paths: BaselinePaths,
+    prescribed: tuple[RecordArray, PrescribedTraffic],
+    runs: BaselineRuns,
+    listed: Sequence[int] = (),
+) -> Learned | None:
+    """What was learned from the pilot tests of a run folder; a `RunFolderError` if some are missing or damaged."""
+    return learned_from(_read(folder, paths, listed, list(pilot_requests(prescribed))), runs)
+
+
+def _read(folder: Path, paths: BaselinePaths, listed: Sequence[int], requests: Sequence[ShardRequest]) -> pa.Table:
+    found = [stored_baseline(folder, paths, listed, request) for request in requests]
     if any(done is None for done in found):
-        there = f"baseline runs of {sum(done is not None for done in found)} of {len(found)} files"
-        expected = "those of all paths: they say how probable each test is"
-        raise RunFolderError(str(folder / SHADOW), there, expected, "Let `harness run` go on with --resume.")
-    return as_recorded(pa.concat_tables(done.table for done in found if done is not None), environment)
+        there = f"{sum(done is not None for done in found)} of {len(found)} files"
+        expected = "all of them: they say what is tested, and how probable each test is"
+        where = str(baseline_file(folder, requests[0]).parent)
+        raise RunFolderError(where, there, expected, "Let `harness run` go on with --resume.")
+    return pa.concat_tables(done.table for done in found if done is not None)
+
+
+def learned_from(table: pa.Table, runs: BaselineRuns) -> Learned | None:
+    """What all pilot tests teach that have not failed; None if those are none."""
+    table = table.filter(pc.is_null(table.column("failure")))
+    if not table.num_rows:
+        return None
+    width = runs.x_m.shape[1]
+    names = "av_position_m", "av_speed_mps", "bv_position_m", "bv_speed_mps"
+    (x_av, last), *others = (padded(table.column(name), width) for name in names)
+    shadow, onset = (table.column(name).to_numpy().astype(np.int64) for name in ("shadow", "onset_step"))
+    return learn(Following(shadow, onset + 1, last - 1, x_av, *(values for values, _ in others)), runs)
+
+
+def with_learned(table: pa.Table, learned: Learned | None) -> pa.Table:
+    """All baseline runs as workers get them, with what was learned."""
+    return table if learned is None else table.replace_schema_metadata({LEARNED: pickle.dumps(learned)})
+
+
+def learned_in(table: pa.Table) -> Learned | None:
+    """See `with_learned`."""
+    found = (table.schema.metadata or {}).get(LEARNED)
+    return None if found is None else pickle.loads(found)  # noqa: S301 - our own
 
 
 def as_recorded(table: pa.Table, environment: Environment) -> BaselineRuns:

@@ -18,12 +18,14 @@ import pyarrow as pa
 from harness.campaign.campaign import Campaign
 from harness.controllers.find import build_host
 from harness.controllers.hosts import Death
+from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import MOMENT_LIMITS, NOBODY, Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import Rule, StopRule
 from harness.importance.functions import build_importance, mixture_weights
 from harness.importance.tables import Tables, build_tables, table_path
+from harness.pool.learned import Learned
 from harness.pool.shells import Draw
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.pool.walk import BaselineRuns
@@ -37,13 +39,17 @@ from harness.worlds import World
 
 @dataclass(frozen=True)
 class ShardRequest:
-    """A fixed range of episodes, or of ``baseline`` runs; ``draws`` says which cut-ins they are, where that is so."""
+    """A fixed range of episodes, or of ``baseline`` runs; ``draws`` says which cut-ins they are, where that is so.
+
+    Pilot tests have initial states and traffic ``prescribed``.
+    """
 
     index: int
     first_episode: int
     n_episodes: int
     draws: tuple[Draw, ...] = ()
     baseline: bool = False
+    prescribed: tuple[RecordArray, PrescribedTraffic] | None = None
 
 
 class Rounds:
@@ -134,12 +140,16 @@ class Source:
         """Strata of a stored run."""
         return None
 
-    def begin_after(self, runs: BaselineRuns) -> None:  # noqa: ARG002 - there are none
-        """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`.
+    def begin_after(self, runs: BaselineRuns, learned: Learned | None = None) -> None:  # noqa: ARG002 - there are none
+        """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`; of pilot tests it learned.
 
         Raises `HarnessError`: nothing on these paths can be tested.
         """
         raise ValueError("this campaign has no baseline runs")
+
+    def pilot(self) -> tuple[RecordArray, PrescribedTraffic] | None:
+        """Tests that do not count, after baseline runs, from which a surrogate is to be learned; None for none."""
+        return None
 
     def states(self, first_episode: int, n_episodes: int) -> RecordArray:
         """Initial states of consecutive episodes, shape (n_episodes,)."""

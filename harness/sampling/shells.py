@@ -9,6 +9,7 @@ boundary are tested until what is stated about them is roughly known; then those
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
+from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
 from harness.estimators.likelihood import Level
@@ -26,6 +28,7 @@ from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
 from harness.pool.build import campaign_pool, campaign_pool_key, pool_path
 from harness.pool.cut_ins import Pool
+from harness.pool.learned import Learned
 from harness.pool.shells import Draw, PrescribedEpisodes, checked_boundary
 from harness.pool.vehicle_pool import baseline_paths_file, campaign_baseline_paths, vehicle_pool
 from harness.pool.walk import BaselineRuns
@@ -34,8 +37,8 @@ from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
 from harness.sampling.allocation import CONFIDENCE, Allocation
 from harness.sampling.protocol import Rounds, ShardRequest, Source
-from harness.strata import ShellDesign, StoredDesign
-from harness.vocabulary import IntArray
+from harness.strata import ASSUMPTION_FREE, LEARNED, ShellDesign, StoredDesign
+from harness.vocabulary import IntArray, RecordArray
 
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
@@ -79,10 +82,17 @@ class Shells(Source):
         """Strata of a stored run; a `RunFolderError` where they are missing, damaged, or of a too early version."""
         return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
 
-    def begin_after(self, runs: BaselineRuns) -> None:
+    def begin_after(self, runs: BaselineRuns, learned: Learned | None = None) -> None:
         if self.baseline_paths is None:
             raise ValueError("this campaign has no baseline runs")
-        self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs))
+        self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs, learned))
+        if learned is not None and LEARNED in (design := self.prescribed.design).strata:
+            said = f"{learned.n_tests:,} pilot tests, which do not count: {learned.in_words}"
+            self.design = self.prescribed.design = replace(design, learned=said)
+
+    def pilot(self) -> tuple[RecordArray, PrescribedTraffic] | None:
+        n, asked = self.campaign.pool.pilot_tests, self.campaign.testing.shells.statement
+        return self.prescribed.pilot(n, self.campaign.seed) if n and asked == ASSUMPTION_FREE else None
 
     def rounds(self, held: int = 0) -> ShellRounds:
         return ShellRounds(self.campaign, self.prescribed.design, self.prescribed.available, held)

@@ -28,7 +28,12 @@ class SuperPopulation(Section):
     """
 
     paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="paths that pools are drawn from, with replacement")
-    reference_paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="independent paths that the truth is from")
+    reference_paths: Whole = Field(
+        65_536,
+        ge=0,
+        le=1 << 22,
+        description="independent paths that the truth is from; 0, of vehicles that act before: that of the former",
+    )
     pool_paths: Whole = Field(16_384, ge=256, le=1 << 20, description="paths of each pool; smoke.yaml has 32,768")
 
 
@@ -79,6 +84,7 @@ class Experiment(Section):
     )
     beside: str | None = Field(None, description="decide limits beside this reference driver: accept.times_reference")
     budgets: list[Whole] = Field([], description="numbers of tests within which limits are judged, and stop.episodes")
+    levels: list[Positive] = Field([], description="further levels at which the same tests of shells are judged")
     siblings: bool = Field(False, description="also judge former rules of limits and bounds, which err more often")
     super_population: SuperPopulation = SuperPopulation()
 
@@ -92,6 +98,10 @@ class Experiment(Section):
         """Share of intervals that are to hold the truth, or of decisions that are to be right."""
         confidence = self.campaign.stop.confidence
         return (1.0 + confidence) / 2.0 if self.limits else confidence
+
+    def nominal_of(self, result: str) -> float:
+        """`nominal`, or the further level that a result is at."""
+        return next((level for level in self.levels if result.endswith(f" at {level:g}")), self.nominal)
 
     @property
     def all_budgets(self) -> tuple[int, ...]:

@@ -31,12 +31,14 @@ from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.errors import CampaignError, HarnessError
 from harness.importance.functions import build_importance
 from harness.pool.cut_ins import onset_steps
-from harness.pool.shells import CANDIDATES, acceleration_limit
-from harness.pool.vehicle_pool import BaselinePaths, walk_candidates
+from harness.pool.learned import Learned, learned_crashes
+from harness.pool.shells import CANDIDATES, PrescribedEpisodes, acceleration_limit
+from harness.pool.vehicle_pool import BaselinePaths, vehicle_pool, walk_candidates
 from harness.pool.walk import PILOT_PATHS, STRIDE, Enumerator, enumerate_cut_ins, write_script
 from harness.progress import Progress
-from harness.resolved import resolve
-from harness.sampling.baseline import recorded, without_cut_in
+from harness.records.schemas import pilot_table
+from harness.resolved import Resolved, resolve
+from harness.sampling.baseline import ALL_MOTION, learned_from, recorded, without_cut_in
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import Followers, av_records
 from harness.vehicles.library import Library
@@ -267,10 +269,51 @@ def choose_paths(
     return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
 
 
+LEARNERS = 12
+"""Surrogates that are learned of a vehicle, each from runs and pilot tests of its own; a replication has one."""
+FEW_CUT_INS = 400
+"""Kept of each shell for these: the pilot tests need no more."""
+
+
+def learn_vehicle(campaign: Campaign, paths: BaselinePaths) -> list[Learned]:
+    """Learn the vehicle as its campaign would, several times, each from other ones of the paths; empty if it does not.
+
+    Each has as many baseline runs as the campaign, and as many pilot tests.
+    """
+    few = campaign.pool.model_copy(update={"cut_ins_per_shell": FEW_CUT_INS})
+    resolved, loop = _ready(campaign.model_copy(update={"pool": few}))
+    found, n_tests = list[Learned](), campaign.pool.pilot_tests
+    for k in range(LEARNERS * (n_tests > 0)):
+        rows = np.random.default_rng([paths.seed, k]).integers(0, len(paths), campaign.pool.shadow_paths)
+        some = replace(paths, **{name: getattr(paths, name)[rows] for name in ("index", "state", "weight")})
+        where = resolved.environment
+        runs = recorded(without_cut_in(loop, some.seed, 0, some.index, some.state, where), where)
+        pool = vehicle_pool(resolved, some, runs)
+        pilot = PrescribedEpisodes(resolved.campaign, pool).pilot(n_tests, k)
+        learned = learned_from(pilot_table(loop.beside(keep=ALL_MOTION).run(0, *pilot)), runs)
+        found += [] if learned is None else [learned]
+    return found
+
+
+def _ready(campaign: Campaign) -> tuple[Resolved, EpisodeLoop]:
+    """A campaign and the loop of its vehicle, which keeps all of its motion."""
+    resolved = resolve(campaign)
+    policy = Drawing(campaign.seed, resolved.environment, build_importance(campaign, None), resolved.av)
+    host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
+    return resolved, EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)
+
+
 def walk_paths(
-    campaign: Campaign, paths: BaselinePaths, executor: Executor, progress: Progress, stride: int = STRIDE
+    campaign: Campaign,
+    paths: BaselinePaths,
+    executor: Executor,
+    progress: Progress,
+    stride: int = STRIDE,
+    learned: Sequence[Learned] = (),
 ) -> SuperPopulation:
     """Let the campaign's vehicle walk paths, and ask every ``stride``-th of their cut-ins.
+
+    Surrogates that were ``learned`` are drivers that come after it.
 
     Raises `HarnessError`: the vehicle failed, or did something else in a test than in its shadow run.
     """
@@ -278,18 +321,17 @@ def walk_paths(
     for first in range(0, len(paths), WALKED_CHUNK):
         part = {name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in ("index", "state", "weight")}
         jobs.append((first, replace(paths, **part)))
-    walk = partial(_walk, campaign.model_dump_json(), stride)
+    walk = partial(_walk, campaign.model_dump_json(), stride, learned)
     return joined(results_of("walked paths", jobs, walk, progress, run=executor.map, size=lambda job: len(job[1])))
 
 
-def _walk(campaign_json: str, stride: int, job: tuple[int, BaselinePaths]) -> SuperPopulation:
+def _walk(
+    campaign_json: str, stride: int, learned: Sequence[Learned], job: tuple[int, BaselinePaths]
+) -> SuperPopulation:
     """Walk paths that have numbers from a first one on, and drive the vehicle on their cut-ins as tests would be."""
     first, paths = job
-    resolved = resolve(Campaign.model_validate_json(campaign_json))
+    resolved, loop = _ready(Campaign.model_validate_json(campaign_json))
     campaign, environment, library = resolved.campaign, resolved.environment, resolved.library
-    policy = Drawing(campaign.seed, environment, build_importance(campaign, None), resolved.av)
-    host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
-    loop = EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)  # with all of its motion kept
     runs = recorded(without_cut_in(loop, paths.seed, first, paths.index, paths.state, environment), environment)
     offset = np.random.default_rng([paths.seed, first]).integers(0, stride, len(paths))
     where = paths.seed, paths.index, paths.state, environment, library.followers(environment.lateral.present)
@@ -308,6 +350,10 @@ def _walk(campaign_json: str, stride: int, job: tuple[int, BaselinePaths]) -> Su
         raise HarnessError(f"avs: {campaign.av.controller or campaign.av.fmu}", found, expected, mend)
     crashes = tests.results.episode["outcome"] == CRASH
     of_cut_ins = bits[row, step] | (crashes.astype(np.int64) << library.n_drivers)  # the vehicle comes after these
+    for k, one in enumerate(learned):
+        asked = (bits != 0) & (mass > 0.0)
+        own = learned_crashes(one, *where[:4], runs, asked, campaign.crash.counts_above_mps)
+        of_cut_ins |= own[row, step].astype(np.int64) << (library.n_drivers + 1 + k)
     somebody = of_cut_ins != 0
     row, step = row[somebody], step[somebody]
     return SuperPopulation(mass.sum(1), first + row, mass[row, step], of_cut_ins[somebody])

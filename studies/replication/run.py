@@ -43,7 +43,7 @@ def validate(
             found[subject] = [row for part in parts for row in part]
     judgements = corrected(
         [
-            judge(subject, result, [row for row in rows if row.result == result], experiment.nominal)
+            judge(subject, result, [row for row in rows if row.result == result], experiment.nominal_of(result))
             for subject, rows in found.items()
             for result in dict.fromkeys(row.result for row in rows)
         ]

@@ -28,10 +28,11 @@ from harness.estimators.shells import Shells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import CrashedTests, Tally, combined
 from harness.pool.cut_ins import CutIns, Pool
-from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata, shells_of
+from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata, shells_of, widest
+from harness.pool.vehicle_pool import LEAST_LEARNED
 from harness.sampling.allocation import Allocation
 from harness.sampling.shells import PairRounds, ShellRounds
-from harness.strata import LIBRARY_STATEMENT, ShellDesign
+from harness.strata import ASSUMPTION_FREE, LEARNED, LIBRARY_STATEMENT, ShellDesign
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 from studies.replication.experiment import Adversary
@@ -62,6 +63,11 @@ def limit_at(factor: float, budget: int) -> dict[str, str]:
     """
     wrong = ["accepted"] * (factor <= 1.0) + ["rejected"] * (factor >= 1.0)
     return {f"limit {factor:g} x rate, {verdict} within {budget:,} tests": verdict for verdict in wrong}
+
+
+def at_level(level: float) -> str:
+    """Name of the rows of results at another level."""
+    return f"{FREE} at {level:g}"
 
 
 class CrashingCutIns(NamedTuple):
@@ -241,6 +247,7 @@ class ShellCampaign(_Drawn):
     budgets: Sequence[int] = ()
     siblings: bool = False
     beside: str | None = None
+    levels: Sequence[float] = ()
 
     def _replicate(self, replication: int, drawn: Sequence[DrawnPool], rng: np.random.Generator) -> Iterator[Row]:
         return (self._decide if self.limits else self._estimate)(replication, drawn[0], rng)
@@ -297,6 +304,9 @@ class ShellCampaign(_Drawn):
         outside = int(estimate.details["statements"][0]["n_crashes_outside"])
         row = estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
         yield row
+        for level in self.levels:
+            limits = planner.seen.limits_of(ASSUMPTION_FREE, Level.two_sided(level))
+            yield replace(row, result=at_level(level), ci_low=limits.low, ci_high=limits.high)
         if self.siblings and (runs := (tally := planner.tally).runs) is not None:
             without = tally._replace(runs=runs._replace(own=np.zeros_like(runs.own)))
             limits = combined(design.p, without, design.n_independent, Level.two_sided(estimate.confidence))
@@ -328,11 +338,11 @@ def _reference_rows(estimate: Estimate, reference: str, replication: int, *, rea
     """Ratio to a reference driver, and the share of crashes that it would have avoided; open where nothing is said."""
     found = next((each for each in estimate.details["references"] if each["reference"] == reference), None)
     z = Level.two_sided(estimate.confidence).z
-    for name, key, widest in (
+    for name, key, open_ in (
         (ratio_to(reference), "ratio", (math.nan, 0.0, math.inf)),
         (preventable_by(reference), "preventable", (math.nan, 0.0, 1.0)),
     ):
-        value, low, high = widest if found is None else (found[key], found[f"{key}_low"], found[f"{key}_high"])
+        value, low, high = open_ if found is None else (found[key], found[f"{key}_low"], found[f"{key}_high"])
         counts, error = (estimate.n_episodes, estimate.n_crashes), (high - low) / 2.0 / z
         yield Row(name, replication, *counts, value, error, low, high, reached, refused=found is None)
 
@@ -434,6 +444,11 @@ class OvertakingShells:
         return [DrawnPool(design, mass, each[rows] @ joined, *failing, cut_ins) for each in self.crashing]
 
 
+def draw_of(sources: Sequence[OvertakingShells], rng: np.random.Generator) -> list[DrawnPool]:
+    """A new pool of one of some sources, each as probable."""
+    return sources[int(rng.integers(len(sources)))].draw(rng)
+
+
 class Division:
     """Cut-ins of a super-population, divided into cells by a library without the equals of some vehicles."""
 
@@ -446,8 +461,12 @@ class Division:
         *,
         limit_mps2: float,
         shadow_runs: bool = False,
+        learned: int | None = None,
     ) -> None:
-        """Leave out the equals of vehicles that crash on these masses of cut-ins, (m,) each."""
+        """Leave out the equals of vehicles that crash on these masses of cut-ins, (m,) each.
+
+        The driver ``learned`` has a shell beyond the boundaries, as in the pool of a vehicle.
+        """
         bit = {name: driver for driver, name in enumerate(library.surrogates)}
         rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}
         conservative_first = tuple(sorted(bit, key=rate.__getitem__))
@@ -455,7 +474,12 @@ class Division:
         reduced = leave_out(library, alike, conservative_first)
         names = tuple(name for name in conservative_first if name in reduced.surrogates)
         self._population = population
-        self._shell = shells_of(population.bits, np.array([bit[name] for name in names])).astype(np.int64)
+        order = np.array([bit[name] for name in names])
+        if learned is not None:
+            place, own = widest(names, reduced) + 1, population.mass * population.crashes(learned)
+            if own[shells_of(population.bits, order) >= place].sum() > LEAST_LEARNED * own.sum():
+                names, order = (*names[:place], LEARNED, *names[place:]), np.insert(order, place, learned)
+        self._shell = shells_of(population.bits, order).astype(np.int64)
         n_references = len(library.references)
         each_reference = (1 << n_references) - 1
         crash_too = (population.bits >> len(library.surrogates)) & each_reference

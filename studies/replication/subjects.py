@@ -11,7 +11,6 @@ from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.pool.shells import acceleration_limit
-from harness.pool.walk import STRIDE
 from harness.progress import Progress
 from harness.strata import LIBRARY_STATEMENT
 from harness.traffic.loading import load_environment
@@ -29,6 +28,7 @@ from studies.replication.populations import (
     Truths,
     choose_paths,
     enumerate_paths,
+    learn_vehicle,
     of_pair,
     of_vehicle,
     reference_drivers,
@@ -42,6 +42,7 @@ from studies.replication.shells import (
     PairedCampaign,
     ShellCampaign,
     bound_outside,
+    draw_of,
     limit_at,
     result_of,
 )
@@ -60,12 +61,13 @@ def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> 
     if experiment.acting and not experiment.pairs:
         size, seeds = experiment.super_population, (experiment.seed + 1, experiment.seed)
         sizes = zip(seeds, (size.reference_paths, size.paths), strict=True)
-        walked = [choose_paths(experiment.campaign, seed, n_paths, progress) for seed, n_paths in sizes]
+        walked = [choose_paths(experiment.campaign, seed, n_paths, progress) for seed, n_paths in sizes if n_paths]
         for name in experiment.acting:
             campaign = experiment.subject(name)
-            of_both = zip(walked, (STRIDE, 1), strict=True)
-            populations = (walk_paths(campaign, paths, executor, progress, stride) for paths, stride in of_both)
-            yield _acting(experiment, name, *populations)
+            learned = learn_vehicle(campaign, walked[-1])
+            pools = walk_paths(campaign, walked[-1], executor, progress, 1, learned)
+            truth = walk_paths(campaign, walked[0], executor, progress) if size.reference_paths else None
+            yield _acting(experiment, name, truth, pools, len(learned))
 
 
 def _chain(experiment: Experiment, place: int, chain: Chain) -> Tested:
@@ -95,26 +97,35 @@ def _holding(experiment: Experiment, progress: Progress) -> Iterator[Tested]:
         yield Subject(name, truths.vehicle(name)[RATE]), WeightedCampaign(tested, episodes, experiment.results)
 
 
-def _acting(experiment: Experiment, name: str, truth: SuperPopulation, pools: SuperPopulation) -> Tested:
-    """A vehicle that acts before the cut-in, by the paths that it has walked."""
+def _acting(
+    experiment: Experiment, name: str, truth: SuperPopulation | None, pools: SuperPopulation, n_learned: int
+) -> Tested:
+    """A vehicle that acts before the cut-in, by the paths that it has walked, and one of its surrogates each time."""
     campaign = experiment.subject(name)
     library, limit = load_library(campaign.pool.library), acceleration_limit(campaign.av)
     vehicle = {library.n_drivers: 1.0}
-    known = of_vehicle(truth, truth.crash_mass(vehicle), reference_drivers(library))
-    crashing, paths = pools.crash_mass(vehicle), campaign.pool.shadow_paths
-    division = Division(library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
-    return _vehicle(experiment, name, division.of_vehicle(crashing), known)
+    crashing, paths, references = pools.crash_mass(vehicle), campaign.pool.shadow_paths, reference_drivers(library)
+    if truth is None:
+        known = _exactly(of_vehicle(pools, crashing, references))
+    else:
+        known = of_vehicle(truth, truth.crash_mass(vehicle), references)
+    divide = partial(Division, library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
+    learned: list[int | None] = [library.n_drivers + 1 + k for k in range(n_learned)]
+    sources = [divide(learned=one).of_vehicle(crashing) for one in learned or [None]]
+    return _vehicle(experiment, name, sources[0], known, partial(draw_of, sources))
 
 
 def _seed(experiment: Experiment, name: str) -> int:
     return experiment.seed_of(list(experiment.avs).index(name))
 
 
-def _vehicle(experiment: Experiment, name: str, source: OvertakingShells, known: Mapping[str, Known]) -> Tested:
+def _vehicle(
+    experiment: Experiment, name: str, source: OvertakingShells, known: Mapping[str, Known], draw: Draw | None = None
+) -> Tested:
     """A vehicle by what is known about it, its crash rate among it; adversaries have the seed of what they are of."""
     of = experiment.adversaries[name].of if name in experiment.adversaries else name
     outside, boundary = source.crashes_outside(source.crashing[0]), source.template.library.boundary
-    own = experiment.subject(of), name, source.draw, _seed(experiment, of), known, source.crash_rate, outside
+    own = experiment.subject(of), name, draw or source.draw, _seed(experiment, of), known, source.crash_rate, outside
     unit = 1.0 if experiment.beside is None else source.reference_rate(experiment.beside)
     return _of_shells(experiment, *own, unit, left_out=source.left_out, boundary=boundary)
 
@@ -143,7 +154,8 @@ def _of_shells(
     others |= dict.fromkeys([BOUND, *decisions], Known.exactly(own_rate))
     others |= {bound_outside(each): Known(share * own_rate, 0.0, own_rate) for each, share in beyond.items()}
     subject = Subject(name, known[RATE], others, outside, **more)
-    return subject, ShellCampaign(campaign, draw, seed, limits, budgets, experiment.siblings, experiment.beside)
+    more_of = experiment.siblings, experiment.beside, experiment.levels
+    return subject, ShellCampaign(campaign, draw, seed, limits, budgets, *more_of)
 
 
 def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:

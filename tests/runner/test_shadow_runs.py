@@ -53,6 +53,29 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(stored_run, tmp_path):
     assert unlike_columns(stored_run(ACTS), out) == []
 
 
+AS_NEEDED = "av.controller=examples.acting:CarefulAsNeeded"
+
+
+def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_is_stored(tmp_path):
+    """Ended among the pilot tests and going on: the same bits."""
+    campaign, out, other = golden(ACTS, AS_NEEDED), tmp_path / "run", tmp_path / "other"
+    run_golden(campaign, out)
+    assert "learned" in json.loads((out / "shells.json").read_text())["strata"]
+    assert "pilot tests" in estimates(out)["estimates"]["shells"]["details"]["learned"]
+    pilot = sorted((out / "pilot").glob("*.parquet"))
+    assert sum(pq.read_table(file).num_rows for file in pilot) == manifest(out)["pilot_tests"]["n_runs"] >= 300
+    learned = [row for row in stored_table(out, "episodes").to_pylist() if row["outcome"] == "crash"]
+    assert replay(out, learned[-1]["episode"]).bit_equal
+    assert estimate(out)["estimates"]["shells"]["crash_rate"] == estimates(out)["estimates"]["shells"]["crash_rate"]
+    copy_of(out, other)
+    for table in ("episodes", "traces"):
+        shutil.rmtree(other / table)
+    (other / "pilot" / pilot[-1].name).unlink()
+    edit(other, n_episodes=0, shards=[], status="interrupted")
+    run_golden(campaign, other, resume=True)
+    assert unlike_columns(out, other) == []
+
+
 NOISY = "parameters: {noise_mps2: 0.2}"
 
 
@@ -61,7 +84,8 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
     asked = (*method, SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
         run_here(campaign(*asked, f"av={of('FreshNoise', NOISY)}"), tmp_path / "fresh")
-    assert set(stored_table(tmp_path / "fresh", "episodes").column("outcome").to_pylist()) == {"failed"}
+    kept = [*(tmp_path / "fresh").glob("pilot/*.parquet"), *(tmp_path / "fresh").glob("episodes/*.parquet")]
+    assert {outcome for file in kept for outcome in pq.read_table(file).column("outcome").to_pylist()} == {"failed"}
     seeded = run_here(campaign(*asked, f"av={of('Speeds', NOISY)}"), tmp_path / "seeded").folder
     assert manifest(seeded)["repeated"]["differing"] == []
     assert stored_table(seeded, "episodes").column("failure").drop_null().to_pylist() == []
@@ -128,7 +152,7 @@ def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
     with pytest.raises(RunFolderError, match=r"shard-000000\.parquet.*Delete this file"):
         replay(folder, 5)
     files_of(folder)[0].unlink()
-    with pytest.raises(RunFolderError, match="baseline runs of 1 of 2 files"):
+    with pytest.raises(RunFolderError, match="shadow: found 1 of 2 files"):
         replay(folder, 5)
     assert estimate(folder) == estimates(folder)  # needs no path
 
