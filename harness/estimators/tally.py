@@ -197,7 +197,7 @@ class OnRuns(NamedTuple):
         of_mean = float(scale @ tally.crashes) ** 2
         excess = max(square - of_mean, 0.0) * max(1.0 + errors * math.sqrt(2.0 / n), 0.0)
         if n < FEW_PAIRS and errors > 0.0:
-            excess += 2.0 * self.n_runs * float(np.max(scale[tally.crashes > 0])) ** 2
+            excess += 2.0 * self.n_runs * float(np.max(scale[tally.crashes > 0], initial=0.0)) ** 2
         return of_mean + excess
 
 
