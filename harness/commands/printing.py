@@ -46,7 +46,8 @@ def show_error(error: HarnessError) -> None:
         say(f" {error.where}: {error.found}", err=True)
     for part in parts:
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
-        say(f" {part.where}", *(f"  {each + ':':<9} {getattr(part, each)}" for each in _PARTS), err=True)
+        told = (getattr(part, each).replace("`", "'") for each in _PARTS)  # commands in docs and in Python have these
+        say(f" {part.where}", *(f"  {each + ':':<9} {text}" for each, text in zip(_PARTS, told, strict=True)), err=True)
 
 
 _AGAIN = "Nothing finished is lost: then give the same command again (`run` with --resume)."

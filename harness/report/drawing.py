@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from numpy.typing import ArrayLike
 
 from harness.numbers import exponent_of, plain, power_of_ten
@@ -82,6 +82,9 @@ def tick_label(value: float) -> str:
     return power_of_ten(exponent) if mantissa == "1" else f"{mantissa}·{power_of_ten(exponent)}"
 
 
+Kind = Literal["line", "band", "dots", "boxes", "text"]
+
+
 class Mark(NamedTuple):
     """What is drawn, by its columns (n,).
 
@@ -89,7 +92,7 @@ class Mark(NamedTuple):
     x and y of a text. ``dash`` is of a line, ``opacity`` of the rest.
     """
 
-    kind: Literal["line", "band", "dots", "boxes", "text"]
+    kind: Kind
     colour: str
     columns: tuple[ArrayLike, ...]
     label: str = ""
@@ -108,18 +111,9 @@ class Panel:
     marks: list[Mark] = field(default_factory=list)
     height: float = 250.0
 
-    def add(
-        self,
-        kind: Literal["line", "band", "dots", "boxes", "text"],
-        colour: str,
-        *columns: ArrayLike,
-        label: str = "",
-        dash: str = "",
-        opacity: float = 1.0,
-        width: float = 1.8,
-    ) -> None:
+    def add(self, kind: Kind, colour: str, *columns: ArrayLike, **options: Any) -> None:
         """Draw one more `Mark`."""
-        self.marks.append(Mark(kind, colour, columns, label, dash, opacity, width))
+        self.marks.append(Mark(kind, colour, columns, **options))
 
     @property
     def svg(self) -> Markup:
@@ -128,48 +122,28 @@ class Panel:
         top = 20.0 + LINE * (1 + max((row for _, row, _ in legend), default=-1))
         left = AXIS if not self.y.names else 14.0 + 1.05 * CHARACTER * max(map(len, self.y.names))
         width, height = WIDTH - left - RIGHT, self.height - top - BOTTOM
-        parts = [Markup('<text x="0" y="12" style="fill:var(--ink);font-weight:600">{}</text>').format(self.title)]
-        parts += [
-            Markup('<g transform="translate({},{})">{}<text x="20" y="4">{}</text></g>').format(
-                _n(x), _n(28.0 + LINE * row), _swatch(mark), mark.label
-            )
-            for mark, row, x in legend
-        ]
+        bottom, middle = top + height, left + width / 2.0
+        parts = [f'<text y="12" style="fill:var(--ink);font-weight:600">{escape(self.title)}</text>']
+        for mark, row, x in legend:
+            place, label = f"translate({x:.0f},{28.0 + LINE * row:.0f})", escape(mark.label)
+            parts.append(f'<g transform="{place}">{_swatch(mark)}<text x="20" y="4">{label}</text></g>')
         for value, text in self.x.ticks():
-            x = _n(left + width * float(self.x.place(value)))
-            parts.append(
-                Markup('<path class="grid" d="M{0} {1}V{2}"/><text x="{0}" y="{3}" class="mid">{4}</text>').format(
-                    x, _n(top), _n(top + height), _n(top + height + 14.0), text
-                )
-            )
+            x = left + width * float(self.x.place(value))
+            parts.append(f'<path class="grid" d="M{x:.1f} {top:.0f}V{bottom:.1f}"/>')
+            parts.append(f'<text x="{x:.1f}" y="{bottom + 14.0:.1f}" class="mid">{escape(text)}</text>')
         for value, text in self.y.ticks():
-            y = top + height * (1.0 - float(self.y.place(value)))
+            y = bottom - height * float(self.y.place(value))
             if not self.y.names:
-                parts.append(Markup('<path class="grid" d="M{} {}h{}"/>').format(_n(left), _n(y), _n(width)))
-            parts.append(Markup('<text x="{}" y="{}" class="end">{}</text>').format(_n(left - 6.0), _n(y + 4.0), text))
-        inner = Markup("").join(_drawn(mark, self, width, height) for mark in self.marks)
-        parts.append(
-            Markup('<svg x="{}" y="{}" width="{}" height="{}">{}</svg>').format(
-                *map(_n, (left, top, width, height)), inner
-            )
-        )
-        parts.append(
-            Markup('<path class="axis" d="M{} {}V{}H{}"/>').format(*map(_n, (left, top, top + height, left + width)))
-        )
-        parts.append(
-            Markup('<text x="{}" y="{}" class="mid">{}</text>').format(
-                _n(left + width / 2.0), _n(self.height - 4.0), self.x.title
-            )
-        )
-        if self.y.label:
-            parts.append(
-                Markup('<text transform="translate(11,{}) rotate(-90)" class="mid">{}</text>').format(
-                    _n(top + height / 2.0), self.y.title
-                )
-            )
-        return Markup('<svg viewBox="0 0 {} {}" aria-hidden="true" class="panel">{}</svg>').format(
-            _n(WIDTH), _n(self.height), Markup("").join(parts)
-        )
+                parts.append(f'<path class="grid" d="M{left:.1f} {y:.1f}h{width:.1f}"/>')
+            parts.append(f'<text x="{left - 6.0:.1f}" y="{y + 4.0:.1f}" class="end">{escape(text)}</text>')
+        inner = "".join(_drawn(mark, self, width, height) for mark in self.marks)
+        parts.append(f'<svg x="{left:.1f}" y="{top:.0f}" width="{width:.1f}" height="{height:.1f}">{inner}</svg>')
+        parts.append(f'<path class="axis" d="M{left:.1f} {top:.0f}V{bottom:.1f}h{width:.1f}"/>')
+        parts.append(f'<text x="{middle:.1f}" y="{self.height - 4.0:.0f}" class="mid">{escape(self.x.title)}</text>')
+        turned = f'transform="translate(11,{top + height / 2.0:.0f}) rotate(-90)"'
+        parts.append(f'<text {turned} class="mid">{escape(self.y.title)}</text>' if self.y.label else "")
+        head = f'<svg viewBox="0 0 {WIDTH:.0f} {self.height:.0f}" aria-hidden="true" class="panel">'
+        return Markup(f"{head}{''.join(parts)}</svg>")  # noqa: S704 - every text in it is escaped
 
     def _legend(self) -> Iterator[tuple[Mark, int, float]]:
         """Marks with a label, in which row and where in it they stand."""
@@ -203,54 +177,43 @@ class Plot:
 
     def file(self, style: str) -> bytes:
         """An SVG file that stands alone, with the panels below each other in a ``style`` sheet."""
-        heights = [panel.height for panel in self.panels]
-        panels = Markup("").join(
-            Markup('<svg y="{}" width="{}" height="{}">{}</svg>').format(
-                _n(sum(heights[:k])), _n(WIDTH), _n(panel.height), panel.svg
-            )
-            for k, panel in enumerate(self.panels)
-        )
-        head = Markup('<svg xmlns="http://www.w3.org/2000/svg" viewBox="-8 -8 {} {}">').format(
-            _n(WIDTH + 16.0), _n(sum(heights) + 16.0)
-        )
+        panels, y = "", 0.0
+        for panel in self.panels:
+            panels += f'<svg y="{y:.0f}" width="{WIDTH:.0f}" height="{panel.height:.0f}">{panel.svg}</svg>'
+            y += panel.height
+        head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-8 -8 {WIDTH + 16.0:.0f} {y + 16.0:.0f}">'
         return f"{head}<style>{style}</style>{panels}</svg>\n".encode()
 
 
-def _n(value: float) -> str:
-    """A coordinate."""
-    return f"{value:.1f}".removesuffix(".0")
-
-
-def _drawn(mark: Mark, panel: Panel, width: float, height: float) -> Markup:
+def _drawn(mark: Mark, panel: Panel, width: float, height: float) -> str:
     """A mark in its panel's inner part, which cuts off what is beyond its edges."""
     first, *rest = (np.atleast_1d(np.asarray(column, np.float64)) for column in mark.columns)
     xs = [first, rest[0]] if mark.kind == "boxes" else [first]
     ys = rest[1:] if mark.kind == "boxes" else rest[: 2 if mark.kind == "band" else 1]
-    x, y = ([axis.place(each) for each in of] for axis, of in ((panel.x, xs), (panel.y, ys)))
-    x, y = [width * each for each in x], [height * (1.0 - each) for each in y]
+    x, y = [width * panel.x.place(each) for each in xs], [height * (1.0 - panel.y.place(each)) for each in ys]
     if mark.kind == "text":
         anchor, dx = ("end", -4.0) if x[0][0] > 0.9 * width else ("start", 5.0)
-        return Markup('<text x="{}" y="{}" class="on" style="text-anchor:{};fill:var(--{})">{}</text>').format(
-            _n(x[0][0] + dx), _n(y[0][0] + 4.0), anchor, mark.colour, mark.label
+        style, place = (
+            f"text-anchor:{anchor};fill:var(--{mark.colour})",
+            f'x="{x[0][0] + dx:.1f}" y="{y[0][0] + 4.0:.1f}"',
         )
+        return f'<text {place} class="on" style="{style}">{escape(mark.label)}</text>'
     if mark.kind == "dots":
         discs = zip(x[0], y[0], np.broadcast_to(rest[1], x[0].shape), strict=True)
-        path = "".join(
-            f"M{_n(a - r)} {_n(b)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0"
-            for a, b, r in discs
-        )
+        arc = "a{0:.1f} {0:.1f} 0 1 0 {1:.1f} 0"
+        path = "".join(f"M{a - r:.1f} {b:.1f}{arc.format(r, 2 * r)}{arc.format(r, -2 * r)}" for a, b, r in discs)
     elif mark.kind == "boxes":
-        path = "".join(f"M{_n(a)} {_n(c)}H{_n(b)}V{_n(d)}H{_n(a)}z" for a, b, c, d in zip(*x, *y, strict=True))
+        path = "".join(f"M{a:.1f} {c:.1f}H{b:.1f}V{d:.1f}H{a:.1f}z" for a, b, c, d in zip(*x, *y, strict=True))
     elif mark.kind == "band":
         path = _joined(np.append(x[0], x[0][::-1]), np.append(y[0], y[1][::-1])) + "z"
     else:
         path = _joined(x[0], y[0])
-    return Markup('<path style="{}" d="{}"/>').format(_style(mark), path)
+    return f'<path style="{_style(mark)}" d="{path}"/>'
 
 
 def _joined(x: FloatArray, y: FloatArray) -> str:
     known = np.isfinite(x) & np.isfinite(y)
-    return "M" + "L".join(f"{_n(a)} {_n(b)}" for a, b in zip(x[known], y[known], strict=True))
+    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x[known], y[known], strict=True))
 
 
 def _style(mark: Mark) -> str:
@@ -260,6 +223,6 @@ def _style(mark: Mark) -> str:
     return f"fill:var(--{mark.colour})" + (f";fill-opacity:{mark.opacity:g}" if mark.opacity < 1.0 else "")
 
 
-def _swatch(mark: Mark) -> Markup:
+def _swatch(mark: Mark) -> str:
     form = {"line": "M0 0h15", "dots": "M4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0"}.get(mark.kind, "M1 -5h14v10h-14z")
-    return Markup('<path style="{}" d="{}"/>').format(_style(mark), form)
+    return f'<path style="{_style(mark)}" d="{form}"/>'

@@ -49,8 +49,8 @@ def test_texts_are_escaped_and_marks_stand_where_their_axis_says():
     ElementTree.fromstring(svg)
     for there in ("&lt;b&gt;a &amp; b&lt;/b&gt;", "a &lt; b", ">gap, × 10⁻⁷</text>", ">0.5</text>", ">10</text>"):
         assert there in svg
-    [(width, height)] = re.findall(r'<svg x="54" y="\S+" width="([\d.]+)" height="([\d.]+)">', svg)
-    ends = f'd="M0 {height}L{float(width) / 2:g} {float(height) / 2:g}"', f'd="M{float(width) - 3:g} 0a3'
+    [(width, height)] = re.findall(r'<svg x="54.0" y="\S+" width="([\d.]+)" height="([\d.]+)">', svg)
+    ends = f'd="M0.0 {height}L{float(width) / 2:.1f} {float(height) / 2:.1f}"', f'd="M{float(width) - 3:.1f} 0.0a3.0'
     assert [end for end in ends if end not in svg] == []
 
 
