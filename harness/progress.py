@@ -26,7 +26,8 @@ class Progress:
     Who sets ``cancelled`` ends work in another thread the next time that it reports something.
     """
 
-    cancelled = False
+    cancelled, remark = False, ""
+    """``remark`` is said behind the names of stages to come."""
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
         """Begin a stage of ``total`` units (None: not known), ``done`` of which were finished by an earlier run."""
@@ -106,7 +107,9 @@ class ShownProgress(Progress):
         """Begin a bar in the place of the last stage's; a log that has had a line is told at once."""
         for task_id in self._bars.task_ids:
             self._bars.remove_task(task_id)
-        self._bars.add_task(name, total=total, completed=done, before=done, budget=total, figures={}, words="")
+        self._bars.add_task(
+            name + self.remark, total=total, completed=done, before=done, budget=total, figures={}, words=""
+        )
         if self._told:
             self._print()
 

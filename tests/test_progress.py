@@ -6,11 +6,15 @@ import io
 import math
 import re
 import threading
+from unittest.mock import Mock
 
 import pytest
 
 from harness import numbers as n
 from harness.progress import Progress, ShownProgress, episodes_left, shown_progress
+from harness.resolved import resolve
+from harness.sampling.shells import Shells
+from tests.stored_runs import golden
 
 
 class Terminal(io.StringIO):
@@ -66,6 +70,16 @@ def test_a_narrow_terminal_shows_rate_figures_and_time_left(monkeypatch):
     for text in ("episodes", " 38%", "/s · crashes 1,234 · RHW 0.081 · ", " s left"):
         assert text in last_line
     assert "criticality" not in last_line
+
+
+def test_a_pool_of_its_own_says_why_it_is_built(monkeypatch):
+    told = []
+    progress = Mock(stage=lambda name, *_: told.append(name + progress.remark), remark="")
+    monkeypatch.setattr("harness.sampling.shells.Shells._draw_from", lambda *_: None)
+    monkeypatch.setattr("harness.sampling.shells.campaign_pool", lambda _, bar: bar.stage("pool of cut-ins", 9))
+    Shells(resolve(golden("shells-twin", "crash.counts_above_mps=2")), progress)
+    assert told == ["pool of cut-ins (one of its own, once: only impacts above 2 m/s are crashes)"]
+    assert progress.remark == ""
 
 
 def test_tests_since_the_last_look_bring_the_end_nearer():

@@ -26,6 +26,7 @@ from harness.estimators.pairs import PairCounts
 from harness.estimators.shells import Shells as SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
+from harness.numbers import plain
 from harness.pool.build import campaign_pool, campaign_pool_key, pool_path
 from harness.pool.cut_ins import Pool
 from harness.pool.learned import Learned
@@ -56,7 +57,10 @@ class Shells(Source):
         if self.campaign.has_baseline_runs:
             self.baseline_paths = campaign_baseline_paths(resolved, progress)
         else:
+            if above := self.campaign.crash.counts_above_mps:
+                progress.remark = f" (one of its own, once: only impacts above {plain(above)} m/s are crashes)"
             self._draw_from(campaign_pool(resolved, progress))
+            progress.remark = ""
 
     def _draw_from(self, pool: Pool) -> None:
         self.prescribed = PrescribedEpisodes(self.campaign, pool)
