@@ -205,3 +205,16 @@ def test_saturated_strata_are_warned_of_and_deficient_ones_named():
     short = [s for s in estimate.details["strata"] if s["rank"] < min(s["columns"], s["n"] - 1)]
     assert gain["rank_deficient"] == [s["n_control_steps"] for s in short]
     assert gain["claimed"] == pytest.approx(estimate.details["var_y"] / estimate.details["var_z"], rel=1e-9)
+
+
+@pytest.mark.parametrize(("times", "rank"), [(0.5, 1), (2.0, 2)])
+def test_the_tolerance_of_ranks_is_the_documented_one(times, rank):
+    """Two columns around means of 3 and 40; the second varies by a multiple of the tolerance (docs/scv-defect.md)."""
+    n, ratios = 400, np.ones((400, 9, 3))
+    tolerance = n * np.finfo(np.float64).eps * np.sqrt(n) * np.sqrt(1.0 + 3.0**2 + 40.0**2)
+    angle = 2.0 * np.pi * np.arange(n) / n
+    ratios[:, 0, 0] = 3.0 + np.sin(angle)
+    ratios[:, 0, 1] = 40.0 + times * tolerance * np.sqrt(2.0 / n) * np.cos(angle)
+    stratum = Stratum(1)
+    stratum.add(ratios, np.zeros(n))
+    assert stratum.fit().rank == rank
