@@ -16,16 +16,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from harness.campaign.drivers import FVDMParameters, IDMParameters
 from harness.compiled import cache_root
 from harness.errors import writing
 from harness.importance.challenge import LEVELS, build_after_cut_in, build_before_cut_in, build_immediate
 from harness.importance.grid import AFTER, BEFORE
 from harness.traffic.laws import Environment
-from harness.vehicles.drivers import MODEL_FIELDS
 from harness.vocabulary import Float32Array, RecordArray
 
 _FORMAT = 4
 """Raise it when the meaning of a table changes."""
+MODEL_FIELDS = ("kind", *dict.fromkeys((*IDMParameters.model_fields, *FVDMParameters.model_fields)))
+"""What decides the acceleration of a surrogate."""
 
 
 class Tables(NamedTuple):

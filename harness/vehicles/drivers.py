@@ -12,34 +12,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from itertools import chain
 from typing import NamedTuple, get_args
 
 import numpy as np
 
-from harness.campaign.drivers import BuiltInParameters, FVDMParameters, IDMParameters, Reaction, Reference, Reflexes
+from harness.campaign.drivers import BuiltInParameters, Reaction, Reference, Reflexes
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.compiled import compiled_inline
 from harness.vocabulary import Record, RecordArray
 
-KINDS = dict(zip(get_args(BuiltInParameters), (0, 1, 2, -1, -2, -3), strict=True))
+IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
+CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = -1, -2, -3
 """Below zero: those that remember a danger."""
-IDM_KIND, FVDM_KIND, CONSTANT_KIND, CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = KINDS.values()
 SMALLEST_GAP_M = 0.1
 """Gap below which the models see this gap: they divide by it."""
 
 MOST_FOLLOWERS = 62
 """Whether they crash are bits of one integer."""
-
-MODEL_FIELDS = tuple(dict.fromkeys(("kind", *IDMParameters.model_fields, *FVDMParameters.model_fields)))
-"""What decides the acceleration of one without a memory once it has reacted."""
-_DERIVED = ("reaction_steps", "used_up_steps", "max_jerk_mps3", "inattention_probability", "perceives_lateral_m")
-_NUMBERS = dict.fromkeys(chain(*(kind.model_fields for kind in KINDS), _DERIVED))
-DRIVER_DTYPE = np.dtype(
-    [(name, np.int64) for name in ("kind", "delay_steps", "inattention_steps")]
-    + [(name, np.float64) for name in _NUMBERS]
-)
-"""All parameters of all models (properties among them, and how a driver lags behind), 0 where one has no such."""
 
 
 class Followers(NamedTuple):
@@ -54,6 +45,15 @@ class Followers(NamedTuple):
     counts_above_mps: float = 0.0
 
 
+@cache
+def driver_dtype() -> np.dtype[np.void]:
+    """All parameters of all models, and how a driver lags behind; 0 where one has no such."""
+    derived = "reaction_steps", "used_up_steps", "max_jerk_mps3", "inattention_probability", "perceives_lateral_m"
+    numbers = dict.fromkeys(chain(*(model.model_fields for model in get_args(BuiltInParameters)), derived))
+    whole = "kind", "delay_steps", "inattention_steps"
+    return np.dtype([(name, np.int64) for name in whole] + [(name, np.float64) for name in numbers])
+
+
 def driver_records(
     drivers: Sequence[BuiltInParameters], reactions: Sequence[Reflexes] | None = None, *, see_onset: bool = False
 ) -> RecordArray:
@@ -62,10 +62,12 @@ def driver_records(
     ``see_onset`` says that cut-ins take time: reference drivers then perceive and evaluate them, and none of their
     delay has been used up before.
     """
-    records = np.zeros(len(drivers), dtype=DRIVER_DTYPE)
+    remembering = CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND
+    kinds = dict(zip(get_args(BuiltInParameters), (IDM_KIND, FVDM_KIND, CONSTANT_KIND, *remembering), strict=True))
+    records: RecordArray = np.zeros(len(drivers), driver_dtype())
     for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
-        record["kind"] = KINDS[type(driver)]
-        for name in DRIVER_DTYPE.names or ():
+        record["kind"] = kinds[type(driver)]
+        for name in records.dtype.names or ():
             record[name] = getattr(driver, name, record[name])
         record["reaction_steps"] = 10.0 * record["reaction_time_s"]
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3

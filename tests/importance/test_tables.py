@@ -5,8 +5,8 @@ import pytest
 
 from harness.campaign.drivers import IDMParameters
 from harness.importance import tables as cache
-from harness.importance.tables import Tables, build_tables, table_path, tables_hash
-from harness.vehicles.drivers import MODEL_FIELDS, driver_records
+from harness.importance.tables import MODEL_FIELDS, Tables, build_tables, table_path, tables_hash
+from harness.vehicles.drivers import driver_records
 from tests.kernels import environment
 
 DRIVER = driver_records([IDMParameters()])
