@@ -153,7 +153,7 @@ def _result(name: str) -> dict[str, Any]:
 
 def results_table(names: tuple[str, ...]) -> str:
     """Table of long runs; ratios are to the run of the episode mixture."""
-    head = ("run", "tests", "crash rate", "ratio", "relvar", "P(cut-in)")
+    head = ("run", "tests", "crash rate", "ratio", "relvar")
     runs = {name: _result(name) for name in names}
     yardstick = next(found for name, found in runs.items() if "episode" in name)
     return _table(head, [(name, *_result_cells(found, yardstick)) for name, found in runs.items()])
@@ -173,7 +173,6 @@ def _result_cells(found: dict[str, Any], yardstick: dict[str, Any]) -> tuple[str
         f"{found['crash_rate']:.4g}",
         _ratio(found, yardstick),
         f"{found['relvar']:.3g}",
-        f"{found['mean_weight_cut_in']:.3g}",
     )
 
 
@@ -206,8 +205,7 @@ def limits_table() -> str:
     fast = found["of_the_tests"]["av_above_144_kmph"]
     return _table(("cut-ins", "share of the crash rate", "± standard error"), rows) + (
         f"\nOf the tests, {fast:.1%} have an AV faster than 144 km/h. Default vehicle, {found['crash_rate']:.3g} per "
-        f"test, {found['n_crashes']:,} sampled crashes. `{found['command']}` prints it; its docstring says how the run "
-        "is made.\n"
+        f"test, {found['n_crashes']:,} sampled crashes. `{found['command']}`; its docstring says how.\n"
     )
 
 
@@ -237,8 +235,8 @@ def validated_range(name: str) -> str:
 
     return (
         f"Of {len(of)} vehicles with true rates of {span('truth', '.3g')}: coverage {span('coverage', '.3f')}, bias "
-        f"{span('bias', '+.1%')}, {span('tests_median', ',.0f')} tests (medians). {_command(name)}; each vehicle is in "
-        f"[{name}.json](validation/{name}.json).\n"
+        f"{span('bias', '+.1%')}, {span('tests_median', ',.0f')} tests (medians). {_command(name)} "
+        f"([{name}.json](validation/{name}.json)).\n"
     )
 
 
@@ -266,14 +264,14 @@ def decisions(name: str = "gate") -> str:
         found = {each: of[f"limit {way} within {budget:,} tests"] for each, of in by_vehicle.items()}
         medians = [one["tests_median"] for one in found.values() if one["reached"] > 0.5]
         usual = found["idm"]["tests_median"]
-        return f"{min(medians):,.0f} to {max(medians):,.0f} tests (median; {usual:,.0f} of the default vehicle)"
+        return f"{min(medians):,.0f} to {max(medians):,.0f} tests (medians; default vehicle {usual:,.0f})"
 
     return (
         f"Of {len(by_vehicle)} vehicles, {content['judgements'][0]['replications']} campaigns each, at most "
         f"{most('accepted')} accepted and {most('rejected')} rejected; by the former rule "
-        f"{most('accepted', FORMER)} and {most('rejected', FORMER)}. A limit of twice the rate was decided after "
-        f"{tests('2 x rate, rejected')}, one of half the rate after {tests('0.5 x rate, accepted')}. "
-        f"{_command(name)}; each vehicle is in [{name}.json](validation/{name}.json).\n"
+        f"{most('accepted', FORMER)} and {most('rejected', FORMER)}. A limit of twice the rate takes "
+        f"{tests('2 x rate, rejected')}, of half the rate {tests('0.5 x rate, accepted')}. "
+        f"{_command(name)} ([{name}.json](validation/{name}.json)).\n"
     )
 
 
@@ -351,7 +349,7 @@ def _validated_cells(one: dict[str, Any]) -> tuple[str, ...]:
 
 def methods_table() -> str:
     """Table of methods on the default vehicle, all by replication."""
-    head = ("method", "estimator", "replications × tests", "bias", "coverage", "tests for RHW 0.3", "as claimed")
+    head = ("method", "estimator", "bias", "coverage", "tests for RHW 0.3", "as claimed")
     rows = [
         (words, *_method_cells(one))
         for name, words in METHODS.items()
@@ -367,7 +365,6 @@ def _method_cells(one: dict[str, Any]) -> tuple[str, ...]:
     claimed = one["claimed_relvar"] * tests * RELVAR_TO_TESTS
     return (
         f"`{one['result']}`",
-        f"{one['replications']:,} × {tests:,.0f}",
         f"{one['bias']:+.1%} ± {one['bias_std_error']:.1%}",
         f"{one['coverage']:.3f}",
         f"{tests:,.0f} (median)" if needed is None else f"{_two_digits(needed):,}",
