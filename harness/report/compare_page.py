@@ -6,16 +6,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from inspect import getmembers, isfunction
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from pydantic import BaseModel
 
 from harness import numbers
 from harness.errors import HarnessError, RunFolderError, printable
-from harness.estimators.short_answer import vehicle_words, verdict_of_pair
+from harness.estimators.short_answer import pair_asked, vehicle_words, verdict_of_pair
 from harness.numbers import count, tenths
 from harness.pool.replay import LEAD, PATH_COLUMNS
 from harness.records.folder import read_as, write_bytes
@@ -33,47 +32,26 @@ SHOWN = 2
 """Crashes of each: a vehicle in foreign code is run again in a process of its own."""
 
 
-class Contrast(BaseModel, extra="allow"):
-    """What lies between A and B, as in `harness.estimators.pairs.contrast`, if it is not ``refuted``."""
-
-    ci_low: float
-    ci_high: float
-    n_differing: int
-    refuted: bool = False
-
-
-class Stored(Contrast):
-    """What is looked at of ``compare.json``; the template shows more of it."""
-
-    campaigns: dict[Literal["a", "b"], dict[str, str]]
-    conditional: Contrast
-    margin: dict[str, Any] | None
-    shells: list[dict[str, Any]]
-
-
 def write_comparison(folder: str | Path) -> Path:
     """Write ``report.html`` into the folder of a comparison, and return the page, which is self-contained.
 
     Raises `RunFolderError`: a file of the comparison or of one of its runs is missing, damaged, or of another run.
     """
     folder = Path(folder)
-    stored = read_as(Stored, folder / COMPARISON, mend=MEND)
+    stored = read_as(dict[str, Any], folder / COMPARISON, mend=MEND)
     runs = [read_run_folder(folder / side) for side in ("a", "b")]
-    for run, of in zip(runs, stored.campaigns.values(), strict=True):
+    for run, of in zip(runs, stored["campaigns"].values(), strict=True):
         if (found := run.manifest["campaign_hash"]) != of["campaign_hash"]:
             expected = f"campaign {of['campaign_hash']} ({COMPARISON})"
             raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, MEND)
-    counted = runs[0].campaign.crash.counts_above_mps
-    pairs, inside = crashing_pairs(runs, stored.shells), stored.conditional
-    given = runs[0].campaign.testing.shells.statement == "library" and not inside.refuted
-    asked = inside if given else stored
+    pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
     plot = pairs_plot(pairs.who, pairs.weight, pairs.gap_m, pairs.closing_mps)
     environment = templates()
     environment.filters.update(getmembers(numbers, isfunction), sentence=sentence, vehicle=vehicle_words)
     page = environment.get_template("compare.html.j2").render(
-        compared=stored, asked=asked, given=given, above=counted,
-        verdict=verdict_of_pair(asked.model_dump(), stored.margin),
-        sides=list(zip("AB", runs, stored.campaigns.values(), strict=True)),
+        compared=stored, asked=asked, given=asked is not stored,
+        verdict=verdict_of_pair(asked, stored["margin"]), above=runs[0].campaign.crash.counts_above_mps,
+        sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
         plot=plot, scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
     )  # fmt: skip
     write_bytes(folder / "report.html", printable(page).encode("utf-8"))

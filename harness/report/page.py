@@ -7,15 +7,12 @@ from inspect import getmembers, isfunction
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
-
 from harness import numbers
-from harness.campaign.campaign import Campaign
-from harness.campaign.files import written_out
+from harness.campaign.files import dump_campaign
 from harness.errors import printable
 from harness.estimators.estimate import Estimate
 from harness.estimators.shells import ShellDetails, Within
-from harness.numbers import count, leaves, words
+from harness.numbers import count, leaves
 from harness.records.folder import write_bytes
 from harness.records.reader import table_sizes
 from harness.report.crashes import crash_gallery, environment_of
@@ -61,7 +58,7 @@ def write_report(folder: str | Path) -> Path:
         notes=run_notes(run, summary),
         diagnostics=diagnostics(run),
         details=details(run),
-        settings=setting_sections(run.campaign, reproducible=run.manifest.get("reproducible")),
+        settings=dump_campaign(run.campaign),
         folder=run.typed,
         run_folder=RUN_FOLDER,
     )
@@ -143,35 +140,3 @@ def details(run: RunFolder) -> list[tuple[str, Any]]:
         if isinstance(e, Estimate)
     }
     return leaves(found)
-
-
-Settings = list[tuple[str, str, str]]
-"""Of each its path inside the section, its value as text, and what it means."""
-
-
-def setting_sections(campaign: Campaign, *, reproducible: bool | None = None) -> dict[str, Settings]:
-    """Settings by top-level key, as in the file; scalars come first, as ``campaign``, with what the manifest adds."""
-    meanings = dict(_described(campaign, ""))
-    sections: dict[str, Settings] = {"campaign": []}
-    for key, part in written_out(campaign).items():
-        for path, leaf in leaves(part, key):
-            title, _, inner = path.partition(".") if isinstance(part, dict) else ("campaign", "", path)
-            sections.setdefault(title, []).append((inner, words(leaf), meanings.get(path, "")))
-    if reproducible is not None:
-        meaning = "whether an episode runs again bit for bit (manifest)"
-        sections["campaign"].append(("reproducible", words(reproducible), meaning))
-    return sections
-
-
-def _described(content: Any, path: str) -> list[tuple[str, str]]:
-    """Follow the validated instances, not the schema, so that the chosen driver model decides what a name means."""
-    found: list[tuple[str, str]] = []
-    if isinstance(content, BaseModel):
-        for name, info in type(content).model_fields.items():
-            inner = f"{path}.{name}" if path else name
-            found.append((inner, info.description or ""))
-            found += _described(getattr(content, name), inner)
-    elif isinstance(content, dict):
-        for name, part in content.items():
-            found += _described(part, f"{path}.{name}")
-    return found

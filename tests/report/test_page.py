@@ -19,7 +19,7 @@ from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
 from tests.stored_runs import truncate
 
 SEEN = {
-    "weighted": ({"severity"}, ["hardest braking a_min [assumed]"]),
+    "weighted": ({"severity"}, ["defensive_share: 0.1"]),
     "no_crash": (set(), ["No crash was seen."]),
     "nde": ({"severity"}, []),
     "failed": ({"severity"}, ["9 of 300 tests FAILED", "step: returned nan, expected"]),
