@@ -432,6 +432,8 @@ def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideRef
     for r, reference in enumerate(design.references):
         crashes_too = design.crashes_too(r)
         rate, square = float(design.reference_rate[r]), float(design.reference_square[r])
+        if rate == 0.0:  # a reference that crashes nowhere on these paths is nothing to compare with
+            continue
         low, high = (_beside(design, tests, r, design.p.size, level) for tests in (cells, worst))
         ratio = own / rate if rate > 0.0 else math.nan, low[0], high[1]
         preventable = preventable_share(design.cell_p, cells, ~crashes_too, design.n_independent, level)

@@ -49,7 +49,8 @@ class Learned(NamedTuple):
     def in_words(self) -> str:
         """What is not in the table."""
         lag = f", with {self.lag:g} of its last acceleration" if self.lag else ""
-        return f"it acts {self.dead_steps * STEP_S:.1f} s after what it sees{lag}"
+        late = f"{self.dead_steps * STEP_S:.1f} s after what it sees" if self.dead_steps else "at once"
+        return f"it acts {late}{lag}"
 
     def digest(self) -> str:
         """Hash of all of it."""

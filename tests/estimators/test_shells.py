@@ -26,7 +26,7 @@ from harness.estimators.tally import (
     paths_that_count,
     pool_variance,
 )
-from harness.strata import Statement
+from harness.strata import Reference, Statement
 from tests.estimators.small_blocks import EXACT, SHELLS, in_shells, tally
 
 P, LEVEL = SHELLS.p, Level.two_sided(0.9)
@@ -61,6 +61,17 @@ def test_limits_are_those_of_the_likelihood_ratio_and_wider_where_the_pool_errs(
     rough = combined(P, found._replace(crash_mass=found.crash_mass * 50), 100, LEVEL)
     assert rough.rate == exact.rate
     assert rough.high - rough.rate > 1.3 * (exact.high - exact.rate)
+
+
+def test_a_reference_that_crashes_nowhere_in_the_pool_is_nothing_to_compare_with():
+    """As beside a vehicle that keeps its distance all along: every other reference is still there."""
+    who = Reference("r157-cc", "a driver"), Reference("r157-fsm", "another")
+    beside = replace(
+        SHELLS, references=who, reference_rate=np.array([0.0, 1e-5]), reference_square=np.array([0.0, 1.0])
+    )
+    (found,) = shells_estimate((0, 3, 0, 40), (1, 0, 0, 40), shells=beside).details["references"]
+    assert found["reference"] == "r157-fsm"
+    assert math.isfinite(found["ratio"])
 
 
 N_PATHS = 20_000
