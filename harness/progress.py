@@ -7,13 +7,12 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from typing import Self, TextIO
-
-from rich.console import Console
-from rich.progress import BarColumn, Task, TaskProgressColumn
-from rich.progress import Progress as Bars
+from typing import TYPE_CHECKING, Self, TextIO
 
 from harness.numbers import count, duration, words
+
+if TYPE_CHECKING:
+    from rich.progress import Task
 
 Figure = float | int | str
 FORESEEN = 10.0
@@ -81,6 +80,10 @@ class ShownProgress(Progress):
         *,
         interval_s: float = 30.0,
     ) -> None:
+        from rich.console import Console  # noqa: PLC0415 - what shows nothing needs none
+        from rich.progress import BarColumn, TaskProgressColumn  # noqa: PLC0415
+        from rich.progress import Progress as Bars  # noqa: PLC0415
+
         self._stream, self._interval_s = stream or sys.stderr, interval_s
         self._asked = target_rhw, min_crashes
         columns = "{task.description}", BarColumn(bar_width=12), TaskProgressColumn(), "{task.fields[words]}"
