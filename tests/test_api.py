@@ -30,7 +30,7 @@ def test_all_that_is_promised_is_there():
 
 def test_importing_it_loads_nothing_slow_and_a_report_nothing_to_drive_or_to_plot_with():
     slow = {"numba", "scipy", "libsumo", "pandas", "pyarrow", "matplotlib"}
-    of_report = {"matplotlib", "libsumo", "ray", "fmpy"}
+    of_report = {"matplotlib", "libsumo", "ray", "fmpy", "scipy.optimize", "rich"}
     code = f"import harness.cli, sys; print({slow} & {{*sys.modules}})"
     code += f"; import harness.report.page, harness.report.compare_page; print({of_report} & {{*sys.modules}})"
     command = [sys.executable, "-c", code]

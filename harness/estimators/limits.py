@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
 from scipy.special import betaincinv, ndtri
 
 from harness.vocabulary import FloatArray
@@ -73,6 +72,8 @@ def capped_mean_upper(mean: float, cap: float, n: int, confidence: float) -> flo
     share, almost_one = mean / cap, math.log1p(-(2.0**-53))
     if share >= 1.0 or relative_entropy(share, almost_one) <= needed:
         return min(1.0, cap)
+    from scipy.optimize import brentq  # noqa: PLC0415 - a page asks for no limit
+
     log_bound = brentq(
         lambda log_p: relative_entropy(share, log_p) - needed, math.log(share), almost_one, xtol=1e-14, rtol=1e-13
     )
