@@ -331,10 +331,14 @@ class Shells:
         """Of the first strata; anything is possible where crashes lie on too few paths."""
         if (n_strata, level) not in self._known:
             p, tally = self._design.p[:n_strata], self.tally.part(slice(0, n_strata))
-            sure = paths_that_count(p, tally, -ROOM) < FEWEST_PATHS
-            found = RateLimits(float(p @ tally.share), 0.0, 1.0, math.inf, math.inf if sure else 0.0)
-            if paths_that_count(p, tally) >= FEWEST_PATHS:
+            found = RateLimits(float(p @ tally.share), 0.0, 1.0, math.inf, math.inf)
+            if not (few := paths_that_count(p, tally) < FEWEST_PATHS):
                 found = combined(p, tally, self._design.n_independent, level)
+            testable = np.resize(self._design.available[:n_strata] or 1, p.size) > 0
+            # Crashes of strata that are still to be tested may lie on other paths.
+            to_come = tally.runs is not None and bool((tally.tests[testable] == 0).any())
+            if to_come or (few and paths_that_count(p, tally, -ROOM) >= FEWEST_PATHS):
+                found = found._replace(from_pool_at_least=0.0)
             self._known[n_strata, level] = found
         return self._known[n_strata, level]
 

@@ -278,6 +278,21 @@ def test_one_or_two_pairs_of_few_crashes_say_nothing():
     assert paths_that_count(p, noisy) < FEWEST_PATHS < paths_that_count(p, noisy, -ROOM)
 
 
+@pytest.mark.parametrize(("untested", "available", "sure"), [(0, 9, False), (0, 0, True), (50, 9, True)])
+def test_few_paths_end_nothing_while_another_stratum_is_to_be_tested(untested, available, sure):
+    """All crashes on two of 100 runs: there may be others where nothing has been tested, unless nothing can be."""
+    two = counted([1, 2] * 30, range(60), 1e-4, [0] * 60)._replace(tests=np.array([1000, untested]), runs=None)
+    place = CrashedTests(np.array([1, 2] * 30), np.arange(60), np.full(60, 1e-4), np.zeros(60, np.int64))
+    design = replace(SHELLS, strata=("careful", "outside"), cell_stratum=(0, 1), cell_references=(0, 0), n_paths=100)
+    design = replace(
+        design, cell_p=P[:2], available=(9_000, available), statements=(replace(SHELLS.library, n_inside=1),)
+    )
+    seen = Shells()
+    seen.count(design, two, place)
+    limits = seen.limits_of("assumption_free", LEVEL)
+    assert (limits.from_pool, limits.from_pool_at_least) == (math.inf, math.inf if sure else 0.0)
+
+
 @pytest.mark.parametrize("n_paths", [8, 25, 150, 500])
 def test_it_is_the_number_of_equal_paths_and_the_guard_tells_few_from_many(n_paths):
     """Eighty crashes, each a cut-in of its own; the guard decides wrongly in 1,000 draws never."""
