@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -24,25 +24,15 @@ CANDIDATES, SHOWN = 50, 3
 """Crashes considered and shown per ranking: with a share of traces only some of the worst have one."""
 MOST_JUDGED, MOST_TRACED = 20_000, 1_000
 """Hardest crashes of which it is asked who would have avoided them; of vehicles whose motion the traces must tell."""
-
-
-class Crash(NamedTuple):
-    """One crash; units as in the schema of ``episodes``, ``weight`` as in `RunSummary`."""
-
-    episode: int
-    impact_speed_mps: float
-    crash_time_s: float
-    weight: float
-    cut_in_s: float
-    cut_in_r2_m: float
-    cut_in_r2dot_mps: float
-    component: int
+SHOWN_COLUMNS = ("impact_speed_mps", "crash_time_s", "weight", "cut_in_s", "cut_in_r2_m", "cut_in_r2dot_mps")
+"""Of a crash in the table, beside its episode; as in `RunSummary`."""
 
 
 class GalleryRow(NamedTuple):
     """One crash in the table: why it is there, how to see it again, and its place among the scenes if it was traced."""
 
-    crash: Crash
+    episode: int
+    crash: dict[str, float]
     reason: str
     share_of_estimate: float
     component: str
@@ -81,17 +71,17 @@ def crash_gallery(
     total, stored = float(crashes["weight"].sum()), _rows(run, {int(episode[place]) for place in reasons} & traced)
     rows, shown = list[GalleryRow](), list[Scene]()
     for place, why in reasons.items():
-        found: dict[str, Any] = {name: float(crashes[name][place]) for name in Crash._fields}
-        crash = Crash(**found | {name: int(found[name]) for name in ("episode", "component")})
+        crash = {name: float(crashes[name][place]) for name in SHOWN_COLUMNS}
+        number, component = int(episode[place]), _component_name(run, int(crashes["component"][place]))
         names = [name for name, avoids in zip(OTHERS, avoided[place], strict=True) if avoids]
         by, scene = ", ".join(names) or ("–" if UNKNOWN in ends[place] else "nobody"), None
-        if traces is not None and crash.episode in traced:
-            told, scene = f"impact at {tenths(crash.impact_speed_mps)} m/s ({', '.join(why)})", len(shown)
-            row, trace = (each.filter(pc.equal(each["episode"], crash.episode)) for each in (stored, traces))
-            shown.append(scenes.scene(row, trace, why=told))
-        share = crash.weight / total if total > 0.0 else math.nan
-        component, command = _component_name(run, crash.component), f"harness replay {run.typed} {crash.episode}"
-        rows.append(GalleryRow(crash, ", ".join(why), share, component, by, command, scene))
+        if traces is not None and number in traced:
+            impact, scene = tenths(crash["impact_speed_mps"]), len(shown)
+            row, trace = (each.filter(pc.equal(each["episode"], number)) for each in (stored, traces))
+            shown.append(scenes.scene(row, trace, why=f"impact at {impact} m/s ({', '.join(why)})"))
+        share = crash["weight"] / total if total > 0.0 else math.nan
+        command = f"harness replay {run.typed} {number}"
+        rows.append(GalleryRow(number, crash, ", ".join(why), share, component, by, command, scene))
     return rows, shown
 
 

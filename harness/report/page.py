@@ -10,8 +10,7 @@ from typing import Any
 from harness import numbers
 from harness.campaign.files import dump_campaign
 from harness.errors import printable
-from harness.estimators.estimate import Estimate
-from harness.estimators.shells import ShellDetails, Within
+from harness.estimators.shells import Within
 from harness.numbers import count, leaves
 from harness.records.folder import write_bytes
 from harness.records.reader import table_sizes
@@ -57,7 +56,6 @@ def write_report(folder: str | Path) -> Path:
         outcomes=outcome_rows(summary),
         notes=run_notes(run, summary),
         diagnostics=diagnostics(run),
-        details=details(run),
         settings=dump_campaign(run.campaign),
         folder=run.typed,
         run_folder=RUN_FOLDER,
@@ -129,14 +127,3 @@ def diagnostics(run: RunFolder) -> list[tuple[str, Any]]:
     """Return sums of the run as (key, value); of shells without those about weights, which have none to say."""
     found = leaves(run.estimates.diagnostics)
     return found if run.shells is None else [(path, leaf) for path, leaf in found if leaf not in (None, {})]
-
-
-def details(run: RunFolder) -> list[tuple[str, Any]]:
-    """Return what single estimators report about themselves and no other section shows, as (estimator.key, value)."""
-    shown = ShellDetails.__annotations__ if run.shells is not None else ()
-    found = {
-        name: {key: content for key, content in e.details.items() if name != run.estimates.headline or key not in shown}
-        for name, e in run.estimates.estimates.items()
-        if isinstance(e, Estimate)
-    }
-    return leaves(found)

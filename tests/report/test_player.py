@@ -133,14 +133,14 @@ def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_n
     monkeypatch.setattr(crashes, "_ends", lambda *_: ends)
     rows, scenes = crashes.crash_gallery(run, summary, crashes.environment_of(run))
     assert [row.reason.split(", ")[0] for row in rows][: len(leads)] == [lead.split(", ")[0] for lead in leads]
-    shown = [row.crash.episode for row in rows]
+    shown = [row.episode for row in rows]
     allowed = [int(summary.crashes["episode"][by_rank[rank]]) for rank in who or range(impact.size)]
     assert set(shown) <= set(allowed)
     words = {NOBODY: "nobody", BRAKES: "brakes-8", BOTH: "r157-cc, brakes-8"}
     avoided = {allowed[i]: words[end] for i, end in enumerate(who.values())}
     assert [row.avoided_by for row in rows] == [avoided.get(episode, "nobody") for episode in shown]
     assert [scene["episode"] for scene in scenes] == shown
-    hardest = [row.crash.impact_speed_mps for row in rows if row.reason.startswith("avoided")]
+    hardest = [row.crash["impact_speed_mps"] for row in rows if row.reason.startswith("avoided")]
     assert hardest == sorted(hardest, reverse=True)
 
 
@@ -148,11 +148,11 @@ def test_a_report_shows_crashes_with_those_who_avoid_them(stored_run, tmp_path):
     folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
     scenes = scenes_in(write_report(folder).read_text(encoding="utf-8"))
     rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run), crashes.environment_of(run))
-    assert [row.crash.episode for row in rows if row.scene is not None] == [scene["episode"] for scene in scenes]
+    assert [row.episode for row in rows if row.scene is not None] == [scene["episode"] for scene in scenes]
     for row, scene in zip(rows, scenes, strict=True):
         avoids = [ghost["name"] for ghost in scene["ghosts"] if ghost["crash"] is None]
         assert row.avoided_by == (", ".join(avoids) or "nobody")
-        again = harness.replay(folder, row.crash.episode).scene | {"title": scene["title"]}
+        again = harness.replay(folder, row.episode).scene | {"title": scene["title"]}
         assert scene == json.loads(json.dumps(again, default=np.ndarray.tolist))
 
 

@@ -167,7 +167,7 @@ def test_gallery_prefers_traced_crashes_where_few_are_traced(run_folder, summary
         traces = pq.read_table(path)
         pq.write_table(traces.filter(np.asarray(traces.column("episode")) == tenth), path)
     rows, scenes = crash_gallery(read_run_folder(run_folder), summary, None)
-    shown = [(row.crash.episode, row.reason.split(", ")[0], row.scene) for row in rows if row.scene is not None]
+    shown = [(row.episode, row.reason.split(", ")[0], row.scene) for row in rows if row.scene is not None]
     assert shown == [(tenth, "hardest no. 10", 0)]
     assert [scene["episode"] for scene in scenes] == [tenth]
     assert any(row.scene is None for row in rows)
