@@ -18,7 +18,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
 from harness.estimators.block import Block, Drawn
 from harness.estimators.estimate import Estimate
-from harness.estimators.limits import normal_half_width
+from harness.estimators.likelihood import Level
 from harness.estimators.stopping import StopRule
 from harness.estimators.weighted import Nade
 from harness.vocabulary import CRASH, FloatArray, Method
@@ -74,7 +74,7 @@ def fixed(population: Population, n: int, replications: int) -> str:
     covered, widths, effective = np.zeros(2), [], []
     for k in range(replications):
         found = population.campaign(np.random.default_rng([SEED, n, k]), n, Nade())
-        half = normal_half_width(found.std_error, CONFIDENCE)
+        half = Level.two_sided(CONFIDENCE).z * found.std_error
         by_normal = abs(found.crash_rate - population.rate) <= half
         covered += [by_normal, found.ci_low <= population.rate <= found.ci_high]
         widths.append((found.ci_high - found.ci_low) / 2.0 / half)

@@ -27,7 +27,7 @@ from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
 from harness.estimators.block import Block, joined
 from harness.estimators.estimate import FailureBounds, finite_json
-from harness.estimators.limits import normal_half_width
+from harness.estimators.likelihood import Level
 from harness.estimators.scv import Scv
 from harness.progress import Progress
 from harness.runner.stored import stored_blocks
@@ -69,7 +69,7 @@ class Procedure:
     @property
     def z(self) -> float:
         """Quantile of the normal interval."""
-        return normal_half_width(1.0, self.confidence)
+        return Level.two_sided(self.confidence).z
 
 
 class Tests(NamedTuple):

@@ -227,7 +227,12 @@ def block_from_tables(
     `SHELL_COLUMNS`, too. Crashes that are no harder than ``counts_above_mps`` count as none.
     """
     index = _integers(episodes, "episode")
-    _require_consecutive(index)
+    if not index.size:
+        raise _damaged("episodes", "no rows", "at least one episode per shard")
+    if (gaps := np.diff(index) != 1).any():
+        at = int(np.argmax(gaps))
+        expected = "every episode once, in index order; a failed one is a row too"
+        raise _damaged(f"episodes, row {at + 1}", f"episode {index[at + 1]} after episode {index[at]}", expected)
     outcome = _outcomes(episodes)
     failed, n_control_steps = outcome == FAILED, _integers(episodes, "n_control_steps")
     columns: dict[str, Column] = {
@@ -290,16 +295,6 @@ def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
         mend = "The records belong to another campaign or are damaged. " + MEND_SHARD
         raise RunFolderError(f"column {name}", f"{len(values)} numbers in {table.num_rows} rows", expected, mend)
     return values.reshape(table.num_rows, width)
-
-
-def _require_consecutive(index: IntArray) -> None:
-    if len(index) == 0:
-        raise _damaged("episodes", "no rows", "at least one episode per shard")
-    gaps = np.diff(index) != 1
-    if gaps.any():
-        at = int(np.argmax(gaps))
-        expected = "every episode once, in index order; a failed one is a row too"
-        raise _damaged(f"episodes, row {at + 1}", f"episode {index[at + 1]} after episode {index[at]}", expected)
 
 
 def _log_weights(episodes: pa.Table, failed: BoolArray, first: int) -> FloatArray:

@@ -25,11 +25,6 @@ def clopper_pearson(
     return low, high
 
 
-def normal_half_width(std_error: float, confidence: float) -> float:
-    """Half-width of the two-sided normal interval."""
-    return -float(ndtri((1.0 - confidence) / 2.0)) * std_error
-
-
 def skewed_distances(std_error: float, third_moment: float, tail: float) -> tuple[float, float]:
     """Distances of the limits of an estimate whose error is skewed, below and above: the farther of Hall's and normal.
 

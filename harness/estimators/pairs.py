@@ -281,8 +281,21 @@ class PairedEstimate:
             "n_pairs_outside": self.free["n_pairs"] - self.conditional["n_pairs"],
             "refuted": self.refuted,
         }
+        design, columns = self.pairs.design, ("n_both", "n_only_a", "n_only_b", "n_neither")
+        failed = self.pairs.tally(0).failed + self.pairs.tally(1).failed
+        shells = [
+            {
+                "shell": design.strata[s],
+                "inside": s < design.library.n_inside,
+                "p": float(design.p[s]),
+                "n_pairs": int(self.pairs.tests[s]),
+                **dict(zip(columns, row.tolist(), strict=True)),
+                "n_failed_tests": int(failed[s]),
+            }
+            for s, row in enumerate(self.pairs.outcomes())
+        ]
         each = {"a": self.a.shown, "b": self.b.shown}
-        more = {"confidence": self.a.confidence, "conditional": inside, "shells": _shells(self.pairs)}
+        more = {"confidence": self.a.confidence, "conditional": inside, "shells": shells}
         warnings = [f"{name}: {text}" for name, of in (("A", self.a), ("B", self.b)) for text in of.warnings]
         return finite_json({**each, **self.free, **more, "warnings": warnings})
 
@@ -304,19 +317,3 @@ def _own(pairs: PairCounts, side: int, confidence: float) -> Estimate:
     tally = pairs.tally(side)
     worst = Shells.of(pairs.design, tally.failed_as_crashes())
     return FailureBounds(Shells.of(pairs.design, tally), worst, int(tally.failed.sum())).result(confidence)
-
-
-def _shells(pairs: PairCounts) -> list[dict[str, Any]]:
-    design, columns = pairs.design, ("n_both", "n_only_a", "n_only_b", "n_neither")
-    failed = pairs.tally(0).failed + pairs.tally(1).failed
-    return [
-        {
-            "shell": design.strata[s],
-            "inside": s < design.library.n_inside,
-            "p": float(design.p[s]),
-            "n_pairs": int(pairs.tests[s]),
-            **dict(zip(columns, row.tolist(), strict=True)),
-            "n_failed_tests": int(failed[s]),
-        }
-        for s, row in enumerate(pairs.outcomes())
-    ]

@@ -37,7 +37,6 @@ LOOK_RATIO = 1.1
 """Of neighbouring looks: since the half-width shrinks with 1/√n, they differ by 5 % in precision, which is the noise of
 the half-width itself at the default floor of 100 crashes (half of 1/√100); a finer grid mostly repeats the same look.
 With two passes a campaign uses about 20 % more tests than a fixed size would need, at a ratio of 1.25 nearly 50 %."""
-PASSES_NEEDED = 2
 DEFAULT_MIN_CRASHES = 100
 FIRST_TESTS = "the first tests of each shell (testing.shells.first_tests)"
 POOL_SHARE = 0.5
@@ -159,12 +158,13 @@ class Look:
 class Rule:
     """Looks at results, leaves what it found in ``look``, and says when they are enough.
 
-    ``target`` is the relative half-width that is asked for, None where only the budget ends the tests; ``passes`` is
-    how many looks in a row must find it.
+    ``target`` is the relative half-width that is asked for, None where only the budget ends the tests.
     """
 
-    def __init__(self, target: float | None, min_crashes: int, *, passes: int = 1) -> None:
-        self._target, self._min_crashes, self._needed = target, min_crashes, passes
+    _needed = 1  # looks in a row that must find it
+
+    def __init__(self, target: float | None, min_crashes: int) -> None:
+        self._target, self._min_crashes = target, min_crashes
         self._passes = 0
         self.look = Look()
 
@@ -224,19 +224,14 @@ class StopRule(Rule):
     """Fed with the estimate of weighted tests at each look in turn.
 
     ``estimator``, the method's own, is whose estimate `observe` wants, ``looks`` at which numbers of episodes.
-    ``min_crashes`` is the floor where ``stop.min_crashes`` says nothing.
     """
 
+    _needed = 2
+
     def __init__(
-        self,
-        campaign_stop: Stop,
-        method: Method,
-        shard_ends: Sequence[int],
-        ratio: float = LOOK_RATIO,
-        *,
-        min_crashes: int = DEFAULT_MIN_CRASHES,
+        self, campaign_stop: Stop, method: Method, shard_ends: Sequence[int], ratio: float = LOOK_RATIO
     ) -> None:
-        super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or min_crashes, passes=PASSES_NEEDED)
+        super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or DEFAULT_MIN_CRASHES)
         self.estimator: EstimatorName = SAMPLING[method].headline
         self.looks = look_grid(campaign_stop.episodes, shard_ends, ratio)
         self.look = Look(one_more_crash=math.inf)

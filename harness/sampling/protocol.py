@@ -75,9 +75,7 @@ class KnownRounds(Rounds):
     def __init__(self, campaign: Campaign) -> None:
         self._total, self._confidence = campaign.stop.episodes, campaign.stop.confidence
         self._ends = campaign.run.shard_ends(self._total)
-        self.rule = self._rule = StopRule(
-            campaign.stop, campaign.testing.method, self._ends, min_crashes=campaign.min_crashes
-        )
+        self.rule = self._rule = StopRule(campaign.stop, campaign.testing.method, self._ends)
         self._sums, self._n_episodes = accumulator(self._rule.estimator), 0
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
@@ -105,19 +103,17 @@ class Source:
 
     def __init__(self, resolved: Resolved, progress: Progress) -> None:
         self.resolved, self.campaign = resolved, resolved.campaign
-        self.tables = self._built_tables(progress)
+        self.tables: Tables | None = None
+        if self.campaign.sampling.mixes:
+            drivers = resolved.surrogates
+            progress.stage("criticality tables", len(drivers))
+            challenge = self.campaign.testing.challenge
+            self.tables = build_tables(resolved.environment, drivers, challenge, progress.advance)
         importance = build_importance(self.campaign, self.tables)
         self.policy = Drawing(self.campaign.seed, resolved.environment, importance, resolved.av, NOBODY)
         self.initial_states = InitialStates(resolved.environment.numbers)
         self.design: ShellDesign | None = None
         self.baseline_paths: BaselinePaths | None = None
-
-    def _built_tables(self, progress: Progress) -> Tables | None:
-        if not self.campaign.sampling.mixes:
-            return None
-        drivers = self.resolved.surrogates
-        progress.stage("criticality tables", len(drivers))
-        return build_tables(self.resolved.environment, drivers, self.campaign.testing.challenge, progress.advance)
 
     @classmethod
     def cached_files(cls, resolved: Resolved) -> list[Path]:

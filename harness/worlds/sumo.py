@@ -195,14 +195,19 @@ class SumoWorld(SumoCells):
         self._require_equal("m/s", self._get_speed, speeds, names)
 
     def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        changing = cut_in.nonzero()[0].tolist()
-        for k in changing:
-            self._begin_cut_in(self._names[k][BV])
+        changing = [self._names[k][BV] for k in cut_in.nonzero()[0].tolist()]
+        for name in changing:
+            self._plan_every(PLAN_NOW_S, name)
+            self._api.vehicle.changeLane(name, RIGHT, 0.0)
         advance(self.x, self.v, speed)
         if self._shim is not None:
             if not self._shim.step(speed):
                 self._read_released()
-                self._require_as_read(self._shim)
+                # Libsumo's getters are asked again only where the shim has read other values than are wanted now.
+                if not np.array_equal(self._shim.position, self.x.ravel()):
+                    self._require_equal("m", self._get_position, self.x)
+                if not np.array_equal(self._shim.speed, self.v.ravel()):
+                    self._require_equal("m/s", self._get_speed, self.v)
         else:
             self._tell(speed)
             self._simulation_step(0.0)
@@ -211,16 +216,11 @@ class SumoWorld(SumoCells):
             self._n_steps += 1
             if self._n_steps % SPEED_CHECK_STEPS == 0:
                 self._require_equal("m/s", self._get_speed, self.v)
-        for k in changing:
-            self._end_cut_in(self._names[k][BV])
+        for name in changing:
+            self._plan_every(NEVER_PLAN_S, name)
+            if (lane := self._api.vehicle.getLaneIndex(name)) != RIGHT:
+                raise _disobeyed(f"{name}, lane", lane, RIGHT)
         return self._contacts(self._get_collisions)
-
-    def _require_as_read(self, shim: Shim) -> None:
-        """Ask again, and by libsumo's getters, where the shim has read other values than are wanted now."""
-        if not np.array_equal(shim.position, self.x.ravel()):
-            self._require_equal("m", self._get_position, self.x)
-        if not np.array_equal(shim.speed, self.v.ravel()):
-            self._require_equal("m/s", self._get_speed, self.v)
 
     def _read_released(self) -> None:
         """Take over from SUMO the state of vehicles that were not commanded: here all are."""
@@ -232,17 +232,9 @@ class SumoWorld(SumoCells):
         deque(map(self._set_speed, names, speed[changed].tolist()), maxlen=0)
         self._told[:] = speed
 
-    def _begin_cut_in(self, name: str) -> None:
+    def _plan_every(self, seconds: float, name: str) -> None:
         if not self._vanilla:
-            self._api.vehicle.setActionStepLength(name, PLAN_NOW_S, True)
-        self._api.vehicle.changeLane(name, RIGHT, 0.0)
-
-    def _end_cut_in(self, name: str) -> None:
-        if not self._vanilla:
-            self._api.vehicle.setActionStepLength(name, NEVER_PLAN_S, True)
-        lane = self._api.vehicle.getLaneIndex(name)
-        if lane != RIGHT:
-            raise _disobeyed(f"{name}, lane", lane, RIGHT)
+            self._api.vehicle.setActionStepLength(name, seconds, True)
 
     def _require_equal(
         self, unit: str, getter: Callable[[str], float], expected: FloatArray, names: Sequence[str] | None = None

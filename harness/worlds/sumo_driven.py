@@ -128,12 +128,6 @@ def recyclable(sumo: Mapping[str, str | float]) -> bool:
     )
 
 
-def type_xml(sumo: Mapping[str, str | float]) -> str:
-    """An additional file with the type."""
-    written = " ".join(f"{name}={quoteattr(str(value))}" for name, value in av_type(sumo).items())
-    return f'<additional>\n    <vType id="{TYPE_NAME}" {written}/>\n</additional>\n'
-
-
 def refused(sumo: Mapping[str, str | float], message: str) -> CampaignError:
     """The error for a type that SUMO itself refuses, naming the attribute that SUMO's message names."""
     attributes = av_type(sumo)
@@ -158,7 +152,8 @@ class SumoAvWorld(SumoWorld):
         self.acts_before_cut_in = acts_before_cut_in
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._wanted: FloatArray = np.zeros((n_cells, 3))
-        self._xml = type_xml(av)
+        written = " ".join(f"{name}={quoteattr(str(value))}" for name, value in av_type(av).items())
+        self._xml = f'<additional>\n    <vType id="{TYPE_NAME}" {written}/>\n</additional>\n'
         with self._written_type() as folder:
             stderr = folder / "stderr"
             try:
@@ -222,8 +217,7 @@ class FreshWorld(SumoAvWorld):
     """
 
     def __init__(self, av: Mapping[str, str | float], seed: int, **options: Any) -> None:
-        self._seed = seed
-        self._sumo_seed = 0
+        self._seed, self._sumo_seed = seed, 0
         super().__init__(1, av, **options)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - there is one cell

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import FailureBounds
-from harness.estimators.limits import normal_half_width
+from harness.estimators.likelihood import Level
 from harness.estimators.scv import CHUNK_ROWS as CHUNK
 from harness.estimators.scv import Scv, StratumFit, fill_product_columns
 from harness.estimators.weighted import Nade
@@ -70,7 +70,7 @@ class Claims:
 
     def row(self, rhw: float, confidence: float) -> dict[str, Any]:
         """Figures of what is claimed so far; ``settled`` says whether it means anything."""
-        nade, z = self.nade.result(confidence), normal_half_width(1.0, confidence)
+        nade, z = self.nade.result(confidence), Level.two_sided(confidence).z
         scv = self._scv.result(confidence) if self._with_scv else None
         mean_weight = self._weight / self._n
         settled = weights_are_in(self._method, mean_weight)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
-from harness.estimators.limits import normal_half_width
+from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import LOW_MEAN_WEIGHT
 from harness.vocabulary import FloatArray, Method
 
@@ -129,4 +129,4 @@ def verdict(paper: float, found: dict[str, Any], *, within: float, tolerance: fl
 
 def tests_for(relvar: float, rhw: float, confidence: float) -> float:
     """Tests after which a mean of this relative variance per test has the relative half-width."""
-    return relvar * (normal_half_width(1.0, confidence) / rhw) ** 2
+    return relvar * (Level.two_sided(confidence).z / rhw) ** 2

@@ -11,7 +11,8 @@ import pyarrow as pa
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
-from harness.estimators.limits import clopper_pearson, normal_half_width
+from harness.estimators.likelihood import Level
+from harness.estimators.limits import clopper_pearson
 from harness.records.folder import read_table
 from harness.resolved import resolve
 from harness.runner.run import run_campaign
@@ -121,7 +122,7 @@ def crash_rate(tests: Tests, confidence: float) -> dict[str, Any]:
     if np.all(y[~tests.failed] == 1.0):
         low, high = map(float, clopper_pearson(np.count_nonzero(y), n, (1.0 - confidence) / 2.0))
         return figure(rate, low, high)
-    half = normal_half_width(np.sqrt(max(float(y @ y) / n - rate * rate, 0.0) / max(n - 1, 1)), confidence)
+    half = Level.two_sided(confidence).z * float(np.sqrt(max(float(y @ y) / n - rate * rate, 0.0) / max(n - 1, 1)))
     return figure(rate, max(rate - half, 0.0), rate + half)
 
 

@@ -16,7 +16,8 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from harness.estimators.estimate import Estimate
-from harness.estimators.limits import clopper_pearson, normal_half_width
+from harness.estimators.likelihood import Level
+from harness.estimators.limits import clopper_pearson
 from harness.vocabulary import FloatArray
 from studies.replication.populations import Known
 
@@ -110,7 +111,7 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
     low, high = map(float, clopper_pearson(covered, n, (1.0 - COVERAGE_CONFIDENCE) / 2.0))
     tests_5, median, tests_95 = table.n_tests.quantile([0.05, 0.5, 0.95]).tolist()
     fixed, relvar = not table.reached.any() and table.n_tests.nunique() == 1, _mean(errors**2)
-    met, z = subject.meets_assumption_of(result), normal_half_width(1.0, confidence)
+    met, z = subject.meets_assumption_of(result), Level.two_sided(confidence).z
     return {
         "subject": subject.name,
         "result": result,

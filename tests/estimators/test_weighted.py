@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom, binomtest
 
-from harness.estimators.limits import _hall, capped_mean_upper, clopper_pearson, normal_half_width, skewed_distances
+from harness.estimators.likelihood import Level
+from harness.estimators.limits import _hall, capped_mean_upper, clopper_pearson, skewed_distances
 from harness.estimators.weighted import Moments, Nade
 from tests.estimators.small_blocks import block, fed
 
@@ -153,6 +154,6 @@ def test_limits_reach_as_far_as_the_normal_ones_and_lean_to_the_side_of_the_skew
     below, above = skewed_distances(std_error, skewness * std_error**3, (1.0 - confidence) / 2.0)
     mirrored = skewed_distances(std_error, -skewness * std_error**3, (1.0 - confidence) / 2.0)
     assert (below, above) == pytest.approx(mirrored[::-1])
-    assert min(below, above) >= normal_half_width(std_error, confidence) * (1.0 - 1e-12)
+    assert min(below, above) >= Level.two_sided(confidence).z * std_error * (1.0 - 1e-12)
     if skewness > 1e-3 and confidence > 0.8:
         assert above > below
