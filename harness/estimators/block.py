@@ -233,7 +233,7 @@ def block_from_tables(
         at = int(np.argmax(gaps))
         expected = "every episode once, in index order; a failed one is a row too"
         raise _damaged(f"episodes, row {at + 1}", f"episode {index[at + 1]} after episode {index[at]}", expected)
-    outcome = _outcomes(episodes)
+    outcome = outcome_places(episodes.column("outcome"), "episodes")
     failed, n_control_steps = outcome == FAILED, _integers(episodes, "n_control_steps")
     columns: dict[str, Column] = {
         "cut_in": _known(episodes, "cut_in_step"),
@@ -279,11 +279,17 @@ def _known(table: pa.Table, name: str) -> BoolArray:
     return np.asarray(pc.is_valid(table.column(name))).astype(np.bool_)
 
 
-def _outcomes(episodes: pa.Table) -> Int8Array:
-    """How each episode ended, as a place in `OUTCOMES`, shape (n,)."""
-    outcomes = episodes.column("outcome").unify_dictionaries().combine_chunks()
-    place = np.array([OUTCOMES.index(name) for name in outcomes.dictionary.to_pylist()], np.int8)
-    return np.asarray(place[outcomes.indices.to_numpy()])
+def outcome_places(column: pa.ChunkedArray, where: str) -> Int8Array:
+    """How each episode ended, as a place in `OUTCOMES`, shape (n,); a `RunFolderError` where one is unknown."""
+    coded = column.cast(pa.string()).combine_chunks().dictionary_encode()
+    names = coded.dictionary.to_pylist()
+    if coded.null_count or not {*names} <= {*OUTCOMES}:
+        unknown = next((name for name in names if name not in OUTCOMES), None)
+        found = "an episode without outcome" if unknown is None else f"the outcome {unknown!r}"
+        mend = "The records are from another version of the harness: use that version, or run again."
+        raise RunFolderError(where, found, f"one of {', '.join(OUTCOMES)}", mend)
+    places: Int8Array = np.array([OUTCOMES.index(name) for name in names], np.int8)[coded.indices.to_numpy()]
+    return places
 
 
 def _nested(table: pa.Table, name: str, width: int) -> FloatArray:

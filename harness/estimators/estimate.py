@@ -110,11 +110,9 @@ class Accumulator(Protocol):
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""
-        ...
 
     def result(self, confidence: float) -> Estimate:
         """Estimate from the episodes so far, at least one; leaves the state as it is."""
-        ...
 
 
 class FailureBounds:

@@ -120,15 +120,12 @@ class Nade:
         self.n += len(block)
         self.n_crashes += len(weights)
         self.y += Moments.of(weights)
-        self._largest_y = _larger(self._largest_y, weights)
-        self._largest_log_weight = _larger(self._largest_log_weight, block.log_weight)
-        self._largest_cut_in_log_weight = _larger(self._largest_cut_in_log_weight, block.log_weight[block.cut_in])
+        self._largest_y = float(np.max(weights, initial=self._largest_y))
+        self._largest_log_weight = float(np.max(block.log_weight, initial=self._largest_log_weight))
+        of_cut_ins = block.log_weight[block.cut_in]
+        self._largest_cut_in_log_weight = float(np.max(of_cut_ins, initial=self._largest_cut_in_log_weight))
         self._design_cap = max(self._design_cap, math.inf if (cap := block.drawn.weight_cap) is None else cap)
         self._log_path_cap = max(self._log_path_cap, block.log_path_cap())
-
-    def mean(self) -> float:
-        """ΣY/n."""
-        return self.y.mean(self.n)
 
     def largest_share(self) -> float:
         """Largest Y as a share of ΣY, 0 without a crash."""
@@ -150,10 +147,10 @@ class Nade:
             return known, "the weight cap known by design"
         if math.isfinite(known):
             return known, "the largest P(cut-in | path)/share of forced cut-ins among the paths driven"
-        seen = self._largest_cut_in_log_weight
-        if math.isfinite(seen):
-            return _exp(seen), "the largest weight seen among episodes with a cut-in (no cap is known)"
-        return _exp(self._largest_log_weight), "the largest weight seen (no cap is known)"
+        seen, among = self._largest_cut_in_log_weight, " among episodes with a cut-in"
+        if not math.isfinite(seen):
+            seen, among = self._largest_log_weight, ""
+        return math.exp(seen) if seen < 700.0 else math.inf, f"the largest weight seen{among} (no cap is known)"
 
     def is_settled(self) -> bool:
         """Whether there are enough crashes for limits from moments to mean what they say."""
@@ -194,7 +191,7 @@ class Nade:
     def result(self, confidence: float) -> Estimate:
         """Mean of Y with its interval."""
         errors = self.y.std_error(self.n), self.y.third_moment(self.n)
-        return self.estimate(self.mean(), *errors, confidence, method="mean of weighted crashes")
+        return self.estimate(self.y.mean(self.n), *errors, confidence, method="mean of weighted crashes")
 
     def estimate(
         self,
@@ -216,7 +213,7 @@ class Nade:
         plain normal interval.
         """
         cap, origin = self.cap()
-        hoeffding = capped_mean_upper(self.mean(), cap, self.n, confidence)
+        hoeffding = capped_mean_upper(self.y.mean(self.n), cap, self.n, confidence)
         below, above = skewed_distances(std_error, third_moment or 0.0, (1.0 - confidence) / 2.0)
         low, high, half = max(0.0, rate - below), min(1.0, rate + above), (below + above) / 2.0
         if self.n_crashes == 0:
@@ -254,14 +251,6 @@ def count_warnings(n_crashes: int) -> list[str]:
     if n_crashes >= FEW_CRASHES:
         return []
     return [f"only {n_crashes} crashes were sampled (below {FEW_CRASHES}): the interval is rough"]
-
-
-def _larger(so_far: float, values: FloatArray) -> float:
-    return max(so_far, float(np.max(values, initial=-math.inf)))
-
-
-def _exp(log_value: float) -> float:
-    return math.exp(log_value) if log_value < 700.0 else math.inf
 
 
 class Nde(Nade):

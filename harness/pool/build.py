@@ -130,24 +130,15 @@ class Aim:
 
 def take_aim(environment: Environment, library: Library, settings: PoolSettings, progress: Progress) -> Aim:
     """Find out by a pilot run of naturalistic paths where surrogates crash."""
-    names = list(library.surrogates)
     pilot = Enumerator(environment, library.followers(environment.lateral.present), settings.seed ^ POOL_SEED)
     progress.stage("pool: pilot", PILOT_PATHS)
-    rates = pilot.run(0, PILOT_PATHS, progress).rates(len(names))
-    aim = Aim(pilot, rates, _conservative(rates, names.index(library.boundary)))
-    return Aim(pilot.aimed(rates, aim.share), rates, aim.conservative)
-
-
-def _conservative(rates: FloatArray, boundary: int) -> BoolArray:
-    """Which columns (surrogates, and the cut-in) are to be known well, shape (D + 1,) bool.
-
-    Those that are no more aggressive than the boundary, and crash in the traffic that it crashes in.
-    """
-    mean = rates.mean(0)
+    rates = pilot.run(0, PILOT_PATHS, progress).rates(len(library.surrogates))
+    mean, boundary = rates.mean(0), list(library.surrogates).index(library.boundary)
     seen = mean > 0.0  # one that no path has met yet is met by few
     relvar = np.where(seen, rates.var(0) / np.where(seen, mean, 1.0) ** 2, np.inf)
-    conservative: BoolArray = (mean <= mean[boundary]) & (relvar <= FAR_OFF * relvar[boundary])
-    return conservative
+    # To be known well are those no more aggressive than the boundary, if they crash in the traffic that it crashes in.
+    aim = Aim(pilot, rates, (mean <= mean[boundary]) & (relvar <= FAR_OFF * relvar[boundary]))
+    return replace(aim, enumerator=pilot.aimed(rates, aim.share))
 
 
 def planned_number(aim: Aim, settings: PoolSettings) -> int:

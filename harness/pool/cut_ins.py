@@ -129,11 +129,6 @@ class Pool:
         found: IntArray = self.cell_shell[self.cut_ins.cell]
         return found
 
-    @property
-    def boundary(self) -> int:
-        """Index of the outermost shell that the statement library keeps."""
-        return self.names.index(self.library.boundary)
-
     def to_json(self) -> dict[str, Any]:
         """What is known of surrogates and shells, as plain content."""
         p = self.shell_p.tolist()

@@ -23,7 +23,7 @@ from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign, Statement
 from harness.traffic.laws import Environment
-from harness.vehicles.library import Library, StatementSettings, library_records
+from harness.vehicles.library import Library, library_records
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 
 CANDIDATES = 32_768
@@ -145,19 +145,12 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
 
 def _statements(pool: Pool, groups: list[list[int]]) -> tuple[Statement, ...]:
     """The library's statements, the narrowest boundary first."""
-
-    def place(each: StatementSettings) -> int:
-        return pool.names.index(each.boundary)
-
-    def inside(each: StatementSettings) -> int:
-        return sum(group[-1] <= place(each) for group in groups)
-
-    keeps_to = "crashes only where the surrogate {} or a more careful one crashes"
-    found = sorted(pool.library.all_statements.items(), key=lambda each: place(each[1]))
-    return tuple(
-        Statement(name, each.boundary, each.assumes or keeps_to.format(each.boundary), inside(each), each.checked)
-        for name, each in found
-    )
+    found = []
+    for name, each in pool.library.all_statements.items():
+        n_inside = sum(group[-1] <= pool.names.index(each.boundary) for group in groups)
+        assumes = each.assumes or f"crashes only where the surrogate {each.boundary} or a more careful one crashes"
+        found.append(Statement(name, each.boundary, assumes, n_inside, each.checked))
+    return tuple(sorted(found, key=lambda each: pool.names.index(each.boundary)))
 
 
 def checked_boundary(library: Library, design: ShellDesign, environment: Environment) -> RecordArray:

@@ -22,13 +22,14 @@ from pydantic import TypeAdapter, ValidationError
 from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.estimators.answer import Estimates
+from harness.estimators.block import outcome_places
 from harness.estimators.estimate import Estimate, Unavailable
 from harness.estimators.shells import ShellDetails, Within
 from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_shards, stored_columns
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray, IntArray
+from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
 
 ROWS_TOGETHER = 5_000
 """Of small shards: each batch costs a millisecond."""
@@ -49,11 +50,6 @@ class ShownShells(ShellDetails):
     def widest(self) -> Within:
         """The statement with the widest boundary."""
         return self.statements[-1]
-
-    @property
-    def has_outside(self) -> bool:
-        """Whether there are cut-ins beyond every boundary."""
-        return self.widest.n_shells < len(self.shells)
 
     @property
     def pool_half_width(self) -> float:
@@ -231,10 +227,8 @@ def summarise(run: RunFolder) -> RunSummary:
     count, causes, per_shell = np.zeros(len(OUTCOMES)), Counter[str](), Counter[int]()
     kept: list[dict[str, FloatArray]] = []
     for batch in run.episodes(*COLUMNS, "outcome", "failure"):
-        outcome = _outcome_index(batch.column("outcome"), run)
-        if (
-            counted := run.campaign.crash.counts_above_mps
-        ) > 0.0:  # what is no harder is none here, as in the estimates
+        outcome = outcome_places(pa.table(batch).column("outcome"), str(run.path / "episodes"))
+        if (counted := run.campaign.crash.counts_above_mps) > 0.0:  # no harder is none here, as in the estimates
             outcome[(outcome == CRASH) & (floats(batch.column("impact_speed_mps")) <= counted)] = TIMEOUT
         count += np.bincount(outcome, minlength=len(OUTCOMES))
         for item in batch.column("failure").drop_null().value_counts():
@@ -270,18 +264,6 @@ def _log_tests(per_shell: Counter[int], run: RunFolder) -> FloatArray:
         mend = "The records are not those of a run with testing.method shells: run the campaign again."
         raise RunFolderError(str(run.path / "episodes"), "a test without shell (component -1)", expected, mend)
     return np.log([float(max(per_shell[shell], 1)) for shell in range(max(per_shell, default=-1) + 1)])
-
-
-def _outcome_index(column: pa.Array, run: RunFolder) -> IntArray:
-    coded = column.cast(pa.string()).dictionary_encode()
-    names = coded.dictionary.to_pylist()
-    if coded.null_count or not {*names} <= {*OUTCOMES}:
-        unknown = next((name for name in names if name not in OUTCOMES), None)
-        found = "an episode without outcome" if unknown is None else f"the outcome {unknown!r}"
-        mend = "The records are from another version of the harness: use that version, or run again."
-        raise RunFolderError(str(run.path / "episodes"), found, f"one of {', '.join(OUTCOMES)}", mend)
-    places: IntArray = np.array([OUTCOMES.index(name) for name in names], np.int64)[coded.indices.to_numpy()]
-    return places
 
 
 def lateral_facts(run: RunFolder) -> dict[str, Any] | None:

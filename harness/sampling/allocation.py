@@ -101,18 +101,15 @@ class Allocation:
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if wanted.any():
-            wanted = wanted + self._fill(active, self.smallest_round - int(wanted.sum()))
+            # Further first tests by the probability of strata, while that is all that is known of them.
+            missing, p = max(self.smallest_round - int(wanted.sum()), 0), np.where(active, self.design.p, 0.0)
+            if p.any():
+                wanted = wanted + np.ceil(missing * p / p.sum()).astype(np.int64)
         elif active.any():
             size = max(SMALLEST_ROUND, self.smallest_round, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
             room = np.where(active, self.available - tests, 0)
             wanted = (given_by or partial(self._spread, tally))(min(size, budget), room)
         return _cut(np.minimum(wanted, self.available - tests), budget)
-
-    def _fill(self, active: BoolArray, missing: int) -> IntArray:
-        """Further first tests by the probability of strata, while that is all that is known of them."""
-        p = np.where(active, self.design.p, 0.0)
-        filled: IntArray = np.ceil(max(missing, 0) * p / p.sum()).astype(np.int64) if p.any() else np.zeros(p.size, int)
-        return filled
 
     def _used_up(self, tally: Tally) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""

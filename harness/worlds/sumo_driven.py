@@ -128,15 +128,6 @@ def recyclable(sumo: Mapping[str, str | float]) -> bool:
     )
 
 
-def refused(sumo: Mapping[str, str | float], message: str) -> CampaignError:
-    """The error for a type that SUMO itself refuses, naming the attribute that SUMO's message names."""
-    attributes = av_type(sumo)
-    named = max((name for name in attributes if name.lower() in message.lower()), key=len, default="")
-    where, values = (f"av.sumo.{named}", attributes[named]) if named else ("av.sumo", "values")
-    found = f"{values}, which SUMO refuses"
-    return CampaignError(where, found, "a vType that SUMO accepts", f"SUMO says: {message}")
-
-
 def _wrong(name: str, found: str | float, expected: str, mend: str) -> CampaignError:
     return CampaignError(f"av.sumo.{name}", str(found), expected, mend)
 
@@ -152,7 +143,8 @@ class SumoAvWorld(SumoWorld):
         self.acts_before_cut_in = acts_before_cut_in
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._wanted: FloatArray = np.zeros((n_cells, 3))
-        written = " ".join(f"{name}={quoteattr(str(value))}" for name, value in av_type(av).items())
+        attributes = av_type(av)
+        written = " ".join(f"{name}={quoteattr(str(value))}" for name, value in attributes.items())
         self._xml = f'<additional>\n    <vType id="{TYPE_NAME}" {written}/>\n</additional>\n'
         with self._written_type() as folder:
             stderr = folder / "stderr"
@@ -164,7 +156,10 @@ class SumoAvWorld(SumoWorld):
                 messages = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
                 if not messages:
                     raise
-                raise refused(av, messages[0]) from error
+                named = max((name for name in attributes if name.lower() in messages[0].lower()), key=len, default="")
+                where, values = (f"av.sumo.{named}", attributes[named]) if named else ("av.sumo", "values")
+                found, mend = f"{values}, which SUMO refuses", f"SUMO says: {messages[0]}"
+                raise CampaignError(where, found, "a vType that SUMO accepts", mend) from error
 
     @contextmanager
     def _written_type(self) -> Iterator[Path]:

@@ -28,7 +28,7 @@ def test_surrogates_are_ordered_by_crash_rates_that_lie_around_the_reference(poo
     assert pool.names == (*ladder, "brakes-3-when-needed", "never-brakes", "full-throttle-2")
     assert np.all(np.diff(pool.mu) > 0.0)
     assert pool.mu[pool.names.index("brakes-5")] < FORCED_RATE < pool.mu[pool.names.index("brakes-3")]
-    inside = pool.mu[: pool.boundary + 1]
+    inside = pool.mu[: pool.names.index(pool.library.boundary) + 1]
     assert np.all(inside[1:] < 2.0 * inside[:-1])
 
 
@@ -104,8 +104,9 @@ def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside
     assert np.array_equal(np.unique(stratum), [0, outermost])
     outside = rows[within.size :]
     assert len(set(outside.tolist())) == 500
-    beyond = pool.shell_p[pool.boundary + 1 : -1]
-    share, p = (pool.shell[outside] == pool.boundary + 1).mean(), beyond[0] / beyond.sum()
+    first_beyond = pool.names.index(pool.library.boundary) + 1
+    beyond = pool.shell_p[first_beyond:-1]
+    share, p = (pool.shell[outside] == first_beyond).mean(), beyond[0] / beyond.sum()
     assert abs(share - p) < 4.0 * np.sqrt(p * (1.0 - p) / 500)  # misses with probability 6e-5
     with pytest.raises(IndexError):
         prescribed.rows((Draw(0, within.size, 1),))
