@@ -96,25 +96,17 @@ class Drawn:
 class Block:
     """Consecutive episodes ``first_episode … first_episode + n - 1``, in index order.
 
-    Attributes
-    ----------
-    first_episode : int
-    outcome : (n,) int8
-        Places in `OUTCOMES`. A failed episode is a row like any other and never a crash.
-    log_weight : (n,) float64
-        log p(x_c) - log q_sampled(x_c); exactly 0 without control.
-    columns : mapping of str to array, a row for each episode
-        What else the method records, also as attributes; those that it does not record are left out. ``cut_in`` (n,)
-        bool. ``impact_mps`` (n,): closing speed at contact, NaN without a crash. ``cut_off`` (n,) bool: see
-        `CUT_OFF_STEPS`. ``log_q`` (n, M): per importance
-        function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode. ``n_control_steps``
-        (n,): stratum l of each episode. ``first_ratios`` (n, 9, J): q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine
-        control steps, 1 beyond the last one. ``log_p_cut_in`` (n,): log P(cut-in | path), where the method draws the
-        path ahead; it bounds Y of that episode alone. Of shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C):
-        its path's probability of a cut-in of each cell; ``ahead`` (n,) bool: whether the vehicle was ever ahead of the
-        boundary that a statement checks; and `BASELINE_COLUMNS`, with ``step`` (n,) of the cut-in, below 0 where a
-        failed test has come to none.
-    drawn : Drawn
+    ``outcome`` (n,) are places in `OUTCOMES`: a failed episode is a row like any other and never a crash.
+    ``log_weight`` (n,) is log p(x_c) - log q_sampled(x_c), exactly 0 without control. ``columns`` are what else the
+    method records, a row for each episode, also as attributes; those that it does not record are left out. ``cut_in``
+    (n,) bool. ``impact_mps`` (n,): closing speed at contact, NaN without a crash. ``cut_off`` (n,) bool: see
+    `CUT_OFF_STEPS`. ``log_q`` (n, M): per importance function, the sum over control steps of log(q_j/p), -inf where q_j
+    cannot draw the episode. ``n_control_steps`` (n,): stratum l of each episode. ``first_ratios`` (n, 9, J):
+    q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one. ``log_p_cut_in`` (n,): log
+    P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode alone. Of shells ``stratum``
+    and ``cell`` (n,), ``cell_mass`` (n, C): its path's probability of a cut-in of each cell; ``ahead`` (n,) bool:
+    whether the vehicle was ever ahead of the boundary that a statement checks; and `BASELINE_COLUMNS`, with ``step``
+    (n,) of the cut-in, below 0 where a failed test has come to none.
     """
 
     first_episode: int
@@ -288,8 +280,7 @@ def outcome_places(column: pa.ChunkedArray, where: str) -> Int8Array:
         found = "an episode without outcome" if unknown is None else f"the outcome {unknown!r}"
         mend = "The records are from another version of the harness: use that version, or run again."
         raise RunFolderError(where, found, f"one of {', '.join(OUTCOMES)}", mend)
-    places: Int8Array = np.array([OUTCOMES.index(name) for name in names], np.int8)[coded.indices.to_numpy()]
-    return places
+    return np.asarray(np.array([OUTCOMES.index(name) for name in names], np.int8)[coded.indices.to_numpy()])
 
 
 def _nested(table: pa.Table, name: str, width: int) -> FloatArray:

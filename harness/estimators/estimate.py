@@ -25,30 +25,14 @@ Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is Non
 class Estimate:
     """A crash rate per test, how sure it is, and what a reader must know to trust it.
 
-    Attributes
-    ----------
-    crash_rate, std_error : float
-        Crashes per test.
-    ci_low, ci_high, upper_bound : float
-        Two-sided interval and one-sided bound at `confidence`; finite also when no crash was seen.
-    rhw : float
-        Half-width of the interval relative to the rate; infinite when the rate is 0.
-    n_episodes, n_crashes : int
-        Tests counted and crashes sampled among them.
-    n_effective : float
-        (ΣY)²/ΣY².
-    largest_weight_share : float
-        Largest single Y as a share of ΣY.
-    weight_cap : float
-        Largest weight that a crash can have by design; infinite where nothing is known to bound it.
-    method : str
-        How rate, interval and upper bound were made, in words.
-    warnings : tuple of str
-        What a reader must know, the cautions first; empty if nothing is known to be wrong.
-    cautions : tuple of str
-        Why the interval may be wrong. A statement begins with them, and no precision is claimed beside them.
-    details : dict
-        What only this estimator has to say.
+    ``crash_rate`` and ``std_error`` are in crashes per test, as are the two-sided interval ``ci_low``, ``ci_high`` and
+    the one-sided ``upper_bound`` at ``confidence``, which are finite also when no crash was seen. ``rhw`` is the
+    interval's half-width relative to the rate, infinite when the rate is 0. Of ``n_episodes`` tests ``n_crashes`` are
+    crashes; ``n_effective`` is (ΣY)²/ΣY², ``largest_weight_share`` the largest single Y as a share of ΣY, and
+    ``weight_cap`` the largest weight that a crash can have by design, infinite where nothing is known to bound it.
+    ``method`` says how rate, interval and upper bound were made. ``warnings`` are what a reader must know, the
+    ``cautions`` first: why the interval may be wrong. A statement begins with them, and no precision is claimed beside
+    them. ``details`` are what only this estimator has to say.
     """
 
     crash_rate: float

@@ -79,13 +79,8 @@ class Interval(NamedTuple):
 class PairCounts:
     """Pairs of tests of some strata.
 
-    Attributes
-    ----------
-    design : ShellDesign
-    ends : ndarray of int64, shape (S, 3, 3)
-        How often A ended in one way (second axis) and B in another (third): no crash, crash, failed.
-    mass : ndarray, shape (S, 3, 3, S)
-        Over the same pairs, the sum of their paths' probability of a cut-in of every stratum.
+    ``ends`` (S, 3, 3) is how often A ended in one way (second axis) and B in another (third): no crash, crash, failed.
+    ``mass`` (S, 3, 3, S) is, over the same pairs, the sum of their paths' probability of a cut-in of every stratum.
     """
 
     design: ShellDesign

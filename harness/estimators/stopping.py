@@ -159,8 +159,10 @@ class Rule:
     """Looks at results, leaves what it found in ``look``, and says when they are enough.
 
     ``target`` is the relative half-width that is asked for, None where only the budget ends the tests.
+    ``of_first_tests`` says whether a round brings the tests that every shell gets before anything is decided of it.
     """
 
+    of_first_tests = False
     _needed = 1  # looks in a row that must find it
 
     def __init__(self, target: float | None, min_crashes: int) -> None:
@@ -261,11 +263,9 @@ class RoundRule(Rule):
 
     ``held`` is the number of tests that the run folder holds: before them nothing is given up, whatever is asked for
     now. A limit is decided by ``level_at`` a number of tests and a confidence, whatever the budget: a run that is
-    continued is looked at where it would have been without the break, and once more where that was. ``of_first_tests``
-    says whether the round brings the tests that every shell gets before anything is decided of it.
+    continued is looked at where it would have been without the break, and once more where that was.
     """
 
-    of_first_tests = False
     _seen: Shells
     level_at = staticmethod(decision_level)
 
@@ -308,10 +308,8 @@ class PairRule(Rule):
 
     ``look.rhw`` is that of the difference, over the larger rate; ``margin`` is what is known about the margin, None
     where none is asked about; ``conditional`` says whether only what lies within the boundary is looked at.
-    ``of_first_tests`` see `RoundRule`: here nothing stops in such a round.
+    Nothing stops in a round of first tests.
     """
-
-    of_first_tests = False
 
     def __init__(self, campaign: Campaign, margin: float | None) -> None:
         super().__init__(campaign.stop.rhw, campaign.min_crashes)

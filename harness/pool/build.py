@@ -41,8 +41,8 @@ _MADE_BY = ("build.py", "cut_ins.py", "shells.py")
 """Code that decides what is in a pool, beside the kernels."""
 
 
-def campaign_pool_key(resolved: Resolved) -> str:
-    """Hash of all that a pool depends on: environment, level of lane changing, library, settings, and code."""
+def campaign_pool_key(resolved: Resolved, order: Sequence[str] = ()) -> str:
+    """Hash of all that a pool depends on: environment, lane changing, library, settings, code, and a given order."""
     library = resolved.library
     boundaries = library.boundary, *(statement.boundary for statement in library.statements.values())
     content = [
@@ -55,6 +55,7 @@ def campaign_pool_key(resolved: Resolved) -> str:
         [sorted(boundaries), library.boundary, library.envelope],
         resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths", "pilot_tests"}),
         resolved.campaign.crash.counts_above_mps,
+        *order,
     ]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
@@ -71,7 +72,7 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
 
     Raises `RunFolderError`: the pool could not be kept.
     """
-    key = _key(resolved, order)
+    key = campaign_pool_key(resolved, order)
     if (cached := cached_pool(resolved, order)) is not None:
         return cached
     require_place(pool_path(key).parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
@@ -80,14 +81,9 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
     return pool
 
 
-def _key(resolved: Resolved, order: Sequence[str]) -> str:
-    key = campaign_pool_key(resolved)
-    return hashlib.sha256(json.dumps([key, *order]).encode()).hexdigest()[:24] if order else key
-
-
 def cached_pool(resolved: Resolved, order: Sequence[str] = ()) -> Pool | None:
     """The pool of a campaign; None if none has been built on this machine, or its file is damaged or another's."""
-    key = _key(resolved, order)
+    key = campaign_pool_key(resolved, order)
     try:
         pool = read_pool(pool_path(key)) if pool_path(key).is_file() else None
     except RunFolderError:
@@ -211,8 +207,7 @@ def _p_cut_in_at_crash(rates: FloatArray, p_cut_in: FloatArray) -> FloatArray:
     """Mean P(cut-in | path), shape (D,), where surrogates crash: of weighted ``rates`` (n, D) and ``p_cut_in`` (n,)."""
     both, mean = rates * p_cut_in[:, None], rates.mean(0)
     at_most = both.mean(0) + 3.0 * both.std(0) / np.sqrt(len(rates))
-    found: FloatArray = np.divide(at_most, mean, out=np.ones_like(mean), where=mean > 0.0)
-    return found
+    return np.asarray(np.divide(at_most, mean, out=np.ones_like(mean), where=mean > 0.0))
 
 
 def _keep(mass: FloatArray, shell: Int8Array, n_shells: int, settings: PoolSettings) -> tuple[IntArray, IntArray]:

@@ -41,8 +41,7 @@ _METADATA, _DIGEST = b"harness_pool", b"harness_pool_sha256"
 
 def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
     """Steps of the onset of cut-ins in given steps (n,), with a ``lead`` (n,)."""
-    onset: IntArray = np.maximum(step - lead, 0)
-    return onset
+    return np.asarray(np.maximum(step - lead, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +80,7 @@ class CutIns:
     @property
     def row(self) -> IntArray:
         """Which row of the pool's paths each is of, shape (n,): in the pool of a vehicle its baseline run."""
-        rows: IntArray = self.path - PILOT_PATHS
-        return rows
+        return np.asarray(self.path - PILOT_PATHS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +124,7 @@ class Pool:
     @cached_property
     def shell(self) -> IntArray:
         """Shell of each kept cut-in, shape (n,)."""
-        found: IntArray = self.cell_shell[self.cut_ins.cell]
-        return found
+        return np.asarray(self.cell_shell[self.cut_ins.cell])
 
     def to_json(self) -> dict[str, Any]:
         """What is known of surrogates and shells, as plain content."""

@@ -22,8 +22,6 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign, Statement
-from harness.traffic.laws import Environment
-from harness.vehicles.library import Library, library_records
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 
 CANDIDATES = 32_768
@@ -37,8 +35,7 @@ _REFERENCES = {"r157-cc": "a careful and competent driver", "r157-fsm": "a drive
 
 def conservative_first(rates: FloatArray) -> IntArray:
     """Order of the surrogates by the rates (n, D + 1) of paths, as places in the library, shape (D,)."""
-    order: IntArray = np.argsort(rates[:, :-1].mean(0), kind="stable")
-    return order
+    return np.asarray(np.argsort(rates[:, :-1].mean(0), kind="stable"))
 
 
 def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:
@@ -151,12 +148,6 @@ def _statements(pool: Pool, groups: list[list[int]]) -> tuple[Statement, ...]:
         assumes = each.assumes or f"crashes only where the surrogate {each.boundary} or a more careful one crashes"
         found.append(Statement(name, each.boundary, assumes, n_inside, each.checked))
     return tuple(sorted(found, key=lambda each: pool.names.index(each.boundary)))
-
-
-def checked_boundary(library: Library, design: ShellDesign, environment: Environment) -> RecordArray:
-    """The driver that a vehicle is compared with in each test, shape (1,); (0,) if no statement is checked."""
-    models = [] if design.checked is None else [library.surrogates[design.checked.boundary]]
-    return library_records(models, environment.lateral.present)
 
 
 def cells_in_strata(pool: Pool, groups: list[list[int]]) -> tuple[IntArray, IntArray, IntArray]:

@@ -165,22 +165,12 @@ def _shells(folder: Path, headline: Estimate | Unavailable) -> ShownShells | Non
 class RunSummary:
     """Counts and weights of a run's tests, and the columns of those that plots need.
 
-    A weight is what a test adds to the sum that is the estimate: its likelihood ratio or, of tests from shells,
-    p_s/n_s. Failed tests are counted and have no weight.
-
-    Attributes
-    ----------
-    count, weight : ndarray, shape (5,)
-        Episodes and sum of weights per outcome, in the order of ``OUTCOMES``.
-    causes : Counter of str
-        Failed episodes per cause.
-    rows : dict of ndarray, shape (m,)
-        ``outcome``, ``weight`` and `COLUMNS`, NaN where there is none, of tests that had a cut-in or a weight other
-        than 1: of the others, most in plain naturalistic driving, there is nothing to draw.
-    all_weights_one : bool
-        Whether no maneuver was drawn from an importance function: plain naturalistic driving.
-    from_shells : bool
-        Whether tests were drawn from shells.
+    ``count``, ``weight`` (5,) are episodes and sum of weights per outcome, in the order of `OUTCOMES`; ``causes`` are
+    failed episodes per cause. A weight is what a test adds to the sum that is the estimate: its likelihood ratio or, of
+    tests from shells, p_s/n_s. Failed tests are counted and have no weight. ``rows`` (m,) are ``outcome``, ``weight``
+    and `COLUMNS`, NaN where there is none, of tests that had a cut-in or a weight other than 1: of the others, most in
+    plain naturalistic driving, there is nothing to draw. ``all_weights_one`` says whether no maneuver was drawn from an
+    importance function: plain naturalistic driving.
     """
 
     count: FloatArray

@@ -46,8 +46,7 @@ def first_tests(design: ShellDesign, asked: int | None = None) -> IntArray:
         return np.full(design.p.size, asked, np.int64)
     within = design.p[: design.statements[0].n_inside].sum()
     share = np.ceil(FIRST_TESTS * design.p / within) if within > 0.0 else np.full(design.p.size, np.inf)
-    found: IntArray = np.clip(share, LEAST_FIRST_TESTS, MOST_FIRST_TESTS).astype(np.int64)
-    return found
+    return np.asarray(np.clip(share, LEAST_FIRST_TESTS, MOST_FIRST_TESTS).astype(np.int64))
 
 
 @dataclass(frozen=True)
@@ -122,8 +121,7 @@ class Allocation:
         """Strata that it is time to test: those inside the narrowest boundary that leaves much open."""
         boundaries = (each.n_inside for each in self.design.statements if each.n_inside < self.n_asked)
         n = next((n for n in boundaries if not self._enough_inside(n, tally.tests, inner_rhw)), self.n_asked)
-        begun: BoolArray = np.arange(tally.tests.size) < n
-        return begun
+        return np.asarray(np.arange(tally.tests.size) < n)
 
     def _enough_inside(self, n: int, tests: IntArray, inner_rhw: Callable[[int], float]) -> bool:
         """Whether it is time to test more than the first ``n`` strata."""
@@ -149,5 +147,4 @@ class Allocation:
 
 def _cut(wanted: IntArray, budget: int) -> IntArray:
     """Tests per stratum, cut from the last stratum on to a budget."""
-    added: IntArray = np.diff(np.minimum(np.cumsum(wanted), max(budget, 0)), prepend=0)
-    return added
+    return np.asarray(np.diff(np.minimum(np.cumsum(wanted), max(budget, 0)), prepend=0))

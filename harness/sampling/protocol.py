@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import pyarrow as pa
 
@@ -52,7 +52,7 @@ class ShardRequest:
     prescribed: tuple[RecordArray, PrescribedTraffic] | None = None
 
 
-class Rounds:
+class Rounds(Protocol):
     """Requests in rounds; the next round is asked for when all of the last one have been added.
 
     ``rule`` says why it is enough.
@@ -62,11 +62,9 @@ class Rounds:
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
         """Requests of each round."""
-        raise NotImplementedError
 
     def enough(self, block: Block) -> bool:
         """Add the tests of the next shard; True when the campaign is to stop."""
-        raise NotImplementedError
 
 
 class KnownRounds(Rounds):

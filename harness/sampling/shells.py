@@ -30,7 +30,7 @@ from harness.numbers import plain
 from harness.pool.build import campaign_pool, campaign_pool_key, pool_path
 from harness.pool.cut_ins import Pool
 from harness.pool.learned import Learned
-from harness.pool.shells import Draw, PrescribedEpisodes, checked_boundary
+from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import baseline_paths_file, campaign_baseline_paths, vehicle_pool
 from harness.pool.walk import BaselineRuns
 from harness.progress import Progress
@@ -39,6 +39,7 @@ from harness.resolved import Resolved
 from harness.sampling.allocation import CONFIDENCE, Allocation
 from harness.sampling.protocol import Rounds, ShardRequest, Source
 from harness.strata import ASSUMPTION_FREE, LEARNED, ShellDesign, StoredDesign
+from harness.vehicles.library import library_records
 from harness.vocabulary import IntArray, RecordArray
 
 MOST_SHARDS_PER_ROUND = 16
@@ -65,7 +66,9 @@ class Shells(Source):
     def _draw_from(self, pool: Pool) -> None:
         self.prescribed = PrescribedEpisodes(self.campaign, pool)
         self.design = self.prescribed.design
-        boundary = checked_boundary(self.resolved.library, self.design, self.resolved.environment)
+        surrogates, checked = self.resolved.library.surrogates, self.design.checked  # beside whom each test is driven
+        models = [] if checked is None else [surrogates[checked.boundary]]
+        boundary = library_records(models, self.resolved.environment.lateral.present)
         self.policy = self.policy._replace(boundary=boundary)
 
     @classmethod

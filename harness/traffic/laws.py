@@ -103,12 +103,6 @@ def acceleration(maneuver: int) -> float:
 
 
 @compiled_inline
-def upper_edge(maneuver: int) -> float:
-    """Upper edge (m/s²) of the 0.2-wide bin that maneuver index 0 … 29 stands for; the last bin has none."""
-    return (maneuver - 20) / 5.0 + 0.1
-
-
-@compiled_inline
 def t_cdf(z: float, table: FloatArray) -> float:
     """P(T ≤ z); 0 and 1 outside of the table."""
     position = (z + _T_LIMIT) * _T_PER_UNIT
@@ -129,7 +123,8 @@ def cumulative_probability(k: int, law: AccelerationLaw, environment: Environmen
     """P(A ≤ a_k)."""
     if k >= law.cap:
         return 1.0
-    noise = t_cdf((upper_edge(k) - law.mean) * law.inverse_scale, environment.noise_t[law.noise])
+    upper_edge = acceleration(k) + 0.1  # m/s², of the 0.2-wide bin; the last one has none
+    noise = t_cdf((upper_edge - law.mean) * law.inverse_scale, environment.noise_t[law.noise])
     return float((1.0 - law.brake_share) * noise + law.brake_share * environment.brake_cumulative[k])
 
 
@@ -310,8 +305,7 @@ class InitialStates:
         return states_from([v, r1, self._rate(rate_u, v, r1), nowhere, nowhere])
 
     def _u(self, v: FloatArray) -> FloatArray:
-        u: FloatArray = (v - self._n["fit_range__v_centre_mps"]) / self._n["fit_range__v_scale_mps"]
-        return u
+        return np.asarray((v - self._n["fit_range__v_centre_mps"]) / self._n["fit_range__v_scale_mps"])
 
     def _gap(self, probability: FloatArray, v: FloatArray) -> FloatArray:
         """R1 = shift + LogNormal, truncated to the fit range."""
@@ -323,8 +317,7 @@ class InitialStates:
         with np.errstate(divide="ignore"):
             below = special.ndtr((np.log(np.maximum(n["fit_range__r1_min_m"] - shift, 0.0)) - mean) / sd)
             upto = special.ndtr((np.log(n["fit_range__r1_max_m"] - shift) - mean) / sd)
-        gap: FloatArray = shift + np.exp(mean + sd * special.ndtri(below + probability * (upto - below)))
-        return gap
+        return np.asarray(shift + np.exp(mean + sd * special.ndtri(below + probability * (upto - below))))
 
     def _rate(self, probability: FloatArray, v: FloatArray, r1: FloatArray) -> FloatArray:
         """R1dot = location + scale t, given that R1 is not closed within the smallest time to collision."""
@@ -340,5 +333,4 @@ class InitialStates:
         scale = np.exp(c("log_scale") + c("log_scale_u") * u + c("log_scale_w") * w + c("log_scale_ww") * (w * w))
         df = float(n["initial_state__r1dot_df"])
         slowest = special.stdtr(df, (-r1 / n["initial_state__r1dot_min_ttc_s"] - location) / scale)
-        rate: FloatArray = location + scale * special.stdtrit(df, slowest + probability * (1.0 - slowest))
-        return rate
+        return np.asarray(location + scale * special.stdtrit(df, slowest + probability * (1.0 - slowest)))

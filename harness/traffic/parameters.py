@@ -20,8 +20,6 @@ from harness.vocabulary import ACCELERATIONS_MPS2, Record
 SHIPPED_FOLDER = Path(__file__).parent
 FIXED = {"step_s": STEP_S, "vehicle_length_m": VEHICLE_LENGTH_M}
 """What the compiled motion and SUMO's network are made for: no file can change it, but campaigns' hashes contain it."""
-
-
 LONGEST_LEAD_S = 10.0
 _SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
 
@@ -68,11 +66,9 @@ def _ordered(*ranges: tuple[str, str], equal: bool) -> Any:
         for low, high in ranges:
             least, most = getattr(self, low).value, getattr(self, high).value
             if least > most or (least == most and not equal):
-                found, expected = (
-                    f"{least:g}, with {high} {most:g}",
-                    f"a number {'of at most' if equal else 'below'} {high}",
-                )
-                raise broken_rule(low, found, expected, "Change places, or correct one of them.")
+                expected = f"a number {'of at most' if equal else 'below'} {high}"
+                mend = "Change places, or correct one of them."
+                raise broken_rule(low, f"{least:g}, with {high} {most:g}", expected, mend)
         return self
 
     return model_validator(mode="after")(checked)

@@ -44,11 +44,7 @@ def open_shim(names: Sequence[str], told: FloatArray, x: FloatArray, v: FloatArr
         return None  # built for another machine, or by an earlier version
     encoded = (ctypes.c_char_p * len(names))(*(name.encode() for name in names))
     handle = library.shim_open(inner.__file__.encode(), encoded, ctypes.c_long(len(names)))
-    if not handle:
-        return None
-    shim = Shim(library, handle, told, x, v)
-    shim.find_vehicles()
-    return shim
+    return Shim(library, handle, told, x, v) if handle else None
 
 
 class Shim:
@@ -66,6 +62,7 @@ class Shim:
         self._wanted = np.zeros_like(told)
         arrays = self._wanted, told, x, v, self.position, self.speed
         self._addresses = [array.ctypes.data for array in arrays]  # to ask for them takes longer than the call
+        self.find_vehicles()
 
     def find_vehicles(self) -> None:
         """Look the vehicles up again: those of an earlier simulation in this process are gone.

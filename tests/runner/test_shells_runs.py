@@ -99,7 +99,7 @@ def test_shells_of_an_earlier_version_or_of_another_pool_are_refused(stored_run,
             estimate(folder)
     del content["statements"]
     (folder / "shells.json").write_text(json.dumps({**content, "n_inside": 6, "boundary": "brakes-2-late-1s"}))
-    with pytest.raises(RunFolderError, match=r"an earlier version.*Run the campaign again into a new folder"):
+    with pytest.raises(RunFolderError, match=r"no key statements.* one of an earlier version into a new folder"):
         estimate(folder)
 
 

@@ -88,7 +88,8 @@ def test_adversaries_crash_on_few_paths_inside_or_in_a_share_of_all_outside(made
         source.crashing[0],
         division.of_vehicle(division.as_adversary(adversary, crashing), adversary).crashing[0],
     )
-    inside, outside = slice(source.template.boundary + 1), slice(source.template.boundary + 1, -1)
+    n_inside = source.template.names.index(source.template.library.boundary) + 1
+    inside, outside = slice(n_inside), slice(n_inside, -1)
     if "hole" in made:
         assert np.all(other[:, outside] >= (0.01 - 1e-12) * source.mass[:, outside])
         assert other.sum() == pytest.approx(own.sum() + 0.01 * source.mass[:, outside].sum(), rel=0.05)
