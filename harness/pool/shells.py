@@ -22,6 +22,7 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign, Statement
+from harness.vehicles.library import Library
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 
 CANDIDATES = 32_768
