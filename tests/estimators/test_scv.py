@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from harness.estimators.block import Block
-from harness.estimators.limits import normal_half_width, skewed_distances
+from harness.estimators.likelihood import Level
+from harness.estimators.limits import skewed_distances
 from harness.estimators.scv import (
     CHUNK_ROWS,
     MixtureCv,
@@ -133,7 +134,7 @@ def test_the_interval_is_as_skewed_as_the_residuals():
     below, above = skewed_distances(estimate.std_error, np.sum(residuals**3) / len(y) ** 3, 0.05)
     assert estimate.ci_high - estimate.crash_rate == pytest.approx(above, rel=1e-9)
     assert estimate.crash_rate - estimate.ci_low == pytest.approx(min(below, estimate.crash_rate), rel=1e-9)
-    assert above > 1.01 * normal_half_width(estimate.std_error, 0.9)
+    assert above > 1.01 * Level.two_sided(0.9).z * estimate.std_error
 
 
 def test_control_that_never_acted_leaves_the_plain_mean():
