@@ -174,6 +174,8 @@ def pool_of(
     order = conservative_first(rates) if order is None else order
     n = len(rates)
     ordered = rates[:, order]
+    mu, both = ordered.mean(0), ordered * (rates[:, -1] / paths.weight)[:, None]
+    at_most = both.mean(0) + 3.0 * both.std(0) / np.sqrt(n)
     shell, references = shells_of(paths.crashes, order), paths.crashes >> n_surrogates
     cell, cell_shell, cell_references, by_path = cells_of(mass, shell, references, n_references)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
@@ -191,9 +193,9 @@ def pool_of(
         n_paths=n,
         p_cut_in=float(rates[:, -1].mean()),
         p_cut_in_se=float(rates[:, -1].std() / np.sqrt(n)),
-        mu=ordered.mean(0),
+        mu=mu,
         mu_covariance=np.atleast_2d(np.cov(ordered.T, bias=True)) / n,
-        p_cut_in_at_crash=_p_cut_in_at_crash(ordered, rates[:, -1] / paths.weight),
+        p_cut_in_at_crash=np.divide(at_most, mu, out=np.ones_like(mu), where=mu > 0.0),
         cell_shell=cell_shell,
         cell_references=cell_references,
         cell_p=by_path.mean(0),
@@ -201,13 +203,6 @@ def pool_of(
         reference_square=(by_reference * by_reference).mean(0),
         cut_ins=sample,
     )
-
-
-def _p_cut_in_at_crash(rates: FloatArray, p_cut_in: FloatArray) -> FloatArray:
-    """Mean P(cut-in | path), shape (D,), where surrogates crash: of weighted ``rates`` (n, D) and ``p_cut_in`` (n,)."""
-    both, mean = rates * p_cut_in[:, None], rates.mean(0)
-    at_most = both.mean(0) + 3.0 * both.std(0) / np.sqrt(len(rates))
-    return np.asarray(np.divide(at_most, mean, out=np.ones_like(mean), where=mean > 0.0))
 
 
 def _keep(mass: FloatArray, shell: Int8Array, n_shells: int, settings: PoolSettings) -> tuple[IntArray, IntArray]:

@@ -13,7 +13,7 @@ from harness.estimators.likelihood import Level, spread
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.tally import Tally, combined
 from harness.strata import ASSUMPTION_FREE, ShellDesign
-from harness.vocabulary import BoolArray, IntArray
+from harness.vocabulary import IntArray
 
 GROWTH = 1.1
 """Tests after a round over tests before it; also the distance of the looks at the result."""
@@ -96,7 +96,11 @@ class Allocation:
         tests = tally.tests
         if self._used_up(tally):
             return np.zeros_like(tests)
-        begun = self._begun(tally, inner_rhw or partial(self._inner_rhw, tally))
+
+        def of_crashes(n: int) -> float:
+            return combined(self.design.p[:n], tally.part(slice(0, n)), self.design.n_independent, _LEVEL).rhw
+
+        begun = np.arange(tests.size) < self._n_begun(tests, inner_rhw or of_crashes)
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if wanted.any():
@@ -108,7 +112,8 @@ class Allocation:
             size = max(SMALLEST_ROUND, self.smallest_round, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
             room = np.where(active, self.available - tests, 0)
             wanted = (given_by or partial(self._spread, tally))(min(size, budget), room)
-        return _cut(np.minimum(wanted, self.available - tests), budget)
+        wanted = np.minimum(wanted, self.available - tests)
+        return np.asarray(np.diff(np.minimum(np.cumsum(wanted), max(budget, 0)), prepend=0))  # cut from the last one on
 
     def _used_up(self, tally: Tally) -> bool:
         """Whether nearly all that is left to know lies in strata without further cut-ins."""
@@ -117,11 +122,10 @@ class Allocation:
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
-    def _begun(self, tally: Tally, inner_rhw: Callable[[int], float]) -> BoolArray:
-        """Strata that it is time to test: those inside the narrowest boundary that leaves much open."""
+    def _n_begun(self, tests: IntArray, inner_rhw: Callable[[int], float]) -> int:
+        """Of how many strata it is time: of those inside the narrowest boundary that leaves much open."""
         boundaries = (each.n_inside for each in self.design.statements if each.n_inside < self.n_asked)
-        n = next((n for n in boundaries if not self._enough_inside(n, tally.tests, inner_rhw)), self.n_asked)
-        return np.asarray(np.arange(tally.tests.size) < n)
+        return next((n for n in boundaries if not self._enough_inside(n, tests, inner_rhw)), self.n_asked)
 
     def _enough_inside(self, n: int, tests: IntArray, inner_rhw: Callable[[int], float]) -> bool:
         """Whether it is time to test more than the first ``n`` strata."""
@@ -133,9 +137,6 @@ class Allocation:
             return True
         return inner_rhw(n) <= INNER_RHW
 
-    def _inner_rhw(self, tally: Tally, n: int) -> float:
-        return combined(self.design.p[:n], tally.part(slice(0, n)), self.design.n_independent, _LEVEL).rhw
-
     def _spread(self, tally: Tally, size: int, most: IntArray) -> IntArray:
         weights, room = np.column_stack([self.design.p, np.zeros_like(self.design.p)]), ADDED * (tally.tests > 0)
         lower, upper = (
@@ -143,8 +144,3 @@ class Allocation:
             for crashes in (tally.crashes, tally.crashes + tally.failed)
         )
         return spread(weights, lower, upper, _LEVEL, size, most)
-
-
-def _cut(wanted: IntArray, budget: int) -> IntArray:
-    """Tests per stratum, cut from the last stratum on to a budget."""
-    return np.asarray(np.diff(np.minimum(np.cumsum(wanted), max(budget, 0)), prepend=0))
