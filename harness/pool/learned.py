@@ -96,27 +96,25 @@ def _bins_of(tests: Following, place: IntArray) -> None:
 
 @compiled_inline
 def _respond(
-    a: float, step: int, first: int, dead_steps: int, lag: float, wanted: FloatArray, n_steps: int, v_run: FloatArray
+    learned: Learned, a: float, step: int, first: int, wanted: FloatArray, n_steps: int, v_run: FloatArray
 ) -> float:
-    """Acceleration (m/s²) in a step after ``a`` in the last one; before ``first`` that of the baseline run."""
-    if step >= first:
-        return float(lag * a + (1.0 - lag) * wanted[step - dead_steps])
+    """Acceleration (m/s²) in a step after ``a`` in the last one; that of the baseline run until it can be another."""
+    if step >= first + learned.dead_steps:
+        return float(learned.lag * a + (1.0 - learned.lag) * wanted[step - learned.dead_steps])
     return float((v_run[step + 1] - v_run[step]) / STEP_S) if step < n_steps else a
 
 
 @compiled_threads
 def _retrace(learned: Learned, tests: Following, runs: BaselineRuns, error: FloatArray) -> None:
     """How far (m) from the vehicle its surrogate is at the end of each test (n,)."""
-    table, lag, dead_steps = learned.table, learned.lag, learned.dead_steps
     wanted = np.zeros(tests.x_av.shape[1])
     for i in range(tests.first.size):
         first, last = tests.first[i], tests.last[i]
         x, v, run = tests.x_av[i, first], tests.v_av[i, first], tests.shadow[i]
         a = (v - tests.v_av[i, first - 1]) / STEP_S
         for step in range(first, last):
-            g, c = bin_of(gap(tests.x_bv[i, step], x), v - tests.v_bv[i, step])
-            wanted[step] = table[g, c]
-            a = _respond(a, step, first + dead_steps, dead_steps, lag, wanted, runs.n_steps[run], runs.v_mps[run])
+            wanted[step] = learned.table[bin_of(gap(tests.x_bv[i, step], x), v - tests.v_bv[i, step])]
+            a = _respond(learned, a, step, first, wanted, runs.n_steps[run], runs.v_mps[run])
             v_after = next_speed(v, a)
             x, v = next_position(x, v, v_after), v_after
         error[i] = abs(x - tests.x_av[i, last])
@@ -169,19 +167,15 @@ def learned_crashes(
     counts_above_mps: float,
 ) -> BoolArray:
     """On which of the cut-ins ``asked`` (n, steps) of baseline runs the learned surrogate crashes, (n, steps)."""
-    found, scratch = np.zeros(asked.shape, np.bool_), empty_trajectory(environment)
-    known = unboxed(environment), unboxed(runs)
-    learnt = learned.table, learned.lag, learned.dead_steps
-    wanted = np.zeros(asked.shape[1] + 1)
-    _drive(*learnt, seed, index, state, *known, unboxed(scratch), wanted, asked, counts_above_mps, found)
+    found, scratch = np.zeros(asked.shape, np.bool_), unboxed(empty_trajectory(environment))
+    known = unboxed(environment), unboxed(runs), scratch, np.zeros(asked.shape[1] + 1)
+    _drive(learned, seed, index, state, *known, asked, counts_above_mps, found)
     return found
 
 
 @compiled_threads
 def _drive(
-    table: FloatArray,
-    lag: float,
-    dead_steps: int,
+    learned: Learned,
     seed: int,
     index: IntArray,
     state: RecordArray,
@@ -193,7 +187,7 @@ def _drive(
     counts_above_mps: float,
     found: BoolArray,
 ) -> None:
-    until, fastest = environment.numbers.max_steps, max(table.max(), 0.0)
+    until, fastest, dead_steps = environment.numbers.max_steps, max(learned.table.max(), 0.0), learned.dead_steps
     for i in range(index.size):
         walk(state[i], seed, index[i], 0, until, False, environment, path)
         x_run, v_run, n_steps = runs.x_m[i], runs.v_mps[i], runs.n_steps[i]
@@ -211,9 +205,8 @@ def _drive(
                 left = ahead + (path.slowest[step] - v) * rest - 0.5 * fastest * (rest * rest)
                 if step > cut + dead_steps and a <= fastest and left > SAFE_M:
                     break  # it stays behind whatever it does
-                g, c = bin_of(ahead, v - v_bv)
-                wanted[step] = table[g, c]
-                a = _respond(a, step, onset + 1 + dead_steps, dead_steps, lag, wanted, n_steps, v_run)
+                wanted[step] = learned.table[bin_of(ahead, v - v_bv)]
+                a = _respond(learned, a, step, onset + 1, wanted, n_steps, v_run)
                 v_after = next_speed(v, a)
                 x, v = next_position(x, v, v_after), v_after
                 if step >= cut and gap(path.x_after[step + 1], x) < CONTACT_M:

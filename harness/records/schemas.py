@@ -6,6 +6,7 @@ first, then the surrogates; for the others the surrogates alone. Values are from
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -177,20 +178,21 @@ def baseline_schema() -> pa.Schema:
     )
 
 
+_WHO = {"av": AV, "bv": BV}
+
+
 def pilot_schema() -> pa.Schema:
     """Schema of the ``pilot`` table: one row per test from which the vehicle was learned."""
-    positions, speeds = "front bumper, initially and after each step", "initially and after each step"
     return pa.schema(
         [
             _field("shadow", _I8, "1", "baseline run that the test repeats"),
-            _field("cut_in_step", _I2, "0.1 s", "step of the cut-in"),
-            _field("onset_step", _I2, "0.1 s", "step from which on the vehicle may have seen it"),
+            _field("onset_step", _I2, "0.1 s", "step from which on the vehicle may have seen the cut-in"),
             _field("outcome", _NAME, "", "crash, timeout, bv_lv_contact or failed"),
             *(
-                _field(f"{who}_{what}", pa.list_(_F8), unit, doc)
-                for who in ("av", "bv")
-                for what, unit, doc in (("position_m", "m", positions), ("speed_mps", "m/s", speeds))
+                _field(f"{who}_position_m", pa.list_(_F8), "m", "front bumper, at first and after each step")
+                for who in _WHO
             ),
+            *(_field(f"{who}_speed_mps", pa.list_(_F8), "m/s", "at first and after each step") for who in _WHO),
             _or_null("failure", pa.string(), "", "cause, for failed tests"),
         ]
     )
@@ -358,12 +360,10 @@ def pilot_table(shard: Shard) -> pa.Table:
     e, traces = shard.results.episode, [shard.traces[row] for row in range(shard.results.episode.size)]
     columns: dict[str, Any] = {
         "shadow": shard.traffic.announced_index,
-        "cut_in_step": shard.traffic.cut_step.astype(np.int16),
         "onset_step": np.maximum(shard.traffic.cut_step - shard.traffic.lead, 0).astype(np.int16),
         "outcome": _names(e["outcome"], OUTCOMES),
         "failure": pa.array([shard.failures.get(row) for row in range(e.size)], pa.string()),
     }
-    for who, vehicle in (("av", AV), ("bv", BV)):
-        for what, column in (("position_m", 0), ("speed_mps", 1)):
-            columns[f"{who}_{what}"] = pa.array([trace[:, vehicle, column] for trace in traces], pa.list_(pa.float64()))
+    for (who, vehicle), (column, what) in product(_WHO.items(), enumerate(("position_m", "speed_mps"))):
+        columns[f"{who}_{what}"] = pa.array([trace[:, vehicle, column] for trace in traces], pa.list_(pa.float64()))
     return _table(pilot_schema(), columns, e)

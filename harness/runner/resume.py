@@ -10,7 +10,7 @@ import platform
 import time
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from importlib import metadata
@@ -87,8 +87,7 @@ class Manifest:
     """Finished shards in order, from the first on, and counts over them: keeps ``manifest.json`` and its campaign true.
 
     ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are
-    more keys. ``limits_before`` are other limits that have been asked of the folder's tests, ``listed_baseline``
-    the checksums of its baseline runs, ``listed_pilot`` those of its pilot tests.
+    more keys. ``limits_before`` are other limits that have been asked of the folder's tests.
     """
 
     def __init__(
@@ -102,8 +101,6 @@ class Manifest:
         self._causes: Counter[str] = Counter()
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
         asked = [] if campaign.accept is None else [_asked(campaign.accept)]
-        self.listed_baseline: list[int] = earlier.get("baseline_crc32", [])
-        self.listed_pilot: list[int] = earlier.get("pilot_crc32", [])
         earlier_limits = earlier.get("limits", []) if earlier["n_episodes"] else []
         self.limits_before = [limit for limit in earlier_limits if limit not in asked]
         self._content: dict[str, Any] = {
@@ -145,6 +142,11 @@ class Manifest:
         """What an earlier run has noted of a shard of the same place and size; empty if it has not."""
         found: list[dict[str, Any]] = self._earlier["shards"][request.index : request.index + 1]
         return next((shard for shard in found if shard["n_episodes"] == request.n_episodes), {})
+
+    def earlier(self, key: str) -> Sequence[int]:
+        """Checksums that an earlier run has noted of what comes before tests."""
+        found: Sequence[int] = self._earlier.get(key, ())
+        return found
 
     def forget_replaced(self, request: ShardRequest) -> None:
         """Cut what an earlier run has left before the shard that this one is about to take the place of, if it does.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -48,16 +48,7 @@ from harness.runner.resume import (
 from harness.runner.stored import estimate_run
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import distance_per_test_m, prepare
-from harness.sampling.baseline import (
-    BaselineResult,
-    as_recorded,
-    baseline_file,
-    baseline_requests,
-    learned_from,
-    pilot_requests,
-    stored_baseline,
-    with_learned,
-)
+from harness.sampling.baseline import IN_MANIFEST, baseline_file, begin, stored_baseline
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
 
@@ -205,35 +196,18 @@ class Run:
         self.manifest.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
 
     def _make_baseline(self, paths: BaselinePaths) -> None:
-        """Drive the vehicle along all paths without a cut-in, and in pilot tests; learn it from these."""
-        known, manifest, source = partial(stored_baseline, self.out, paths), self.manifest, self.source
-        requests, listed = baseline_requests(len(paths)), manifest.listed_baseline
-        table = self._drive("baseline runs", len(paths), requests, partial(known, listed), ("shadow_runs", "baseline"))
-        runs = as_recorded(table, self.resolved.environment)
-        manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
-        source.begin_after(runs)
-        learned = None
-        if (pilot := source.pilot()) is not None:
-            requests, n = pilot_requests(pilot), pilot[0].size
-            tests = self._drive(
-                "pilot tests", n, requests, partial(known, manifest.listed_pilot), ("pilot_tests", "pilot")
-            )
-            if (learned := learned_from(tests, runs)) is not None:
-                source.begin_after(runs, learned)
-        self._workers.follow_from(parquet(with_learned(table, learned)))
+        """Drive the vehicle along all paths without a cut-in, and in pilot tests that it is learned from."""
+        table, runs = begin(self.source, partial(self._drive, paths))
+        self.manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
+        self._workers.follow_from(parquet(table))
 
-    def _drive(
-        self,
-        what: str,
-        n: int,
-        requests: Iterator[ShardRequest],
-        known: Callable[[ShardRequest], BaselineResult | None],
-        keys: tuple[str, str],
-    ) -> pa.Table:
+    def _drive(self, paths: BaselinePaths, what: str, requests: Sequence[ShardRequest]) -> pa.Table:
         """What comes before tests that count, but for what an earlier run has done of it; the manifest follows."""
+        n, (counted, listed) = sum(each.n_episodes for each in requests), IN_MANIFEST[what]
         self._progress.stage(f"{what}{self._workers.where}", n)
         tables, causes, crc32 = [], Counter[str](), []
-        for result in self._workers.run(requests, known):
+        known = partial(stored_baseline, self.out, paths, self.manifest.earlier(listed))
+        for result in self._workers.run(iter(requests), known):
             file = baseline_file(self.out, result.request)
             if result.parquet:
                 write_bytes(file, result.parquet)
@@ -242,7 +216,7 @@ class Run:
             causes += result.failures
             self._progress.advance(result.request.n_episodes)
             counts = {"n_runs": sum(map(len, tables)), "n_failed": causes.total()}
-            self.manifest.note(**{keys[0]: counts, f"{keys[1]}_crc32": crc32})
+            self.manifest.note(**{counted: counts, listed: crc32})
             self.manifest.follow()
         most, where = self.campaign.run.max_failed_share, f"the run folder's {file.parent.name}/ tables"
         require_few_failed(causes.total(), n, causes, most, what, where)

@@ -24,7 +24,7 @@ from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.resume import cpu_name, require_same_pool, versions
 from harness.sampling import prepare, source_of
-from harness.sampling.baseline import read_baseline, read_pilot
+from harness.sampling.baseline import begin, read_stored
 from harness.sampling.protocol import block_of
 from harness.vocabulary import ESTIMATORS, EstimatorName
 from harness.worlds import build_world
@@ -183,12 +183,7 @@ def _replay(
     """Row and trace of the episode, run again."""
     source = prepare(resolved)
     if source.baseline_paths is not None:
-        listed = read_manifest(folder)
-        given = folder, source.baseline_paths
-        runs = read_baseline(*given, resolved.environment, listed.get("baseline_crc32", ()))
-        source.begin_after(runs)
-        if (pilot := source.pilot()) is not None:
-            source.begin_after(runs, read_pilot(*given, pilot, runs, listed.get("pilot_crc32", ())))
+        begin(source, partial(read_stored, folder, source.baseline_paths, read_manifest(folder)))
     require_same_pool(folder, source)
     options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
     world = build_world(resolved.campaign, 1, in_sumo=gui or fcd is not None, gui=gui, options=options)

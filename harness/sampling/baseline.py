@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import pickle
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -27,7 +28,7 @@ from harness.pool.vehicle_pool import BaselinePaths
 from harness.pool.walk import BaselineRuns, write_script
 from harness.records.folder import parquet, read_table
 from harness.records.schemas import baseline_table, pilot_table
-from harness.sampling.protocol import ShardRequest
+from harness.sampling.protocol import ShardRequest, Source
 from harness.traffic.laws import Environment
 from harness.vocabulary import AV, FAILED, IntArray, RecordArray
 
@@ -37,6 +38,9 @@ SHARD_RUNS = 50
 """Baseline runs of one file and one task: half a second of a slow controller."""
 PILOT = "pilot"
 """Folder of the pilot tests."""
+BASELINE_RUNS, PILOT_TESTS = "baseline runs", "pilot tests"
+IN_MANIFEST = {BASELINE_RUNS: ("shadow_runs", "baseline_crc32"), PILOT_TESTS: ("pilot_tests", "pilot_crc32")}
+"""Keys of their numbers, and of their checksums."""
 LEARNED = b"harness.learned"
 """Key in the metadata of the baseline runs as workers get them."""
 ALL_MOTION = RecordPolicy(0, "all", 0.0)
@@ -113,28 +117,34 @@ def _causes(table: pa.Table) -> Counter[str]:
     return Counter(table.column("failure").drop_null().to_pylist())
 
 
-def read_baseline(
-    folder: Path, paths: BaselinePaths, environment: Environment, listed: Sequence[int] = ()
-) -> BaselineRuns:
-    """All baseline runs of a run folder; a `RunFolderError` if some are missing or damaged."""
-    return as_recorded(_read(folder, paths, listed, list(baseline_requests(len(paths)))), environment)
+def begin(source: Source, drive: Callable[[str, Sequence[ShardRequest]], pa.Table]) -> tuple[pa.Table, BaselineRuns]:
+    """Let a campaign's tests follow from baseline runs and pilot tests, whose tables ``drive`` gives.
+
+    Returns the baseline runs: as workers get them, with what was learned (`learned_in`), and as arrays.
+    """
+    table, learned = drive(BASELINE_RUNS, list(baseline_requests(len(source.baseline_paths or ())))), None
+    runs = as_recorded(table, source.resolved.environment)
+    source.begin_after(runs)
+    if (pilot := source.pilot()) is not None:
+        learned = learned_from(drive(PILOT_TESTS, list(pilot_requests(pilot))), runs)
+        source.begin_after(runs, learned)
+    return table.replace_schema_metadata({LEARNED: pickle.dumps(learned)}), runs
 
 
-def read_pilot(
-    folder: Path,
-    paths: BaselinePaths,
-    prescribed: tuple[RecordArray, PrescribedTraffic],
-    runs: BaselineRuns,
-    listed: Sequence[int] = (),
-) -> Learned | None:
-    """What was learned from the pilot tests of a run folder; a `RunFolderError` if some are missing or damaged."""
-    return learned_from(_read(folder, paths, listed, list(pilot_requests(prescribed))), runs)
+def learned_in(table: pa.Table) -> Learned | None:
+    """What comes with baseline runs; see `begin`."""
+    found: Learned | None = pickle.loads(table.schema.metadata[LEARNED])  # noqa: S301 - our own
+    return found
 
 
-def _read(folder: Path, paths: BaselinePaths, listed: Sequence[int], requests: Sequence[ShardRequest]) -> pa.Table:
+def read_stored(
+    folder: Path, paths: BaselinePaths, manifest: Mapping[str, Any], what: str, requests: Sequence[ShardRequest]
+) -> pa.Table:
+    """All of a run folder's; a `RunFolderError` if some are missing or damaged."""
+    listed = manifest.get(IN_MANIFEST[what][1], ())
     found = [stored_baseline(folder, paths, listed, request) for request in requests]
     if any(done is None for done in found):
-        there = f"{sum(done is not None for done in found)} of {len(found)} files"
+        there = f"{what} of {sum(done is not None for done in found)} of {len(found)} files"
         expected = "all of them: they say what is tested, and how probable each test is"
         where = str(baseline_file(folder, requests[0]).parent)
         raise RunFolderError(where, there, expected, "Let `harness run` go on with --resume.")
@@ -151,17 +161,6 @@ def learned_from(table: pa.Table, runs: BaselineRuns) -> Learned | None:
     (x_av, last), *others = (padded(table.column(name), width) for name in names)
     shadow, onset = (table.column(name).to_numpy().astype(np.int64) for name in ("shadow", "onset_step"))
     return learn(Following(shadow, onset + 1, last - 1, x_av, *(values for values, _ in others)), runs)
-
-
-def with_learned(table: pa.Table, learned: Learned | None) -> pa.Table:
-    """All baseline runs as workers get them, with what was learned."""
-    return table if learned is None else table.replace_schema_metadata({LEARNED: pickle.dumps(learned)})
-
-
-def learned_in(table: pa.Table) -> Learned | None:
-    """See `with_learned`."""
-    found = (table.schema.metadata or {}).get(LEARNED)
-    return None if found is None else pickle.loads(found)  # noqa: S301 - our own
 
 
 def as_recorded(table: pa.Table, environment: Environment) -> BaselineRuns:

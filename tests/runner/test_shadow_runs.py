@@ -152,7 +152,7 @@ def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
     with pytest.raises(RunFolderError, match=r"shard-000000\.parquet.*Delete this file"):
         replay(folder, 5)
     files_of(folder)[0].unlink()
-    with pytest.raises(RunFolderError, match="shadow: found 1 of 2 files"):
+    with pytest.raises(RunFolderError, match="baseline runs of 1 of 2 files"):
         replay(folder, 5)
     assert estimate(folder) == estimates(folder)  # needs no path
 
