@@ -11,7 +11,7 @@ import click
 from harness.cli import main as run_main
 from harness.commands.options import CAMPAIGN, FOLDER, RUN_FOLDER, examples, json_option, quiet_option
 from harness.commands.printing import print_json, print_table
-from harness.errors import WorldDisagreementError
+from harness.errors import HarnessError, WorldDisagreementError
 from harness.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -117,7 +117,11 @@ def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, q
     from studies.case_study.study import load_study  # noqa: PLC0415 - keeps --help fast
 
     asked = load_study(study_file, quick=quick)
-    from studies.case_study.steps import run_study  # noqa: PLC0415 - slow to import: once the file is right
+    try:
+        from studies.case_study.steps import run_study  # noqa: PLC0415 - slow to import: once the file is right
+    except ModuleNotFoundError as error:
+        mend = "Install it, in the harness's folder: pip install '.[studies]'."
+        raise HarnessError("studies case", f"no package {error.name}", "the extra 'studies'", mend) from error
 
     def told(name: str, seconds: float | None) -> None:
         if not (as_json or quiet):
