@@ -87,6 +87,7 @@ class Claims:
             row[f"{name}_rhw"] = half / rate if rate > 0.0 else None
             row[f"{name}_tests"] = tests_for(self._n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
         row |= dict.fromkeys(("gain_claimed", "gain_degrees_of_freedom", "gain_leave_one_out", "difference"))
+        row["n_saturated"] = 0 if scv is None else len(scv.details["gain"]["saturated"])
         if scv is not None and scv.std_error > 0.0 < nade.crash_rate:
             row |= {f"gain_{key}": scv.details["gain"][key] for key in ("degrees_of_freedom", "leave_one_out")}
             row["gain_claimed"] = (nade.std_error / scv.std_error) ** 2
@@ -111,8 +112,10 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
     fits, figures = claims.scv.fits(), {}
     strata = [
         {"control_steps": level, "columns": fit.n_columns, "rank": fit.rank, **_spread_of([fit])}
-        for level, fit in (fits if step.strata else ())
+        for level, fit in (fits if step.spread_tests else ())
     ]
+    if step.spread_tests:
+        write_table(context.folder / SPREAD, spread(first_block(run, min(step.spread_tests, n))))
     if rows:
         total, beyond = (
             sum(fit.n * fit.intercept for level, fit in fits if level > k) for k in (-1, MAX_CONTROL_STEPS)
@@ -139,6 +142,32 @@ def gain_of_parts(run: Path, size: int, n: int, parts: int, confidence: float) -
     return ratio_of_variances([nade for nade, _ in rates], [scv for _, scv in rates], confidence)
 
 
+SPREAD = "results.parquet"
+
+
+def spread(block: Block) -> pa.Table:
+    """Results of some tests before and after adjustment, Y and Z = Y - Hβ, those that are not 0, by control steps."""
+    scv = Scv()
+    scv.add(block)
+    y, (of_stratum, explained) = block.weighted_crashes(), explained_by(block, scv.fits())
+    z = y - explained + of_stratum
+    kept = (y != 0.0) | (z != 0.0)
+    return pa.table({"control_steps": block.n_control_steps[kept], "y": y[kept], "z": z[kept]})
+
+
+def explained_by(block: Block, fits: Sequence[tuple[int, StratumFit]]) -> FloatArray:
+    """What regressions say of each test: η_l, and η_l + (h - means)·β with each β, (1 + k, n); 0 where l has none."""
+    found = np.zeros((1 + len(fits[0][1].beta), len(block)))
+    for level, fit in fits:
+        at = np.flatnonzero(block.n_control_steps == level)
+        for rows in (at[start : start + CHUNK] for start in range(0, len(at), CHUNK)):
+            columns = np.empty((len(rows), fit.n_columns), order="F")
+            fill_product_columns(block.first_ratios[rows], level, columns)
+            found[:, rows] = fit.intercept
+            found[1:, rows] += fit.beta @ (columns - fit.means).T
+    return found
+
+
 TESTS_EACH = (1, 5, 20, 100, 1_000)
 """Tests for each principal component of columns that is used: of few, coefficients are worse than none elsewhere."""
 
@@ -153,21 +182,22 @@ class KnownMeans:
         self._fits, self._of_campaigns = others.fits(TESTS_EACH), list[FloatArray]()
 
     def add(self, block: Block) -> None:
-        """Add a campaign: variances of Y, and of Y less η_l + (h - means)·β with each β, 0 where l has none."""
+        """Add a campaign: variances and means of Y, of Y less η_l alone, and less what columns explain, too."""
         y = block.weighted_crashes()
-        left = np.tile(y, (1 + len(TESTS_EACH), 1))
-        for level, fit in self._fits:
-            at = np.flatnonzero(block.n_control_steps == level)
-            for rows in (at[start : start + CHUNK] for start in range(0, len(at), CHUNK)):
-                columns = np.empty((len(rows), fit.n_columns), order="F")
-                fill_product_columns(block.first_ratios[rows], level, columns)
-                left[1:, rows] -= fit.intercept + fit.beta @ (columns - fit.means).T
-        self._of_campaigns.append(left.var(axis=1))
+        left = np.vstack([y, y - explained_by(block, self._fits)])
+        self._of_campaigns.append(np.array([left.var(axis=1), left.mean(axis=1)]))
 
-    def gain(self, confidence: float) -> dict[str, Any]:
-        """NADE's variance over what is left of it."""
-        plain, *adjusted = np.transpose(self._of_campaigns)
-        return ratio_of_means(plain, min(adjusted, key=np.mean), confidence)
+    def row(self, confidence: float) -> dict[str, Any]:
+        """NADE's variance over what is left: by columns in the other tests, by strata, by both, and replicated."""
+        (plain, strata, *columns), (plain_rate, _, *rates) = np.array(self._of_campaigns).transpose(1, 2, 0)
+        best = int(np.argmin([np.mean(one) for one in columns]))
+        total, left = (sum(getattr(fit, key) for _, fit in self._fits) for key in ("total_squares", "residual_squares"))
+        return {
+            "within_claimed": figure(total / left if left > 0.0 else None),
+            "gain_strata": ratio_of_means(plain, strata, confidence),
+            "gain_known": ratio_of_means(plain, columns[best], confidence),
+            "gain_known_replicated": ratio_of_variances(plain_rate, rates[best], confidence),
+        }
 
 
 def _spread_of(fits: Sequence[StratumFit]) -> dict[str, Any]:

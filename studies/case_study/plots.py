@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import matplotlib.style
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,9 +16,9 @@ from matplotlib.figure import Figure
 from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.records.folder import read_table
 from harness.report.drawing import tick_label
-from studies.case_study.counted import CURVES
+from studies.case_study.counted import CURVES, SPREAD
 from studies.case_study.figures import is_settled
-from studies.case_study.study import Convergence, Line, Made, Study
+from studies.case_study.study import Convergence, Line, Made, Study, Variants
 
 INK, BLUE, VERMILLION, GREEN, GREY = "#1c2126", "#0067a8", "#c94f0a", "#00795a", "#8b95a0"
 STYLE: list[Any] = ["default", "seaborn-v0_8-whitegrid", {"font.size": 9.0, "axes.titlelocation": "left"}]
@@ -43,9 +44,14 @@ def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str
         for name, step in study.steps.items():
             if isinstance(step, Convergence):
                 plots[name] = convergence_plot(name, step, made, study.rhw, study.confidence)
+            elif isinstance(step, Variants) and step.epsilons and step.reference:
+                known = made[step.reference].result["figures"]["crash_rate"]["value"]
+                plots[name] = settings_plot(made[name].result["variants"], known, study.rhw)
             elif step.kind == "control_variates":
                 plots[f"{name}_growth"] = growth_plot(made[name].result["looks"], study.rhw)
-                plots[name] = strata_plot(made[name].result["strata"])
+                if strata := made[name].result["strata"]:
+                    plots[name] = strata_plot(strata)
+                    plots[f"{name}_results"] = spread_plot(read_table(made[name].folder / SPREAD))
     return {name: plot for name, plot in plots.items() if plot is not None}
 
 
@@ -58,10 +64,10 @@ def _figure(height_in: float, *titles: str) -> tuple[Figure, list[Axes]]:
     return figure, panels
 
 
-def _drawn(figure: Figure, caption: str) -> Plot:
+def _drawn(figure: Figure, caption: str, legend: Literal["best", "lower left"] = "best") -> Plot:
     for axes in figure.axes:
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=8)
+            axes.legend(fontsize=8, loc=legend)
     figure.savefig(buffer := io.BytesIO(), format="png", dpi=160, metadata={"Software": None})
     return Plot(caption, buffer.getvalue())
 
@@ -84,8 +90,14 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
         is_limit = found["high"] is None and found["low"] is not None
         axes.errorbar(place, value, yerr=ends, fmt="^" if is_limit else "o", color=colour, capsize=4.0, markersize=7)
         words = ("> " if is_limit else "") + tick_label(float(f"{value:.2g}")) + (" †" if colour == GREY else "")
-        at_offset: dict[str, Any] = {"xytext": (0, -18 if is_limit else 7), "textcoords": "offset points"}
-        axes.annotate(words, (place, found["high"] or value), **at_offset, ha="center", fontsize=8)
+        at_offset: dict[str, Any] = {
+            "xytext": (0, -18 if is_limit else 7),
+            "textcoords": "offset points",
+            "ha": "center",
+        }
+        axes.annotate(
+            words, (place, found["high"] or value), **at_offset, fontsize=8, bbox={"color": "white", "pad": 0.5}
+        )
     axes.margins(y=0.15)
     axes.set_xticks(range(len(ours)), list(ours), fontsize=8)
     axes.grid(visible=False, axis="x")
@@ -110,7 +122,7 @@ def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw
     left.set(xlabel="tests", xscale="log", ylim=(0.0, MOST_RATE * reference or 1.0))
     right.axhline(rhw, **_DASHED)
     right.set(xlabel="tests", xscale="log", yscale="log")
-    caption = f"Crash rates with {confidence:.0%} bands (dashed: {step.reference}), and relative half-widths, by tests."
+    caption = f"Crash rates with {confidence:.0%} bands (dashed: {step.reference}), and RHW, by tests."
     return _drawn(figure, caption)
 
 
@@ -151,6 +163,51 @@ def growth_plot(looks: list[dict[str, Any]], rhw: float) -> Plot | None:
     right.axhline(1.0, **_DASHED)
     for axes in (left, right):
         axes.set(xlabel="tests", xscale="log", yscale="log")
-    return _drawn(
-        figure, "By tests: relative half-widths; and SCV's gain as claimed, corrected in two ways, and replicated."
-    )
+    caption = "By tests: RHW, and SCV's gain as claimed, corrected and replicated."
+    return _drawn(figure, caption, "lower left")
+
+
+def spread_plot(results: pa.Table) -> Plot | None:
+    """Distributions of results before and after adjustment, by number of control steps and of all."""
+    steps, y, z = (results.column(key).to_numpy() for key in ("control_steps", "y", "z"))
+    if not np.any(y > 0.0):
+        return None
+    y, z = y / (scale := np.median(y[y > 0.0])), z / scale
+    side = np.geomspace(1e-2, 2.0 * max(np.abs(y).max(), np.abs(z).max()), 25)
+    figure = Figure(figsize=(8.6, 3.4), layout="constrained")
+    panels = figure.subplots(2, 5, sharex=True, sharey=True).ravel()
+    for level, axes in enumerate(panels, start=1):
+        rows = steps == level if level <= MAX_CONTROL_STEPS else np.full(len(steps), True)
+        for values, key, label in ((y, "nade", "Y, NADE"), (z, "scv", "Z, SCV")):
+            axes.hist(
+                values[rows],
+                [*-side[::-1], *side],
+                label=label if level == 1 else None,
+                histtype="step",
+                color=_COLOURS[key],
+            )
+        axes.set_title(f"l = {level}" if level <= MAX_CONTROL_STEPS else "all")
+        axes.set_xscale("symlog", linthresh=1e-2, linscale=0.5)
+        axes.set_yscale("symlog", linthresh=1.0)
+        axes.set_xticks([-1.0, 0.0, 1.0], ["-1", "0", "1"])
+    panels[0].set_ylabel("tests")
+    return _drawn(figure, "By control steps l: results over the median crash, of NADE (Y) and SCV (Z); zeros left out.")
+
+
+def settings_plot(variants: list[dict[str, Any]], known_rate: float, rhw: float) -> Plot:
+    """Of each setting tests as claimed, by replication and over shuffles; mean weight and rate over the known one."""
+    figure, (left, right) = _figure(3.4, f"tests for a relative half-width of {rhw:g}", "should be 1")
+    looks = (("claimed", "as claimed", "o", GREY), ("rnot", "RNoT", "s", GREEN), ("true", "by replication", "o", BLUE))
+    for key, label, marker, colour in looks:
+        style: dict[str, Any] = {"color": colour, "linestyle": "none", "markersize": 8 if key == "claimed" else 5}
+        left.plot([row[key]["value"] or np.nan for row in variants], marker, label=label, **style)
+        left.plot([np.nan if row[key]["value"] else row[key]["low"] or np.nan for row in variants], "^", **style)
+    left.set_yscale("log")
+    right.plot([row["mean_weight"] for row in variants], "o-", color=INK, label="mean weight", markersize=4)
+    rates = [(row["nade_rate"]["value"] or np.nan) / known_rate for row in variants]
+    right.plot(rates, "o-", color=BLUE, label="rate / known rate", markersize=4)
+    right.axhline(1.0, **_DASHED)
+    right.set_ylim(bottom=0.0)
+    for axes in (left, right):
+        axes.set_xticks(range(len(variants)), [row["variant"] for row in variants], fontsize=8, rotation=30)
+    return _drawn(figure, "By ε: tests (triangles: lower limits); mean weight, and rate over the known one.")

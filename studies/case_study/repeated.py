@@ -131,7 +131,7 @@ def claims_in_twin(
         "scv_claimed": marked(mean_of(tests["scv"], confidence), settled=row["settled"]),
         "gain_claimed": marked(ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
         "gain_true": ratio_of_variances(rates["nade"], rates["scv"], confidence),
-        **({"gain_known": known.gain(confidence)} if known else {}),
+        **(known.row(confidence) if known else {}),
         "difference": max((each["difference"] for each in rows if each["difference"] is not None), default=None),
     }
 

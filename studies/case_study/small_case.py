@@ -253,7 +253,7 @@ def claims_of_setting(
         "nade_claimed": marked(nade, settled=means_something),
         "scv_claimed": marked(scv, settled=means_something),
         "nade_covers": covered([each["nade_rate"] for each in many], world.crash_rate),
-        "gain_known": known.gain(confidence),
+        **known.row(confidence),
     }
 
 

@@ -53,7 +53,9 @@ class ControlVariates(Section):
     of: StepName = Field(description="step of kind run: a step mixture with records.moments first_9 or all")
     sizes: list[Whole] = Field(min_length=1, description="numbers of tests, rising, for the table")
     looks: Whole = Field(12, ge=2, le=100, description="numbers of tests between 300 and the last one, for the plot")
-    strata: bool = Field(True, description="whether strata are shown one by one")
+    spread_tests: Whole | None = Field(
+        200_000, ge=10, description="first tests whose results are shown one by one; null to leave strata out"
+    )
     parts: Whole = Field(
         10, ge=3, le=1_000, description="of each size that the run has so many of, for the gain by replication"
     )
@@ -87,6 +89,7 @@ class Variants(Section):
     each_of: list[dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides]] = Field(
         [], description="lists of such settings, of which every combination is another variant"
     )
+    shown: dict[str, str] = Field({}, description="those that the page has, if not all, and their names there")
     epsilons: list[Probability] = Field([], description="values of testing.epsilon, a variant each")
     reference: StepName | None = Field(None, description="step with the crash rate of all, for tests by replication")
     shuffles: Whole = Field(0, ge=0, le=10_000, description="orderings of all tests of a variant, for their RNoT")

@@ -7,12 +7,18 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from harness.estimators.scv import Scv
 from studies.__main__ import main
 from studies.case_study import tested
+from studies.case_study.counted import KnownMeans, spread
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
 from studies.case_study.page import claim_rows
+from studies.case_study.repeated import variants_of
 from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
+from studies.case_study.theorems import bound
+from studies.chains.chain import CHAINS, Episodes
+from studies.chains.sampler import blocks, with_optimal_function
 from tests.stored_runs import SCENARIOS
 
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
@@ -113,7 +119,9 @@ def test_claims_say_where_they_are_from_and_are_judged(study, made):
     page = (folder / "case_study.md").read_text()
     assert r"a \| bound" in page
     assert "- 2: it was made up" in page
-    assert (folder / "plots" / "tests.png").read_bytes().startswith(b"\x89PNG")
+    pictures = {path.stem for path in (folder / "plots").iterdir() if path.read_bytes().startswith(b"\x89PNG")}
+    assert pictures == {"tests", "curves", "adjusted", "adjusted_growth", "adjusted_results", "variants"}
+    assert all(f"](plots/{name}.png)" in page for name in pictures)
 
 
 def test_steps_agree_with_the_run_that_they_keep(made):
@@ -139,12 +147,27 @@ def test_the_theorems_hold_on_exact_chains(made):
             "largest_error_known": 1e-12, "claimed_error_estimated": 1e-12}  # fmt: skip
     assert all(figures[name]["value"] <= limit for name, limit in most.items())
     assert figures["scatter_estimated"]["value"] > 0.01
+    assert figures["variance_over_bound"]["value"] == pytest.approx(0.012246779639791351, rel=1e-9)
+
+
+def test_the_bound_of_theorem_2_by_hand():
+    """Two equal weights. Of l = 1: μ = 1/4, least variance 7/96, at weight 1/2; of l = 2: μ = 1/8, 49/512, at 1/4."""
+    p, steps, crash = np.array([[0.375, 0, 0], [0.125, 0, 1], [0.25, 1, 1], [0.125, 1, 0], [0.125, 2, 1]]).T
+    ratios = np.ones((5, 2, 2))
+    ratios[2, 0], ratios[3, 0] = (1.5, 0.5), (0.5, 1.5)
+    episodes = Episodes(p, ratios, steps.astype(int), np.ones(5), crash.astype(bool))
+    uncontrolled = 0.125 * 0.875
+    first = 2 * min(0.375 * (1 / 1.5 - 0.25) ** 2 + 0.0625 / 16, 0.125 * 1.75**2 + 0.1875 / 16) + 3 * (0.25 * 2) ** 2
+    second = 4 * 0.125 * 0.875**2 + 3 * (0.125 * 4) ** 2
+    assert bound(episodes) == pytest.approx(3 * (uncontrolled + first + second), rel=1e-12)
 
 
 def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
     for quick in (False, True):
         study = load_study(SHIPPED, quick=quick)
         assert set(step_keys(study)) == set(study.steps)
+        variants = [step for step in study.steps.values() if step.kind == "variants"]
+        assert quick or all(set(step.shown) <= set(variants_of(step)) for step in variants)
     assert len(study.claims) >= 15
 
 
@@ -183,6 +206,28 @@ def test_ratios_of_paired_repetitions():
     rates = [1.0, 2.0, 4.0]
     assert ratio_of_variances(rates, rates, 0.9) == exactly(1.0)
     assert ratio_of_variances(rates, [1.0, 1.0, 1.0], 0.9) == figure(None)
+
+
+def test_the_spread_after_adjustment_is_what_algorithm_1_claims():
+    (block,) = blocks(CHAINS["decisive"], "step_mixture", [2_000], 1)
+    found, scv = spread(block).to_pandas(), Scv()
+    scv.add(block)
+    for level, fit in scv.fits():
+        z = found[found.control_steps == level].z.to_numpy()
+        squares = np.sum((z - fit.intercept) ** 2) + (fit.n - len(z)) * fit.intercept**2
+        assert squares == pytest.approx(fit.residual_squares, rel=1e-9, abs=1e-20)
+
+
+def test_known_means_gain_what_theorem_3_promises():
+    """In the theorem's world nothing is left of the variance of tests that the fit has not seen."""
+    world, rng, scv = with_optimal_function(), np.random.default_rng(1), Scv()
+    scv.add(world.block("step_mixture", world.maneuvers(2_000, rng)))
+    known = KnownMeans(scv)
+    for _ in range(5):
+        known.add(world.block("step_mixture", world.maneuvers(500, rng)))
+    row = known.row(0.9)
+    assert all(row[key]["value"] > 1e6 for key in ("within_claimed", "gain_known", "gain_known_replicated"))
+    assert row["gain_strata"]["value"] == pytest.approx(1.0, rel=0.01)  # all tests have one control step
 
 
 def test_relative_variance_of_known_weights():
