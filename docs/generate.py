@@ -209,7 +209,7 @@ def limits_table() -> str:
     )
 
 
-VALIDATED = ("shells_acting", "shells_acting_room")
+VALIDATED = ("shells_acting", "shells_acting_room", "shells_acting_needed")
 """Replication experiments with a table of their vehicles."""
 METHODS = {
     "twin_nde": "NDE, level 10,000",
