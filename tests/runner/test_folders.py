@@ -138,7 +138,7 @@ def written(file: str, text: str | None):
         ),
         (lambda run: shard_files(run)[1].unlink(), READERS, "episodes/shard-000001.parquet found: no such file"),
         (lambda run: shard_files(run, "traces")[1].unlink(), READERS[1:], "traces/shard-000001.parquet found: no such"),
-        (lambda run: (run / "estimates.json").unlink(), READERS[1:2], "`harness estimate"),
+        (lambda run: (run / "estimates.json").unlink(), READERS[1:2], "harness estimate"),
         (lambda run: edit(run, n_episodes=0, shards=[]), READERS[::2], "has not finished an episode yet"),
         (lambda run: edit(run, part={"number": 1}), READERS[:1], "a part of a run"),
         (lambda run: edit(run, reported_from=90, stopped_by="two_phase"), READERS[:1], "a run in two phases"),
