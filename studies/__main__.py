@@ -120,7 +120,7 @@ def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, q
     try:
         from studies.case_study.steps import run_study  # noqa: PLC0415 - slow to import: once the file is right
     except ModuleNotFoundError as error:
-        mend = "Install it, in the harness's folder: pip install '.[studies]'."
+        mend = "Install it, in the harness's folder: pip install -c requirements.lock -e '.[studies]'."
         raise HarnessError("studies case", f"no package {error.name}", "the extra 'studies'", mend) from error
 
     def told(name: str, seconds: float | None) -> None:

@@ -63,7 +63,7 @@ def estimate(
     Nothing is simulated in SUMO. Estimators that are asked for, and with -v all, are shown in a table; one that the
     records do not allow with the reason. The exit code is 2 if they allow none of those asked for.
 
-    With --environment the shells' probabilities in other traffic are found in the twin (15 s), and crash shares within
+    With --environment the shells' probabilities in other traffic are found in the twin (25 s), and crash shares within
     shells are taken to be the same there. Traffic in which they cannot be is refused.
     """
     if environment is not None:
@@ -88,8 +88,8 @@ def estimate(
     elif verbose or estimators:
         print_estimates(in_folder(content, folder), estimators)
     else:
-        page = folder / "report.html"
-        print_answer(content, folder, page if page.is_file() else None)
+        page = folder / "report.html"  # of the run's own traffic
+        print_answer(content, folder, page if environment is None and page.is_file() else None)
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
 
@@ -174,7 +174,7 @@ def export(folder: Path, episode: int, *, form: str, out: Path | None) -> None:
         try:
             from harness.report.openscenario import write_openscenario as write  # noqa: PLC0415 - an extra
         except ModuleNotFoundError as error:
-            mend = "Install it, in the harness's folder: pip install '.[export]'."
+            mend = "Install it, in the harness's folder: pip install -c requirements.lock -e '.[export]'."
             raise HarnessError("--to xosc", f"no package {error.name}", "the extra 'export'", mend) from error
     else:
         from harness.report.player import write_csv as write  # noqa: PLC0415 - keeps --help fast

@@ -82,7 +82,7 @@ def _fmpy() -> Any:
         import fmpy  # noqa: PLC0415 - an extra
         import fmpy.fmi2  # noqa: PLC0415 - an extra
     except ImportError as error:
-        mend = "Install it, in the harness's folder: pip install '.[fmi]'."
+        mend = "Install it, in the harness's folder: pip install -c requirements.lock -e '.[fmi]'."
         raise CampaignError("av.fmu", "no package fmpy", "the extra for FMUs", mend) from error
     return fmpy
 

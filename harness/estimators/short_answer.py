@@ -137,7 +137,7 @@ def _rows(
     yield Row("rate", counted, value, ends, per_km)
     for each in best.details.get("references", ())[:1]:
         if each["crash_rate"] > 0.0:
-            yield _beside(each, at_least="≥ " if untested else "")
+            yield _beside(each, at_least="≥ " if untested else "", acts=campaign.av.acts_before_cut_in)
     if campaign.has_baseline_runs and best.n_crashes:
         yield from _whence(campaign, best, manifest.get("expected"))
     if severity is not None:
@@ -187,9 +187,11 @@ def _decided(decision: Mapping[str, Any]) -> Row:
     return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
 
 
-def _beside(found: Mapping[str, Any], at_least: str) -> Row:
+def _beside(found: Mapping[str, Any], at_least: str, *, acts: bool) -> Row:
     low, high = found["ratio_low"], found["ratio_high"]
     who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
+    if acts:  # it takes over in the vehicle's own motion: what making room saves is not in the ratio
+        who = f"{found['reference']} from its own approach"
     if not found["ratio"]:
         return Row("ratio", "× competent driver", f"< {ratio(high)}", "no crash seen", who)
     apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"

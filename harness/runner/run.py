@@ -269,6 +269,6 @@ def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) ->
             "run.executor",
             "ray, but no package ray",
             "the extra for clusters",
-            "Install it here and on all machines of the cluster: pip install '.[ray]' in the harness's folder.",
+            "Install it in the harness's folder, on all machines: pip install -c requirements.lock -e '.[ray]'.",
         ) from error
     return RayWorkers(resolved, n_workers, n_runs=n_runs)

@@ -123,9 +123,8 @@ def sumo_program(name: str, where: str) -> Path:
 
         if (path := Path(str(sumo.SUMO_HOME)) / "bin" / name).exists():
             return path
-    raise CampaignError(
-        where, f"no {name}", "the extra 'sumo'", "Install it, in the harness's folder: pip install '.[sumo]'."
-    )
+    mend = "Install it, in the harness's folder: pip install -c requirements.lock -e '.[sumo]'."
+    raise CampaignError(where, f"no {name}", "the extra 'sumo'", mend)
 
 
 SPEED_CHECK_STEPS = 10

@@ -127,7 +127,7 @@ def test_another_kind_or_version_or_no_fmu_at_all_is_refused(fmu, tmp_path, old,
 
 def test_without_the_extra_its_name_is_said(fmu, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "fmpy", None)
-    with pytest.raises(CampaignError, match=r"pip install '\.\[fmi\]'"):
+    with pytest.raises(CampaignError, match=r"pip install -c requirements.lock -e '\.\[fmi\]'"):
         build_host(load(tmp_path, f"{{file: '{fmu}', {WIRED}}}").av, n_cells=1, seed=0)
 
 

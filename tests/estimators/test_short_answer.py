@@ -33,7 +33,7 @@ SAID = {
         "ended by: all tests done",
     ],
     "shells-need-based": ["need-based · ", "keeping to need-based "],
-    "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin"],
+    "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc from its own approach"],
     "forced-inattentive": ["fvdm (reaction.delay_s 0.2, "],
     "forced-krauss": ["SUMO’s Krauss · 240 tests in SUMO"],
     "shells-lateral-twin": ["idm · 240 tests"],

@@ -83,5 +83,5 @@ def test_what_cannot_be_written_is_said_and_nothing_is_left(stored_run, tmp_path
     monkeypatch.setitem(sys.modules, "scenariogeneration", None)
     monkeypatch.delitem(sys.modules, "harness.report.openscenario", raising=False)
     assert main(["export", str(folder), "0", "--to", "xosc", "--out", str(tmp_path / "a.xosc")]) == 2
-    assert ".[export]" in capsys.readouterr().err
+    assert "pip install -c requirements.lock -e '.[export]'" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["damaged"]

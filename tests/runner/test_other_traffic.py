@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from harness.cli import main
 from harness.errors import CampaignError
 from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.traffic.parameters import SHIPPED_FOLDER
-from tests.stored_runs import estimates
+from tests.stored_runs import copy_of, estimates
 
 SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
 
@@ -40,11 +41,23 @@ def test_the_same_traffic_under_another_name_gives_the_same_answer(stored_run, t
 def test_the_rate_is_proportional_to_the_share_that_does_not_look(stored_run, tmp_path):
     """And the ratio to a driver in the same traffic does not move. The pool's error is 5 %, mostly of equal paths."""
     folder = stored_run("shells-twin")
-    told, stored = answer(folder, environment(tmp_path, ignore_share=0.02)), estimates(folder)["estimates"]["shells"]
+    mine = environment(tmp_path, ignore_share=0.02)
+    told, stored = answer(folder, mine), estimates(folder)["estimates"]["shells"]
     assert told["crash_rate"] == pytest.approx(2.0 * stored["crash_rate"], rel=0.05)
     ratios = [each["details"]["references"][0]["ratio"] for each in (told, stored)]
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
-    assert "as there" in estimate_in_other_traffic(folder, str(tmp_path / "mine.yaml"))["answer"]["scope"]
+    assert "as there" in estimate_in_other_traffic(folder, mine)["answer"]["scope"]
+
+
+def test_the_page_of_the_old_traffic_is_not_named_below_the_answer(stored_run, tmp_path, capsys):
+    folder = str(copy_of(stored_run("shells-twin"), tmp_path / "run"))
+    Path(folder, "report.html").touch()
+    assert main(["estimate", folder]) == 0
+    assert f"  report  {folder}/report.html\n" in capsys.readouterr().out
+    assert main(["estimate", folder, "--environment", "ndd-overtaking-1"]) == 0
+    told = capsys.readouterr().out
+    assert "crash rate" in told
+    assert "report.html" not in told
 
 
 def test_cut_ins_that_no_test_stands_for_are_refused(stored_run, tmp_path):

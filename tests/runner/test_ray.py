@@ -175,5 +175,5 @@ def test_another_version_on_a_machine_is_refused(run, campaign, tmp_path, monkey
 def test_without_the_package(run, campaign, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "harness.runner.ray")
-    with pytest.raises(CampaignError, match=r"pip install '\.\[ray\]'"):
+    with pytest.raises(CampaignError, match=r"pip install -c requirements.lock -e '\.\[ray\]'"):
         run(campaign(*TWIN, ON_RAY), tmp_path / "run")

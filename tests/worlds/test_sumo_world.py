@@ -58,7 +58,9 @@ def test_a_second_simulation_is_refused_and_closing_twice_leaves_the_next_one_al
 
 def test_without_its_extra_or_a_screen_the_gui_is_refused_in_words(open_world, monkeypatch):
     monkeypatch.setitem(sys.modules, "sumo", None)
-    with pytest.raises(CampaignError, match=r"found no sumo-gui; expected the extra"):
+    with pytest.raises(
+        CampaignError, match=r"found no sumo-gui; expected the extra .* -c requirements.lock -e '\.\[sumo\]'"
+    ):
         open_world(1, gui=True)
     monkeypatch.setattr("harness.worlds.sumo.sumo_program", Path)
     monkeypatch.delenv("DISPLAY", raising=False)
