@@ -78,7 +78,7 @@ def load_campaign(
                 Path(name).name, [each.name for each in Path(file).parent.glob("*" + Path(name).suffix)]
             )
             mend = meant or "Correct the path; it is relative to the folder of the campaign file."
-            raise CampaignError(place(where), f"{name}, but there is no file {file}", expected, mend)
+            raise CampaignError(place(where), f"no file {file}", expected, mend)
         campaign = campaign.replaced(where, f"{file}:{end}" if end else file)
     if check_files:
         shipped_or_own(campaign.environment.parameters, SHIPPED_PARAMETERS, place(("environment", "parameters")))
@@ -186,7 +186,7 @@ class Places:
         for override in reversed(self.overrides):
             if tuple(where[: len(override.path)]) == override.path:
                 return override.option
-        spot = f"{self.path}:{self.line_of(where)}"
+        spot = f"{self.path}:{self.line_of(where)}" if self.lines else self.path  # the latter of a vehicle
         place = f"{dotted(where)} ({spot})" if where else spot
         section = tuple(where) if tuple(where) in self.lines else tuple(where[:-1])  # of a key that is missing
         inside = [item.option for item in self.overrides if item.path[: len(section)] == section]

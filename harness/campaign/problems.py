@@ -102,9 +102,9 @@ def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:
 
 def did_you_mean(word: object, words: Sequence[str]) -> str:
     """The closest of some words, as a question; empty if none is close."""
-    return next(
-        (f"Did you mean '{close}'?" for close in difflib.get_close_matches(str(word)[:_LONGEST], words, n=1)), ""
-    )
+    asked = str(word)[:_LONGEST]
+    cutoff = 0.75 if len(asked) > 4 else 0.6  # of three letters a wrong one leaves 0.67
+    return next((f"Did you mean '{close}'?" for close in difflib.get_close_matches(asked, words, 1, cutoff)), "")
 
 
 def describe_found(value: Any) -> str:

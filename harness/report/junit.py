@@ -62,6 +62,7 @@ def write_junit(path: Path, suite: str, cases: Sequence[Case], attachments: Sequ
         if case.outcome != "passed":
             ET.SubElement(element, case.outcome, message=case.message)
         attached = "\n".join(f"[[ATTACHMENT|{each.resolve()}]]" for each in attachments)
-        ET.SubElement(element, "system-out").text = f"{case.message}\n{attached}\n"
+        told = f"{case.message}\n" if case.outcome == "passed" else ""  # else it is in the element of the outcome
+        ET.SubElement(element, "system-out").text = f"{told}{attached}\n"
     ET.indent(root)
     write_text(path, printable(ET.tostring(root, encoding="unicode", xml_declaration=True)) + "\n")

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.drivers import BuiltInParameters
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
 from harness.estimators.answer import conditional_paired_statement, paired_statement
 from harness.estimators.pairs import MarginVerdict, PairedEstimate, PairedShells, paired_estimate
@@ -86,7 +87,7 @@ def compare_campaigns(
         _take_over(Path(stored), folders[0], sides[0])
     for side, folder in zip(sides, folders, strict=True):  # both, before either is touched
         require_own_folder(folder, side, resume=True)
-    require_same_shells(sides)
+    require_same_shells(sides, stored)
     found, rule = _compared(sides, folders, margin, workers, progress or Progress())
     labels = labels or (a.name, b.name)
     statements = [paired_statement(found, *labels), conditional_paired_statement(found)]
@@ -213,12 +214,28 @@ def require_comparable(a: Campaign, b: Campaign) -> None:
         raise CampaignError(where, f"{of_a.get(where)} in A and {of_b.get(where)} in B{more}", expected, mend)
 
 
-def require_same_shells(sides: Both) -> None:
+def require_same_shells(sides: Both, stored: str | Path | None = None) -> None:
     """Refuse vehicles that would not have the same strata of cut-ins."""
     limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
     envelope = sides[0].library.envelope_mps2
     if (limits[0] > envelope) != (limits[1] > envelope):
         found = f"a hardest acceleration of {limits[0]:g} m/s² in A and {limits[1]:g} m/s² in B"
         expected = f"both up to {envelope:g} m/s², the envelope of the surrogate library, or both above"
-        mend = f"Limit both (av.limits.max_acceleration_mps2: {envelope:g}), or neither."
-        raise CampaignError("av", found, expected, mend)
+        raise CampaignError("av", found, expected, _limit_both(sides, int(limits[1] > envelope), stored))
+
+
+def _limit_both(sides: Both, harder: int, stored: str | Path | None) -> str:
+    """How to compare vehicles of which the ``harder`` side accelerates beyond the envelope of the library."""
+    av, envelope = sides[harder].campaign.av, sides[harder].library.envelope_mps2
+    built_in = isinstance(av.parameters, BuiltInParameters)
+    if not built_in and av.controller is None and av.fmu is None:
+        return "Nothing in the harness limits a vehicle that SUMO or a program drives: compare it with another such."
+    key = f"av.{'parameters' if built_in else 'limits'}.max_acceleration_mps2"
+    mend = f"Add --set {key}={envelope:g}, which limits both."
+    if not built_in and "max_acceleration_mps2" not in av.limits.model_fields_set:
+        mend += f" Nobody has limited {SIDES[harder].upper()}: its limit is the default."
+    if stored is not None:
+        mend += (
+            f" The run in {stored} had no such limit: name A's vehicle or campaign instead, so that it is run again."
+        )
+    return mend

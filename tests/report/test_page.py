@@ -179,6 +179,7 @@ def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     message = f"REJECTED: <above> & beyond\\u001b[31m. {CONTENT['statement']}"
     assert all(each.message == message for each in asked.result)
     assert f"[[ATTACHMENT|{report}]]" in asked.system_out
+    assert file.read_text().count("REJECTED") == 1
 
 
 def test_a_gate_never_passes_because_nothing_was_asked():
