@@ -100,8 +100,8 @@ class Within:
     ci_low: float
     ci_high: float
     rhw: Number
-    rhw_from_pool: float
-    rhw_from_pool_at_least: float
+    rhw_from_pool: Number
+    rhw_from_pool_at_least: Number
     n_episodes: int
     n_crashes: int
     n_failed: int
@@ -133,8 +133,8 @@ class ShellDetails:
     """``details`` of the estimate: shells from conservative to aggressive, and the pool that they come from."""
 
     pool: str
-    rhw_from_pool: float
-    rhw_from_pool_at_least: float
+    rhw_from_pool: Number
+    rhw_from_pool_at_least: Number
     p_cut_in: float
     p_impossible: float
     learned: str
@@ -421,13 +421,13 @@ class BesideReference:
     described: str
     delay_s: float | None
     crash_rate: float
-    std_error: float
-    ratio: float
-    ratio_low: float
-    ratio_high: float
-    preventable: float
-    preventable_low: float
-    preventable_high: float
+    std_error: Number
+    ratio: Number
+    ratio_low: Number
+    ratio_high: Number
+    preventable: Number
+    preventable_low: Number
+    preventable_high: Number
 
 
 def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideReference, ...]:

@@ -119,11 +119,12 @@ def _rhw_panel(tests: Axis, n: FloatArray, rhw: FloatArray, target: float | None
 def shells_plot(found: ShownShells) -> Plot:
     """Draw contribution with its limits (left) and half-width (right), from careful to careless."""
     shells, names = found.shells, (*(shell.shell for shell in found.shells), POOL)
-    half_widths = np.array([*(shell.half_width for shell in shells), found.pool_half_width])
+    pool = np.nan_to_num(found.pool_half_width)  # NaN where it is not known: there is no interval then
+    half_widths = np.array([*(shell.half_width for shell in shells), pool])
     # An untested shell may hold anything up to its probability: it would flatten all others, and runs out instead.
     tested = [shell for shell in shells if shell.n_episodes] or list(shells)
     limit = 1.12 * max(shell.high for shell in tested)
-    widest = 1.3 * max(*(shell.half_width for shell in tested), found.pool_half_width)
+    widest = 1.3 * max(*(shell.half_width for shell in tested), pool)
     rows, y = np.arange(len(names)), Axis("", len(names) - 0.4, -0.6, names=names)
     left, right = (
         Panel(title, Axis(f"{label}, per test", 0.0, end), y, height=62.0 + 22.0 * len(names))
@@ -170,6 +171,8 @@ def _source(found: ShownShells) -> str:
 
 
 def _open_question(found: ShownShells, names: tuple[str, ...], half_widths: list[float]) -> str:
+    if math.isnan(found.pool_half_width):
+        return "The pool’s own error is not known: its paths are too few."
     widest = max(half_widths)
     name, most = names[half_widths.index(widest)], share(found.share_of_uncertainty(widest))
     if name == POOL:

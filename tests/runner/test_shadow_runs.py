@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -13,6 +14,7 @@ from harness import estimate, replay
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.pool.shells import CANDIDATES
 from harness.records.schemas import baseline_schema
+from harness.report.page import write_report
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.conftest import SHELLS
@@ -171,6 +173,18 @@ def test_tests_that_do_not_say_which_runs_they_repeat_have_the_bound_of_the_erro
     assert former["ci_low"] == pytest.approx(now["ci_low"], rel=1e-3)  # so few crashes tell no better than the bound
     least = [of["details"]["rhw_from_pool_at_least"] for of in (former, now)]
     assert least[0] > 1.5 * least[1]
+
+
+def test_a_page_is_written_where_so_few_paths_crashed_that_the_pool_s_error_is_not_known(stored_run, tmp_path):
+    folder = copy_of(stored_run(ACTS), tmp_path / "run")
+    content = estimates(folder)["estimates"]
+    details = content["shells"]["details"]
+    for part in (details, *details["statements"]):
+        part.update(rhw_from_pool=None, rhw_from_pool_at_least=None)
+    edit(folder, "estimates.json", estimates=content)
+    page = write_report(folder).read_text()
+    assert "pool’s own error is not known" in page
+    assert "nan" not in set(re.findall(r"[a-z]+", (folder / "plots" / "shells.svg").read_text().lower()))
 
 
 def test_a_vehicle_that_ends_its_process_in_a_shadow_run_fails_there(campaign, run, tmp_path):
