@@ -163,9 +163,9 @@ def _whence(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | No
     whole, runs = best.rhw, best.details.get("rhw_from_pool", math.inf)
     if not (math.isfinite(whole) and math.isfinite(runs)):
         return
-    which = "baseline runs" if 2.0 * runs * runs > whole * whole else "tests"
+    which = "runs" if 2.0 * runs * runs > whole * whole else "tests"
     remark = "" if expected is None else f"try {count(expected['runs'])} runs, {count(expected['tests'])} tests"
-    alone = f"{count(campaign.pool.shadow_paths)} runs alone ± {share(runs)}"
+    alone = f"{count(campaign.pool.shadow_paths)} baseline runs ± {share(runs)}"
     yield Row("width", "half-width", f"± {share(whole)}, most by {which}", alone, remark)
 
 
@@ -190,8 +190,8 @@ def _decided(decision: Mapping[str, Any]) -> Row:
 def _beside(found: Mapping[str, Any], at_least: str, *, acts: bool) -> Row:
     low, high = found["ratio_low"], found["ratio_high"]
     who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
-    if acts:  # it takes over in the vehicle's own motion: what making room saves is not in the ratio
-        who = f"{found['reference']} from its own approach"
+    if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
+        who = f"{found['reference']}, same approach"
     if not found["ratio"]:
         return Row("ratio", "× competent driver", f"< {ratio(high)}", "no crash seen", who)
     apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"

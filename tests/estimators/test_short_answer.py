@@ -33,7 +33,7 @@ SAID = {
         "ended by: all tests done",
     ],
     "shells-need-based": ["need-based · ", "keeping to need-based "],
-    "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc from its own approach"],
+    "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc, same approach"],
     "forced-inattentive": ["fvdm (reaction.delay_s 0.2, "],
     "forced-krauss": ["SUMO’s Krauss · 240 tests in SUMO"],
     "shells-lateral-twin": ["idm · 240 tests"],
@@ -144,14 +144,14 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
 @pytest.mark.parametrize(
     ("alone", "expected", "row"),
     [
-        (0.4, {"runs": 1300, "tests": 240}, ("± 50 %, most by baseline runs", "± 40 %", "try 1,300 runs, 240 tests")),
+        (0.4, {"runs": 1300, "tests": 240}, ("± 50 %, most by runs", "± 40 %", "try 1,300 runs, 240 tests")),
         (0.1, None, ("± 50 %, most by tests", "± 10 %", "")),
     ],
 )
 def test_of_a_vehicle_that_acts_it_says_whether_runs_or_tests_are_missing(alone, expected, row):
     campaign = golden("shells-acting-twin")
     [found] = _whence(campaign, SimpleNamespace(rhw=0.5, details={"rhw_from_pool": alone}), expected)
-    runs = f"{campaign.pool.shadow_paths:,} runs alone {row[1]}"
+    runs = f"{campaign.pool.shadow_paths:,} baseline runs {row[1]}"
     assert (found.value, found.interval, found.remark) == (row[0], runs, row[2])
 
 
