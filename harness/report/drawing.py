@@ -119,9 +119,10 @@ class Panel:
     def svg(self) -> Markup:
         """The panel as an SVG element that is as wide as its place."""
         legend = list(self._legend())
-        top = 20.0 + LINE * (1 + max((row for _, row, _ in legend), default=-1))
-        left = AXIS if not self.y.names else 14.0 + 1.05 * CHARACTER * max(map(len, self.y.names))
-        width, height = WIDTH - left - RIGHT, self.height - top - BOTTOM
+        rows = 1 + max((row for _, row, _ in legend), default=-1)
+        top = 20.0 + LINE * rows + (8.0 if rows else 0.0)  # below it the uppermost tick reaches over the axes
+        left, width = self._left, WIDTH - self._left - RIGHT
+        height = self.height - top - BOTTOM
         bottom, middle = top + height, left + width / 2.0
         parts = [f'<text y="12" style="fill:var(--ink);font-weight:600">{escape(self.title)}</text>']
         for mark, row, x in legend:
@@ -144,6 +145,14 @@ class Panel:
         parts.append(f'<text {turned} class="mid">{escape(self.y.title)}</text>' if self.y.label else "")
         head = f'<svg viewBox="0 0 {WIDTH:.0f} {self.height:.0f}" aria-hidden="true" class="panel">'
         return Markup(f"{head}{''.join(parts)}</svg>")  # noqa: S704 - every text in it is escaped
+
+    @property
+    def _left(self) -> float:
+        return AXIS if not self.y.names else 14.0 + 1.05 * CHARACTER * max(map(len, self.y.names))
+
+    def room_before(self, label: str) -> float:
+        """Share of the width that a text at the right edge leaves free; below 0 where it is too long."""
+        return 1.0 - (CHARACTER * len(label) + 8.0) / (WIDTH - self._left - RIGHT)
 
     def _legend(self) -> Iterator[tuple[Mark, int, float]]:
         """Marks with a label, in which row and where in it they stand."""

@@ -65,7 +65,7 @@
       others = scene.ghosts;
       first = scene.first * STEP;
       end = Math.max(first + STEP, ...[...scene.tracks, ...others].map(last));
-      [...pick.children].forEach((each, i) => set(each, { "aria-pressed": i === index }));
+      pick.querySelectorAll("button").forEach((each, i) => set(each, { "aria-pressed": i === index }));
       title.textContent = scene.title;
       set(slider, { min: scene.first, max: Math.round(end / STEP) });
       jumps.replaceChildren();
@@ -95,7 +95,7 @@
       scale = width / clamp(ahead + behind + 2 * LENGTH + 8, 40, 100);
       anchor = Math.min((behind + LENGTH + 3) * scale, width / 2);
       const [lane, w, l] = [LANE, WIDTH, LENGTH].map((each) => each * scale);
-      const top = 8, low = top + 2 * lane, height = low + 36;
+      const top = 18, low = top + 2 * lane, height = low + 36;
       view.replaceChildren();
       set(view, { viewBox: `0 0 ${width} ${height}`, height });
       add(view, "rect", { class: "asphalt", y: top, width, height: 2 * lane });
@@ -187,7 +187,7 @@
         show(label, seen && (ghost >= 0 || ahead));
         const name = `${x < 8 ? "◂ " : ""}${called(track)}${crashed ? " crashed" : ""}`;
         label.textContent = ahead ? `${name} ${far} m ▸` : name;
-        const height = ghost < 0 ? y + (track === tracks.LV ? -4 : 11) : low + 18 + 14 * ghost;
+        const height = ghost >= 0 ? low + 18 + 14 * ghost : track === tracks.LV ? top - 5 : y + 11;
         const from = ahead ? width - 6 : clamp(rear, 4, width - 130);
         set(label, { x: from, y: height, "text-anchor": ahead ? "end" : "start" });
       }
@@ -240,6 +240,7 @@
     };
     button.onclick = keys[" "];
     slider.oninput = () => go(slider.value * STEP, true);
+    add(pick, "span", { class: "small" }, "Crash in episode");
     if (scenes.length < 2) pick.remove();
     scenes.forEach((each, i) => { add(pick, "button", { title: each.title }, each.episode).onclick = () => load(i); });
     document.addEventListener("click", ({ target }) => target.dataset.scene && load(+target.dataset.scene));

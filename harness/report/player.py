@@ -223,9 +223,10 @@ def _ending(track: Scene, bv: Scene, scene: Scene) -> str:
     if crash is None:
         places = range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
         closest, end = min(_gap(track, bv, place) for place in places), places[-1]
+        gap = f"{tenths(closest)} m" if closest >= 0.05 else "< 0.1 m"
         if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:
-            return f"no crash until the test ends, {tenths(closest)} m behind BV and still {tenths(rate)} m/s faster"
-        return f"avoids it, {tenths(closest)} m at the closest"
+            return f"no crash until the test ends, {gap} behind BV and still {tenths(rate)} m/s faster"
+        return f"avoids it, {gap} at the closest"
     v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
     from_the_side = scene["onset"] < cut and crash == cut + 1
     who = "BV strikes it from the side" if from_the_side else "strikes BV from behind"

@@ -147,18 +147,20 @@ def shells_plot(found: ShownShells) -> Plot:
         right.add("text", "muted", min(width, widest / 1.3), row, label=text)
     for each in found.statements:
         if (boundary := each.n_shells - 0.5) < len(shells) - 0.5:
-            for panel in (left, right):
-                panel.add("line", "muted", [0.0, panel.x.high], [boundary] * 2, dash=DASHED, width=1.0)
-            left.add("text", "muted", limit, boundary, label=f"outside {each.boundary} ({each.name}) ↓")
+            label = f"outside {each.boundary} ({each.name}) ↓"
+            for panel, end in ((left, limit * max(left.room_before(label), 0.0)), (right, right.x.high)):
+                panel.add("line", "muted", [0.0, end], [boundary] * 2, dash=DASHED, width=1.0)
+            left.add("text", "muted", limit, boundary, label=label)
     source, open_question = _source(found), _open_question(found, names, half_widths.tolist())
     alt = (
         f"Bars per shell from {shells[0].shell} to {shells[-1].shell}: contribution to the crash rate with limits, and "
         f"half-width. {source} {open_question}"
     )
+    orange = " (orange outside every boundary)" if (rate[~inside] > 0.0).any() else ""
     caption = (
-        "From careful (top) to careless. The rate: what each shell adds, with its limits (orange outside every "
-        f"boundary). {source} The uncertainty: probability × half-width of the crash share, and its share of the sum "
-        f"of squares, which makes the interval. {open_question}"
+        f"From careful (top) to careless. The rate: what each shell adds, with its limits{orange}. {source} The "
+        "uncertainty: probability × half-width of the crash share, and its share of the sum of squares, which makes "
+        f"the interval. {open_question}"
     )
     return Plot("shells", [left, right], alt, caption)
 
@@ -210,7 +212,7 @@ def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | N
         panel.add("line", colour, gaps, speeds, dash=dash, label=f"{name}’s limit")
     text = (
         f"Each of {count(cut_in.sum())} cut-ins by its gap and closing speed; {count(crash.sum())} of them crashed. "
-        "White: not tested."
+        "Where no cell is drawn, nothing was tested."
     )
     if lines:
         text += (

@@ -107,6 +107,7 @@ def test_of_a_vehicle_that_acts_nobody_knows_without_its_motion(stored_run):
     assert (Scenes(campaign, None).ends(rows, stored_table(folder, "traces")) == UNKNOWN).all()
 
 
+AVOIDED = "crash {} that r157-cc would have avoided"
 NOBODY, BRAKES, BOTH = (30, 30), (30, -1), (-1, -1)
 
 
@@ -115,7 +116,7 @@ NOBODY, BRAKES, BOTH = (30, 30), (30, -1), (-1, -1)
     [
         (
             {1: BOTH, 3: BRAKES, 4: BOTH},
-            ["avoided by r157-cc no. 1", "avoided by r157-cc no. 2", "hardest avoidable no. 2"],
+            [AVOIDED.format(1), AVOIDED.format(2), "hardest avoidable no. 2"],
         ),
         ({5: BRAKES}, ["hardest avoidable no. 1, typical no. 1, weight no. 1"]),
         ({}, ["hardest no. 1", "hardest no. 2", "hardest no. 3"]),
@@ -140,7 +141,7 @@ def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_n
     avoided = {allowed[i]: words[end] for i, end in enumerate(who.values())}
     assert [row.avoided_by for row in rows] == [avoided.get(episode, "nobody") for episode in shown]
     assert [scene["episode"] for scene in scenes] == shown
-    hardest = [row.crash["impact_speed_mps"] for row in rows if row.reason.startswith("avoided")]
+    hardest = [row.crash["impact_speed_mps"] for row in rows if row.reason.startswith("crash")]
     assert hardest == sorted(hardest, reverse=True)
 
 
@@ -202,10 +203,15 @@ def test_a_crash_that_was_not_traced_is_listed_without_a_scene(reports):
 
 
 @pytest.mark.parametrize(
-    ("speed", "said"), [(21.0, "no crash until the test ends, 1.5 m behind BV and still 1.0 m/s"), (20.0, "avoids it")]
+    ("speed", "ahead", "said"),
+    [
+        (21.0, 7.0, "no crash until the test ends, 1.5 m behind BV and still 1.0 m/s"),
+        (20.0, 7.0, "avoids it, 2.0 m at"),
+        (20.0, 5.02, "avoids it, < 0.1 m at"),
+    ],
 )
-def test_a_test_that_ends_while_the_vehicle_closes_in_has_avoided_nothing(speed, said):
+def test_a_test_that_ends_while_the_vehicle_closes_in_has_avoided_nothing(speed, ahead, said):
     time_s = np.arange(6) / 10
-    bv = {"x": 7.0 + 20.0 * time_s, "v": np.full(6, 20.0)}
+    bv = {"x": ahead + 20.0 * time_s, "v": np.full(6, 20.0)}
     av = {"x": speed * time_s, "v": np.full(6, speed), "crash": None}
     assert player._ending(av, bv, {"first": 0, "cut_in": 0, "onset": 0}).startswith(said)
