@@ -80,6 +80,19 @@ def test_recipes_of_the_same_controller_are_the_same_vehicle_and_all_others_run(
         assert rows == per_vehicle
 
 
+def test_the_vehicle_that_makes_room_is_asked_from_the_first_step_on(tmp_path, monkeypatch, capsys):
+    page = (ROOT / "docs/acting-vehicles.md").read_text("utf-8")
+    monkeypatch.chdir(tmp_path)
+    (text,) = re.findall(r"^```py\n# room.py\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    Path("room.py").write_text(text, encoding="utf-8")
+    (command,) = re.findall(r"^harness run (room.py:.*?)  ", page, re.MULTILINE)
+    asked = {}
+    for options in (command.split(), command.split()[:1]):
+        assert main(["av-check", *options, "--episodes", "20", "--json"]) == 0
+        asked[len(options)] = json.loads(capsys.readouterr().out)
+    assert len({json.dumps(each["behaviour"]) for each in asked.values()}) == 2
+
+
 @pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md"])
 def test_the_first_vehicle_of_a_new_user_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
