@@ -227,10 +227,7 @@ def av_check(
     if as_json:
         print_json(found.to_json())
     else:
-        values = dict(leaves(found.to_json()))
-        of_idm = {name: values.pop(f"idm_{name}", "") for name in tuple(values) if not name.startswith("idm_")}
-        rows = [{"what": name, "found": value, "built-in IDM": of_idm[name]} for name, value in values.items()]
-        print_table("What the AV is like", rows)
+        print_table("What the AV is like", found.rows)
         say(found.verdict)
     ctx.exit(found.exit_code)
 

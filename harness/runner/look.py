@@ -58,6 +58,21 @@ class Behaviour:
     n_crashes: int
 
 
+IN_WORDS = {
+    "mean_acceleration_mps2": "mean acceleration, m/s²",
+    "min_acceleration_mps2": "hardest braking, m/s²",
+    "max_acceleration_mps2": "hardest acceleration, m/s²",
+    "share_at_min": "share of steps at its hardest allowed braking",
+    "share_at_max": "share of steps at its hardest allowed acceleration",
+    "reaction_s": "from the onset of a cut-in to the first braking, median, s",
+    "braking_share": "share of cut-ins after which it braked",
+    "n_cut_ins": "cut-ins",
+    "n_crashes": "crashes (no rate: cut-ins are forced)",
+    "us_per_step": "time per step, µs",
+    "episodes_per_s": "tests per second",
+}
+
+
 @dataclass(frozen=True)
 class Speed:
     """Time per episode step, and episodes per second."""
@@ -107,8 +122,25 @@ class AvCheck:
         slower = self.speed.us_per_step / self.idm_speed.us_per_step
         return (
             f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_cut_ins} "
-            f"cut-ins, {seen.reaction_s:.1f} s after they began (median); a step takes {slower:.1f} times that of IDM."
+            f"cut-ins, {seen.reaction_s:.1f} s after they began (median, also where it had no need to brake sooner); "
+            f"a step takes {slower:.1f} times that of IDM."
         )
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """A table for people: what was found, beside the built-in IDM."""
+        found = self.to_json()
+        own, idm = ({**found[f"{who}behaviour"], **found[f"{who}speed"]} for who in ("", "idm_"))
+        lowest, highest = found["limits_mps2"]
+        rows = [
+            ("kind of vehicle, engine, method", f"{self.source}, {self.engine}, {self.method}", ""),
+            ("tests", self.n_episodes, ""),
+            *((f"failed: {cause}", n, "") for cause, n in (found["failures"] or {"none": 0}).items()),
+            ("tests that came out otherwise", found["differing"] or "none", ""),
+            ("accelerations allowed, m/s²", [lowest, highest], ""),
+            *((text, own[name], idm[name]) for name, text in IN_WORDS.items()),
+        ]
+        return [{"what": text, "found": value, "built-in IDM": of_idm} for text, value, of_idm in rows]
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON content; undefined numbers become null."""

@@ -125,8 +125,11 @@ def test_the_command_line(capfd):
     out = capfd.readouterr().out
     assert re.search(r"built-in IDM +[│┃]\n", out)
     assert re.match(r"READY: 6 tests twice, the same bits; it braked after \d+% of \d+ cut-ins", out.splitlines()[-1])
-    (mean,) = re.findall(r"behaviour.mean_acceleration_mps2 +│ +(\S+) +│ +(\S+) +│", out)
+    (mean,) = re.findall(r"mean acceleration, m/s² +│ +(\S+) +│ +(\S+) +│", out)
     assert mean[0] == mean[1]  # it is the built-in IDM
+    assert "failed: none" in out
+    assert "_" not in out
+    assert "{}" not in out
     assert main([*call, "--json"]) == 0
     assert json.loads(capfd.readouterr().out)["deterministic"] is True
     assert main([*call, "--set", "av={}", "--set", "av.controller=not_there:X"]) == 2
