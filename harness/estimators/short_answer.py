@@ -1,4 +1,4 @@
-"""The answer at a glance: at most nine lines for a terminal, and the same rows for the first screen of the page."""
+"""The answer at a glance: some nine lines for a terminal, and the same rows for the first screen of the page."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ENDED = {
     "rhw": "precision reached",
     "accept": "decision reached",
     "episodes": "budget spent",
-    "pool": "no cut-in of the pool is left",
+    "pool": "every cut-in of the pool was tested",
     "contradicted": "vehicle does not do what the statement assumes",
     "pool_error": "the pool’s own error is too wide",
     "open": "budget spent before the margin was decided",
@@ -130,27 +130,30 @@ def _rows(
     value = f"{number(shown)} per test"
     if not best.n_crashes:
         shown, ends, value = best.upper_bound, "no crash seen", f"< {number(best.upper_bound)} per test"
-    per_km = "" if not distance_km else f"{number(shown * 1e6 / distance_km)} per million km"
+    less = "" if best.n_crashes else "< "
+    per_km = "" if not distance_km else f"{less}{number(shown * 1e6 / distance_km)} per million km"
     untested = any(each["p"] > 0.0 and not each["n_episodes"] for each in best.details.get("shells", ()))
-    if untested and best.n_crashes:
-        value, per_km = f"≥ {value}", "counts none where not tested"
-    yield Row("rate", counted, value, ends, per_km)
-    for each in best.details.get("references", ())[:1]:
-        if each["crash_rate"] > 0.0:
-            yield _beside(each, at_least="≥ " if untested else "", acts=campaign.av.acts_before_cut_in)
+    # A shell without tests adds nothing to the rate, and all of its probability to the upper limit.
+    so_far = " so far" if untested and best.n_crashes else ""
+    yield Row("rate", f"{counted}{so_far}", value, ends, per_km)
+    beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0]
+    for each in beside[:1]:
+        yield _beside(each, acts=campaign.av.acts_before_cut_in)
+    if not beside and campaign.has_baseline_runs and not best.cautions:
+        yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
     if campaign.has_baseline_runs and best.n_crashes:
         yield from _whence(campaign, best, manifest.get("expected"))
     if severity is not None:
-        there = " where tested" if untested else ""
         above = _share_within(severity.share_above_5_mps, severity.limits_above_5_mps)
         below = _share_within(severity.share_below_1_mps, severity.limits_below_1_mps)
-        value = f"median {tenths(severity.median_mps)} m/s{there}"
-        yield Row("impact", "impact", value, f"{above} > {plain(HARD_MPS)} m/s", f"{below} < {plain(TOUCH_MPS)} m/s")
+        value = f"median {tenths(severity.median_mps)} m/s"
+        what = f"impact{so_far}"
+        yield Row("impact", what, value, f"{above} > {plain(HARD_MPS)} m/s", f"{below} < {plain(TOUCH_MPS)} m/s")
         if (of := severity.unavoidable) is not None:
             hardest = of.driver == _BRAKES_HARDEST
             why = "not even 8 m/s² avoids it" if hardest else f"{of.driver} crashes there, too"
             ends = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}"
-            yield Row("unavoidable", "unavoidable", f"{share(of.share)} of the rate{there}", ends, why)
+            yield Row("unavoidable", f"unavoidable{so_far}", f"{share(of.share)} of the rate", ends, why)
     asked = campaign.testing.shells.statement
     statements = best.details.get("statements", ())
     chosen = [each for each in statements if each["name"] == asked] or statements
@@ -187,7 +190,7 @@ def _decided(decision: Mapping[str, Any]) -> Row:
     return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
 
 
-def _beside(found: Mapping[str, Any], at_least: str, *, acts: bool) -> Row:
+def _beside(found: Mapping[str, Any], *, acts: bool) -> Row:
     low, high = found["ratio_low"], found["ratio_high"]
     who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
     if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
@@ -195,8 +198,9 @@ def _beside(found: Mapping[str, Any], at_least: str, *, acts: bool) -> Row:
     if not found["ratio"]:
         return Row("ratio", "× competent driver", f"< {ratio(high)}", "no crash seen", who)
     apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
-    value = f"{at_least}{ratio(found['ratio'])} ({apart})"
-    return Row("ratio", "× competent driver", value, f"{ratio(low)} to {ratio(high)}", who)
+    return Row(
+        "ratio", "× competent driver", f"{ratio(found['ratio'])} ({apart})", f"{ratio(low)} to {ratio(high)}", who
+    )
 
 
 def _within(found: Mapping[str, Any]) -> Row:
@@ -204,7 +208,7 @@ def _within(found: Mapping[str, Any]) -> Row:
     what = f"keeping to {name}"
     if found["refuted"]:
         return Row("within", what, "does NOT keep to it", "", f"{count(n)} crashes in {outside} beyond it")
-    beyond = f"no crash in {outside} beyond it" if found["n_episodes_outside"] else "nothing was tested beyond"
+    beyond = f"no crash in {outside} beyond it" if found["n_episodes_outside"] else "nothing tested beyond it"
     if found["n_ahead"]:
         beyond = f"NOT KEPT TO in {count(found['n_ahead'])} of {count(found['n_checked'])} tests"
     if not found["n_crashes"]:
@@ -243,17 +247,22 @@ def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None) -> str:
         asked = best.precision
         for each in best.details.get("statements", ()):
             asked = each["rhw"] if each["name"] == campaign.testing.shells.statement else asked
-        reached = f"± {share(asked)}" if asked <= WIDEST_RHW else "with next to nothing known"
-        ended += f" {reached}, asked: ± {share(target)}"
+        reached = f" ± {share(asked)}" if asked <= WIDEST_RHW else f" at over ± {share(WIDEST_RHW)}"
+        if not best.n_crashes or best.cautions:
+            reached = ", precision not known" if best.n_crashes else ", no crash seen"
+        ended += f"{reached}, asked: ± {share(target)}"
+        if stopped_by == "pool":
+            ended += "; raise pool.cut_ins_per_shell"
     elif stopped_by == "episodes" and campaign.accept is None:
         ended = "all tests done"
     return f"sampling error in this simulated traffic only ({share(best.confidence)}); ended by: {ended}"
 
 
 def lines(answer: Mapping[str, Any], took_s: float | None, report: Path | None = None) -> list[str]:
-    """An answer (``answer`` in ``estimates.json``) for a terminal: at most `LINES` lines of `WIDTH` columns.
+    """An answer (``answer`` in ``estimates.json``) for a terminal: at most `LINES` lines.
 
-    Where there is much to warn of the last rows give way: all of it is on the page.
+    Those of more than `WIDTH` columns go on below. Where there is much to warn of the last rows give way: all of it is
+    on the page.
     """
     warnings = [f"! {text}" for text in answer["warnings"]]
     if len(warnings) > MOST_WARNINGS:
@@ -266,18 +275,27 @@ def lines(answer: Mapping[str, Any], took_s: float | None, report: Path | None =
         room = WIDTH - len(" · ".join(head)) - 3
         head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
     table = _columns([(row["what"], row["value"], row["interval"], row["remark"]) for row in rows])
-    return [" · ".join(head), *_cut([*table, *warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+    return [" · ".join(head), *table, *_wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
 
 
-def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Rows of equally many texts, each column as wide as its widest."""
+def _columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Rows of equally many texts, each column as wide as its widest; a row too long for that is pushed together."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
+    for row in rows:
+        *others, last = (text.ljust(width) for text, width in zip(row, widths, strict=True))
+        left, remark = "  ".join(["", *others]).rstrip(), last.rstrip()
+        line = "  ".join(["", *others, remark]).rstrip()
+        if len(line) > WIDTH:
+            line = f"{left}  {remark:>{max(WIDTH - 2 - len(left), 0)}}"
+        yield from [line] if len(line) <= WIDTH else _wrapped(["  ".join(filter(None, row))])
 
 
-def _cut(texts: Iterable[str]) -> Iterator[str]:
-    lines = (f"  {text.rstrip()}" for text in texts)
-    return (line if len(line) <= WIDTH else f"{line[: WIDTH - 2]} …" for line in lines)
+def _wrapped(texts: Iterable[str]) -> Iterator[str]:
+    """Lines of at most `WIDTH` columns, which begin after two spaces and go on after four."""
+    fill = textwrap.TextWrapper(WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
+    for text in texts:
+        whole = text.replace(" %", "\u00a0%").replace("± ", "±\u00a0")  # a number and its sign stay together
+        yield from (line.replace("\u00a0", " ") for line in fill.wrap(whole))
 
 
 def verdict_of_pair(found: Mapping[str, Any], margin: Mapping[str, Any] | None) -> str:
@@ -329,4 +347,4 @@ def pair_lines(content: Mapping[str, Any], counts_above_mps: float, report: Path
     counted = f" above {plain(counts_above_mps)} m/s" if counts_above_mps else ""
     pairs = f"{count(content['n_pairs'])} pairs on the same cut-ins"
     head = f"{verdict_of_pair(asked, content['margin'])} · {pairs} · crashes{counted} per test"
-    return [head, *_cut([*_columns(rows), *remarks[:2], scope]), f"  report  {report}"]
+    return [head, *_columns(rows), *_wrapped([*remarks[:2], scope]), f"  report  {report}"]

@@ -74,9 +74,10 @@ def estimate_in_other_traffic(
     told: dict[str, Any] = {key: manifest[key] for key in ("retraced", "repeated") if key in manifest}
     told |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_per_test_m(there.environment)}
     content = estimate_blocks(blocks, there.campaign, told, estimators=["shells"], confidence=confidence)
-    drivers = " and ".join(each.name for each in tested.references) or "no driver known"
+    drivers = " and ".join(each.name for each in tested.references)
+    known = f" (off by {share(off, least=0.001)} for {drivers})" if drivers else ""
     was, now = (Path(each).stem for each in (campaign.environment.parameters, environment))
-    words = f"tests of {was}, answered for {now}: crash shares within shells as there ({drivers}: ± {share(off)})"
+    words = f"tests of {was}, answered for {now}: holds if as large a share of each shell crashes as there{known}"
     answer = {**content["answer"], "scope": words}
     return {**content, "answer": answer, "scope": f"{content['scope']} {words[:1].upper()}{words[1:]}."}
 
