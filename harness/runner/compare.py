@@ -81,13 +81,13 @@ def compare_campaigns(
     """
     require_comparable(a, b)
     sides = require_ready(a, "compare"), require_ready(b, "compare")
+    require_same_shells(sides, stored)
     out = Path(out)
     folders = out / "a", out / "b"
     if stored is not None:
         _take_over(Path(stored), folders[0], sides[0])
     for side, folder in zip(sides, folders, strict=True):  # both, before either is touched
         require_own_folder(folder, side, resume=True)
-    require_same_shells(sides, stored)
     found, rule = _compared(sides, folders, margin, workers, progress or Progress())
     labels = labels or (a.name, b.name)
     statements = [paired_statement(found, *labels), conditional_paired_statement(found)]
@@ -231,6 +231,8 @@ def _limit_both(sides: Both, harder: int, stored: str | Path | None) -> str:
     if not built_in and av.controller is None and av.fmu is None:
         return "Nothing in the harness limits a vehicle that SUMO or a program drives: compare it with another such."
     key = f"av.{'parameters' if built_in else 'limits'}.max_acceleration_mps2"
+    if stored is not None and harder:
+        return f"Add --against {key}={envelope:g}, which limits B."
     mend = f"Add --set {key}={envelope:g}, which limits both."
     if not built_in and "max_acceleration_mps2" not in av.limits.model_fields_set:
         mend += f" Nobody has limited {SIDES[harder].upper()}: its limit is the default."
