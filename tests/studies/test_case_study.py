@@ -1,6 +1,7 @@
 """The study as a user runs it: made once, resumed, refused where it is wrong, and every number of its page traced."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,12 @@ def made(study):
         name: Made(place := folder / "steps" / f"{name}-{key}", json.loads((place / "result.json").read_text()))
         for name, key in keys.items()
     }
+
+
+def test_without_the_extra_its_locked_installation_is_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "studies.case_study.steps", None)
+    assert main(["case", str(SHIPPED), "--out", str(tmp_path / "case")]) == 2
+    assert "pip install -c requirements.lock -e '.[studies]'" in capsys.readouterr().err
 
 
 def test_a_second_run_changes_nothing(study, capsys):
