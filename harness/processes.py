@@ -286,6 +286,7 @@ class Forked:
     def __init__(self, server: Child, pid: int) -> None:
         self._server, self.pid = server, pid
         self._exit_code: int | None = None
+        self._is_orphan = False
 
     def poll(self) -> int | None:
         """Its exit code; None while it runs."""
@@ -294,8 +295,17 @@ class Forked:
                 self._server.connection.send(self.pid)
                 self._exit_code = self._server.connection.recv()
             except (EOFError, OSError):
-                self._exit_code = -signal.SIGKILL  # its server has been killed, and it ends with that
+                self._exit_code, self._is_orphan = -signal.SIGKILL, True  # its server was killed, and it ends with that
         return self._exit_code
+
+    def let_end(self) -> None:
+        """Give an orphan the time to end what it has started in further sessions: nobody else could."""
+        self.poll()
+        until = time.monotonic() + LOOK_S + _ENDING_S
+        with suppress(ProcessLookupError):
+            while self._is_orphan and time.monotonic() < until:
+                os.kill(self.pid, 0)
+                time.sleep(_POLL_S)
 
     def wait(self, timeout: float = math.inf) -> int:
         """Its exit code, once it has ended; `subprocess.TimeoutExpired` if it does not."""
@@ -404,6 +414,8 @@ def worker_modules(engine: str) -> tuple[str, ...]:
 
 def end(process: subprocess.Popen[bytes] | Forked) -> int:
     """End a process that leads a session, with everything that it has started; returns its exit code."""
+    if isinstance(process, Forked):
+        process.let_end()
     with suppress(ProcessLookupError, PermissionError):  # there is nobody left
         os.killpg(process.pid, signal.SIGKILL)
     return process.wait()
