@@ -28,7 +28,7 @@ from harness.numbers import (
     tenths,
     words,
 )
-from harness.strata import ASSUMPTION_FREE
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
 WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
@@ -311,7 +311,7 @@ def verdict_of_pair(found: Mapping[str, Any], margin: Mapping[str, Any] | None) 
 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
     """What lies between A and B under the statement that the comparison (``compare.json``) was asked for."""
-    given = content.get("asked") == "library" and not content["conditional"].get("refuted")
+    given = content.get("asked") == LIBRARY_STATEMENT and not content["conditional"].get("refuted")
     asked: Mapping[str, Any] = content["conditional"] if given else content
     return asked
 

@@ -65,7 +65,6 @@ class Following(NamedTuple):
     """
 
     shadow: IntArray
-
     first: IntArray
     last: IntArray
     x_av: FloatArray

@@ -41,7 +41,7 @@ from harness.vocabulary import FloatArray, IntArray, RecordArray
 EVENLY = 0.1
 """Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
 LEAST_LEARNED = 0.05
-"""Share of the learned surrogate's crash rate beyond the boundaries from which on it has a shell there."""
+"""Share of the learned surrogate's crash rate beyond the boundaries from which on it has a shell there [assumed]."""
 CHOICE_DRAW = 2
 """Draw of a baseline run within the diagnostic stream."""
 

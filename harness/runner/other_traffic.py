@@ -33,11 +33,11 @@ from harness.strata import ShellDesign
 from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray
 
 MOST_BEYOND = 0.01
-"""Share of the probability in a shell, counted as it crashes, that may lie where no cut-in of the old pool does."""
+"""Share of the probability in a shell, as it crashes, that may lie where no cut-in of the old pool does [assumed]."""
 SAME_POOL = 0.05
-"""How far a pool that another version has built may differ."""
+"""How far a pool that another version has built may differ [assumed]."""
 MOST_OFF = 0.1
-"""How far the rate of a reference driver may come out wrong."""
+"""How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
 _OPTION = "--environment"
 
 
