@@ -60,7 +60,8 @@ class Asked(NamedTuple):
 
 def asked(method: Method, n: int) -> Asked:
     """Tests of the default AV in the twin, and what surrogates would have done in them."""
-    campaign = Campaign.model_validate({"name": "alarm", "seed": SEED, "testing": {"method": method}})
+    content = {"environment": {"parameters": "ndd-overtaking-1"}, "testing": {"method": method}}
+    campaign = Campaign.model_validate({"name": "alarm", "seed": SEED, **content})
     ready, pool = prepare(resolve(campaign)), campaign_pool(resolve(campaign))
     table = episodes_table(ready.loop(TwinWorld(256)).run(0, ready.states(0, n)), SEED)
     block = block_from_tables(table, None, method=method, alpha=mixture_weights(campaign))

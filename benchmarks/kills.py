@@ -32,7 +32,7 @@ from benchmarks.contenders import SCENARIOS
 from benchmarks.ray_nodes import Nodes, missing
 from harness.records.folder import TABLES
 
-METHODS = {"forced": "overtaking_forced", "step_mixture": "overtaking_nade", "shells": "smoke"}
+METHODS = {"forced": "overtaking_forced", "step_mixture": "overtaking_nade", "shells": "overtaking_shells"}
 """Method and its scenario."""
 SETTINGS = ("world.engine=twin", "world.cells=64", "stop.rhw=null", "run.shard_size=500", "records.trace_share=0.01")
 LONGEST_WAIT_S = 600.0
@@ -195,7 +195,7 @@ def struck_command(name: str, folder: Path, run: Path, chance: random.Random, ki
         work, temporary, left = folder / side / "work", folder / side / "tmp", kills if side == "killed" else 0
         temporary.mkdir(parents=True)
         shutil.copytree(run, work) if name in ("estimate", "report") else work.mkdir()
-        words = COMMANDS[name].format(scenario=SCENARIOS / "smoke.yaml", work=work.name).split()
+        words = COMMANDS[name].format(scenario=SCENARIOS / "overtaking_shells.yaml", work=work.name).split()
         cache = {"HARNESS_CACHE_DIR": str(folder / side / "cache")} if name == "pool" else {}
         environment = {**os.environ, "TMPDIR": str(temporary), **cache}
         while True:

@@ -3,7 +3,7 @@
     python -m benchmarks.lateral_rates                          the table, some minutes
     python -m benchmarks.lateral_rates --paths 65536 --plot docs/images/lateral-ratio.png
 
-The same numbers, one lead at a time, to a relative error: harness pool scenarios/smoke.yaml
+The same numbers, one lead at a time, to a relative error: harness pool scenarios/overtaking_shells.yaml
 --set pool.library=benchmarks/lateral_rows.yaml --set environment.cut_in_lead_s=1.0
 """
 
@@ -25,7 +25,7 @@ from harness.vehicles.library import load_library
 LIBRARY = Path(__file__).parent / "lateral_rows.yaml"
 PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
 ENVIRONMENTS = {
-    **{f"{lead:g} s": EnvironmentSettings(cut_in_lead_s=lead) for lead in (0.0, 0.5, 1.0, 1.5, 2.0)},
+    **{f"{lead:g} s": EnvironmentSettings(parameters=PAPER, cut_in_lead_s=lead) for lead in (0.0, 0.5, 1.0, 1.5, 2.0)},
     "log-normal": EnvironmentSettings(parameters=LATERAL),
     "one step": EnvironmentSettings(parameters=PAPER),
 }

@@ -1,6 +1,6 @@
 """Which traffic a crash rate comes from: the figures of docs/limits.md, from a run of method shells.
 
-    harness run scenarios/smoke.yaml --out runs/limits --set world.engine=twin --set stop.rhw=null \
+    harness run scenarios/overtaking_shells.yaml --out runs/limits --set world.engine=twin --set stop.rhw=null \
         --set stop.min_crashes=null --set stop.episodes=40000 --set testing.shells.first_tests=3000 \
         --set records.traces=none --set records.trace_share=0
     python -m benchmarks.limits runs/limits

@@ -61,7 +61,7 @@ def main() -> None:
 
         def resolved(*more: str) -> Resolved:
             changes = f"pool={{library: {library}, relative_error: {error}}}", *more
-            return resolve(load_campaign("scenarios/smoke.yaml", changes))
+            return resolve(load_campaign("scenarios/overtaking_shells.yaml", changes))
 
         here = campaign_pool(resolved())
         tested = design_shells(here, ENVELOPE_MPS2)

@@ -75,7 +75,7 @@ def main(replications: int) -> None:
     """Print the table."""
     campaigns = [
         load_campaign(
-            SCENARIOS / "smoke.yaml",
+            SCENARIOS / "overtaking_shells.yaml",
             [*SETTINGS, f"run.shard_size={size}", f"testing.shells.smallest_round={smallest}"],
         )
         for size, smallest in ROUNDS

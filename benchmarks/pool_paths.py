@@ -41,7 +41,7 @@ def stopped(sums: FloatArray, squares: FloatArray, aim: Aim, error: float, rng: 
 
 def main() -> None:
     """Print the lines."""
-    resolved = resolve(load_campaign("scenarios/smoke.yaml", ["pool.seed=101"]))
+    resolved = resolve(load_campaign("scenarios/overtaking_shells.yaml", ["pool.seed=101"]))
     aim = take_aim(resolved.environment, resolved.library, resolved.campaign.pool, Progress())
     n_rounds, n_surrogates = int(sys.argv[1]) // ROUND_PATHS if sys.argv[1:] else 1024, len(resolved.library.surrogates)
     firsts = range(PILOT_PATHS, PILOT_PATHS + n_rounds * ROUND_PATHS, ROUND_PATHS)

@@ -24,7 +24,7 @@ SEED = 77
 
 def main() -> None:
     """Print the rows."""
-    campaign = load_campaign("scenarios/smoke.yaml")
+    campaign = load_campaign("scenarios/overtaking_shells.yaml")
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     names = list(library.surrogates)
     before = names[: names.index(library.boundary) + 1]

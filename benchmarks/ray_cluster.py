@@ -32,7 +32,7 @@ BITS = {
         "stop.episodes=20000",
         "run.shard_size=500",
     ),
-    "shells": ("smoke", "world.engine=twin", "stop.rhw=0.4", "testing.shells.first_tests=null"),
+    "shells": ("overtaking_shells", "world.engine=twin", "stop.rhw=0.4", "testing.shells.first_tests=null"),
     "forced in SUMO": (*FORCED, "stop.episodes=4000", "run.shard_size=250"),
 }
 """Scenario and settings."""

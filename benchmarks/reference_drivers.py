@@ -39,7 +39,7 @@ def main() -> None:
     drivers = {**TESTED, **REFERENCES, **ENVELOPE}
     described = {"format": "surrogate-library", "version": 1, "boundary": "need-based", "surrogates": drivers}
     library = Library.model_validate({**described, "envelope": "full-throttle-2"})
-    environment, names = load_environment(load_campaign("scenarios/smoke.yaml").environment), list(drivers)
+    environment, names = load_environment(load_campaign("scenarios/overtaking_shells.yaml").environment), list(drivers)
     pilot = Enumerator(environment, library.followers(environment.lateral.present), SEED)
     rates = pilot.run(0, PILOT_PATHS, Progress()).rates(len(names))
     # Aimed at the careful ones: the others, and the cut-in itself, are known well enough anyway.

@@ -37,13 +37,13 @@ def _same(drawn: list[DrawnPool], _: np.random.Generator) -> list[DrawnPool]:
 def main(replications: int, overrides: list[str]) -> None:
     """Print the table."""
     settings = ["stop.min_crashes=null", "testing.shells.first_tests=null", "stop.episodes=1e6", *overrides]
-    pool = campaign_pool(resolve(load_campaign(SCENARIOS / "smoke.yaml", settings)))
+    pool = campaign_pool(resolve(load_campaign(SCENARIOS / "overtaking_shells.yaml", settings)))
     design = replace(design_shells(pool, 2.0), n_paths=10**12).without_references()
     print("| crashes outside | asked RHW | confidence | median tests | bias | covers |")
     print("| --- | --- | --- | --- | --- | --- |")
     for rhw, confidence in ASKED:
         campaign = load_campaign(
-            SCENARIOS / "smoke.yaml", [*settings, f"stop.rhw={rhw}", f"stop.confidence={confidence}"]
+            SCENARIOS / "overtaking_shells.yaml", [*settings, f"stop.rhw={rhw}", f"stop.confidence={confidence}"]
         )
         for hole in HOLES:
             share = np.array([IDM.get(name, 0.0) for name in design.strata])

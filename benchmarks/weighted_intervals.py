@@ -59,7 +59,8 @@ def _crashes(weights: FloatArray, cap: float) -> Block:
 
 def drive(name: str, av: dict[str, object], method: Method, n: int) -> Population:
     """Weighted crashes of an AV in the twin."""
-    campaign = Campaign.model_validate({"name": "intervals", "av": av, "testing": {"method": method}})
+    content = {"environment": {"parameters": "ndd-overtaking-1"}, "av": av, "testing": {"method": method}}
+    campaign = Campaign.model_validate({"name": "intervals", **content})
     source, parts, nade = twin_episodes(campaign, SEED, ()), [], Nade()
     for first in range(0, n, CHUNK):
         block = source(first, CHUNK)

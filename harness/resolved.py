@@ -14,7 +14,7 @@ from harness.errors import CampaignError
 from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment, load_parameters
 from harness.vehicles.drivers import av_records, driver_records
-from harness.vehicles.library import Library, load_library
+from harness.vehicles.library import OF_TRAFFIC, Library, load_library
 from harness.vocabulary import RecordArray
 from harness.worlds.sumo_driven import av_type
 from harness.worlds.system_libraries import require_libraries
@@ -22,7 +22,7 @@ from harness.worlds.system_libraries import require_libraries
 
 @dataclass(frozen=True, eq=False)
 class Resolved:
-    """A campaign and the content of the files that it names.
+    """A campaign, its library named if it left that to its traffic, and the content of the files that it names.
 
     ``av`` (1,) is the record of a built-in AV, (0,) of any other; ``surrogates`` (J,) are the drivers that challenges
     are computed for. ``content_hash`` is of all that changes an episode's bits, the environment's numbers included;
@@ -82,12 +82,14 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     """
     parameters = load_parameters(campaign.environment)
     environment = load_environment(campaign.environment, parameters)
-    if (words := refusal(campaign, Use(command, environment.lateral.present))) is not None:
+    takes_time = environment.lateral.present
+    if (words := refusal(campaign, Use(command, takes_time))) is not None:
         raise CampaignError(*words)
+    campaign = campaign.replaced(("pool", "library"), campaign.pool.library or OF_TRAFFIC[takes_time])
     return Resolved(
         campaign,
         environment,
-        av_records(campaign.av, see_onset=environment.lateral.present),
+        av_records(campaign.av, see_onset=takes_time),
         driver_records([each.parameters for each in campaign.surrogates.values()]),
         campaign.content_hash(parameters.content_hash()),
         controller_sha256,

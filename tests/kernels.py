@@ -37,7 +37,9 @@ def alone(part):
 
 @functools.cache
 def environment(level=1.0, hold_s=1.0):
-    return load_environment(EnvironmentSettings(lane_change_level=level, acceleration_hold_s=hold_s))
+    return load_environment(
+        EnvironmentSettings(parameters="ndd-overtaking-1", lane_change_level=level, acceleration_hold_s=hold_s)
+    )
 
 
 @compiled_threads

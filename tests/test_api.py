@@ -68,7 +68,7 @@ def test_load_run_estimate_and_replay_in_a_few_lines(tmp_path):
         harness.run(harness.load_campaign(MIXTURE_FILE, SMALL), folder)
 
 
-# -- README's first command: the smoke campaign against a committed reference --
+# -- the recommended method against a committed reference --
 
 
 REFERENCE = json.loads((ROOT / "tests/reference/default.json").read_text(encoding="utf-8"))
@@ -76,8 +76,8 @@ REFERENCE = json.loads((ROOT / "tests/reference/default.json").read_text(encodin
 
 def test_the_answer_is_that_of_the_reference(tmp_path):
     """Fixed seeds on both sides: beyond 2 standard errors with a probability of 5 % once, and none after."""
-    folder = tmp_path / "smoke"
-    command = [Path(sys.executable).with_name("harness"), "run", "scenarios/smoke.yaml", "--out", folder]
+    folder = tmp_path / "shells"
+    command = [Path(sys.executable).with_name("harness"), "run", "scenarios/overtaking_shells.yaml", "--out", folder]
     command += ["--set=stop.rhw=0.05", "--set=testing.shells.first_tests=1400"]  # as precise as the reference deserves
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

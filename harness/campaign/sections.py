@@ -164,7 +164,9 @@ class Testing(Section):
 class PoolSettings(Section):
     """The pool of cut-ins that shells are drawn from; built once, in the twin."""
 
-    library: str = Field("ladder-2", description="name of a shipped surrogate library, or a path to your own")
+    library: str | None = Field(
+        None, description="name of a shipped surrogate library, or a path to your own; none: the traffic's"
+    )
     relative_error: float = Field(
         0.005,
         ge=0.001,

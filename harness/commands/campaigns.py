@@ -66,9 +66,10 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     """
     campaign = loaded(campaign_file, overrides, av)
     from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
-    from harness.runner.look import plan_campaign  # noqa: PLC0415 - slow to import: only once the campaign is right
+    from harness.resolved import resolve  # noqa: PLC0415 - slow to import: only once the campaign is right
+    from harness.runner.look import plan_campaign  # noqa: PLC0415
 
-    plan = plan_campaign(campaign)
+    plan, campaign = plan_campaign(campaign), resolve(campaign).campaign
     if as_json:
         print_json({"campaign": campaign.model_dump(mode="json"), "plan": plan})
         return

@@ -79,8 +79,8 @@ def compare_campaigns(
     Raises `CampaignError`: the campaigns differ in something else, or do not draw from the same shells. Raises
     `RunFolderError`: ``out`` holds other runs.
     """
-    require_comparable(a, b)
     sides = require_ready(a, "compare"), require_ready(b, "compare")
+    require_comparable(*(side.campaign for side in sides))
     require_same_shells(sides, stored)
     out = Path(out)
     folders = out / "a", out / "b"

@@ -18,6 +18,8 @@ from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import RecordArray
 
 SHIPPED_FOLDER = Path(__file__).parent
+OF_TRAFFIC = {False: "ladder-2", True: "ladder-lateral-1"}
+"""Shipped library by whether cut-ins take time."""
 MOST_SURROGATES = 60
 """Outcomes of a cut-in are bits of one integer."""
 
@@ -164,6 +166,9 @@ class Library(Section):
         return self
 
 
-def load_library(name: str) -> Library:
-    """Read a shipped library by name, or a file by its path; a `CampaignError` names every place that is wrong."""
-    return read_model(shipped_or_own(name, SHIPPED_FOLDER, "pool.library"), Library)
+def load_library(name: str | None, *, takes_time: bool = False) -> Library:
+    """Read a shipped library by name, or a file by its path; without either that for cut-ins that take time, or not.
+
+    Raises `CampaignError`: names every place that is wrong.
+    """
+    return read_model(shipped_or_own(name or OF_TRAFFIC[takes_time], SHIPPED_FOLDER, "pool.library"), Library)

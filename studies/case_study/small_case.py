@@ -145,7 +145,7 @@ class SmallWorld:
 
 def small_world(level: float, *, nodes: int = NODES) -> SmallWorld:
     """All courses at a level of lane changing."""
-    environment = load_environment(EnvironmentSettings(lane_change_level=level))
+    environment = load_environment(EnvironmentSettings(parameters="ndd-overtaking-1", lane_change_level=level))
     records = driver_records([each.parameters for each in default_surrogates().values()])
     drivers = [av_records(AutomatedVehicle()), *np.split(records, len(records))]
     x, weight = np.polynomial.legendre.leggauss(nodes)

@@ -15,6 +15,8 @@ from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import Positive, Section, Whole
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError
+from harness.traffic.loading import load_environment
+from harness.vehicles.library import OF_TRAFFIC
 from harness.vocabulary import SAMPLING, EstimatorName
 from studies.chains.chain import CHAINS
 
@@ -176,9 +178,10 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
     Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
     """
     experiment = read_model(path, Experiment, [parse_override(text) for text in overrides])
-    library = experiment.campaign.pool.library
+    takes_time = load_environment(experiment.campaign.environment).lateral.present
+    library = experiment.campaign.pool.library or OF_TRAFFIC[takes_time]
     if "/" not in library and not library.endswith((".yaml", ".yml")):
-        return experiment
+        return experiment.replaced(("campaign", "pool", "library"), library)
     file = (path.parent / library).resolve()
     if not file.is_file():
         expected, mend = "a library, or the name of a shipped one", "Correct the path, relative to the experiment's."

@@ -15,6 +15,7 @@ from harness.campaign.files import dump_campaign, load_campaign, load_panel, sch
 from harness.campaign.yaml_text import read_yaml, yaml_text
 from harness.errors import CampaignError
 from harness.resolved import resolve
+from harness.vehicles.library import OF_TRAFFIC, load_library
 
 FOLDER = Path(__file__).parents[2] / "scenarios"
 SCENARIOS = sorted(file for file in FOLDER.glob("*.yaml") if file.name != "av_panel.yaml")
@@ -146,6 +147,7 @@ SHIPPED = {
     "overtaking_nade_epsilon_0.1": "9c126fcf2823adcd",
     "overtaking_nde": "71294e917364cdb2",
     "overtaking_recursive": "a43f69057d98143b",
+    "overtaking_shells": "5eabd80673e0bac0",
     "smoke": "5eabd80673e0bac0",
 }
 PANEL = "6f6894f12ed359ea"
@@ -176,9 +178,19 @@ def test_shipped_scenarios():
 
 @pytest.mark.parametrize(("changes", "expected"), CHANGED, ids=str)
 def test_changed_scenarios(changes, expected):
-    assert load_campaign(FOLDER / "smoke.yaml", changes).content_hash("p") == expected
+    assert load_campaign(FOLDER / "overtaking_shells.yaml", changes).content_hash("p") == expected
 
 
 def test_the_panel():
-    found = {name: load_campaign(FOLDER / "smoke.yaml", av=name).content_hash("p") for name in load_panel().avs}
+    file = FOLDER / "overtaking_shells.yaml"
+    found = {name: load_campaign(file, av=name).content_hash("p") for name in load_panel().avs}
     assert hashlib.sha256(json.dumps(found, sort_keys=True).encode()).hexdigest()[:16] == PANEL
+
+
+def test_a_library_that_is_not_named_is_that_of_the_traffic():
+    paper, none = FOLDER / "overtaking_shells.yaml", "pool.library=null"
+    assert resolve(load_campaign(paper, [none])).content_hash == SHIPPED["overtaking_shells"]
+    takes_time = "environment.cut_in_lead_s=0.5"
+    found, named = (load_campaign(paper, [takes_time, f"pool.library={name}"]) for name in ("null", OF_TRAFFIC[True]))
+    assert resolve(found).campaign == named
+    assert resolve(found).library == load_library(OF_TRAFFIC[True])

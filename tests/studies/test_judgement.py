@@ -119,7 +119,7 @@ def covered(rows):
 def test_intervals_cover_at_the_stop_and_conditional_ones_do_not_where_vehicles_differ_outside():
     """Nine tenths of the difference lie beyond the boundary, which the conditional statement leaves out."""
     campaign = load_campaign(
-        SCENARIOS / "smoke.yaml", ["world.engine=twin", "stop.rhw=0.5", "testing.shells.first_tests=12"]
+        SCENARIOS / "overtaking_shells.yaml", ["world.engine=twin", "stop.rhw=0.5", "testing.shells.first_tests=12"]
     )
     found = PairedCampaign(campaign, known_pool, seed=3).run(range(REPLICATIONS))
     free, inside = ([row for row in found if row.result == name] for name in (DIFFERENCE, CONDITIONAL_DIFFERENCE))

@@ -29,8 +29,8 @@ FEW, MANY = 60, 300
 
 
 def campaign(method: str, episodes: int) -> Campaign:
-    content = {"name": "x", "world": {"engine": "twin"}, "testing": {"method": method}, "stop": {"episodes": episodes}}
-    return Campaign.model_validate(content)
+    content = {"world": {"engine": "twin"}, "testing": {"method": method}, "stop": {"episodes": episodes}}
+    return Campaign.model_validate({"name": "x", "environment": {"parameters": "ndd-overtaking-1"}, **content})
 
 
 def judged(runs: dict[str, list[Row]], result: str) -> list[Judgement]:

@@ -25,7 +25,7 @@ from studies.replication.shells import Division, equals, looks
 from tests.golden.record import unlike
 
 PATHS = 1024
-ENVIRONMENT = load_environment(EnvironmentSettings())
+ENVIRONMENT = load_environment(EnvironmentSettings(parameters="ndd-overtaking-1"))
 LIBRARY = load_library("ladder-1")
 AVS = {
     name: AutomatedVehicle.model_validate(av)
@@ -41,8 +41,8 @@ AVS = {
 
 
 def campaign_of(episodes) -> Campaign:
-    content = {"name": "x", "testing": {"method": "shells"}, "stop": {"episodes": episodes, "rhw": None}}
-    return Campaign.model_validate(content)
+    content = {"testing": {"method": "shells"}, "stop": {"episodes": episodes, "rhw": None}}
+    return Campaign.model_validate({"name": "x", "environment": {"parameters": "ndd-overtaking-1"}, **content})
 
 
 def drivers_of(*names) -> Drivers:

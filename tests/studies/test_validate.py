@@ -37,7 +37,7 @@ version: 1
 name: twin
 replications: 16
 campaign:
-  environment: {lane_change_level: 1e4}
+  environment: {parameters: ndd-overtaking-1, lane_change_level: 1e4}
   testing: {method: forced}
   stop: {episodes: 500}
 super_population: {reference_paths: 1024}
@@ -84,7 +84,7 @@ format: validation-experiment
 version: 1
 name: enumerated
 replications: 8
-campaign: {testing: {method: shells}, stop: {rhw: 0.5, episodes: 2000}}
+campaign: {environment: {parameters: ndd-overtaking-1}, testing: {method: shells}, stop: {rhw: 0.5, episodes: 2000}}
 super_population: {paths: 1024, reference_paths: 1024, pool_paths: 256}
 avs: {idm: {}}
 adversaries: {hole: {of: idm, hole: 0.3}}

@@ -37,7 +37,13 @@ def campaign(controller: str, **parameters) -> Campaign:
         "before_cut_in": "controller",
         "limits": {"max_acceleration_mps2": 2.0},
     }
-    content = {"name": "x", "av": av, "world": {"engine": "twin"}, "testing": {"method": "shells"}}
+    content = {
+        "name": "x",
+        "environment": {"parameters": "ndd-overtaking-1"},
+        "av": av,
+        "world": {"engine": "twin"},
+        "testing": {"method": "shells"},
+    }
     stop = {"rhw": 0.5, "episodes": 20_000}
     return Campaign.model_validate({**content, "stop": stop, "pool": {"shadow_paths": 200}})
 

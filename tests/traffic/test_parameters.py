@@ -14,7 +14,8 @@ from harness.traffic.loading import load_environment, load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.kernels import alone
 
-SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
+PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
+SHIPPED = SHIPPED_FOLDER / f"{PAPER}.yaml"
 TEXT = SHIPPED.read_text(encoding="utf-8")
 DATA, _ = read_yaml(SHIPPED)
 NUMBERS = [(section, name) for section, numbers in DATA.items() if isinstance(numbers, dict) for name in numbers]
@@ -52,7 +53,9 @@ def refusal(section):
 
 
 def test_every_number_reaches_the_kernels():
-    record = load_environment(EnvironmentSettings(lane_change_level=350.0, acceleration_hold_s=0.1)).numbers
+    record = load_environment(
+        EnvironmentSettings(parameters=PAPER, lane_change_level=350.0, acceleration_hold_s=0.1)
+    ).numbers
     assert len(NUMBERS) > 70
     for section, name in NUMBERS:
         assert record[f"{section}__{name}"] == DATA[section][name]["value"]
@@ -60,7 +63,8 @@ def test_every_number_reaches_the_kernels():
 
 
 def test_the_hash_is_that_of_the_numbers_alone(mine):
-    assert load_parameters(EnvironmentSettings()).content_hash() == "838b5235175d4be5"  # as of the first version
+    shipped = load_parameters(EnvironmentSettings(parameters=PAPER))
+    assert shipped.content_hash() == "838b5235175d4be5"  # as of the first version
     noted = load_parameters(mine(TEXT.replace(DF, "  df: {value: 16.0, source: user, note: checked}")))
     assert noted.content_hash() == "838b5235175d4be5"
     assert DF in TEXT
@@ -116,7 +120,6 @@ def test_a_lateral_section_that_says_too_little_or_too_much_is_refused(mine, num
 
 
 draw_lead = alone(of_lateral.draw_lead)
-PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
 
 
 def leads(law, n=20_000, seed=1):
