@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from harness.cli import main as run_main
-from harness.commands.options import CAMPAIGN, FOLDER, RUN_FOLDER, examples, json_option, quiet_option
+from harness.commands.options import (
+    CAMPAIGN,
+    FILE,
+    FOLDER,
+    RUN_FOLDER,
+    examples,
+    json_option,
+    quiet_option,
+    written_file,
+)
 from harness.commands.printing import print_json, print_table
 from harness.errors import HarnessError, WorldDisagreementError
 from harness.progress import shown_progress
@@ -209,6 +218,37 @@ def alarm(ctx: click.Context, folder: Path, *, as_json: bool) -> None:
         click.echo(f"{verdict or 'nothing is wrong that these tests could show'} (p-value {found['p_value']:.2g})")
     if found["raised"]:
         ctx.exit(WorldDisagreementError.exit_code)
+
+
+@cli.command(
+    short_help="Make trajectories of known traffic, to try `harness fit` on.",
+    epilog=examples(
+        f"{_ME} trajectories ndd-overtaking-2 --hours 10 --out data.parquet",
+        f"{_ME} trajectories my-traffic.yaml --hours 0.5 --level 1 --exact --out data.csv",
+    ),
+    context_settings={"show_default": True},
+)
+@click.argument("environment", metavar="ENVIRONMENT")
+@click.option("--out", "file", type=FILE, callback=written_file(".parquet", ".csv"), required=True, help="To write.")
+@click.option("--hours", type=click.FloatRange(0, 1000, min_open=True), default=10.0, help="Vehicle-hours.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, help="Of all random numbers.")
+@click.option("--level", type=click.FloatRange(0, 1e8, min_open=True), default=1000.0, help="Of lane changing.")
+@click.option("--exact", is_flag=True, help="Vehicles that are alike, measured without error.")
+def trajectories(environment: str, file: Path, *, hours: float, seed: int, level: float, exact: bool) -> None:
+    """Simulate vehicles that drive and change lanes by the laws of ENVIRONMENT, a shipped name or a file of your own.
+
+    Vehicles differ from each other, and positions and speeds are measured with errors that change slowly (0.1 m,
+    0.1 m/s). The table has the columns that `harness fit` reads, lateral_m where cut-ins take time. A level of 1,000
+    makes lane changes of the shipped environments about as frequent as on motorways.
+    """
+    from harness.campaign.sections import EnvironmentSettings  # noqa: PLC0415 - keeps --help fast
+    from harness.traffic.loading import load_environment  # noqa: PLC0415
+    from studies.trajectories import ALIKE, Differences, simulate, write  # noqa: PLC0415
+
+    settings = EnvironmentSettings(parameters=environment, lane_change_level=level)
+    table = simulate(load_environment(settings), hours, seed, ALIKE if exact else Differences())
+    write(table, file)
+    click.echo(f"{file}: {len(table):,} rows")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,0 +1,128 @@
+"""Simulated trajectories follow the laws that they were made from, as far as these can be read off the table."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from harness.campaign.sections import EnvironmentSettings
+from harness.compiled import unboxed
+from harness.traffic.laws import Environment
+from harness.traffic.loading import evaluate_laws, load_environment
+from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray
+from studies.__main__ import main
+from studies.trajectories import ALIKE, CLOSEST_M, Differences, simulate
+
+TRUE = ["v", "r1", "r1dot"]
+
+
+@pytest.fixture(scope="module")
+def environment() -> Environment:
+    settings = EnvironmentSettings(parameters="ndd-overtaking-1-lateral", lane_change_level=1000.0)
+    made = load_environment(settings)
+    numbers = made.numbers.copy()
+    numbers["cut_in__ignore_share"] = 0.5
+    return made._replace(numbers=numbers)
+
+
+@pytest.fixture(scope="module")
+def triples(environment: Environment) -> pd.DataFrame:
+    """One row per triple and time, columns of LV (0), BV (1) and the vehicle behind (2) side by side."""
+    table = simulate(environment, 40.0, 1)
+    table["triple"], table["who"] = np.divmod(table.vehicle_id, 3)
+    rows = table.pivot_table(index=["recording_id", "triple", "time_s"], columns="who").swaplevel(axis=1)
+    lv, bv, behind = (rows[who] for who in range(3))
+    half = 0.5 * bv.length_m
+    return pd.DataFrame(
+        {
+            "v": bv.speed_mps,
+            "r1": lv.s_m - bv.s_m - half - 0.5 * lv.length_m,
+            "r1dot": lv.speed_mps - bv.speed_mps,
+            "r2": bv.s_m - behind.s_m - half - 0.5 * behind.length_m,
+            "r2dot": bv.speed_mps - behind.speed_mps,
+            "beside": (bv.s_m - behind.s_m).abs() < half + 0.5 * behind.length_m,
+            "lane": bv.lane,
+            "lateral": bv.lateral_m,
+            "v_lv": lv.speed_mps,
+        }
+    ).reset_index()
+
+
+def evaluated(states: FloatArray, approaches: FloatArray, environment: Environment) -> tuple[FloatArray, ...]:
+    n, m = len(states), len(approaches)
+    pmf, scale = np.empty((2, n, N_ACCELERATIONS)), np.empty((2, n))
+    chance, accepted = np.empty(n), np.empty(m)
+    evaluate_laws(states, approaches, unboxed(environment), pmf, scale, chance, accepted)
+    return pmf, chance, accepted
+
+
+@pytest.mark.parametrize(("closest_s", "furthest_s"), [(0.0, 4.0), (4.0, 12.0), (12.0, np.inf), (np.inf, np.inf)])
+def test_lane_changes_are_as_many_as_their_hazards_sum_up_to(
+    triples: pd.DataFrame, environment: Environment, closest_s: float, furthest_s: float
+) -> None:
+    """The difference is a martingale: 4 standard errors miss once in 16,000 times."""
+    of = triples.groupby(["recording_id", "triple"])
+    changes = (triples.lane == 0) & (of.lane.shift(1) == 1)
+    before = (triples.lane == 1) & (of.lane.shift(1) == 1) | changes
+    closing = (triples.r2 > 0.0) & (triples.r2dot < 0.0)
+    ttc = (triples.r2 / -triples.r2dot).where(closing, np.inf)
+    here = before & ~triples.beside & (ttc >= closest_s) & ((ttc < furthest_s) | (furthest_s == closest_s))
+    rows = triples[here]
+    approaches = np.where(closing[here].to_numpy()[:, None], rows[["r2", "r2dot"]], [1.0, 1.0])
+    _, chance, accepted = evaluated(rows[TRUE].to_numpy(), approaches, environment)
+    expected = float((0.1 * -np.log1p(-chance * accepted)).sum())
+    assert expected > 10
+    assert abs(int(changes[here].sum()) - expected) < 4.0 * np.sqrt(expected)
+
+
+def test_accelerations_are_those_of_the_laws(triples: pd.DataFrame, environment: Environment) -> None:
+    """Of a second that begins in a state: numbers of each acceleration against the sum of their probabilities."""
+    of = triples.groupby(["recording_id", "triple"])
+    whole = (triples.time_s * 10).round() % 10 == 0
+    stays = of.lane.shift(-10) == 1
+    for law, column in enumerate(("v_lv", "v")):
+        change = (of[column].shift(-10) - triples[column])[whole & stays]
+        states = triples.loc[change.index, TRUE].to_numpy().copy()
+        states[:, 0] = triples.loc[change.index, column]
+        pmf, _, _ = evaluated(states, np.ones((1, 2)), environment)
+        seen = np.bincount(np.abs(change.to_numpy()[:, None] - ACCELERATIONS_MPS2).argmin(axis=1), minlength=31)
+        expected = pmf[law].sum(axis=0)
+        assert len(change) > 10_000
+        assert (np.abs(seen - expected) < 4.5 * np.sqrt(expected) + 1.0).all(), (seen, expected)
+
+
+def test_a_lane_change_shows_itself_by_an_even_motion_to_the_marking(triples: pd.DataFrame) -> None:
+    of = triples.groupby(["recording_id", "triple"])
+    crosses = (triples.lane == 0) & (of.lane.shift(1) == 1) & (of.lateral.shift(1).notna())
+    assert triples.lateral[crosses].to_numpy() == pytest.approx(3.4)
+    assert ((of.lateral.shift(1) - triples.lateral)[crosses] > 1.7 / 41).all()  # the longest lead is 4 s
+
+
+def test_nobody_drives_into_somebody(triples: pd.DataFrame) -> None:
+    assert triples.r1[triples.lane == 1].quantile(0.0) > CLOSEST_M - 0.5  # a step after the last that was far enough
+    assert not triples.beside[triples.lane == 0].any()
+
+
+def test_vehicles_differ_and_are_measured_with_errors_that_were_asked_for(environment: Environment) -> None:
+    only = {"hazard": 0.0, "recording_hazard": 0.0, "acceleration_mps2": 0.0, "spread": 0.0}
+    exact, measured, different = (
+        simulate(environment, 1.0, 2, each) for each in (ALIKE, Differences(**only), Differences())
+    )
+    assert len(measured) == len(exact)
+    for column, sd in (("s_m", 0.1), ("speed_mps", 0.1), ("lateral_m", 0.03)):
+        error = measured[column] - exact[column]
+        assert error.std() == pytest.approx(sd, rel=0.05)
+        assert error.diff().std() < 0.15 * sd  # but where one vehicle's rows end and those of another begin
+    assert not different.lane.equals(measured.lane) or not different.time_s.equals(measured.time_s)
+
+
+@pytest.mark.parametrize("name", ["data.csv", "data.parquet"])
+def test_the_command_writes_what_it_is_named_after(tmp_path: Path, name: str) -> None:
+    file = tmp_path / name
+    call = ["trajectories", "ndd-overtaking-1", "--hours", "0.1", "--seed", "3", "--exact", "--out", str(file)]
+    assert main(call) == 0
+    table = pd.read_csv(file) if file.suffix == ".csv" else pd.read_parquet(file)
+    again = simulate(load_environment(EnvironmentSettings(lane_change_level=1000.0)), 0.1, 3)
+    pd.testing.assert_frame_equal(table, again, check_dtype=False)
+    assert "lateral_m" not in table
