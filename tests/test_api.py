@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import harness
+from harness.resolved import resolve
 from tests.stored_runs import MIXTURE_FILE, ROOT, estimates
 
 BUDGET = ("stop.episodes=3000", "stop.rhw=0.5", "stop.min_crashes=20", "run.shard_size=60")
@@ -57,7 +58,9 @@ def test_load_run_estimate_and_replay_in_a_few_lines(tmp_path):
     assert harness.estimate(folder, estimators=["nade"], confidence=0.5)["confidence"] == 0.5
     files = {"campaign.yaml", "manifest.json", "estimates.json", "report.html", "plots", "episodes", "traces"}
     assert {path.name for path in folder.iterdir()} >= files
-    assert harness.load_campaign(folder / "campaign.yaml") == harness.load_campaign(MIXTURE_FILE, SMALL)
+    assert (
+        harness.load_campaign(folder / "campaign.yaml") == resolve(harness.load_campaign(MIXTURE_FILE, SMALL)).campaign
+    )
     replayed = harness.replay(str(folder), 17, fcd=str(tmp_path / "fcd.xml"))
     assert (replayed.bit_equal, replayed.outcome) == (True, replayed.row["outcome"])
     assert replayed.trace.num_rows == 3 * (replayed.row["n_steps"] + 1)

@@ -166,14 +166,6 @@ REFUSED = (
     # -- vehicles that act before the cut-in --
     Combination(
         "av.before_cut_in",
-        lambda c, use: use.takes_time and c.av.acts_before_cut_in and use.command == "av-check",
-        "controller, " + _TAKES_TIME,
-        "hold_speed, or cut-ins of one step: a look at a vehicle makes no baseline runs, without which nobody knows "
-        "the onset in time",
-        "Add --set av.before_cut_in=hold_speed, or --set environment.parameters=ndd-overtaking-1.",
-    ),
-    Combination(
-        "av.before_cut_in",
         lambda c, use: (
             c.av.acts_before_cut_in and (c.sampling.holds_speed or (use.takes_time and not c.sampling.baseline_runs))
         ),
@@ -219,7 +211,7 @@ REFUSED = (
         "{testing.method}, " + _TAKES_TIME,
         "shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at those that an "
         "attentive vehicle avoids",
-        "Choose shells, or an environment without that section.",
+        "Choose shells, or add --set environment.parameters=ndd-overtaking-1.",
     ),
     # -- comparisons --
     Combination(

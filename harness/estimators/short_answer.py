@@ -237,6 +237,8 @@ def _warnings(
     if severity is not None and severity.cut_off > CUT_OFF_SHARE * best.crash_rate:
         worst = number(best.crash_rate + severity.cut_off)
         yield f"time was up while it closed in: had all these tests crashed, {worst} per test"
+    if manifest.get("cut_ins_take_time") and campaign.av.source in ("sumo", "traci"):
+        yield "SUMO switches lanes in one step: this vehicle cannot see BV come over, as other drivers do"
     if (level := campaign.environment.lane_change_level) != 1.0:
         yield f"lane-change level {plain(level)}: never compare with rates of other levels"
 

@@ -88,12 +88,14 @@ class AvCheck:
     ``failures`` are numbers of episodes of the first run by the cause that they failed with, where one stands for all
     that differ from it in digits alone; ``differing`` are those whose motion was not the same bits in the two layouts,
     with the ``likely_cause`` if there are any; ``limits_mps2`` are the accelerations that count as its limits. The
-    built-in IDM has driven the same episodes in the same cells.
+    built-in IDM has driven the same episodes in the same cells. Cut-ins are of one step, also where they ``take_time``
+    in the campaign, for a vehicle that acts before them: a look makes no baseline runs, which would tell the onset.
     """
 
     source: str
     engine: str
     method: str
+    take_time: bool
     n_episodes: int
     failures: dict[str, int]
     differing: tuple[int, ...]
@@ -132,8 +134,9 @@ class AvCheck:
         found = self.to_json()
         own, idm = ({**found[f"{who}behaviour"], **found[f"{who}speed"]} for who in ("", "idm_"))
         lowest, highest = found["limits_mps2"]
+        cut_ins = "cut-ins that take time" if self.take_time else "cut-ins of one step"
         rows = [
-            ("kind of vehicle, engine, method", f"{self.source}, {self.engine}, {self.method}", ""),
+            ("kind of vehicle, engine, method", f"{self.source}, {self.engine}, {self.method}, {cut_ins}", ""),
             ("tests", self.n_episodes, ""),
             *((f"failed: {cause}", n, "") for cause, n in (found["failures"] or {"none": 0}).items()),
             ("tests that came out otherwise", found["differing"] or "none", ""),
@@ -173,6 +176,7 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
         source=tested.av.source,
         engine=tested.world.engine,
         method=tested.testing.method,
+        take_time=source.resolved.environment.lateral.present,
         n_episodes=n_episodes,
         failures=_by_cause(first.failures.values()),
         differing=differing,
@@ -199,13 +203,14 @@ def _as_checked(campaign: Campaign) -> Campaign:
     """The campaign with cut-ins in (nearly) every episode, all motion kept, and the twin where it can drive the AV."""
     holds = campaign.av.before_cut_in == "hold_speed"
     method = "forced" if holds else "step_mixture"
+    environment = campaign.environment if holds else campaign.environment.replaced(("cut_in_lead_s",), 0.0)
     testing = campaign.testing.model_copy(update={"method": method})
     engine = "sumo" if campaign.av.source in ("sumo", "traci") else "twin"
     world = campaign.world.model_copy(update={"engine": engine, "cells": CELLS})
     records = campaign.records.model_copy(update={"moments": "none", "traces": "all"})
     surrogates = campaign.surrogates or Campaign(name="default").surrogates
-    alpha = {"surrogates": surrogates, "testing": testing, "world": world, "records": records}
-    return campaign.model_copy(update=alpha)
+    asked = {"environment": environment, "surrogates": surrogates, "testing": testing, "world": world}
+    return campaign.model_copy(update={**asked, "records": records})
 
 
 @contextmanager

@@ -136,10 +136,12 @@ class Run:
         self._workers = workers_of(resolved, n_workers, n_runs=n_runs)
         with ExitStack() as refused:
             refused.callback(self._workers.close)
-            distance_m = distance_per_test_m(resolved.environment)
-            self.manifest = Manifest(
-                out, resolved, earlier, began=began, workers=self._workers.n_workers, distance_per_test_m=distance_m
-            )
+            facts = {
+                "workers": self._workers.n_workers,
+                "cut_ins_take_time": resolved.environment.lateral.present,
+                "distance_per_test_m": distance_per_test_m(resolved.environment),
+            }
+            self.manifest = Manifest(out, resolved, earlier, began=began, **facts)
             self._keep_design()
             refused.pop_all()
 

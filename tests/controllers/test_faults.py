@@ -17,6 +17,7 @@ from tests.worlds.running import drive, forced
 
 SMALL = """\
 name: faults
+environment: {parameters: ndd-overtaking-1}
 testing: {method: forced}
 world: {engine: twin, cells: 40}
 records: {moments: none}

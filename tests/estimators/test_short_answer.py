@@ -169,6 +169,15 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
     assert answer.scope.endswith("was tested, no crash seen, asked: ± 30 %; raise pool.cut_ins_per_shell")
 
 
+def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time(stored_run):
+    best = read_run_folder(stored_run("forced-krauss")).headline
+    for name, takes_time, warned in (
+        ("forced-krauss", True, True), ("forced-krauss", False, False), ("forced-twin", True, False)
+    ):  # fmt: skip
+        answer = short_answer(golden(name), best, None, {"cut_ins_take_time": takes_time}, None)
+        assert any("cannot see BV come over" in each for each in answer.warnings) == warned
+
+
 def test_a_comparison_is_as_short():
     """With what makes it long: names, far limits, warnings, a margin."""
     side = {"crash_rate": 1.4e-7, "ci_low": 1e-10, "ci_high": 2e-7, "n_crashes": 93, "upper_bound": 1e-6}
