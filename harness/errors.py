@@ -75,6 +75,10 @@ class CampaignError(HarnessError):
     """The campaign file, or a file that it names, is wrong."""
 
 
+class TrajectoryError(HarnessError):
+    """Trajectories, or how their columns are to be read, are wrong."""
+
+
 class RunFolderError(HarnessError):
     """The output folder holds something else, or its records are damaged."""
 

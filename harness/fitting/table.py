@@ -1,0 +1,454 @@
+"""Trajectories as a table: read from CSV or Parquet one recording at a time, by a mapping of columns, and checked.
+
+One row per vehicle and time. The rows of a recording stand together in a file, in any order among themselves, so that
+no more than one recording is held in memory; without ``recording_id`` a file is one recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+from pydantic import Field
+
+from harness.campaign.files import read_model, shipped_or_own
+from harness.campaign.problems import did_you_mean
+from harness.campaign.sections import Section
+from harness.errors import TrajectoryError
+from harness.vocabulary import FloatArray, IntArray
+
+Needed = Literal["vehicle_id", "time_s", "s_m", "speed_mps", "lane", "length_m"]
+Optional = Literal["recording_id", "lateral_m", "class", "direction"]
+NEEDED: tuple[Needed, ...] = get_args(Needed)
+OPTIONAL: tuple[Optional, ...] = get_args(Optional)
+NAMES = ("recording_id", "vehicle_id", "class", "direction")
+"""Columns that are read as text."""
+Unit = Literal["m", "ft", "km", "m/s", "ft/s", "km/h", "mph", "s", "ms", "us", "ns"]
+UNITS: dict[Unit, float] = dict(
+    zip(get_args(Unit), (1.0, 0.3048, 1e3, 1.0, 0.3048, 1 / 3.6, 0.44704, 1.0, 1e-3, 1e-6, 1e-9), strict=True)
+)
+SLOWEST_HZ = 9.5
+FASTEST_MEDIAN_MPS = 70.0
+USUAL_LENGTH_M = (2.5, 10.0)
+"""Between which the median of vehicles' lengths lies: in feet it is about 15."""
+OF_STEP = 0.05
+"""Share by which speeds may differ from the change of positions."""
+SLIPS = {
+    3.2808: "speeds in ft/s beside positions in m",
+    0.3048: "positions in feet beside speeds in m/s",
+    3.6: "speeds in km/h beside positions in m",
+    2.2369: "speeds in mph beside positions in m",
+    0.6818: "positions in feet beside speeds in mph",
+    1.0973: "positions in feet beside speeds in km/h",
+    1000.0: "positions in km beside speeds in m/s",
+    -1.0: "positions that fall where vehicles drive forward",
+}
+"""What a ratio of speeds to the change of positions comes from."""
+LEAST_LAG_S = 0.3
+ANOTHER_VEHICLE_S = 60.0
+"""An identifier that comes back after so long belongs to another vehicle (NGSIM's do)."""
+
+
+class Mapping(Section):
+    """How the columns of a file are to be read."""
+
+    columns: dict[Needed | Optional, str | float] = Field(
+        default={}, description="name in the file, or one number for all rows, by name of the input table"
+    )
+    units: dict[Needed | Optional, Unit | Annotated[float, Field(gt=0.0)]] = Field(
+        default={}, description="unit in the file, or what it is multiplied by"
+    )
+    lanes: Literal["from_right", "from_left"] | list[int] = Field(
+        default="from_right", description="how lanes are numbered, or their numbers from right to left, others left out"
+    )
+    origin: Literal["centre", "front", "rear"] = Field(default="centre", description="what of a vehicle s_m is")
+    mirror: bool = Field(default=False, description="whether vehicles that close in from behind are on the left")
+    classes: list[str] = Field(default=[], description="classes whose driving is fitted; all, if none is named")
+    layout: Literal["table", "highd"] = Field(default="table", description="whether it is highD's files")
+
+
+SHIPPED_FOLDER = Path(__file__).parent
+
+
+def load_mapping(name: str | None = None, *, mirror: bool | None = None) -> Mapping:
+    """A shipped mapping (``highd``, ``ngsim``), one's own YAML file, or that of the input table itself.
+
+    Raises `CampaignError`: there is no such mapping, or something in it is wrong.
+    """
+    mapping = Mapping() if name is None else read_model(shipped_or_own(name, SHIPPED_FOLDER, "--mapping"), Mapping)
+    return mapping if mirror is None else mapping.replaced(("mirror",), mirror)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All vehicles on a stretch of road for a while.
+
+    Attributes
+    ----------
+    name, file : str
+        For messages.
+    rows : DataFrame
+        Sorted by vehicle and time: ``vehicle`` (int, a number in the recording), ``time_s``, ``frame`` (int),
+        ``s_m`` (centre, rising as one drives), ``speed_mps``, ``lane`` (int, the target lane's is one less),
+        ``length_m``, ``lateral_m`` (NaN where there is none), ``road`` (int, one of its directions), ``fitted`` (bool,
+        of a class whose driving is fitted), ``row`` (in the file, from 1).
+    rate_hz : float
+        Frames per second.
+    vehicles : list of str
+        Identifiers in the file, by number.
+    share_read : float
+        Of the bytes or rows of all files, with this recording.
+    """
+
+    name: str
+    file: str
+    rows: pd.DataFrame
+    rate_hz: float
+    vehicles: Sequence[str]
+    share_read: float
+
+    def where(self, i: int | np.intp) -> str:
+        """Place in the file of the i-th row."""
+        each = self.rows.iloc[int(i)]
+        return (
+            f"{self.file}, row {each.row} (vehicle {self.vehicles[int(each.vehicle)]} of recording {self.name}, "
+            f"t = {each.time_s:.10g} s)"
+        )
+
+
+def recordings(files: Sequence[str | Path], mapping: Mapping) -> Iterator[Recording]:
+    """Recordings of some files, one after the other, checked.
+
+    Raises `TrajectoryError`: a file cannot be read, or what it holds cannot be trajectories in these units.
+    """
+    paths = [Path(file) for file in files]
+    kept = [path for path in paths if mapping.layout != "highd" or not path.stem.endswith("Meta")]
+    for i, path in enumerate(kept):
+        for name, rows, share in _pieces(path, mapping):
+            yield _recording(name, path, _standard(rows, path, mapping), (i + share) / len(kept))
+
+
+# -- files --
+
+
+class _Batch(NamedTuple):
+    rows: pd.DataFrame
+    share_read: float
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Say what is wrong with a file that cannot be read."""
+    try:
+        yield
+    except FileNotFoundError:
+        meant = did_you_mean(path.name, [each.name for each in path.parent.glob("*")])
+        mend = meant or "Check the spelling and the folder that you are in."
+        raise TrajectoryError(str(path), "no such file", "a CSV or Parquet file", mend) from None
+    except IsADirectoryError:
+        raise TrajectoryError(str(path), "a folder", "a CSV or Parquet file", "Name the files in it.") from None
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        found = f"a file that cannot be read ({str(error).splitlines()[0]})"
+        mend = "Is it complete, and of the kind that its name says? Copy or write it again."
+        raise TrajectoryError(str(path), found, "a CSV or Parquet file", mend) from None
+
+
+def _pieces(path: Path, mapping: Mapping) -> Iterator[tuple[str, pd.DataFrame, float]]:
+    """Name and rows of each recording of a file, and the share of the file that is read by then."""
+    parts: list[pd.DataFrame] = []
+    current: str | None = None
+    done: set[str] = set()
+    share = 0.0
+    with _reading(path):
+        for batch in _batches(path, mapping):
+            for key, part in batch.rows.groupby("recording_id", sort=False):
+                name = str(key)
+                if name in done:
+                    found = f"rows of recording {name} again, after those of others (row {part.row.iloc[0]})"
+                    raise TrajectoryError(
+                        str(path),
+                        found,
+                        "its rows together",
+                        "Sort the file by recording_id, or write a file for each.",
+                    )
+                if current is not None and name != current:
+                    yield current, pd.concat(parts, ignore_index=True), share
+                    done.add(current)
+                    parts = []
+                current = name
+                parts.append(part)
+            share = batch.share_read
+    if current is None:
+        raise TrajectoryError(str(path), "no rows", "one row per vehicle and time", "Is it the right file?")
+    yield current, pd.concat(parts, ignore_index=True), 1.0
+
+
+def _batches(path: Path, mapping: Mapping) -> Iterator[_Batch]:
+    """Rows of a file with the columns of the input table that it has, and ``row``."""
+    first = 2  # the header of a CSV file is its first row
+    if path.suffix in (".parquet", ".pq"):
+        with pq.ParquetFile(path) as file:
+            columns = _columns(path, file.schema_arrow.names, mapping)
+            total = max(file.metadata.num_rows, 1)
+            first = 1
+            for batch in file.iter_batches(columns=list(columns.values())):
+                yield _Batch(_renamed(batch, columns, first, path, mapping), (first - 1 + batch.num_rows) / total)
+                first += batch.num_rows
+        return
+    with path.open("rb") as raw:
+        head = raw.readline().decode("utf-8-sig").strip()
+        if not head:
+            raise TrajectoryError(str(path), "an empty file", "a header and rows", "Is it the right file?")
+        line = raw.readline().decode()
+        raw.seek(0)
+        delimiter = max(",;\t", key=head.count)
+        names = [name.strip().strip('"') for name in head.split(delimiter)]
+        columns = _columns(path, names, mapping)
+        types = {name: pa.string() if column in NAMES else pa.float64() for column, name in columns.items()}
+        reader = pa.csv.open_csv(
+            raw,
+            read_options=pa.csv.ReadOptions(column_names=names, skip_rows=1, block_size=1 << 22),
+            parse_options=pa.csv.ParseOptions(delimiter=delimiter),
+            convert_options=pa.csv.ConvertOptions(
+                column_types=types,
+                include_columns=list(columns.values()),
+                decimal_point="," if delimiter == ";" and "," in line else ".",
+            ),
+        )
+        size = path.stat().st_size
+        for batch in reader:
+            yield _Batch(_renamed(batch, columns, first, path, mapping), min(raw.tell() / size, 1.0))
+            first += batch.num_rows
+
+
+def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, str]:
+    """Name in the file of each column of the input table that it has; capital letters do not count."""
+    by_lower = {name.lower(): name for name in names}
+    found: dict[str, str] = {}
+    for column in (*NEEDED, *OPTIONAL):
+        wanted = mapping.columns.get(column, column)
+        if isinstance(wanted, float):
+            continue
+        if wanted.lower() in by_lower:
+            found[column] = by_lower[wanted.lower()]
+        elif column in NEEDED:
+            known = {"xvelocity": "highd", "local_y": "ngsim"}
+            of = next((known[name] for name in by_lower if name in known), None)
+            mend = f"The file looks like that of --mapping {of}." if of and of.lower() else did_you_mean(wanted, names)
+            if column == "length_m" and not mend:
+                mend = "Gaps need lengths: add them, or one for all in a mapping (columns: {length_m: 4.6})."
+            what = f"a column {wanted}" + (f" for {column}" if wanted != column else "")
+            raise TrajectoryError(
+                str(path),
+                f"the columns {', '.join(names)}",
+                what,
+                mend or "Rename a column, or say in a mapping what it is called (--mapping FILE.yaml).",
+            )
+    return found
+
+
+def _renamed(batch: Any, columns: dict[str, str], first: int, path: Path, mapping: Mapping) -> pd.DataFrame:
+    """Rows of a batch by the names of the input table, constants filled in."""
+    data = {}
+    for column, name in columns.items():
+        values = batch.column(name)
+        if column not in NAMES:
+            try:
+                data[column] = values.cast(pa.float64()).to_numpy(zero_copy_only=False)
+            except pa.ArrowInvalid:
+                raise TrajectoryError(
+                    f"{path}, column {name}", f"values of type {values.type}", "numbers", "Write it as numbers."
+                ) from None
+        else:
+            text = values.cast(pa.string()).fill_null("")
+            data[column] = pd.arrays.ArrowExtensionArray(pa.chunked_array([text]))
+    rows = pd.DataFrame(data)
+    for column, value in mapping.columns.items():
+        if isinstance(value, float):
+            rows[column] = value
+    rows["row"] = np.arange(first, first + len(rows))
+    return rows if "recording_id" in rows else rows.assign(recording_id=path.stem)
+
+
+# -- rows by the mapping --
+
+
+def _standard(rows: pd.DataFrame, path: Path, mapping: Mapping) -> pd.DataFrame:
+    """Rows in metres and seconds, with the centre of vehicles, and lanes of which the target lane's is one less."""
+    for column, unit in mapping.units.items():
+        if column in rows:
+            rows[column] *= UNITS[unit] if isinstance(unit, str) else unit
+    if mapping.layout == "highd":
+        rows = _from_highd(rows, path)
+    if (odd := ~np.isfinite(rows[list(NEEDED[1:])].to_numpy())).any():
+        i, column = np.argwhere(odd)[0]
+        where = f"{path}, row {rows.row.iloc[i]}, {NEEDED[1:][column]}"
+        raise TrajectoryError(where, "no finite number", "a number in every row", "Delete the row, or mend the value.")
+    if (odd := rows.lane.to_numpy() % 1 != 0).any():
+        i = int(np.argmax(odd))
+        where = f"{path}, row {rows.row.iloc[i]}, lane"
+        raise TrajectoryError(where, f"{rows.lane.iloc[i]:g}", "a whole number", "Give every lane a number of its own.")
+    if isinstance(mapping.lanes, list):
+        order = {float(lane): i for i, lane in enumerate(mapping.lanes)}
+        rows = rows[rows.lane.isin(list(order))].copy()
+        if rows.empty:
+            found = f"no vehicle in the lanes {', '.join(map(str, mapping.lanes))}"
+            raise TrajectoryError(str(path), found, "rows in them", "Correct `lanes` of the mapping.")
+        rows["lane"] = rows.lane.map(order)
+    from_right = mapping.lanes != "from_left"
+    rows["lane"] = rows.lane.astype(np.int64) * (1 if from_right != mapping.mirror else -1)
+    rows["s_m"] += rows.length_m * {"centre": 0.0, "front": -0.5, "rear": 0.5}[mapping.origin]
+    rows["fitted"] = rows["class"].isin(mapping.classes) if mapping.classes and "class" in rows else True
+    rows["road"] = pd.factorize(rows.direction)[0] if "direction" in rows else 0
+    return rows if "lateral_m" in rows else rows.assign(lateral_m=np.nan)
+
+
+def _from_highd(rows: pd.DataFrame, path: Path) -> pd.DataFrame:
+    """Rows of highD's tracks with both carriageways' positions and lanes as seen by their drivers.
+
+    Direction 1 drives to the left in the picture, so that its right lane is the upper one, of the smallest number.
+    """
+    stem = path.stem.removesuffix("_tracks")
+    vehicles = _highd_meta(path.with_name(f"{stem}_tracksMeta.csv"), ["id", "drivingDirection", "class"])
+    rate = _highd_meta(path.with_name(f"{stem}_recordingMeta.csv"), ["frameRate"])["frameRate"].astype(float).iloc[0]
+    rows = rows.merge(vehicles.rename(columns={"id": "vehicle_id"}), on="vehicle_id", how="left")
+    if (missing := rows.drivingDirection.isna()).any():
+        found = f"no vehicle {rows.vehicle_id[missing].iloc[0]}"
+        raise TrajectoryError(f"{stem}_tracksMeta.csv", found, "all vehicles", "Take both from one recording.")
+    leftwards = (rows.drivingDirection == "1").to_numpy()
+    forward = np.where(leftwards, -1.0, 1.0)
+    return rows.assign(
+        direction=rows.drivingDirection,
+        time_s=rows.time_s / rate,
+        s_m=forward * (rows.s_m + rows.length_m / 2),
+        speed_mps=forward * rows.speed_mps,
+        lane=-forward * rows.lane,
+    )
+
+
+def _highd_meta(path: Path, columns: list[str]) -> pd.DataFrame:
+    """Columns of one of highD's two files about a recording, as text."""
+    try:
+        return pd.read_csv(path, usecols=columns, dtype=str)
+    except FileNotFoundError:
+        found, mend = "no such file", "highD needs it beside the tracks: put it there."
+    except (ValueError, OSError) as error:
+        found, mend = str(error), "Take the file as it was published."
+    raise TrajectoryError(str(path), found, f"a CSV file with {', '.join(columns)}", mend)
+
+
+# -- one recording --
+
+
+def _recording(name: str, path: Path, rows: pd.DataFrame, share_read: float) -> Recording:
+    """Rows sorted by vehicle and time, and checked."""
+    code, identifiers = pd.factorize(rows.vehicle_id)
+    order = np.lexsort((rows.time_s, code))
+    rows = rows.drop(columns=[each for each in NAMES if each in rows]).iloc[order].reset_index(drop=True)
+    code = code[order]
+    time_s = rows.time_s.to_numpy()
+    dt = np.diff(time_s)
+    same = np.diff(code) == 0
+    another = np.append(True, ~same | (dt > ANOTHER_VEHICLE_S))
+    rows["vehicle"] = np.cumsum(another) - 1
+    vehicles = [str(identifiers[i]) for i in code[another]]
+    recording = Recording(name, str(path), rows, 0.0, vehicles, share_read)
+    if (twice := same & (dt == 0.0)).any():
+        where = recording.where(np.argmax(twice) + 1)
+        mend = "Delete it; or name recordings (recording_id), should the vehicle be another."
+        raise TrajectoryError(where, "a second row of this vehicle and time", "one", mend)
+    rate = _rate_hz(recording, dt[same & (dt < ANOTHER_VEHICLE_S)])
+    since = (time_s - time_s.min()) * rate
+    frame = np.rint(since).astype(np.int64)
+    if (odd := np.abs(since - frame) > 0.3).any():
+        found = f"a time between those of others, at {rate:.4g} Hz"
+        mend = "Interpolate all vehicles to the same times."
+        raise TrajectoryError(recording.where(np.argmax(odd)), found, "times in equal steps", mend)
+    rows["frame"] = frame + round(time_s.min() * rate)
+    recording = Recording(name, str(path), rows, rate, vehicles, share_read)
+    _check_units(recording)
+    return recording
+
+
+def _rate_hz(recording: Recording, steps_s: FloatArray) -> float:
+    """Frames per second."""
+    where, mend = f"{recording.file}, recording {recording.name}", "Name recordings at 10 Hz or more."
+    if not steps_s.size:
+        raise TrajectoryError(where, "one row per vehicle", "many", "Is vehicle_id the right column?")
+    step_s = float(np.median(steps_s))
+    regular = steps_s[np.abs(steps_s - step_s) < 0.5 * step_s]
+    rate = 1.0 / float(regular.mean())  # times may be rounded: 0.033, 0.067
+    if rate < SLOWEST_HZ:
+        if step_s >= 10.0:
+            mend = "Are times milliseconds, or frames? Say so in a mapping: units: {time_s: ms}, or seconds per frame."
+        raise TrajectoryError(where, f"a row every {step_s:g} s", "10 Hz or more", mend)
+    return float(round(rate)) if abs(rate / round(rate) - 1.0) < 1e-4 else rate
+
+
+def _check_units(recording: Recording) -> None:
+    """Refuse what cannot be metres and seconds, or belongs to different times; by name, where the ratio tells it."""
+    rows, where = recording.rows, f"{recording.file}, recording {recording.name}"
+    if (odd := rows.length_m.to_numpy() <= 0.0).any():
+        mend = "Gaps need lengths: mend it, or give one for all in a mapping (columns: {length_m: 4.6})."
+        raise TrajectoryError(recording.where(np.argmax(odd)), "no length", "a length above 0 m", mend)
+    n = round(recording.rate_hz)
+    begin = np.arange(0, len(rows) - n, max(n // 2, 1))
+    frame, vehicle = rows.frame.to_numpy(), rows.vehicle.to_numpy()
+    begin = begin[(vehicle[begin] == vehicle[begin + n]) & (frame[begin + n] == frame[begin] + n)]
+    s, v = rows.s_m.to_numpy(), rows.speed_mps.to_numpy()
+    way_m = s[begin + n] - s[begin]
+    summed = np.append(0.0, np.cumsum(v))
+    of_speeds_m = (summed[begin + n + 1] - summed[begin] - 0.5 * (v[begin] + v[begin + n])) / recording.rate_hz
+    moving = np.abs(way_m) > 1e-3 * n / recording.rate_hz
+    ratio = float(np.median(of_speeds_m[moving] / way_m[moving])) if moving.any() else 1.0
+    if abs(ratio - 1.0) > OF_STEP:
+        slip = min(SLIPS, key=lambda each: abs(ratio / each - 1.0))
+        words = f": {SLIPS[slip]}" if abs(ratio / slip - 1.0) < OF_STEP else ""
+        found = f"speeds {ratio:.3g} times the change of positions{words}"
+        mend = "Say their units in a mapping (units: {s_m: ft}); s_m must rise as one drives."
+        raise TrajectoryError(where, found, "m and m/s of one motion", mend)
+    median = float(np.median(v))
+    if not -0.5 < median < FASTEST_MEDIAN_MPS:
+        mend = "Are they feet or km/h, or negative? Say units in a mapping: {s_m: ft, speed_mps: ft/s, length_m: ft}."
+        raise TrajectoryError(where, f"a median speed of {median:.4g} m/s", "0 to 70 m/s", mend)
+    length = float(np.median(rows.length_m))
+    if not USUAL_LENGTH_M[0] <= length <= USUAL_LENGTH_M[1]:
+        mend = "Are they feet? Say so in a mapping: units: {length_m: ft}. Is the column the width?"
+        raise TrajectoryError(where, f"a median length of {length:.3g} m", "2.5 to 10 m", mend)
+    lag_s = _lag(begin, frame, vehicle, way_m * recording.rate_hz, v, n) / recording.rate_hz
+    if abs(lag_s) >= LEAST_LAG_S:
+        found = f"speeds that belong to positions of {abs(lag_s):.1f} s {'earlier' if lag_s > 0 else 'later'}"
+        raise TrajectoryError(where, found, "both of one time", "Correct the shift between the columns.")
+
+
+def _lag(begin: IntArray, frame: IntArray, vehicle: IntArray, way: FloatArray, v: FloatArray, n: int) -> int:
+    """Frames by which speeds lag behind positions; 0 unless a shift explains them better beyond doubt.
+
+    ``way`` is that of the ``n`` frames from each of ``begin``, in m/s times frames.
+    """
+    reach = 2 * n
+    inside = (begin >= reach) & (begin + n + reach < v.size)
+    begin, way = begin[inside], way[inside]
+    first, last = begin - reach, begin + n + reach
+    inside = (vehicle[first] == vehicle[last]) & (frame[last] - frame[first] == n + 2 * reach)
+    begin, way = begin[inside], way[inside]
+    if begin.size < 50:
+        return 0
+    summed = np.append(0.0, np.cumsum(v))
+    lags = np.arange(-reach, reach + 1, max(n // 10, 1))
+    error = np.empty((lags.size, begin.size))
+    for row, lag in zip(error, lags, strict=True):
+        at = begin + lag
+        row[:] = np.abs(summed[at + n + 1] - summed[at] - 0.5 * (v[at] + v[at + n]) - way)
+    best = int(np.argmin(error.mean(axis=1)))
+    gain = error[lags.size // 2] - error[best]
+    sure = gain.mean() > 6.0 * gain.std() / np.sqrt(gain.size) and gain.mean() > 0.2 * error[best].mean()
+    return int(lags[best]) if sure else 0

@@ -1,0 +1,89 @@
+"""Observations of motion that is known, and recordings that are refused."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from harness.errors import TrajectoryError
+from harness.fitting.observations import Observations, Tally, observations, require_enough
+from harness.fitting.table import load_mapping
+from tests.fitting.trajectories import overtaking
+
+
+def observed(rows: pd.DataFrame, tmp_path, **mapping) -> tuple[list[Observations], Tally]:
+    file = tmp_path / "rows.parquet"
+    rows.to_parquet(file, index=False)
+    found = [each for each, _ in observations([file], load_mapping().model_copy(update=mapping))]
+    total = Tally()
+    for each in found:
+        total = total.plus(each.tally)
+    return found, total
+
+
+def joined(found: list[Observations], name: str) -> np.ndarray:
+    return np.concatenate([getattr(each, name) for each in found])
+
+
+def test_states_and_accelerations_of_a_known_motion(tmp_path):
+    rows = overtaking(3.0)
+    found, total = observed(rows, tmp_path)
+    require_enough(total, "rows.parquet")
+    following, leads, at_risk = (joined(found, name) for name in ("following", "leads", "at_risk"))
+
+    # Held accelerations are found exactly, though states are those of the beginning of their second.
+    assert np.abs(following["acceleration_mps2"] - np.round(following["acceleration_mps2"] / 0.2) * 0.2).max() < 1e-9
+    assert following["acceleration_mps2"].std() == pytest.approx(0.2 * np.sqrt(2 / 3), rel=0.05)
+    first = found[0].following[0]
+    bv, lv = (rows.query(f"recording_id == 0 and vehicle_id == {i} and time_s == 0").iloc[0] for i in (1, 0))
+    assert first["v_mps"] == bv.speed_mps
+    assert first["r1dot_mps"] == lv.speed_mps - bv.speed_mps
+    assert first["r1_m"] == pytest.approx(60.0 - (bv.length_m + lv.length_m) / 2)
+
+    # Each cut-in is a row with the state just before it; time at risk ends there.
+    assert at_risk["changes"].sum() == total.used <= total.changes == rows.recording_id.nunique()
+    assert (leads["lead_s"] * leads["lateral_speed_mps"]) == pytest.approx(1.8, abs=0.06)
+    for each in found:
+        risky = each.at_risk
+        assert (np.flatnonzero(risky["changes"]) == len(risky) - 1).all()
+        crossed = rows.query(f"recording_id == {each.recording} and vehicle_id == 1 and lane == 0").time_s.min()
+        assert risky["duration_s"].sum() <= crossed - 0.05 + 1e-9
+        closing = risky["r2dot_mps"] < 0
+        assert risky["ttc_s"][closing] == pytest.approx(-(risky["r2_m"] / risky["r2dot_mps"])[closing])
+        assert np.isinf(risky["ttc_s"][~closing]).all()
+
+
+def test_time_at_risk_is_that_beside_nobody(tmp_path):
+    """By hand, frame by frame: behind LV, and no vehicle alongside."""
+    rows = overtaking(0.5)
+    found, _ = observed(rows, tmp_path)
+    wide = rows.set_index(["recording_id", "time_s", "vehicle_id"])[["s_m", "lane", "length_m"]].unstack()
+    s, lane, length = (wide[name].to_numpy() for name in ("s_m", "lane", "length_m"))
+    apart = np.abs(s[:, 2:] - s[:, 1:2]) - (length[:, 2:] + length[:, 1:2]) / 2
+    gap = s[:, 0] - s[:, 1] - (length[:, 0] + length[:, 1]) / 2
+    free = (apart > 0).all(axis=1) & (lane[:, 1] == 1) & (gap < 115)
+    seen = ((s[:, 2:] < s[:, 1:2]).any(axis=1)) | (s[:, 1] - -200 > 100)
+    by_hand = (free & seen).sum() / 10
+    assert joined(found, "at_risk")["duration_s"].sum() == pytest.approx(by_hand, rel=0.05)
+
+
+def test_noise_widens_accelerations_little_and_is_told(tmp_path):
+    clean, noisy = (observed(overtaking(3.0, noise=noise), tmp_path)[0] for noise in (0.0, 0.1))
+    error = joined(noisy, "free")["acceleration_mps2"] - joined(clean, "free")["acceleration_mps2"]
+    told = np.mean([each.noise_mps2 for each in noisy])
+    assert error.std() == pytest.approx(told, rel=0.1)
+    assert told < 0.7 * 0.1 * np.sqrt(2)  # a difference of two speeds has 0.14
+    assert all(each.noise_mps2 < 1e-2 for each in clean)
+
+
+def test_flicker_of_lanes_makes_no_lane_change(tmp_path):
+    rows = overtaking(2.0)
+    _, total = observed(rows, tmp_path)
+    for time in (0.7, 0.9, 1.1):  # BV has not moved yet
+        rows.loc[(rows.vehicle_id == 1) & np.isclose(rows.time_s, time), "lane"] = 0
+    flickering, smoothed = observed(rows, tmp_path)
+    assert smoothed.flickers > 0
+    assert smoothed.changes == total.changes
+    assert smoothed.used == total.used
+    with pytest.raises(TrajectoryError, match="come back within a second"):
+        require_enough(smoothed, "rows.parquet")
+    assert joined(flickering, "leads")["lead_s"].size
