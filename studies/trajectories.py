@@ -80,7 +80,7 @@ def simulate(environment: Environment, hours: float, seed: int, differences: Dif
     start = InitialStates(environment.numbers).from_uniforms(random.random((n, 5)))
     start["r2_m"], start["r2dot_mps"] = random.uniform(*BEHIND_M, n), -random.uniform(*CLOSING_MPS, n)
 
-    n_steps = round(TRIPLE_S / STEP_S)
+    n_steps = round(TRIPLE_S / STEP_S) - 1
     x, v = np.empty((2, n, 3, n_steps + 1))
     cut, lead = np.full((2, n), -1)
     upto = np.zeros((n, 3), np.int64)
@@ -129,7 +129,7 @@ def drive(
             if upto[i, AV] < 0 and cut[i] >= 0:
                 beside = -(length[i, AV] + length[i, BV] + CLOSEST_M) < r2 < CLOSEST_M
                 if beside or t > cut[i] + LEAVES_AFTER:
-                    upto[i, AV] = max(t, cut[i] + 1)
+                    upto[i, AV] = t
             apart = CLOSEST_M < r1 < environment.numbers.fit_range__r1_max_m
             if t == n_steps or (cut[i] < 0 and not apart):
                 break
@@ -149,12 +149,12 @@ def drive(
                     u = uniform(seed, i, LV_DRAWS if vehicle == LV else BV_DRAWS, 4 * t + vehicle)
                     a[vehicle] = laws.acceleration(laws.draw_acceleration(u, own, environment))
             beside = -(length[i, AV] + length[i, BV]) < r2 <= 0.0
-            if t > 0 and cut[i] < 0 and not beside:
+            if cut[i] < 0 and not beside:
                 accepted = laws.acceptance(r2, state.r2dot_mps, environment) if r2 > 0.0 else 1.0
                 wished = hazard[i] * laws.opportunity(state, environment)
                 clock -= laws.cut_in_hazard(wished, accepted, environment)
                 if clock < 0.0:
-                    cut[i], lead[i] = t, draw_lead(t, seed, i, environment.lateral)
+                    cut[i], lead[i] = t + 1, draw_lead(t, seed, i, environment.lateral)
             for vehicle in range(3):
                 v[i, vehicle, t + 1] = next_speed(v[i, vehicle, t], a[vehicle])
                 x[i, vehicle, t + 1] = next_position(x[i, vehicle, t], v[i, vehicle, t], v[i, vehicle, t + 1])
@@ -165,10 +165,13 @@ def drive(
 
 
 def _lateral(cut: IntArray, lead: IntArray, environment: Environment, n_steps: int) -> FloatArray | None:
-    """BV's distance to the right edge (m), (n, steps + 1): at even speed to the middle of the other lane."""
+    """BV's distance to the right edge (m), (n, steps + 1): at even speed to the middle of the other lane.
+
+    It is at the marking half a step before the first state in which it is on the right.
+    """
     if not environment.lateral.present:
         return None
-    since_onset = np.arange(n_steps + 1) - (cut - lead)[:, None]
+    since_onset = np.arange(n_steps + 1) - (cut - 0.5 - lead)[:, None]
     moved = environment.lateral.distance_m * since_onset / np.maximum(lead, 1)[:, None]
     moved = np.where((cut >= 0)[:, None], np.clip(moved, 0.0, LANE_WIDTH_M), 0.0)
     return np.asarray(1.5 * LANE_WIDTH_M - moved)
