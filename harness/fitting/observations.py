@@ -80,6 +80,9 @@ class Tally(NamedTuple):
     followed_s: float = 0.0
     overlapping_s: float = 0.0
     """Of that, behind a leader that overlaps."""
+    overlapping_fronts_s: float = 0.0
+    overlapping_rears_s: float = 0.0
+    """The same, if positions were those of front or rear bumpers."""
     first_overlap: str = ""
     own_clocks: int = 0
     """Recordings all of whose vehicles begin at the same time."""
@@ -91,7 +94,7 @@ class Tally(NamedTuple):
     straight: int = 0
     """Of those with lateral positions, without lateral motion."""
     closing_s: float = 0.0
-    """At risk with a time to collision below 8 s."""
+    """Whole seconds at risk with a time to collision below 8 s."""
     closing_other_s: float = 0.0
     """The same on the other side."""
 
@@ -157,64 +160,59 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
     track, flickers = _track(recording)
     n = track.second
     changes = np.flatnonzero(track.crosses(-1) & track.fitted)
-    chosen = track.frame % n == 0
-    whole = chosen.copy()
+    chosen = track.fitted & (track.frame % n == 0)
+    other_rows = np.flatnonzero(chosen & track.has_lane(1))
     chosen[changes] = True
-    rows = np.flatnonzero(chosen & track.fitted & track.has_lane(-1))
+    rows = np.flatnonzero(chosen & track.has_lane(-1))
+    whole = track.frame[rows] % n == 0
     scene = _Scene(track, chosen)
+    state, other = scene.states(rows, -1, fit_range), scene.states(other_rows, 1, fit_range)
     duration_s = _durations(track, rows)
 
-    v = track.v[rows]
-    leader, _ = scene.neighbours(rows, 0)
-    r1, r1dot = track.gap(leader, rows), track.rate(leader, rows)
-    fits = (v >= fit_range.v_min_mps) & (v <= fit_range.v_max_mps)
-    follows = (leader >= 0) & (r1 <= fit_range.r1_max_m)
-    behind = follows & fits & (r1 > max(fit_range.r1_min_m, 0.0))
-    overlaps = follows & (r1 < OVERLAP_M)
-    r2, r2dot, ttc_s, at_risk = _followed(scene, rows, -1)
-    *_, other_ttc_s, other = _followed(scene, rows, 1)
-    at_risk, other = at_risk & behind, other & behind
-
-    second = whole[rows] & track.same_run(rows, n)
+    second = whole & track.same_run(rows, n)
     acceleration = np.full(rows.size, np.nan)
     acceleration[second] = _slopes(track, rows[second])
-    seen = track.s[rows] + fit_range.r1_max_m <= track.road_end[track.road[rows]]
-    free, following = second & fits & ~follows & seen, second & behind
+    seen = (state.leader >= 0) | (track.s[rows] + fit_range.r1_max_m <= track.road_end[track.road[rows]])
     since = track.frame[rows] - track.frame[np.searchsorted(track.vehicle, track.vehicle[rows])]
-    initial = whole[rows] & behind & (since // n % INITIAL_EVERY_S == 0)
-    columns: dict[str, RecordArray] = {
-        "vehicle": track.vehicle[rows],
-        "v_mps": v,
-        "r1_m": r1,
-        "r1dot_mps": r1dot,
-        "r2_m": r2,
-    }
-    columns |= {"r2dot_mps": r2dot, "ttc_s": ttc_s, "acceleration_mps2": acceleration, "duration_s": duration_s}
     crosses = np.isin(rows, changes)
-    columns["changes"] = crosses
-
-    leads, straight = _leads(track, rows[crosses & fits])
+    columns = {
+        "vehicle": track.vehicle[rows],
+        "duration_s": duration_s,
+        "v_mps": track.v[rows],
+        "r1_m": state.r1,
+        "r1dot_mps": state.r1dot,
+        "r2_m": state.r2,
+        "r2dot_mps": state.r2dot,
+        "ttc_s": state.ttc_s,
+        "acceleration_mps2": acceleration,
+        "changes": crosses,
+    }
+    leads, straight = _leads(track, rows[crosses & state.fits])
+    overlaps = state.follows & (state.r1 < OVERLAP_M)
+    longer = 0.5 * (track.length[rows] - track.length[state.leader])
     tally = Tally(
         vehicles=np.unique(track.vehicle[rows]).size,
         driven_s=float(duration_s.sum()),
-        outside_s=float(duration_s[~fits].sum()),
-        followed_s=float(duration_s[follows].sum()),
+        outside_s=float(duration_s[~state.fits].sum()),
+        followed_s=float(duration_s[state.follows].sum()),
         overlapping_s=float(duration_s[overlaps].sum()),
-        first_overlap=_overlap(recording, rows, leader, r1, overlaps),
+        overlapping_fronts_s=float(duration_s[state.follows & (state.r1 + longer < OVERLAP_M)].sum()),
+        overlapping_rears_s=float(duration_s[state.follows & (state.r1 - longer < OVERLAP_M)].sum()),
+        first_overlap=_overlap(recording, rows, state, overlaps),
         own_clocks=int(track.vehicle[-1] > 0 and (track.frame[track.begins()] == track.frame.min()).all()),
         flickers=flickers,
         changes=changes.size,
-        used=int((at_risk & crosses).sum()),
+        used=int((state.at_risk & crosses).sum()),
         straight=straight,
-        closing_s=float(duration_s[at_risk & (ttc_s < CLOSING_TTC_S)].sum()),
-        closing_other_s=float(duration_s[other & (other_ttc_s < CLOSING_TTC_S)].sum()),
+        closing_s=float((whole & state.at_risk & (state.ttc_s < CLOSING_TTC_S)).sum()),
+        closing_other_s=float((other.at_risk & (other.ttc_s < CLOSING_TTC_S)).sum()),
     )
     return Observations(
         recording.name,
-        _records(FREE, columns, free),
-        _records(FOLLOWING, columns, following),
-        _records(INITIAL, columns, initial),
-        _records(AT_RISK, columns, at_risk),
+        _records(FREE, columns, second & state.fits & ~state.follows & seen),
+        _records(FOLLOWING, columns, second & state.behind),
+        _records(INITIAL, columns, whole & state.behind & (since // n % INITIAL_EVERY_S == 0)),
+        _records(AT_RISK, columns, state.at_risk),
         leads,
         _noise(track),
         tally,
@@ -348,24 +346,43 @@ class _Scene:
             np.where((i > 0) & (self._spot[behind] == spot), behind, -1),
         )
 
-    def beside(self, rows: IntArray, side: int) -> tuple[IntArray, IntArray, BoolArray]:
-        """Neighbours in the lane beside, and whether it is free alongside and seen far enough behind."""
-        ahead, behind = self.neighbours(rows, side)
-        track = self._track
-        clear = (track.gap(ahead, rows) > 0.0) & (track.gap(rows, behind) > 0.0)
-        seen = (behind >= 0) | (track.s[rows] - track.road_begin[track.road[rows]] >= IN_VIEW_M)
-        return ahead, behind, clear & seen
+    def states(self, rows: IntArray, side: int, fit_range: FitRange) -> _States:
+        """States of some rows (m,) towards the lane beside."""
+        track, fit = self._track, fit_range
+        v = track.v[rows]
+        leader, _ = self.neighbours(rows, 0)
+        r1 = track.gap(leader, rows)
+        fits = (v >= fit.v_min_mps) & (v <= fit.v_max_mps)
+        follows = (leader >= 0) & (r1 <= fit.r1_max_m)
+        behind = follows & fits & (r1 > max(fit.r1_min_m, 0.0))
+        ahead, after = self.neighbours(rows, side)
+        r2, r2dot = track.gap(rows, after), track.rate(rows, after)
+        ttc_s = np.full(rows.size, np.inf)
+        closing = r2dot < 0.0
+        ttc_s[closing] = r2[closing] / -r2dot[closing]
+        seen = (after >= 0) | (track.s[rows] - track.road_begin[track.road[rows]] >= IN_VIEW_M)
+        at_risk = behind & (r2 > 0.0) & (track.gap(ahead, rows) > 0.0) & seen
+        return _States(leader, r1, track.rate(leader, rows), fits, follows, behind, r2, r2dot, ttc_s, at_risk)
 
 
-def _followed(scene: _Scene, rows: IntArray, side: int) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """R2, R2dot and time to collision to who is behind in the lane beside, and whether one can go there, each (m,)."""
-    track = scene._track
-    _, behind, can = scene.beside(rows, side)
-    r2, r2dot = track.gap(rows, behind), track.rate(rows, behind)
-    ttc_s = np.full(rows.size, np.inf)
-    closing = r2dot < 0.0
-    ttc_s[closing] = r2[closing] / -r2dot[closing]
-    return r2, r2dot, ttc_s, can
+class _States(NamedTuple):
+    """States of rows (m,) towards the lane on one side."""
+
+    leader: IntArray
+    """Its row, or -1."""
+    r1: FloatArray
+    r1dot: FloatArray
+    fits: BoolArray
+    """Whether the speed is within the fit range."""
+    follows: BoolArray
+    """Whether R1 is."""
+    behind: BoolArray
+    """Both, without overlap."""
+    r2: FloatArray
+    r2dot: FloatArray
+    ttc_s: FloatArray
+    at_risk: BoolArray
+    """Behind a leader, nobody alongside, and seen who comes from behind."""
 
 
 def _durations(track: _Track, rows: IntArray) -> FloatArray:
@@ -443,13 +460,13 @@ def _slope(x: FloatArray, y: FloatArray) -> float:
 # -- is it enough? --
 
 
-def _overlap(recording: Recording, rows: IntArray, leader: IntArray, gap_m: FloatArray, overlaps: BoolArray) -> str:
+def _overlap(recording: Recording, rows: IntArray, state: _States, overlaps: BoolArray) -> str:
     """The first two vehicles that overlap, in words; empty if none do."""
     if not overlaps.any():
         return ""
     i = int(np.argmax(overlaps))
-    ahead = recording.vehicles[int(recording.rows.vehicle.iloc[leader[i]])]
-    return f"{recording.where(rows[i])}: a gap of {gap_m[i]:.1f} m to vehicle {ahead}"
+    ahead = recording.vehicles[int(recording.rows.vehicle.iloc[state.leader[i]])]
+    return f"{recording.where(rows[i])}: a gap of {state.r1[i]:.1f} m to vehicle {ahead}"
 
 
 def require_enough(total: Tally, where: str) -> None:
@@ -470,8 +487,12 @@ def require_enough(total: Tally, where: str) -> None:
         raise TrajectoryError(f"{where}, lane", found, expected, f"Name a column with lanes. {side}")
     if total.overlapping_s > MOST_OVERLAPPING * total.followed_s:
         share = total.overlapping_s / total.followed_s
-        mend = "Is s_m the front or the rear? Say so in a mapping (origin: front). Are lengths those of the vehicles?"
-        if total.own_clocks:
+        mend = "Are lengths those of the vehicles, and lanes those of the time?"
+        if total.overlapping_fronts_s < 0.2 * total.overlapping_s:
+            mend = "Positions fit front bumpers: set origin: front in a mapping (centre, where it says rear)."
+        elif total.overlapping_rears_s < 0.2 * total.overlapping_s:
+            mend = "Positions fit rear bumpers: set origin: rear in a mapping (centre, where it says front)."
+        elif total.own_clocks:
             mend = f"Do times count from one moment for all vehicles of a recording? {mend}"
         found = f"vehicles that overlap in {share:.1%} of the time; first {total.first_overlap}"
         raise TrajectoryError(where, found, f"at most {MOST_OVERLAPPING:.1%}", mend)

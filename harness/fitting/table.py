@@ -365,7 +365,7 @@ def _recording(name: str, path: Path, rows: pd.DataFrame, share_read: float) -> 
         where = recording.where(np.argmax(twice) + 1)
         mend = "Delete it; or name recordings (recording_id), should the vehicle be another."
         raise TrajectoryError(where, "a second row of this vehicle and time", "one", mend)
-    rate = _rate_hz(recording, dt[same & (dt < ANOTHER_VEHICLE_S)])
+    rate = _rate_hz(recording, dt[same])
     since = (time_s - time_s.min()) * rate
     frame = np.rint(since).astype(np.int64)
     if (odd := np.abs(since - frame) > 0.3).any():
@@ -387,7 +387,7 @@ def _rate_hz(recording: Recording, steps_s: FloatArray) -> float:
     regular = steps_s[np.abs(steps_s - step_s) < 0.5 * step_s]
     rate = 1.0 / float(regular.mean())  # times may be rounded: 0.033, 0.067
     if rate < SLOWEST_HZ:
-        if step_s >= 10.0:
+        if step_s >= 1.0:
             mend = "Are times milliseconds, or frames? Say so in a mapping: units: {time_s: ms}, or seconds per frame."
         raise TrajectoryError(where, f"a row every {step_s:g} s", "10 Hz or more", mend)
     return float(round(rate)) if abs(rate / round(rate) - 1.0) < 1e-4 else rate

@@ -7,10 +7,10 @@ RATE_HZ = 10
 
 
 def overtaking(hours: float, seed: int = 1, *, noise: float = 0.0) -> pd.DataFrame:
-    """Recordings of 60 s with LV and BV on the left, and three vehicles that come from behind on the right.
+    """Recordings of up to 60 s with LV and BV on the left, and three vehicles that come from behind on the right.
 
-    BV cuts in once, at a lateral speed of 0.5 to 1 m/s over 1.8 m, in front of whom it is then. Accelerations of BV
-    and LV are held for a second: -0.2, 0 or 0.2 m/s², taken back in the next.
+    BV cuts in once where there is room, at a lateral speed of 0.5 to 1 m/s over 1.8 m; the recording ends a second
+    after. Accelerations of BV and LV are held for a second: -0.2, 0 or 0.2 m/s², taken back in the next.
     """
     rng = np.random.default_rng(seed)
     n = max(round(hours * 3600 / 60 / 5), 1)
@@ -24,7 +24,8 @@ def overtaking(hours: float, seed: int = 1, *, noise: float = 0.0) -> pd.DataFra
     position = np.zeros_like(speed)
     position[:, :, 1:] = np.cumsum(0.5 * (speed[:, :, 1:] + speed[:, :, :-1]), axis=2) / RATE_HZ
     position += np.array([60.0, 0.0, -40.0, -120.0, -200.0])[:, None]
-    cut = rng.integers(20, 590, n)
+    room = np.abs(position[:, 2:] - position[:, 1:2]).min(axis=1) > 12.0
+    cut = np.array([rng.choice(np.flatnonzero(each[20:590])) + 20 for each in room])
     lateral_speed = rng.uniform(0.5, 1.0, n)
     come = np.clip(1.8 + (np.arange(601) - cut[:, None] - 0.5) / RATE_HZ * lateral_speed[:, None], 0.0, 3.6)
     lateral = np.zeros_like(speed)
@@ -42,4 +43,5 @@ def overtaking(hours: float, seed: int = 1, *, noise: float = 0.0) -> pd.DataFra
         "length_m": length,
         "lateral_m": lateral + noise * rng.standard_normal(shape),
     }
-    return pd.DataFrame({name: values.ravel() for name, values in columns.items()})
+    rows = pd.DataFrame({name: values.ravel() for name, values in columns.items()})
+    return rows[rows.time_s <= (cut[rows.recording_id] + RATE_HZ) / RATE_HZ + 1e-9].reset_index(drop=True)
