@@ -125,6 +125,8 @@ def test_the_command_writes_what_it_is_named_after(tmp_path: Path, name: str) ->
     call = ["trajectories", "ndd-overtaking-1", "--hours", "0.1", "--seed", "3", "--exact", "--out", str(file)]
     assert main(call) == 0
     table = pd.read_csv(file) if file.suffix == ".csv" else pd.read_parquet(file)
-    again = simulate(load_environment(EnvironmentSettings(lane_change_level=1000.0)), 0.1, 3)
+    again = simulate(
+        load_environment(EnvironmentSettings(parameters="ndd-overtaking-1", lane_change_level=1000.0)), 0.1, 3
+    )
     pd.testing.assert_frame_equal(table, again, check_dtype=False)
     assert "lateral_m" not in table
