@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _ME = "python -m studies"
 _out_option = click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; may be new.")
+_BESIDE = ("ndd-overtaking-1", "ndd-overtaking-2")
 _workers_option = click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
 
 
@@ -249,6 +250,41 @@ def trajectories(environment: str, file: Path, *, hours: float, seed: int, level
     table = simulate(load_environment(settings), hours, seed, ALIKE if exact else Differences())
     write(table, file)
     click.echo(f"{file}: {len(table):,} rows")
+
+
+@cli.command(
+    short_help="Put environments beside the motorway trajectories of the package tasi.",
+    epilog=examples(
+        f"pip install tasi==0.15.4 && {_ME} motorway --out runs/motorway",
+        f"{_ME} motorway --out runs/motorway -e my-traffic.yaml",
+    ),
+    context_settings={"show_default": True},
+)
+@_out_option
+@click.option("-e", "--environment", "environments", multiple=True, default=_BESIDE, help="Shipped name, or a file.")
+def motorway(folder: Path, *, environments: Sequence[str]) -> None:
+    """Say in what traffic on a German motorway agrees with environments, and in what it does not.
+
+    The data (DLR Highway Traffic: five minutes of the A39) come with the optional package tasi, and are read there:
+    their licence, CC BY-NC-SA, lets nobody ship them. The folder receives motorway.md, and trajectories.parquet for
+    `harness fit --mirror`.
+    """
+    from harness.campaign.sections import EnvironmentSettings  # noqa: PLC0415 - keeps --help fast
+    from harness.fitting.observations import observations  # noqa: PLC0415
+    from harness.fitting.table import load_mapping  # noqa: PLC0415
+    from harness.records.folder import write_bytes  # noqa: PLC0415
+    from harness.traffic.loading import load_environment  # noqa: PLC0415
+    from studies.motorway import figures, installed_rows, joined, page, trajectories_of  # noqa: PLC0415
+    from studies.trajectories import write  # noqa: PLC0415
+
+    laws = {Path(each).stem: load_environment(EnvironmentSettings(parameters=each)) for each in environments}
+    rows = installed_rows()
+    folder.mkdir(parents=True, exist_ok=True)
+    write(trajectories_of(rows), table := folder / "trajectories.parquet")
+    seen = joined(each for each, _ in observations([table], load_mapping(mirror=True)))
+    written = page(seen, figures(seen, laws))
+    write_bytes(folder / "motorway.md", written.encode())
+    click.echo(written)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
