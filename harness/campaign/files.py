@@ -207,12 +207,16 @@ def names_a_campaign(path: str | Path) -> bool:
     return suffix not in (".py", ".fmu") and (Path(path).exists() or ("/" in text and ":" not in text))
 
 
+QUICK = {"rhw": 0.3, "below_reference": 0.2}
+"""When a vehicle without a campaign has been tested enough."""
+
+
 def _default_campaign(vehicle: str) -> dict[str, Any]:
     place, _, name = vehicle.rpartition(":")
     words = Path(vehicle).stem if vehicle.endswith(".fmu") else f"{Path(place).name.removesuffix('.py')}-{name}"
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", words).strip("-._")
     kept = {"traces": "crash"}  # for the page's player
-    return {"name": name, "av": named_vehicle(vehicle), "stop": {"rhw": 0.3}, "records": kept}
+    return {"name": name, "av": named_vehicle(vehicle), "stop": dict(QUICK), "records": kept}
 
 
 def named_vehicle(text: str, option: str = "") -> dict[str, Any]:

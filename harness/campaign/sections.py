@@ -221,6 +221,13 @@ class Stop(Section):
     rhw: float | None = Field(
         None, gt=0.0, lt=10.0, description="stop at this half-width of the interval over the rate; not for step_mixture"
     )
+    below_reference: float | None = Field(
+        None,
+        gt=0.0,
+        le=1e6,
+        description="with rhw and shells: stop, too, once the rate is known to be below so many times that of the "
+        "library's first reference driver",
+    )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = Field(
         None, description="crashes needed before rhw may stop the campaign; none: 100, with shells 1"

@@ -9,14 +9,14 @@ from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.block import CUT_OFF_STEPS, DANGER_TTC_S, Block
-from harness.estimators.estimate import Estimate, Number, Point, Unavailable, finite_json
+from harness.estimators.estimate import WIDE_RHW, Estimate, Number, Point, Unavailable, finite_json
 from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import PairedEstimate
 from harness.estimators.severity import Severity
 from harness.estimators.short_answer import ShortAnswer, short_answer
-from harness.estimators.stopping import RoundRule, Rule
+from harness.estimators.stopping import RoundRule, Rule, limit_words
 from harness.importance.functions import importance_names
-from harness.numbers import WIDEST_RHW, interval, number, plain, ratio, share, two_digits_up
+from harness.numbers import interval, number, plain, ratio, share, two_digits_up
 from harness.records.folder import StoppedBy
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ESTIMATORS, RUN_FOLDER, EstimatorName
@@ -32,10 +32,8 @@ MENDS: dict[str, str] = {
     "vehicle that acts before the cut-in) and use a new folder",
 }
 """Why a campaign ended before its precision, and the mend."""
-BIASED_RHW = 0.5
-"""Precision from which on stopping at the first interval biases the rate noticeably."""
 TOO_WIDE = (
-    f" A relative half-width above {BIASED_RHW:g} is reached by chance: stopping at the first such interval makes "
+    f" A relative half-width above {WIDE_RHW:g} is reached by chance: stopping at the first such interval makes "
     "rates too high on the mean. Ask for a smaller stop.rhw."
 )
 
@@ -187,15 +185,14 @@ def statement(
         if distance_per_test_km:
             scaled = per_distance(estimate, distance_per_test_km)
             per_million_km = interval(scaled["ci_low"], scaled["ci_high"], scaled["rate"])
+            if estimate.is_wide:
+                per_million_km = f"below {number(scaled['ci_high'])}"
             per_km = f"; that is {per_million_km} crashes per million km of such overtaking driving"
-        width = f", relative half-width {share(estimate.rhw)}"
-        if estimate.rhw > WIDEST_RHW:
-            width = ", still open upwards: far wider than the rate"
-        text = (
-            f"{what} is {number(estimate.crash_rate)} per test ({level} interval "
-            f"{interval(estimate.ci_low, estimate.ci_high)}{'' if estimate.cautions else width}), "
-            f"estimated from {tests}"
-        )
+        rate, within = number(estimate.crash_rate), interval(estimate.ci_low, estimate.ci_high)
+        also = "" if estimate.cautions else f", relative half-width {share(estimate.rhw)}"
+        if estimate.is_wide:
+            rate, also = f"below {number(estimate.ci_high)}", f"; {rate} was seen"
+        text = f"{what} is {rate} per test ({level} interval {within}{also}), estimated from {tests}"
     return warned(estimate.cautions, f"{text}{per_km}.")
 
 
@@ -212,15 +209,18 @@ def failed_statement(found: Mapping[str, Any]) -> str:
 def reference_statements(estimate: Estimate) -> list[str]:
     """How the vehicle compares with each reference driver, a sentence each; none unless drawn from shells."""
     references, level = estimate.details.get("references", ()), share(estimate.confidence)
-    return [_beside(found, level) for found in references if found["crash_rate"] > 0.0]
+    return [_beside(found, level, wide=estimate.is_wide) for found in references if found["crash_rate"] > 0.0]
 
 
-def _beside(found: Mapping[str, Any], level: str) -> str:
+def _beside(found: Mapping[str, Any], level: str, *, wide: bool) -> str:
     who = f"{found['described']} ({found['reference']})"
-    if found["ratio"] == 0.0:
+    if found["ratio"] == 0.0 or (wide and found["ratio_high"] < 1.0):
+        seen = "no crash was sampled"
+        if found["ratio"] > 0.0:
+            seen = f"{ratio(found['ratio'])} times was seen, and {ratio(found['ratio_low'])} is the lower end"
         return (
             f"In the same traffic this vehicle crashes less than {ratio(found['ratio_high'])} times as often as {who} "
-            f"would (upper end of the {level} interval): no crash was sampled."
+            f"would (upper end of the {level} interval): {seen}."
         )
     low, high = found["preventable_low"], found["preventable_high"]
     return (
@@ -292,7 +292,7 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
     look, budget = rule.look, campaign.stop.episodes
     stopped_by: StoppedBy = "pool"
     if look.stopped:
-        stopped_by = "rhw" if look.decision is None else "accept"
+        stopped_by = "accept" if look.decision is not None else "rhw" if look.below is None else "below_reference"
     elif look.decision is not None and look.decision.is_final:
         stopped_by = "contradicted"
     elif look.pool_error_above_target:  # whatever else is spent: more of it would not help
@@ -300,7 +300,10 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
     elif n_episodes >= budget:
         stopped_by = "episodes"
     after, unmet = f"Stopped after {n_episodes:,} tests", " and ".join(look.unmet)
-    if stopped_by in ("rhw", "accept"):
+    if look.below is not None:
+        limit = limit_words(look.below.limit, look.below.driver)
+        why = f"with confidence {plain(look.below.confidence)} the crash rate is below {limit} (stop.below_reference)"
+    elif stopped_by in ("rhw", "accept"):
         why = f"the last condition to be met was {unmet}" if unmet else "every condition was met at the first look"
     elif campaign.stop.rhw is not None or look.decision is not None:
         after, why = f"{after} without {unmet}", MENDS[stopped_by]
@@ -308,7 +311,7 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
             why = _runs_or_tests(rule, campaign, n_episodes) or why
     else:
         why = "stop.episodes was all that was asked for" if stopped_by == "episodes" else MENDS[stopped_by]
-    wide = stopped_by == "rhw" and campaign.sampling.strata and (campaign.stop.rhw or 0.0) > BIASED_RHW
+    wide = stopped_by == "rhw" and campaign.sampling.strata and (campaign.stop.rhw or 0.0) > WIDE_RHW
     return stopped_by, f"{after}: {why}." + (TOO_WIDE if wide else "")
 
 

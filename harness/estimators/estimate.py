@@ -19,6 +19,9 @@ from harness.estimators.block import Block
 
 Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 """What JSON has as null, because it was infinite or not defined, is read as NaN: not known."""
+WIDE_RHW = 0.5
+"""Relative half-width from which on a rate says less than its limits, and stopping at the first such interval biases
+it noticeably."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,11 @@ class Estimate:
     def precision(self) -> float:
         """`rhw` as far as it says how precise the rate is: infinite where the interval may be wrong."""
         return math.inf if self.cautions else self.rhw
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the upper end of an interval from shells says more than the rate: without a crash, or with few."""
+        return "shells" in self.details and not self.cautions and self.rhw > WIDE_RHW
 
     @property
     def shown(self) -> Estimate:

@@ -292,6 +292,12 @@ class Shells:
         """Rate and limits of a statement, or of all strata."""
         return self._limits(self._design.n_within(statement), level)
 
+    @property
+    def first_reference(self) -> str | None:
+        """The first reference driver of the library that crashes at all; None without one."""
+        rates = zip(self._design.references, self._design.reference_rate, strict=True)
+        return next((each.name for each, rate in rates if rate > 0.0), None)
+
     def beside(self, driver: str, statement: str, level: Level) -> tuple[float, float]:
         """Limits of a statement's rate over that of a reference driver; any where crashes lie on too few paths."""
         design = self._design

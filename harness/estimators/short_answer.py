@@ -33,10 +33,11 @@ from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
 CUT_OFF_SHARE = 0.2
-"""Weight, relative to the rate, from which tests that were cut off are warned of."""
+"""Weight, relative to the rate, from which tests that were cut off are warned of, if the interval leaves them out."""
 _BRAKES_HARDEST = "brakes-8"
 ENDED = {
     "rhw": "precision reached",
+    "below_reference": "far enough below the competent driver",
     "accept": "decision reached",
     "episodes": "budget spent",
     "pool": "every cut-in of the pool was tested",
@@ -126,19 +127,20 @@ def _rows(
         yield _decided(decision)
     from_mps = campaign.crash.counts_above_mps
     counted = f"crash rate > {plain(from_mps)} m/s" if from_mps else "crash rate"
+    wide, less = best.is_wide, ""
     shown, ends = best.crash_rate, interval(best.ci_low, best.ci_high)
-    value = f"{number(shown)} per test"
-    if not best.n_crashes:
-        shown, ends, value = best.upper_bound, "no crash seen", f"< {number(best.upper_bound)} per test"
-    less = "" if best.n_crashes else "< "
+    if not best.n_crashes or wide:
+        less, shown = "< ", best.ci_high if best.n_crashes else best.upper_bound
+        ends = f"{number(best.crash_rate)} seen, ≥ {number(best.ci_low)}" if best.n_crashes else "no crash seen"
     per_km = "" if not distance_km else f"{less}{number(shown * 1e6 / distance_km)} per million km"
     untested = any(each["p"] > 0.0 and not each["n_episodes"] for each in best.details.get("shells", ()))
     # A shell without tests adds nothing to the rate, and all of its probability to the upper limit.
     so_far = " so far" if untested and best.n_crashes else ""
-    yield Row("rate", f"{counted}{so_far}", value, ends, per_km)
-    beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0]
-    for each in beside[:1]:
-        yield _beside(each, acts=campaign.av.acts_before_cut_in)
+    rows = [Row("rate", f"{counted}{so_far}", f"{less}{number(shown)} per test", ends, per_km)]
+    beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
+    rows += [_beside(each, acts=campaign.av.acts_before_cut_in, wide=wide) for each in beside]
+    # Of an attentive vehicle little more is known than that it crashes less often than that driver: that comes first.
+    yield from reversed(rows) if wide and beside and beside[0]["ratio_high"] < 1.0 else rows
     if not beside and campaign.has_baseline_runs and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
     if campaign.has_baseline_runs and best.n_crashes:
@@ -149,10 +151,9 @@ def _rows(
         value = f"median {tenths(severity.median_mps)} m/s"
         what = f"impact{so_far}"
         yield Row("impact", what, value, f"{above} > {plain(HARD_MPS)} m/s", f"{below} < {plain(TOUCH_MPS)} m/s")
-        if (of := severity.unavoidable) is not None:
-            hardest = of.driver == _BRAKES_HARDEST
-            why = "not even 8 m/s² avoids it" if hardest else f"{of.driver} crashes there, too"
-            ends = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}"
+        # What a driver who brakes less hard does not avoid another one may.
+        if (of := severity.unavoidable) is not None and of.driver == _BRAKES_HARDEST:
+            ends, why = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}", "not even 8 m/s² avoids it"
             yield Row("unavoidable", f"unavoidable{so_far}", f"{share(of.share)} of the rate", ends, why)
     asked = campaign.testing.shells.statement
     statements = best.details.get("statements", ())
@@ -190,13 +191,16 @@ def _decided(decision: Mapping[str, Any]) -> Row:
     return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
 
 
-def _beside(found: Mapping[str, Any], *, acts: bool) -> Row:
+def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool) -> Row:
     low, high = found["ratio_low"], found["ratio_high"]
     who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
     if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
         who = f"{found['reference']}, same approach"
     if not found["ratio"]:
         return Row("ratio", "× competent driver", f"< {ratio(high)}", "no crash seen", who)
+    if wide and high < 1.0:
+        seen = f"{ratio(found['ratio'])} seen, ≥ {ratio(low)}"
+        return Row("ratio", "× competent driver", f"< {ratio(high)} (crashes less)", seen, who)
     apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
     return Row(
         "ratio", "× competent driver", f"{ratio(found['ratio'])} ({apart})", f"{ratio(low)} to {ratio(high)}", who
@@ -234,9 +238,9 @@ def _warnings(
         yield f"the vehicle does not do what statement {decision['statement']} assumes: ask without it"
     if decision is not None and (before := decision["asked_before"]):
         yield f"these tests were asked about {len(before)} other limits before: {', '.join(map(plain, before))}"
-    if severity is not None and severity.cut_off > CUT_OFF_SHARE * best.crash_rate:
-        worst = number(best.crash_rate + severity.cut_off)
-        yield f"time was up while it closed in: had all these tests crashed, {worst} per test"
+    worst = best.crash_rate + (0.0 if severity is None else severity.cut_off)
+    if worst > max((1.0 + CUT_OFF_SHARE) * best.crash_rate, best.ci_high):
+        yield f"time was up while it closed in: had all these tests crashed, {number(worst)} per test"
     if manifest.get("cut_ins_take_time") and campaign.av.source in ("sumo", "traci"):
         yield "SUMO switches lanes in one step: this vehicle cannot see BV come over, as other drivers do"
     if (level := campaign.environment.lane_change_level) != 1.0:
@@ -245,7 +249,7 @@ def _warnings(
 
 def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None) -> str:
     ended, target = ENDED.get(stopped_by or "", "interrupted"), campaign.stop.rhw
-    if campaign.accept is None and target is not None and stopped_by != "rhw":
+    if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference"):
         asked = best.precision
         for each in best.details.get("statements", ()):
             asked = each["rhw"] if each["name"] == campaign.testing.shells.statement else asked

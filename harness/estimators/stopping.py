@@ -153,6 +153,8 @@ class Look:
     """What is known about the limit that the campaign asks about, if it does; then that is waited for."""
     rhw_from_pool: float = 0.0
     """What the pool's error alone would leave of ``rhw``; 0 while little is known."""
+    below: Decision | None = None
+    """That the crash rate is far enough below a reference driver's (``stop.below_reference``), if that ended it."""
 
 
 class Rule:
@@ -273,6 +275,7 @@ class RoundRule(Rule):
         super().__init__(campaign.stop.rhw, campaign.min_crashes)
         self._held, self._confidence = held, campaign.stop.confidence
         self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
+        self._below_reference = campaign.stop.below_reference
 
     def observe(self, seen: Shells) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
@@ -283,23 +286,38 @@ class RoundRule(Rule):
         n_crashes, also = int(tally.crashes.sum()), FIRST_TESTS if self.of_first_tests else None
         pool = limits.from_pool_relative() if n_crashes >= self._min_crashes else (0.0, 0.0)
         enough = self._looked(limits.rhw, n_crashes, also=also, pool=pool)
+        if not self.look.stopped and (below := self._below(seen)) is not None:
+            unmet = (f"stop.below_reference ({below.limit:g})",)
+            self.look = replace(self.look, stopped=True, unmet=unmet, below=below)
         return self.look.stopped or (enough and tally.tests.sum() >= self._held)
 
     def more_tests(self, target: float, more_runs: float) -> float:
         """How many times as many tests are expected to reach a relative half-width, see `Shells.more_tests`."""
         return self._seen.more_tests(self._statement, Level.two_sided(self._confidence), target, more_runs)
 
+    def _below(self, seen: Shells) -> Decision | None:
+        """That the rate is below the asked multiple of a reference driver's, at the level of decisions."""
+        if self._below_reference is None or self._target is None or (driver := seen.first_reference) is None:
+            return None
+        found = self._beside(seen, self._below_reference, driver)
+        return found if found.verdict == "accepted" else None
+
+    def _beside(self, seen: Shells, limit: float, driver: str | None) -> Decision:
+        """What is known about a limit after these tests, at the level of decisions."""
+        n = int(seen.tally.tests.sum())
+        level, statement = self.level_at(n, self._confidence), self._statement
+        ends = seen.limits_of(statement, level)[1:3] if driver is None else seen.beside(driver, statement, level)
+        confidence, contradicted = (1.0 + self._confidence) / 2.0, seen.contradicts(statement)
+        return Decision(limit, statement, confidence, *ends, contradicted, n, driver=driver)
+
     def _decided(self, seen: Shells, accept: Accept) -> bool:
         """Look at a limit until it is decided; that answer stays, also while the folder holds further tests."""
         n, found = int(seen.tally.tests.sum()), self.look.decision
         if found is None or not found.is_final:
-            level, (key, limit, driver) = self.level_at(n, self._confidence), accept.asked
-            limits = seen.limits_of(self._statement, level)
-            ends = limits[1:3] if driver is None else seen.beside(driver, self._statement, level)
-            confidence, contradicted = (1.0 + self._confidence) / 2.0, seen.contradicts(self._statement)
-            found = Decision(limit, self._statement, confidence, *ends, contradicted, n, driver=driver)
-            unmet = (f"accept.{key} ({limit:g})",)
-            self.look = Look(limits.rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
+            key, limit, driver = accept.asked
+            found, unmet = self._beside(seen, limit, driver), (f"accept.{key} ({limit:g})",)
+            rhw = seen.limits_of(self._statement, self.level_at(n, self._confidence)).rhw
+            self.look = Look(rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
         return found.is_final and n >= self._held
 
 

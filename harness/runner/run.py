@@ -237,8 +237,8 @@ class Run:
         for path in {path for table in TABLES for path in shards_on_disk(self.out, table)} - counted:
             path.unlink()
         stopped_by, said = conclusion(self.campaign, rule, manifest.n_episodes)
-        expected = expected_for(rule, self.campaign, manifest.n_episodes) if stopped_by != "rhw" else None
-        missed = self.campaign.stop.rhw is not None and stopped_by != "rhw"
+        missed = self.campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference")
+        expected = expected_for(rule, self.campaign, manifest.n_episodes) if missed else None
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
         if decision is not None:
             code = EXIT_OF[decision.verdict]

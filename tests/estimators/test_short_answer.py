@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.estimators.answer import estimate_blocks
+from harness.estimators.answer import estimate_blocks, reference_statements, statement
 from harness.estimators.short_answer import LINES, WIDTH, _whence, lines, pair_lines, short_answer, vehicle_words
 from harness.records.folder import read_manifest
 from harness.report.summary import read_run_folder
@@ -176,6 +176,30 @@ def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time
     ):  # fmt: skip
         answer = short_answer(golden(name), best, None, {"cut_ins_take_time": takes_time}, None)
         assert any("cannot see BV come over" in each for each in answer.warnings) == warned
+
+
+@pytest.mark.parametrize(
+    ("seen", "high", "first", "value", "ends"),
+    [
+        (0.0, 0.2, "ratio", "< 0.20", "no crash seen"),
+        (0.08, 0.2, "ratio", "< 0.20 (crashes less)", "0.080 seen, ≥ 0.050"),
+        (0.08, 3.0, "rate", "< 3.00 × 10⁻⁸ per test", "1.00 × 10⁻⁹ seen, ≥ 5.00 × 10⁻¹⁰"),
+    ],
+)
+def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, value, ends, stored_run):
+    """An upper limit, where the interval is wide or nothing crashed; the ratio's, where it says something."""
+    folder = stored_run("shells-lateral-twin")
+    best = read_run_folder(folder).headline
+    [beside, *_] = best.details["references"]
+    low = 0.0 if seen == 0.0 else 0.05
+    beside = {**beside, "reference": "r157-cc", "crash_rate": 3e-8, "ratio": seen, "ratio_low": low, "ratio_high": high}
+    rate = {"crash_rate": 1e-9 * (seen > 0.0), "ci_low": 5e-10 * (seen > 0.0), "ci_high": 3e-8, "rhw": 15.0}
+    best = replace(best, **rate, n_crashes=2 * (seen > 0.0), details={**best.details, "references": [beside]})
+    rows = short_answer(golden("shells-lateral-twin", "stop.rhw=0.3"), best, None, {}, None).rows
+    assert (rows[0].key, rows[0].value, rows[0].interval) == (first, value, ends)
+    [told, *_] = reference_statements(best)
+    assert ("this vehicle crashes less than 0.20 times as often as" in told) == (high < 1.0)
+    assert statement(best, 1.0, None).count("is below 3.00 × 10⁻⁸") == (seen > 0.0)
 
 
 def test_a_comparison_is_as_short():

@@ -19,7 +19,7 @@ from harness.estimators.pairs import CRASH, NO_CRASH, no_pairs
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import LOOK_RATIO, Decision, RoundRule, StopRule, look_grid
 from harness.estimators.tally import Tally
-from harness.strata import ASSUMPTION_FREE, Statement
+from harness.strata import ASSUMPTION_FREE, Reference, Statement
 from tests.estimators.small_blocks import SHELLS, block
 
 SHARD = 200
@@ -155,6 +155,26 @@ def test_either_verdict_is_wrong_in_at_most_one_of_twenty():
 def test_the_intervals_own_limits_after_each_round_are_wrong_far_more_often(monkeypatch):
     monkeypatch.setattr(RoundRule, "level_at", staticmethod(lambda *_: LEVEL))
     assert all(binomtest(n, REPLICATIONS, 0.05, alternative="greater").pvalue < 1e-9 for n in wrong())
+
+
+@pytest.mark.parametrize("n", [30, 300, 1_000, 3_000])
+def test_a_run_that_a_reference_driver_ends_is_held_to_the_level_of_decisions(n):
+    """It ends where a gate with the same limit accepts: where the limit is the rate, in at most one of twenty."""
+    known = {"references": (Reference("r157-cc", "a driver"),), "reference_square": np.array([1e-4])}
+    tests, crashes = np.array([n, n, 8 * n]), np.array([0, 1, 0])
+    content, stopped = {"name": "x", "testing": {"method": "shells"}}, []
+    for rate in np.geomspace(1e-7, 1e-2, 40):
+        design = replace(DESIGN, **known, reference_rate=np.array([rate]))
+        counted = Shells()
+        counted.count(design, Tally(tests, crashes, 0 * tests, np.outer(crashes, P), np.zeros((3, 3))))
+        asked = {"stop": {"rhw": 1e-3, "below_reference": 0.2}}
+        gate = {"accept": {"times_reference": {"driver": "r157-cc", "at_most": 0.2}}}
+        below, accepting = (RoundRule(Campaign.model_validate({**content, **each})) for each in (asked, gate))
+        accepting.observe(counted)
+        stopped.append(below.observe(counted))
+        assert stopped[-1] == (accepting.look.decision.verdict == "accepted") == (below.look.below is not None)
+    assert stopped == sorted(stopped)
+    assert 0 < sum(stopped) < 40
 
 
 def test_every_round_is_looked_at_whatever_the_folder_holds():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from harness import estimate
@@ -102,6 +104,22 @@ def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, 
     assert found["statement"] == ("library" if "library" in changes[0] else "assumption_free")
     n_outside = decided.estimates["estimates"]["shells"]["details"]["statements"][0]["n_episodes_outside"]
     assert n_outside == 0 or "library" not in changes[0]
+
+
+def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(campaign, run_here, tmp_path):
+    """Where precision is out of reach; the same folder goes on when that is no longer asked."""
+    asked = partial(campaign, *SHELLS, "world.engine=twin", "stop.rhw=0.01", "stop.episodes=2000")
+    far = run_here(asked("stop.below_reference=2"), tmp_path / "far")
+    assert (far.exit_code, far.stopped_by, far.estimates["decision"]) == (0, "below_reference", None)
+    said = "with confidence 0.95 the crash rate is below 2 times that of r157-cc (stop.below_reference)"
+    assert said in far.ending
+    assert far.estimates["answer"]["scope"].endswith("ended by: far enough below the competent driver")
+    n = far.estimates["n_episodes"]
+    others = run_here(asked("stop.below_reference=0.3"), tmp_path / "other")
+    assert (others.exit_code, others.estimates["n_episodes"]) == (4, 2000)
+    on = run_here(asked(), far.folder, resume=True)
+    assert n < on.estimates["n_episodes"] == 2000
+    assert unlike_columns(on.folder, others.folder) == []
 
 
 def test_a_second_limit_is_answered_and_said(campaign, run_here, tmp_path):
