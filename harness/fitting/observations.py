@@ -46,6 +46,7 @@ SHORTEST_LANE_S = 0.5
 LATERAL_WINDOW_S = 0.5
 """Half of the time over which the lateral speed at a crossing is a slope."""
 STRAIGHT_MPS = 0.1
+SHIFTED_S = 0.8
 OVERLAP_M = -0.5
 """A gap below that is no error of measurement."""
 MOST_OVERLAPPING = 0.005
@@ -93,6 +94,8 @@ class Tally(NamedTuple):
     """Of those, behind a leader within the fit range and beside nobody."""
     straight: int = 0
     """Of those with lateral positions, without lateral motion."""
+    shifted: int = 0
+    """Of those, more than 0.8 s from the middle between both lanes."""
     closing_s: float = 0.0
     """Whole seconds at risk with a time to collision below 8 s."""
     closing_other_s: float = 0.0
@@ -187,7 +190,7 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         "acceleration_mps2": acceleration,
         "changes": crosses,
     }
-    leads, straight = _leads(track, rows[crosses & state.fits])
+    leads, straight, shifted = _leads(track, rows[crosses & state.fits])
     overlaps = state.follows & (state.r1 < OVERLAP_M)
     longer = 0.5 * (track.length[rows] - track.length[state.leader])
     tally = Tally(
@@ -204,6 +207,7 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         changes=changes.size,
         used=int((state.at_risk & crosses).sum()),
         straight=straight,
+        shifted=shifted,
         closing_s=float((whole & state.at_risk & (state.ttc_s < CLOSING_TTC_S)).sum()),
         closing_other_s=float((other.at_risk & (other.ttc_s < CLOSING_TTC_S)).sum()),
     )
@@ -420,13 +424,16 @@ def _noise(track: _Track) -> float:
 # -- lateral motion --
 
 
-def _leads(track: _Track, crossings: IntArray) -> tuple[RecordArray, int]:
-    """Leads of some crossings (rows before them), and how many go without lateral motion.
+def _leads(track: _Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
+    """Leads of some crossings (rows before them); how many go without lateral motion, and how many at another time.
 
     The onset is where a line, level before and straight from there to the crossing, comes nearest to the lateral
     positions: as the law has it, which moves BV at a constant lateral speed. Where a track begins later, there is none.
     """
-    found, straight = [], 0
+    found, straight, shifted = [], 0, 0
+    moves = (np.diff(track.lane) != 0) & (np.diff(track.vehicle) == 0)
+    steady = ~np.isin(track.vehicle, track.vehicle[1:][moves]) & np.isfinite(track.lateral)
+    middle: dict[tuple[int, int], float] = {}
     for row in crossings:
         window = round(LATERAL_WINDOW_S * track.rate_hz)
         near = np.arange(max(row - window + 1, 0), min(row + window + 1, track.run.size))
@@ -435,13 +442,19 @@ def _leads(track: _Track, crossings: IntArray) -> tuple[RecordArray, int]:
         reach = reach[(track.run[reach] == track.run[row]) & np.isfinite(track.lateral[reach])]
         if near.size < window or reach.size < 2 * window:
             continue
-        speed = abs(_slope(near / track.rate_hz, track.lateral[near]))
-        straight += speed < STRAIGHT_MPS
+        speed = _slope(near / track.rate_hz, track.lateral[near])
+        road, lane = where = int(track.road[row]), int(track.lane[row])
+        if where not in middle:
+            on = [track.lateral[steady & (track.road == road) & (track.lane == each)] for each in (lane, lane - 1)]
+            middle[where] = float(np.mean([np.median(each) if each.size else np.nan for each in on]))
+        off_m = abs(track.lateral[reach[-1]] - middle[where])
+        straight += int(abs(speed) < STRAIGHT_MPS)
+        shifted += int(STRAIGHT_MPS <= abs(speed) < off_m / SHIFTED_S)
         before_s = (reach - row - 0.5) / track.rate_hz
         onset = _onset(before_s, track.lateral[reach])
         if onset - before_s[0] >= SHORTEST_LANE_S:
-            found.append((track.vehicle[row], -onset, speed))
-    return np.array(found, LEADS), straight
+            found.append((track.vehicle[row], -onset, abs(speed)))
+    return np.array(found, LEADS), straight, shifted
 
 
 def _onset(time_s: FloatArray, lateral: FloatArray) -> float:
@@ -500,8 +513,10 @@ def require_enough(total: Tally, where: str) -> None:
         found = f"{total.flickers:,} lanes that come back within a second, beside {total.changes:,} lane changes"
         mend = "Smooth lanes, or take them from lateral positions."
         raise TrajectoryError(f"{where}, lane", found, "lanes that last", mend)
-    if total.straight > 0.5 * total.changes:
-        found = f"{total.straight:,} of {total.changes:,} lane changes without lateral motion"
+    how = {"without lateral motion": total.straight, "more than 0.8 s from the lane's marking": total.shifted}
+    odd = max(how, key=how.__getitem__)
+    if how[odd] > 0.5 * total.changes:
+        found = f"{how[odd]:,} of {total.changes:,} lane changes {odd}"
         mend = "Correct the shift between lanes and lateral positions, or leave out lateral_m."
         raise TrajectoryError(f"{where}, lane", found, "lateral_m of the same time", mend)
     if total.outside_s > MOST_OUTSIDE * total.driven_s:

@@ -131,6 +131,9 @@ def recordings(files: Sequence[str | Path], mapping: Mapping) -> Iterator[Record
     """
     paths = [Path(file) for file in files]
     kept = [path for path in paths if mapping.layout != "highd" or not path.stem.endswith("Meta")]
+    if not kept:
+        found = "no file with tracks"
+        raise TrajectoryError(", ".join(map(str, files)), found, "NN_tracks.csv", "Name highD's tracks, too.")
     for i, path in enumerate(kept):
         for name, rows, share in _pieces(path, mapping):
             yield _recording(name, path, _standard(rows, path, mapping), (i + share) / len(kept))
@@ -407,7 +410,7 @@ def _check_units(recording: Recording) -> None:
     way_m = s[begin + n] - s[begin]
     summed = np.append(0.0, np.cumsum(v))
     of_speeds_m = (summed[begin + n + 1] - summed[begin] - 0.5 * (v[begin] + v[begin + n])) / recording.rate_hz
-    moving = np.abs(way_m) > 1e-3 * n / recording.rate_hz
+    moving = np.abs(way_m) > 0.2 * np.abs(way_m).max(initial=0.0)
     ratio = float(np.median(of_speeds_m[moving] / way_m[moving])) if moving.any() else 1.0
     if abs(ratio - 1.0) > OF_STEP:
         slip = min(SLIPS, key=lambda each: abs(ratio / each - 1.0))

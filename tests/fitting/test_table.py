@@ -65,6 +65,12 @@ def shifted() -> pd.DataFrame:
     return ROWS.assign(speed_mps=late).dropna()
 
 
+def late_lanes() -> pd.DataFrame:
+    """Lanes a second late."""
+    late = ROWS.groupby(["recording_id", "vehicle_id"]).lane.shift(9)
+    return ROWS.assign(lane=late).dropna()
+
+
 def flickering() -> pd.DataFrame:
     """A lane that comes and goes as LV drives."""
     return ROWS.assign(lane=np.where((ROWS.vehicle_id == 0) & (ROWS.time_s % 2 < 0.25), 0, ROWS.lane))
@@ -107,6 +113,7 @@ REFUSED = {
         changed(lateral_m=ROWS.groupby(["recording_id", "vehicle_id"]).lateral_m.transform("first")),
         "without lateral motion",
     ),
+    "late lanes": (late_lanes, r"more than 0\.8 s from the lane's marking"),
     "no length": (with_value(3, "length_m", 0.0), r"row 4 \(vehicle 0 of recording 0, t = 0\.3 s\): found no length"),
     "NaN": (with_value(9, "speed_mps", np.nan), "row 10, speed_mps: found no finite number"),
     "a lone row each": (lambda: ROWS[ROWS.time_s == 0], "one row per vehicle"),
