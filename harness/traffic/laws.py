@@ -45,6 +45,7 @@ FREE_DRIVING, CAR_FOLLOWING = 0, 1
 _SPEED_POINTS = 8001
 _T_LIMIT = 64.0
 _T_PER_UNIT = 32.0
+_BELOW_ONE = 1.0 - 2.0**-53
 
 
 class Environment(NamedTuple):
@@ -333,4 +334,5 @@ class InitialStates:
         scale = np.exp(c("log_scale") + c("log_scale_u") * u + c("log_scale_w") * w + c("log_scale_ww") * (w * w))
         df = float(n["initial_state__r1dot_df"])
         slowest = special.stdtr(df, (-r1 / n["initial_state__r1dot_min_ttc_s"] - location) / scale)
-        return np.asarray(location + scale * special.stdtrit(df, slowest + probability * (1.0 - slowest)))
+        below = np.minimum(slowest + probability * (1.0 - slowest), _BELOW_ONE)  # rounding gives 1, whose quantile is inf
+        return np.asarray(location + scale * special.stdtrit(df, below))

@@ -28,7 +28,9 @@ class Number(Section):
     """A value and where it comes from (the tags are explained in the shipped file)."""
 
     value: float
-    source: Literal["paper", "itsc", "ndd", "cutin", "openacc", "assumed", "fitted", "derived", "measured", "user"]
+    source: Literal[
+        "paper", "itsc", "ndd", "cutin", "openacc", "published", "assumed", "fitted", "derived", "measured", "user"
+    ]
     note: str = ""
 
 
