@@ -334,5 +334,5 @@ class InitialStates:
         scale = np.exp(c("log_scale") + c("log_scale_u") * u + c("log_scale_w") * w + c("log_scale_ww") * (w * w))
         df = float(n["initial_state__r1dot_df"])
         slowest = special.stdtr(df, (-r1 / n["initial_state__r1dot_min_ttc_s"] - location) / scale)
-        below = np.minimum(slowest + probability * (1.0 - slowest), _BELOW_ONE)  # rounding gives 1, whose quantile is inf
+        below = np.minimum(slowest + probability * (1.0 - slowest), _BELOW_ONE)  # at 1 it is inf
         return np.asarray(location + scale * special.stdtrit(df, below))
