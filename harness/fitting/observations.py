@@ -497,7 +497,9 @@ def require_enough(total: Tally, where: str) -> None:
     side = "Does who closes in from behind do so on the other side? Set mirror: true in the mapping, or --mirror."
     if total.driven_s == 0.0:
         found, expected = "no vehicle with another lane beside it, on the side where vehicles close in", "lanes 0, 1, …"
-        raise TrajectoryError(f"{where}, lane", found, expected, f"Name a column with lanes. {side}")
+        raise TrajectoryError(
+            f"{where}, lane", found, expected, f"Name a column with lanes, and `classes` as in the file. {side}"
+        )
     if total.overlapping_s > MOST_OVERLAPPING * total.followed_s:
         share = total.overlapping_s / total.followed_s
         mend = "Are lengths those of the vehicles, and lanes those of the time?"

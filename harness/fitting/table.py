@@ -1,7 +1,7 @@
 """Trajectories as a table: read from CSV or Parquet one recording at a time, by a mapping of columns, and checked.
 
 One row per vehicle and time. The rows of a recording stand together in a file, in any order among themselves, so that
-no more than one recording is held in memory; without ``recording_id`` a file is one recording.
+no more than one recording is held in memory (some 400 bytes a row); without ``recording_id`` a file is one recording.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ Unit = Literal["m", "ft", "km", "m/s", "ft/s", "km/h", "mph", "s", "ms", "us", "
 UNITS: dict[Unit, float] = dict(
     zip(get_args(Unit), (1.0, 0.3048, 1e3, 1.0, 0.3048, 1 / 3.6, 0.44704, 1.0, 1e-3, 1e-6, 1e-9), strict=True)
 )
+NO_LENGTH = "Gaps need lengths: mend them, or give one for all in a mapping (columns: {length_m: 4.6})."
+NO_COLUMN = ("Rename a column, or say in a mapping what it is called (--mapping FILE.yaml).", NO_LENGTH)
 SLOWEST_HZ = 9.5
 FASTEST_MEDIAN_MPS = 70.0
 USUAL_LENGTH_M = (2.5, 10.0)
@@ -132,8 +134,8 @@ def recordings(files: Sequence[str | Path], mapping: Mapping) -> Iterator[Record
     paths = [Path(file) for file in files]
     kept = [path for path in paths if mapping.layout != "highd" or not path.stem.endswith("Meta")]
     if not kept:
-        found = "no file with tracks"
-        raise TrajectoryError(", ".join(map(str, files)), found, "NN_tracks.csv", "Name highD's tracks, too.")
+        where = ", ".join(map(str, files))
+        raise TrajectoryError(where, "no file with tracks", "NN_tracks.csv", "Name highD's tracks, too.")
     for i, path in enumerate(kept):
         for name, rows, share in _pieces(path, mapping):
             yield _recording(name, path, _standard(rows, path, mapping), (i + share) / len(kept))
@@ -175,13 +177,9 @@ def _pieces(path: Path, mapping: Mapping) -> Iterator[tuple[str, pd.DataFrame, f
             for key, part in batch.rows.groupby("recording_id", sort=False):
                 name = str(key)
                 if name in done:
-                    found = f"rows of recording {name} again, after those of others (row {part.row.iloc[0]})"
-                    raise TrajectoryError(
-                        str(path),
-                        found,
-                        "its rows together",
-                        "Sort the file by recording_id, or write a file for each.",
-                    )
+                    where, found = f"{path}, row {part.row.iloc[0]}", f"recording {name} again, after others"
+                    mend = "Sort the file by recording_id, or write a file for each."
+                    raise TrajectoryError(where, found, "its rows together", mend)
                 if current is not None and name != current:
                     yield current, pd.concat(parts, ignore_index=True), share
                     done.add(current)
@@ -242,19 +240,15 @@ def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, st
             continue
         if wanted.lower() in by_lower:
             found[column] = by_lower[wanted.lower()]
-        elif column in NEEDED:
-            known = {"xvelocity": "highd", "local_y": "ngsim"}
-            of = next((known[name] for name in by_lower if name in known), None)
-            mend = f"The file looks like that of --mapping {of}." if of and of.lower() else did_you_mean(wanted, names)
-            if column == "length_m" and not mend:
-                mend = "Gaps need lengths: add them, or one for all in a mapping (columns: {length_m: 4.6})."
+        elif column in NEEDED or (column in mapping.columns and column != "recording_id"):
+            known = {} if mapping.columns else {"xvelocity": "highd", "local_y": "ngsim"}
+            of = [f"Is it a file for --mapping {known[name]}?" for name in by_lower if name in known]
+            mend = of[0] if of else did_you_mean(wanted, names) or NO_COLUMN[column == "length_m"]
             what = f"a column {wanted}" + (f" for {column}" if wanted != column else "")
-            raise TrajectoryError(
-                str(path),
-                f"the columns {', '.join(names)}",
-                what,
-                mend or "Rename a column, or say in a mapping what it is called (--mapping FILE.yaml).",
-            )
+            raise TrajectoryError(str(path), f"the columns {', '.join(names)}", what, mend)
+    if mapping.classes and "class" not in found and mapping.layout != "highd":
+        mend = "Add it, or leave out `classes` of the mapping."
+        raise TrajectoryError(str(path), "no column class", "one, as the mapping names classes", mend)
     return found
 
 
@@ -263,16 +257,15 @@ def _renamed(batch: Any, columns: dict[str, str], first: int, path: Path, mappin
     data = {}
     for column, name in columns.items():
         values = batch.column(name)
-        if column not in NAMES:
-            try:
-                data[column] = values.cast(pa.float64()).to_numpy(zero_copy_only=False)
-            except pa.ArrowInvalid:
-                raise TrajectoryError(
-                    f"{path}, column {name}", f"values of type {values.type}", "numbers", "Write it as numbers."
-                ) from None
-        else:
+        if column in NAMES:
             text = values.cast(pa.string()).fill_null("")
             data[column] = pd.arrays.ArrowExtensionArray(pa.chunked_array([text]))
+            continue
+        try:
+            data[column] = values.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+        except pa.ArrowException:
+            found = f"values of type {values.type}"
+            raise TrajectoryError(f"{path}, column {name}", found, "numbers", "Write it as numbers.") from None
     rows = pd.DataFrame(data)
     for column, value in mapping.columns.items():
         if isinstance(value, float):
@@ -309,7 +302,7 @@ def _standard(rows: pd.DataFrame, path: Path, mapping: Mapping) -> pd.DataFrame:
     from_right = mapping.lanes != "from_left"
     rows["lane"] = rows.lane.astype(np.int64) * (1 if from_right != mapping.mirror else -1)
     rows["s_m"] += rows.length_m * {"centre": 0.0, "front": -0.5, "rear": 0.5}[mapping.origin]
-    rows["fitted"] = rows["class"].isin(mapping.classes) if mapping.classes and "class" in rows else True
+    rows["fitted"] = rows["class"].isin(mapping.classes) if mapping.classes else True
     rows["road"] = pd.factorize(rows.direction)[0] if "direction" in rows else 0
     return rows if "lateral_m" in rows else rows.assign(lateral_m=np.nan)
 
@@ -400,8 +393,7 @@ def _check_units(recording: Recording) -> None:
     """Refuse what cannot be metres and seconds, or belongs to different times; by name, where the ratio tells it."""
     rows, where = recording.rows, f"{recording.file}, recording {recording.name}"
     if (odd := rows.length_m.to_numpy() <= 0.0).any():
-        mend = "Gaps need lengths: mend it, or give one for all in a mapping (columns: {length_m: 4.6})."
-        raise TrajectoryError(recording.where(np.argmax(odd)), "no length", "a length above 0 m", mend)
+        raise TrajectoryError(recording.where(np.argmax(odd)), "no length", "a length above 0 m", NO_LENGTH)
     n = round(recording.rate_hz)
     begin = np.arange(0, len(rows) - n, max(n // 2, 1))
     frame, vehicle = rows.frame.to_numpy(), rows.vehicle.to_numpy()

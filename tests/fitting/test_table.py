@@ -268,6 +268,12 @@ def test_a_mapping_is_checked(tmp_path):
     assert "yards" in str(refused.value)
     with pytest.raises(HarnessError, match="Did you mean 'highd'"):
         load_mapping("higd")
+    (tmp_path / "classes.yaml").write_text("classes: [car]\n")
+    (tmp_path / "lateral.yaml").write_text("columns: {lateral_m: laterl_m}\n")
+    ROWS.to_csv(tmp_path / "rows.csv", index=False)
+    for name, words in (("classes", "no column class"), ("lateral", "Did you mean 'lateral_m'")):
+        with pytest.raises(TrajectoryError, match=words):
+            judged(tmp_path / "rows.csv", str(tmp_path / f"{name}.yaml"))
     assert load_mapping("highd").mirror
     assert not load_mapping("highd", mirror=False).mirror
 
