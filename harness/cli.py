@@ -14,7 +14,7 @@ import click
 from harness.commands.campaigns import av_check, check, compare, pool, run, schema, setup
 from harness.commands.options import examples
 from harness.commands.printing import go_on_unread, show_error, show_interrupted, system_error, usage_error
-from harness.commands.stored import estimate, export, replay, report
+from harness.commands.stored import estimate, export, replay, report, sensitivity
 from harness.errors import EXIT_DONE, HarnessError, shortened
 from harness.processes import Interruption, interruptible, open_streams
 
@@ -40,7 +40,7 @@ def cli() -> None:
     """
 
 
-_TESTING = check, av_check, run, compare, pool, estimate, report, replay, export
+_TESTING = check, av_check, run, compare, pool, estimate, sensitivity, report, replay, export
 for command in (*_TESTING, schema, setup):
     cli.add_command(command)
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, verbose_option, written_file
-from harness.commands.printing import in_folder, print_answer, print_estimates, print_json, say
+from harness.commands.printing import in_folder, print_answer, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
+from harness.numbers import number, plain, share
 from harness.vocabulary import COMPARISON, ESTIMATORS
 
 if TYPE_CHECKING:
@@ -64,17 +65,18 @@ def estimate(
     records do not allow with the reason. The exit code is 2 if they allow none of those asked for.
 
     With --environment the shells' probabilities in other traffic are found in the twin (25 s), and crash shares within
-    shells are taken to be the same there. Traffic in which they cannot be is refused.
+    shells are taken to be the same there. Traffic in which they cannot be is refused. Replicates of fitted traffic take
+    a second each, once; with --write, in the run's own traffic, estimates.json and the page tell what they leave open.
     """
     if environment is not None:
-        if write or estimators:
-            raise click.UsageError("--environment goes with neither --write nor -e: the folder keeps its own answer.")
+        if estimators:
+            raise click.UsageError("--environment does not go with -e: tests of shells alone can be moved.")
         from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
         with shown_progress() as bar:
             from harness.runner.other_traffic import estimate_in_other_traffic  # noqa: PLC0415 - keeps --help fast
 
-            content = estimate_in_other_traffic(folder, environment, confidence=confidence, progress=bar)
+            content = estimate_in_other_traffic(folder, environment, confidence=confidence, own=write, progress=bar)
     else:
         from harness.runner.stored import estimate_run  # noqa: PLC0415 - keeps --help fast
 
@@ -92,6 +94,65 @@ def estimate(
         print_answer(content, folder, page if environment is None and page.is_file() else None)
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
+
+
+def _ranges(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    found = {}
+    for text in texts:
+        name, _, ends = text.partition("=")
+        try:
+            low, high = map(float, ends.split(":"))
+        except ValueError:
+            mend = "Write --range cut_in.ignore_share=0.001:0.08."
+            raise HarnessError(f"--range {text}", "no two numbers", "SECTION.NAME=LOW:HIGH", mend) from None
+        found[name] = low, high
+    return found
+
+
+@click.command(
+    short_help="Say which numbers of the traffic an answer hangs on.",
+    epilog=examples(
+        "harness sensitivity runs/smoke", "harness sensitivity runs/smoke --range cut_in.ignore_share=0.001:0.08"
+    ),
+)
+@click.argument("folder", metavar="DIR", type=RUN_FOLDER)
+@click.option(
+    "--range", "ranges", metavar="SECTION.NAME=LOW:HIGH", multiple=True, callback=_ranges,
+    help="Where a number may lie, beside the ranges that the environment states; may be given several times.",
+)  # fmt: skip
+@json_option
+def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json: bool) -> None:
+    """Say by how much the crash rate of the run in DIR, and its ratio to a competent driver, moves with its traffic.
+
+    Fitted numbers move by their standard errors, or in blocks by replicates, assumed ones over their ranges. Nothing is
+    simulated in SUMO: each move takes a second, once. DIR keeps it as sensitivity.json, and its page shows it.
+    """
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+
+    with shown_progress() as bar:
+        from harness.runner.sensitivity import sensitivity as found_by  # noqa: PLC0415 - keeps --help fast
+
+        content = found_by(folder, ranges=ranges, progress=bar)
+        from harness.report.page import write_report  # noqa: PLC0415 - keeps --help fast
+
+        page = write_report(folder)
+    if as_json:
+        print_json(content)
+        return
+    print_table(f"What moves the answer: {content['environment']}", list(map(_bar, content["bars"])))
+    say(
+        "Crash shares within shells are taken to stay as they were. Off by: what a reference driver shows of that.",
+        f"report  {page}",
+    )
+
+
+def _bar(bar: dict[str, Any]) -> dict[str, str]:
+    def ends(of: list[float | None]) -> str:
+        return "× " + " … ".join(number(end, 3) for end in of)
+
+    values = "" if bar["values"] is None else " … ".join(map(plain, bar["values"]))
+    told = {"number": bar["what"], "known": f"{bar['known']} {values}", "rate": ends(bar["rate"])}
+    return {**told, "ratio": ends(bar["ratio"]), "off by": share(bar["off"]), "remark": bar["note"]}
 
 
 @click.command(

@@ -13,8 +13,9 @@ from harness.estimators.estimate import WIDE_RHW, Estimate, Number, Point, Unava
 from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import PairedEstimate
 from harness.estimators.severity import Severity
-from harness.estimators.short_answer import ShortAnswer, short_answer
+from harness.estimators.short_answer import ShortAnswer, assumed_times, short_answer
 from harness.estimators.stopping import RoundRule, Rule, limit_words
+from harness.estimators.traffic import TrafficError
 from harness.importance.functions import importance_names
 from harness.numbers import interval, number, plain, ratio, share, two_digits_up
 from harness.records.folder import StoppedBy
@@ -63,6 +64,7 @@ class Estimates:
     severity: Severity | None = None
     ending: str | None = None
     decision: dict[str, Any] | None = None
+    traffic: TrafficError | None = None
 
 
 def estimate_blocks(
@@ -109,13 +111,24 @@ def estimate_blocks(
             statements=statements,
             reference_statements=tuple(reference_statements(best)),
             boundary_statements=boundary_statements(best),
-            scope=SCOPE,
+            scope=" ".join([*_assumed(best, manifest), SCOPE]),
             answer=short_answer(campaign, best, done.severity, manifest, distance_km),
             severity=done.severity,
             ending=manifest.get("ending"),
             decision=manifest.get("decision"),
         )
     )
+
+
+def _assumed(best: Estimate, manifest: Mapping[str, Any]) -> list[str]:
+    if (times := assumed_times(best, manifest)) is None:
+        return []
+    given, what = manifest["assumed"], "rate" if best.n_crashes else "limit"
+    low, high = (plain(end) for end in given["ends"])
+    return [
+        f"If as few or as many drivers do not look as data allow ({given['name']} {low} or {high}, not "
+        f"{plain(given['value'])}), the {what} is {ratio(times[0])} or {ratio(times[1])} times this one."
+    ]
 
 
 def _answer(

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel
 
 from harness.campaign.campaign import Campaign
@@ -143,6 +144,10 @@ def _rows(
     yield from reversed(rows) if wide and beside and beside[0]["ratio_high"] < 1.0 else rows
     if not beside and campaign.has_baseline_runs and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
+    if (moved := assumed_times(best, manifest)) is not None:
+        high = number(moved[1] * (best.ci_high if best.n_crashes else best.upper_bound))
+        remark = f"if {share(manifest['assumed']['ends'][1])} do not look"
+        yield Row("assumed", "traffic", f"at most × {number(moved[1], 2)} (assumed)", f"up to {high}", remark)
     if campaign.has_baseline_runs and best.n_crashes:
         yield from _whence(campaign, best, manifest.get("expected"))
     if severity is not None:
@@ -160,6 +165,19 @@ def _rows(
     chosen = [each for each in statements if each["name"] == asked] or statements
     for each in chosen[:1]:
         yield _within(each)
+
+
+def assumed_times(best: Estimate, manifest: Mapping[str, Any]) -> tuple[float, float] | None:
+    """By what the rate moves over what the manifest says to be ``assumed``; None where it does not.
+
+    Without a crash it is the upper limit that moves, which lies in one stratum.
+    """
+    if not (given := manifest.get("assumed")) or not (shells := best.details.get("shells")):
+        return None
+    p, n, share = np.array([(each["p"], max(each["n_episodes"], 1), each["crash_share"]) for each in shells]).T
+    of_strata = [p, *(p * np.array(each) for each in given["times"])]
+    rates = [float(each @ share) if best.n_crashes else float(np.max(each / n)) for each in of_strata]
+    return rates[1] / rates[0], rates[2] / rates[0]
 
 
 def _whence(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | None) -> Iterator[Row]:

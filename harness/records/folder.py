@@ -32,6 +32,7 @@ T = TypeVar("T")
 MANIFEST = "manifest.json"
 CAMPAIGN = "campaign.yaml"
 SHELLS = "shells.json"
+SENSITIVITY = "sensitivity.json"
 """Strata of a shells campaign, as its estimates need them."""
 TABLES = ("episodes", "moments", "traces")
 MEND_SHARD = (

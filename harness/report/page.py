@@ -11,19 +11,20 @@ from harness import numbers
 from harness.campaign.files import dump_campaign
 from harness.errors import printable
 from harness.estimators.shells import Within
+from harness.estimators.traffic import Sensitivity
 from harness.numbers import count, leaves
-from harness.records.folder import write_bytes
+from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.records.reader import table_sizes
 from harness.report.crashes import crash_gallery, environment_of
 from harness.report.drawing import Plot
 from harness.report.player import templates
-from harness.report.plots import convergence_plot, severity_plot, shells_plot, where_plot
+from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
 from harness.traffic.laws import Environment
 from harness.vocabulary import OUTCOMES, RUN_FOLDER
 
 PLOT_NAMES = re.compile(
-    r"(severity|where|shells|convergence|weights|answer|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
+    r"(severity|where|shells|sensitivity|convergence|weights|answer|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
 )
 
 
@@ -70,9 +71,18 @@ def _plots(run: RunFolder, summary: RunSummary, traffic: Environment | None) -> 
         severity_plot(run.estimates),
         where_plot(summary, traffic),
         None if run.shells is None else shells_plot(run.shells),
+        sensitivity_plot(found) if (found := _sensitivity(run)) is not None and found.shown else None,
         convergence_plot(run.estimates, run.target_rhw, of_statement=run.asked_statement),
     ]
     return [plot for plot in plots if plot is not None]
+
+
+def _sensitivity(run: RunFolder) -> Sensitivity | None:
+    """What `harness sensitivity` has found of these tests; None where it has not, or of others."""
+    if not (file := run.path / SENSITIVITY).is_file():
+        return None
+    found = read_as(Sensitivity, file, mend=f"Make it again with `harness sensitivity {run.typed}`.")
+    return found if found.campaign_hash == run.manifest["campaign_hash"] else None
 
 
 def _write_plots(folder: Path, plots: list[Plot]) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from harness.compiled import unboxed
 from harness.episode.path import empty_trajectory
 from harness.estimators.answer import Estimates
+from harness.estimators.traffic import Sensitivity
 from harness.numbers import count, number, plain, share
 from harness.pool.replay import StoredPaths, drive_others
 from harness.pool.walk import Script
@@ -36,6 +37,7 @@ KEEPS_SPEED = 20
 """Index of the maneuver 0 m/s²."""
 WHO = {"both": "grey", "only A": "blue", "only B": "reference"}
 """Who crashes, and the colour: on the page the player draws B in that of reference drivers."""
+MOST_BARS = 16
 LARGEST, CELL_M, CELL_MPS = 9.0, 1.0, 0.5
 
 
@@ -163,6 +165,34 @@ def shells_plot(found: ShownShells) -> Plot:
         f"the interval. {open_question}"
     )
     return Plot("shells", [left, right], alt, caption)
+
+
+def sensitivity_plot(found: Sensitivity) -> Plot:
+    """Draw by how much rate and ratio move where numbers of the traffic are not known: one bar each, the longest first.
+
+    Those of which the tests say nothing are left out.
+    """
+    shown = found.shown[:MOST_BARS]
+    names = tuple(bar.what for bar in shown)
+    ends = np.array([[np.nanmin([*of, 1.0]), np.nanmax([*of, 1.0])] for bar in shown for of in (bar.rate, bar.ratio)])
+    rate, ratio = ends[0::2].T, ends[1::2].T
+    low, high = 0.9 * float(max(rate[0].min(), 1e-3)), 1.1 * float(rate[1].max())
+    rows, fitted = np.arange(len(names)), np.array([bar.known == "fitted" for bar in shown])
+    y = Axis("", len(names) - 0.4, -0.6, names=names)
+    panel = Panel("What moves the answer", Axis("times", low, high, log=True), y, height=76.0 + 22.0 * len(names))
+    for kind, colour, label in ((fitted, "blue", "rate, fitted"), (~fitted, "vermillion", "rate, assumed")):
+        if kind.any():
+            left, at = np.maximum(rate[0][kind], low), rows[kind]
+            panel.add("boxes", colour, left, rate[1][kind], at - 0.3, at + 0.3, opacity=0.85, label=label)
+    thin = rows - 0.06, rows + 0.06
+    panel.add("boxes", "ink", np.maximum(ratio[0], low), ratio[1], *thin, label=f"its ratio to {found.driver}")
+    panel.add("line", "muted", [1.0, 1.0], [y.low, y.high], dash=DASHED, width=1.0)
+    text = (
+        "Fitted numbers move over nine tenths of what their data leave open, assumed ones over the stated range. "
+        f"The rate hangs most on {names[0]}: × {number(rate[0][0], 2)} to × {number(rate[1][0], 2)}; the ratio moves "
+        f"by × {number(ratio[0][0], 3)} to × {number(ratio[1][0], 3)}."
+    )
+    return Plot("sensitivity", [panel], text, text)
 
 
 def _source(found: ShownShells) -> str:

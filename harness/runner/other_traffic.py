@@ -4,33 +4,48 @@ Traffic decides how probable a cut-in is; what a vehicle makes of one, only thro
 through which cut-ins of a shell there are. Crash shares within shells are taken to be the same. The reference drivers,
 of which no shell is made, tell how far that holds: their rates follow by the same rule, and are known besides. Traffic
 with cut-ins that no test stands for is refused.
+
+Traffic that was fitted names replicates: environments that other trajectories of the same kind would have given. Each
+is answered by the same tests, from few paths that are the same in all of them (`harness.pool.moved`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.files import shipped_or_own
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import Block
+from harness.estimators.estimate import finite_json
+from harness.estimators.likelihood import Level, likelihood_limit
+from harness.estimators.shells import Shells as SeenShells
+from harness.estimators.traffic import TrafficError, rows, sentences, uncertain
 from harness.numbers import share
 from harness.pool.build import campaign_pool
-from harness.pool.cut_ins import Pool
+from harness.pool.cut_ins import Pool, environment_hash
+from harness.pool.moved import FewPaths
 from harness.pool.shells import acceleration_limit, design_shells
 from harness.progress import Progress
-from harness.records.folder import read_manifest
+from harness.records.folder import read_manifest, read_table
 from harness.records.reader import read_campaign
 from harness.resolved import Resolved, resolve
 from harness.runner.stored import stored_blocks
 from harness.sampling import distance_per_test_m
 from harness.sampling.shells import Shells
 from harness.strata import ShellDesign
-from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray
+from harness.traffic.laws import Environment
+from harness.traffic.loading import load_environment, load_parameters, require_sound_laws
+from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
+from harness.vocabulary import STATE_COLUMNS, EstimatorName, FloatArray, IntArray
 
 MOST_BEYOND = 0.01
 """Share of the probability in a shell, as it crashes, that may lie where no cut-in of the old pool does [assumed]."""
@@ -38,66 +53,294 @@ SAME_POOL = 0.05
 """How far a pool that another version has built may differ [assumed]."""
 MOST_OFF = 0.1
 """How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
+NOT_LOOKING = "cut_in__ignore_share"
 _OPTION = "--environment"
+_ELSEWHERE = "Run the campaign in that environment, into another folder."
+
+
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """A stored run of shells: the traffic ``here`` that it was tested in, its strata, and their pool.
+
+    ``manifest`` is the run's.
+    """
+
+    folder: Path
+    manifest: Mapping[str, Any]
+    here: Resolved
+    design: ShellDesign
+    pool: Pool
+
+    @classmethod
+    def of(cls, folder: str | Path, progress: Progress, option: str = _OPTION) -> Tested:
+        """Raises `HarnessError`: the folder is no run of shells, or its pool cannot be made again."""
+        folder = Path(folder)
+        manifest = read_manifest(folder)
+        campaign = read_campaign(folder, manifest, check_files=True)
+        _require_shells(campaign, option)
+        here = resolve(campaign)
+        design, pool = Shells.stored_design(folder), campaign_pool(here, progress)
+        rebuilt = design_shells(pool, acceleration_limit(campaign.av))
+        if design.strata != rebuilt.strata or not np.allclose(design.p, rebuilt.p, rtol=SAME_POOL):
+            mend = "Use the version of the harness (manifest.json) and the surrogate library that it was made with."
+            raise RunFolderError(
+                str(folder), f"tests of pool {design.pool}", f"shells as those of pool {pool.key}", mend
+            )
+        return cls(folder, manifest, here, design, pool)
+
+    @property
+    def limit_mps2(self) -> float:
+        """Hardest acceleration of the vehicle."""
+        return acceleration_limit(self.here.campaign.av)
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Its tests."""
+        return list(stored_blocks(self.folder, moments=False))
+
+    @cached_property
+    def seen(self) -> SeenShells:
+        """Its tests, counted."""
+        seen = SeenShells()
+        for block in self.blocks:
+            seen.add(block)
+        return seen
+
+    def rate(self, p: FloatArray) -> float:
+        """Crash rate where strata have probabilities (S,); its upper limit where no test crashed."""
+        tally = self.seen.tally
+        if tally.crashes.any():
+            return float(p @ tally.share)
+        worst = tally.failed_as_crashes()
+        return likelihood_limit(p, worst.crashes, worst.tests, Level.two_sided(0.9), 1.0)
 
 
 def estimate_in_other_traffic(
-    folder: str | Path, environment: str, *, confidence: float | None = None, progress: Progress | None = None
+    folder: str | Path,
+    environment: str,
+    *,
+    confidence: float | None = None,
+    own: bool = False,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Content of ``estimates.json`` as the stored tests have it for another environment: a shipped name or a file.
 
+    Where it names replicates ``traffic`` is what they leave open (`TrafficError`). With ``own`` it has to be the
+    folder's own traffic.
+
     Raises `HarnessError`: the folder is no run of shells, the environment is wrong, or the tests say nothing of it.
     """
-    folder, progress = Path(folder), progress or Progress()
-    manifest = read_manifest(folder)
-    campaign = read_campaign(folder, manifest, check_files=True)
-    _require_shells(campaign)
-    here, there = resolve(campaign), resolve(campaign.replaced(("environment", "parameters"), environment))
-    _require_same_leads(here, there, environment)
-    tested, pool = Shells.stored_design(folder), campaign_pool(here, progress)
-    rebuilt = design_shells(pool, acceleration_limit(campaign.av))
-    if tested.strata != rebuilt.strata or not np.allclose(tested.p, rebuilt.p, rtol=SAME_POOL):
-        mend = "Use the version of the harness (manifest.json) and the surrogate library that it was made with."
-        raise RunFolderError(str(folder), f"tests of pool {tested.pool}", f"shells as those of pool {pool.key}", mend)
+    progress = progress or Progress()
+    tested = Tested.of(folder, progress)
+    campaign = tested.here.campaign
+    there = resolve(campaign.replaced(("environment", "parameters"), environment))
+    if own and environment_hash(there.environment) != tested.pool.environment:
+        expected = "the environment that the folder's tests were run in: estimates.json is of that"
+        raise CampaignError(f"{_OPTION} with --write", f"{environment}, with other numbers", expected, _ELSEWHERE)
+    moved = _moved(tested, there, environment, progress)
+    keys = tested.manifest if moved.is_same else ("retraced", "repeated")
+    told: dict[str, Any] = {key: tested.manifest[key] for key in keys if key in tested.manifest}
+    told |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_per_test_m(there.environment)}
+    blocks = map(moved.block, tested.blocks)
+    if not moved.is_same:
+        told["assumed"] = assumed(there, tested.pool, tested.design, progress)
+    asked: list[EstimatorName] | None = None if moved.is_same else ["shells"]
+    content = estimate_blocks(blocks, there.campaign, told, estimators=asked, confidence=confidence)
+    answer, scope = content["answer"], content["scope"]
+    if not moved.is_same:
+        drivers = " and ".join(each.name for each in tested.design.references)
+        known = f" (off by {share(moved.reference_error(), least=0.001)} for {drivers})" if drivers else ""
+        was, now = (Path(each).stem for each in (campaign.environment.parameters, environment))
+        words = f"tests of {was}, answered for {now}: holds if as large a share of each shell crashes as there{known}"
+        answer, scope = {**answer, "scope": words}, f"{scope} {words[:1].upper()}{words[1:]}."
+    content |= {"answer": answer, "scope": scope}
+    if (found := traffic_error(tested, there, moved, content, progress)) is not None:
+        content |= told_traffic(found, content)
+    return content
+
+
+def _moved(tested: Tested, there: Resolved, name: str, progress: Progress) -> Moved:
+    """The strata with the probabilities of other traffic; refused where the tests say nothing of it."""
+    if environment_hash(there.environment) == tested.pool.environment:
+        return Moved(tested.design, tested.design)
+    _require_same_kind(tested.here, there, name)
     progress.stage("pool of the other traffic", None)
-    elsewhere = campaign_pool(there, progress, order=pool.names)
-    moved = Moved.of(tested, design_shells(elsewhere, acceleration_limit(campaign.av)), environment)
-    off = moved.reference_error()
-    blocks = list(map(moved.block, stored_blocks(folder, moments=False)))
-    beyond = _share_beyond(pool, elsewhere, blocks)
+    elsewhere = campaign_pool(there, progress, order=tested.pool.names)
+    moved = Moved.of(tested.design, design_shells(elsewhere, tested.limit_mps2), name)
+    off, beyond = moved.reference_error(), _share_beyond(tested.pool, elsewhere, tested.blocks)
     if beyond > MOST_BEYOND or off > MOST_OFF:
         found = f"traffic where {share(beyond)} of the crashes are in cut-ins unlike any that was tested"
         if beyond <= MOST_BEYOND:
             found = f"traffic for which the rate of a reference driver would come out wrong by {share(off)}"
         expected = f"at most {share(MOST_BEYOND)} and {share(MOST_OFF)}: crash shares within shells must stay the same"
-        raise CampaignError(_OPTION, found, expected, "Run the campaign in that environment, into another folder.")
-    told: dict[str, Any] = {key: manifest[key] for key in ("retraced", "repeated") if key in manifest}
-    told |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_per_test_m(there.environment)}
-    content = estimate_blocks(blocks, there.campaign, told, estimators=["shells"], confidence=confidence)
-    drivers = " and ".join(each.name for each in tested.references)
-    known = f" (off by {share(off, least=0.001)} for {drivers})" if drivers else ""
-    was, now = (Path(each).stem for each in (campaign.environment.parameters, environment))
-    words = f"tests of {was}, answered for {now}: holds if as large a share of each shell crashes as there{known}"
-    answer = {**content["answer"], "scope": words}
-    return {**content, "answer": answer, "scope": f"{content['scope']} {words[:1].upper()}{words[1:]}."}
+        raise CampaignError(_OPTION, found, expected, _ELSEWHERE)
+    return moved
 
 
-def _require_shells(campaign: Campaign) -> None:
+@dataclass(frozen=True)
+class Nearby:
+    """Some traffic beside another: probabilities of the strata ``p`` (S,), and by what rates move from there to here.
+
+    ``rate`` is the vehicle's factor, ``references`` (R,) are those of the drivers, which are known, ``off`` by how much
+    one of these comes out wrong at most, and ``beyond`` the share of the crashes in cut-ins unlike any tested.
+    """
+
+    p: FloatArray
+    rate: float
+    references: FloatArray
+    off: float
+    beyond: float
+
+    @property
+    def ratio(self) -> float:
+        """The factor of the ratio to the first reference driver."""
+        return self.rate / float(self.references[0]) if self.references.size else math.nan
+
+    @property
+    def refused(self) -> bool:
+        """Whether the tests do not say it."""
+        return self.off > MOST_OFF or self.beyond > MOST_BEYOND
+
+
+def nearby(
+    tested: Tested, there: Resolved, moved: Moved, environments: Sequence[Environment], progress: Progress
+) -> Iterator[Nearby]:
+    """Traffic close to that of ``there``, by few paths."""
+    paths = FewPaths(there, tested.pool, tested.design, tested.limit_mps2, progress)
+    (base,), p, shares = paths.of([there.environment]), moved.there.p, moved.reference_shares()
+    tally, n_surrogates = tested.seen.tally, len(tested.pool.names)
+    crash_share = tally.share if tally.crashes.any() else np.ones_like(p)
+    for found in paths.of(environments):
+        now = p * _ratio(found.p, base.p)
+        known = _ratio(found.rate[n_surrogates:], base.rate[n_surrogates:])
+        off = np.abs(_ratio(_ratio(now @ shares, p @ shares), known) - 1.0)
+        crashing = now * crash_share
+        beyond = float(crashing @ (1.0 - _ratio(found.p - found.beyond, found.p)) / crashing.sum())
+        beyond += found.untested / found.p.sum()
+        yield Nearby(now, tested.rate(now) / tested.rate(p), known, float(off.max(initial=0.0)), beyond)
+
+
+def _ratio(a: FloatArray, b: FloatArray) -> FloatArray:
+    """1 where there is nothing to compare with."""
+    return np.divide(a, b, out=np.ones_like(b), where=b > 0.0)
+
+
+def traffic_error(
+    tested: Tested, there: Resolved, moved: Moved, content: Mapping[str, Any], progress: Progress
+) -> TrafficError | None:
+    """What the replicates of the traffic ``there`` leave open of an answer; None where it has none.
+
+    Raises `HarnessError`: their file is missing or wrong.
+    """
+    settings = there.campaign.environment
+    parameters = load_parameters(settings)
+    if parameters.replicates is None:
+        return None
+    values = read_replicates(settings.parameters, parameters)
+    estimate = content["estimates"]["shells"]
+    unseen = None
+    progress.stage("replicates of the traffic", len(values))
+    environments = [each for row in values if (each := environment_with(there, parameters, row)) is not None]
+    found = [each for each in nearby(tested, there, moved, environments, progress) if not each.refused]
+    n_refused, confidence = len(values) - len(found), content["confidence"]
+    if not found:
+        expected = "replicates that these tests can answer"
+        raise CampaignError(_OPTION, f"{len(values)} replicates, of which none can be", expected, _ELSEWHERE)
+    times, references = np.array([each.rate for each in found]), np.array([each.references for each in found])
+    sampling = estimate["ci_low"], estimate["ci_high"]
+    if not estimate["n_crashes"]:
+        sampling = 0.0, estimate["upper_bound"]
+    of_rate = uncertain(estimate["crash_rate"], sampling, times, n_refused, confidence, from_below=unseen is None)
+    ratios = {}
+    for r, driver in enumerate(tested.design.references):
+        for each in estimate["details"]["references"]:
+            if each["reference"] == driver.name:
+                ends = each["ratio_low"] or 0.0, math.inf if each["ratio_high"] is None else each["ratio_high"]
+                moves = times / references[:, r]
+                ratios[driver.name] = uncertain(each["ratio"], ends, moves, n_refused, confidence)
+    name = Path(settings.parameters).stem
+    return TrafficError(name, confidence, len(values), n_refused, of_rate, ratios, unseen)
+
+
+def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progress) -> dict[str, Any] | None:
+    """By what the strata's probabilities move over the range that is stated for who does not look; None without one.
+
+    ``name``, ``value`` and ``ends`` are of that number, ``times`` the factors at both ends, (2, S).
+    """
+    parameters = load_parameters(traffic.campaign.environment)
+    if (number := parameters.numbers().get(NOT_LOOKING)) is None or number.range is None:
+        return None
+    paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)
+    ends = [environment_with(traffic, parameters, {NOT_LOOKING: end}) for end in number.range]
+    if None in ends:
+        return None
+    base, *moved = paths.of([traffic.environment, *filter(None, ends)])
+    times = [_ratio(each.p, base.p).tolist() for each in moved]
+    name = NOT_LOOKING.replace("__", ".")
+    return {"name": name, "value": number.value, "ends": list(number.range), "times": times}
+
+
+def told_traffic(found: TrafficError, content: Mapping[str, Any]) -> dict[str, Any]:
+    """What of ``estimates.json`` tells of it: ``traffic`` itself, lines of the answer below rate and ratio, words."""
+    answer = content["answer"]
+    old = answer["rows"]
+    place = 1 + max((i for i, row in enumerate(old) if row["key"] in ("verdict", "rate", "ratio")), default=-1)
+    new = [asdict(row) for row in rows(found)]
+    said = " ".join(sentences(found))
+    return {
+        "traffic": finite_json(found),
+        "answer": {**answer, "rows": [*old[:place], *new, *old[place:]]},
+        "scope": f"{said} {content['scope']}",
+    }
+
+
+def read_replicates(name: str, parameters: EnvironmentParameters) -> list[dict[str, float]]:
+    """Numbers that vary, of each replicate that an environment, a shipped name or a file, names.
+
+    Raises `HarnessError`: the file is missing or damaged, or has numbers that the environment does not have.
+    """
+    file = shipped_or_own(name, SHIPPED_FOLDER, "environment.parameters")
+    path = file.parent / str(parameters.replicates)
+    again = "Write it anew with `harness fit`, or leave out the key replicates."
+    table = read_table(path, mend=again)
+    known = parameters.values()
+    if unknown := sorted(set(table.column_names) - set(known)) or not table.num_rows:
+        found = f"column {unknown[0]}" if isinstance(unknown, list) else "no rows"
+        raise RunFolderError(str(path), found, f"replicates of the numbers of {file.name}, by section__name", again)
+    rows: list[dict[str, float]] = table.to_pylist()
+    return rows
+
+
+def environment_with(
+    there: Resolved, parameters: EnvironmentParameters, values: Mapping[str, float]
+) -> Environment | None:
+    """The traffic ``there`` with other numbers; None where they give no laws."""
+    settings = there.campaign.environment
+    try:
+        environment = load_environment(settings, parameters.with_values(values))
+        require_sound_laws(environment, settings.parameters)
+    except (CampaignError, ValueError):
+        return None
+    return environment
+
+
+def _require_shells(campaign: Campaign, option: str) -> None:
     if campaign.sampling.strata and not campaign.has_baseline_runs:
         return
     found = f"tests by {campaign.testing.method}"
     if campaign.sampling.strata:
         found = "a vehicle that acts before the cut-in: its cut-ins follow from its own runs"
     expected = "tests of shells, of a vehicle that holds its speed until the cut-in"
-    raise CampaignError(_OPTION, found, expected, "Run the campaign in that environment, into another folder.")
+    raise CampaignError(option, found, expected, _ELSEWHERE)
 
 
-def _require_same_leads(here: Resolved, there: Resolved, name: str) -> None:
-    leads = [each.environment.lateral for each in (here, there)]
-    if leads[0].distance_m != leads[1].distance_m or not np.array_equal(leads[0].cumulative, leads[1].cumulative):
-        found = f"{name}, in which cut-ins take another time"
-        expected = "the same lateral motion: the time in which a vehicle sees a cut-in decides whether it crashes"
-        raise CampaignError(_OPTION, found, expected, "Run the campaign in that environment, into another folder.")
+def _require_same_kind(here: Resolved, there: Resolved, name: str) -> None:
+    """Cut-ins of one step are seen by nobody beforehand: shells mean something else there."""
+    takes_time = [each.environment.lateral.present for each in (here, there)]
+    if takes_time[0] != takes_time[1]:
+        was, now = ("take time" if each else "are one step" for each in takes_time)
+        expected = f"traffic as that of the tests, in which they {was}"
+        raise CampaignError(_OPTION, f"{name}, in which cut-ins {now}", expected, _ELSEWHERE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +360,7 @@ class Moved:
             place = next((keys[0].index(each) for each in alike if each in keys[0]), None)
             if place is None:
                 found = f"{environment}, whose shell {key[0]} was never tested (probability {of_cell:.3g})"
-                mend = "Run the campaign in that environment, into another folder."
+                mend = _ELSEWHERE
                 raise CampaignError(_OPTION, found, f"shells among {', '.join(tested.strata)}", mend)
             p[place] += of_cell
         there = replace(
@@ -142,14 +385,24 @@ class Moved:
             log_weight = np.log(self.there.p[block.stratum])
         return replace(block, columns=columns, drawn=drawn, log_weight=log_weight)
 
+    @property
+    def is_same(self) -> bool:
+        """Whether the traffic is that of the tests."""
+        return self.tested is self.there
+
+    def reference_shares(self) -> FloatArray:
+        """Share of each stratum on which each reference driver crashes, as it was tested, shape (S, R)."""
+        old = self.tested
+        crashing = old.joined.T @ np.array([old.cell_p * old.crashes_too(r) for r in range(len(old.references))]).T
+        shares: FloatArray = np.divide(
+            crashing, old.p[:, None], out=np.zeros_like(crashing), where=old.p[:, None] > 0.0
+        )
+        return shares
+
     def reference_error(self) -> float:
         """By how much the rate of a reference driver comes out wrong at most, by its shares of strata."""
-        worst, old = 0.0, self.tested
-        for r, rate in enumerate(self.there.reference_rate.tolist()):
-            crashing = (old.cell_p * old.crashes_too(r)) @ old.joined
-            shares = np.divide(crashing, old.p, out=np.zeros_like(crashing), where=old.p > 0.0)
-            worst = max(worst, abs(float(self.there.p @ shares) / rate - 1.0) if rate > 0.0 else 0.0)
-        return worst
+        told, known = self.there.p @ self.reference_shares(), self.there.reference_rate
+        return float(np.max(np.abs(told[known > 0.0] / known[known > 0.0] - 1.0), initial=0.0))
 
 
 def _keys(design: ShellDesign) -> list[tuple[str, int]]:

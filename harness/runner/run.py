@@ -18,6 +18,7 @@ from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import conclusion, expected_for
 from harness.estimators.stopping import Rule, Verdict
+from harness.pool.build import campaign_pool
 from harness.pool.replay import Retracing
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
@@ -35,6 +36,7 @@ from harness.records.folder import (
     write_shard,
 )
 from harness.resolved import Resolved, require_ready
+from harness.runner.other_traffic import assumed
 from harness.runner.resume import (
     SMALLEST_FAILED_SAMPLE,
     Manifest,
@@ -143,6 +145,7 @@ class Run:
             }
             self.manifest = Manifest(out, resolved, earlier, began=began, **facts)
             self._keep_design()
+            self._note_what_is_assumed()
             refused.pop_all()
 
     @contextmanager
@@ -229,6 +232,12 @@ class Run:
         require_same_pool(self.out, self.source)
         if self.source.design is not None:
             write_sealed(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
+
+    def _note_what_is_assumed(self) -> None:
+        """Let the manifest say by what the strata move where a number of the traffic has a range."""
+        if (design := self.source.design) is not None and not self.campaign.has_baseline_runs:
+            pool = campaign_pool(self.resolved, self._progress)
+            self.manifest.note(assumed=assumed(self.resolved, pool, design, self._progress))
 
     def finish(self, rule: Rule) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no shard beyond the stop is left."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, model_validator
+from pydantic import AfterValidator, BaseModel, Field, model_validator
 
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
@@ -25,13 +26,25 @@ _SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
 
 
 class Number(Section):
-    """A value and where it comes from (the tags are explained in the shipped file)."""
+    """A value and where it comes from (the tags are explained in the shipped file).
+
+    ``se`` is the standard error of a fitted one, ``range`` says where an assumed one may lie; neither changes a test.
+    """
 
     value: float
     source: Literal[
         "paper", "itsc", "ndd", "cutin", "openacc", "published", "assumed", "fitted", "derived", "measured", "user"
     ]
     note: str = ""
+    se: Annotated[float, Field(ge=0.0)] | None = None
+    range: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _range_holds_the_value(self) -> Self:
+        if self.range is not None and not self.range[0] <= self.value <= self.range[1]:
+            mend = "Name the lower end first, and one that the value is not outside of."
+            raise broken_rule("range", f"{self.range}, with the value {self.value:g}", "two ends around it", mend)
+        return self
 
 
 def _within(low: float, high: float) -> AfterValidator:
@@ -235,6 +248,7 @@ class EnvironmentParameters(Section):
     guard: Guard
     cut_in: CutIn
     lateral: Lateral | None = None
+    replicates: str | None = None
 
     @model_validator(mode="after")
     def _av_has_a_speed(self) -> Self:
@@ -247,16 +261,34 @@ class EnvironmentParameters(Section):
             raise broken_rule("initial_state", found, f"speeds from 0 to {MAX_CONFIGURED_SPEED_MPS:g} m/s", mend)
         return self
 
+    def _entries(self, section: str) -> list[tuple[str, Any]]:
+        of = getattr(self, section)
+        return list(of) if isinstance(of, Section) else []
+
+    def numbers(self) -> dict[str, Number]:
+        """Flat ``section__name``, of those in a list ``section__name__0`` and so on → number, with its provenance."""
+        found: dict[str, Number] = {}
+        for section in type(self).model_fields:
+            for name, entry in self._entries(section):
+                listed = enumerate(entry) if isinstance(entry, list) else ()
+                named = {f"{section}__{name}": entry, **{f"{section}__{name}__{i}": each for i, each in listed}}
+                found |= {key: each for key, each in named.items() if isinstance(each, Number)}
+        return found
+
     def values(self) -> dict[str, float]:
-        """Flat ``section__name`` → value, without provenance; what is fixed is among them."""
-        given = {
-            f"{section}__{name}": number["value"]
-            for section, numbers in self.model_dump().items()
-            if isinstance(numbers, dict)
-            for name, number in numbers.items()
-            if number is not None
-        }
+        """The same without provenance; what is fixed is among them."""
+        given = {name: number.value for name, number in self.numbers().items()}
         return {**{f"scenario__{name}": value for name, value in FIXED.items()}, **given}
+
+    def with_values(self, values: Mapping[str, float]) -> Self:
+        """Other values by their flat names, as of a row of replicates; a `ValueError` where one is not allowed."""
+        content = self.model_dump()
+        for name, value in values.items():
+            place: Any = content
+            for key in name.split("__"):
+                place = place[int(key) if isinstance(place, list) else key]
+            place |= {"value": value, "range": None}
+        return type(self).model_validate(content)
 
     def lateral_motion(self) -> LateralMotion:
         """How long cut-ins show themselves."""

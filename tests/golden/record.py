@@ -28,7 +28,7 @@ from tests.in_process import controllers_here, one_process, run_here, without_pa
 GOLDEN = Path(__file__).parent / "golden.json"
 TABLES = {"episodes": ["episode"], "moments": ["episode", "step"], "traces": ["episode", "step"], "shadow": ["shadow"]}
 """By what each is sorted; vehicles of a step keep their order."""
-LEFT_OUT = {"diagnostics.alarm", "severity", "crc32", "estimates.scv.details.gain"}
+LEFT_OUT = {"diagnostics.alarm", "severity", "crc32", "traffic", "estimates.scv.details.gain"}
 """Of estimates.json: what features of earlier and later days wrote; its checksum, which is of words, too; and what few
 degrees of freedom leave of a variance, which rounding shows in (tests/estimators/test_scv.py has it)."""
 WORDLESS_TYPES = bool, int, float, type(None)

@@ -68,7 +68,7 @@ def test_cut_ins_that_no_test_stands_for_are_refused(stored_run, tmp_path):
 @pytest.mark.parametrize(
     ("name", "where", "found"),
     [
-        ("shells-twin", "ndd-overtaking-1-lateral", "in which cut-ins take another time"),
+        ("shells-twin", "ndd-overtaking-1-lateral", "in which cut-ins take time"),
         ("forced-twin", "ndd-overtaking-1", "tests by forced"),
         ("shells-acting-twin", "ndd-overtaking-1", "acts before the cut-in"),
         ("shells-twin", "nowhere", "which is not shipped"),

@@ -1,0 +1,170 @@
+"""What is not known about the traffic, beside the sampling error: by how much a rate differs between replicates of it.
+
+Replicates are environments that the same trajectories might as well have given. A rate is found in each by the same
+tests and the same paths (`harness.runner.other_traffic`); of the factors by which it moves, ``times`` are the quantiles
+that leave out as much on either side as the interval of the sampling error does. Both errors are independent: on a
+logarithmic scale their distances from the rate add as squares on either side (MOVER: Donner and Zou, Stat. Methods Med.
+Res. 21, 2012, 347). A replicate that could not be answered counts as whatever makes the interval wider.
+
+`Bar` and `Sensitivity` say by how much it moves with one number, or a block of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from harness.estimators.estimate import Number
+from harness.estimators.short_answer import Row
+from harness.numbers import interval, number, ratio, share
+from harness.vocabulary import FloatArray
+
+CARRIES = 0.05
+"""Share of a rate from which on there is an upper limit alone, where nothing was seen of it [assumed]."""
+
+CLOSE = 0.1
+"""Factors closer to 1 than so much on a logarithmic scale are told with three digits."""
+
+Ends = tuple[float, Number]
+
+
+@dataclass(frozen=True)
+class Uncertain:
+    """A rate, or its ratio to another: interval of the sampling error, of the ``environment``, and of both.
+
+    ``times`` are the ends of the environment's interval over the value; an end above without a limit is infinite.
+    """
+
+    value: float
+    times: Ends
+    sampling: Ends
+    environment: Ends
+    both: Ends
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Where in time to collision (``where``) no lane change was seen, and the share of the rate that arises there."""
+
+    where: str
+    share: float
+
+
+@dataclass(frozen=True)
+class TrafficError:
+    """What replicates of an ``environment`` say of a rate, and of its ratios by the names of others.
+
+    Of ``n_replicates`` ``n_refused`` could not be answered. With ``unseen`` there are upper limits alone.
+    """
+
+    environment: str
+    confidence: float
+    n_replicates: int
+    n_refused: int
+    rate: Uncertain
+    ratios: Mapping[str, Uncertain]
+    unseen: Unseen | None = None
+
+
+def uncertain(
+    value: float, sampling: Ends, factors: FloatArray, n_refused: int, confidence: float, *, from_below: bool = True
+) -> Uncertain:
+    """By the factors (B,) of replicates, each over that of the environment itself; else an upper limit alone."""
+    tail = round((1.0 - confidence) / 2.0, 12)  # so that it falls on one of them where it should
+    low = float(np.quantile(np.append(factors, np.zeros(n_refused)), tail, method="lower")) if from_below else 0.0
+    high = float(np.quantile(np.append(factors, np.full(n_refused, np.inf)), 1.0 - tail, method="higher"))
+    if value <= 0.0:
+        return Uncertain(value, (low, high), sampling, (0.0, 0.0), (0.0, sampling[1] * high))
+    environment = value * low, value * high
+    below, above = (
+        math.hypot(*(max(side * _log(end / value), 0.0) for end in ends))
+        for side, ends in zip((-1.0, 1.0), zip(sampling, environment, strict=True), strict=True)
+    )
+    both = value * math.exp(-below), value * math.exp(min(above, 700.0)) if above < math.inf else math.inf
+    return Uncertain(value, (low, high), sampling, environment, both)
+
+
+def _log(value: float) -> float:
+    return math.log(value) if 0.0 < value < math.inf else math.copysign(math.inf, value - 1.0)
+
+
+def rows(found: TrafficError) -> Iterator[Row]:
+    """Lines of the short answer: of the rate, and of its ratio to the first of the others."""
+    why = "with sampling error" if found.unseen is None else f"no lane change seen at {found.unseen.where}"
+    yield Row("traffic", "traffic", f"{times(found.rate)} (fitted)", interval(*found.rate.both), why)
+    for name, each in list(found.ratios.items())[:1]:
+        ends = f"{ratio(each.both[0])} to {ratio(each.both[1])}"
+        yield Row("traffic_ratio", "traffic, × driver", f"{times(each)} (fitted)", ends, f"the ratio to {name}")
+
+
+def times(of: Uncertain) -> str:
+    """``× 0.6 … × 2.1``, or ``at most × 27``."""
+    low, high = (number(end, 2 if abs(_log(end)) > CLOSE else 3) for end in of.times)
+    if of.times[0] > 0.0:
+        return f"× {low} … × {high}"
+    return f"at most × {high}" if math.isfinite(of.times[1]) else "no limit"
+
+
+def sentences(found: TrafficError) -> Iterator[str]:
+    """The same in words, for estimates.json and the page."""
+    n, level, both = found.n_replicates, share(found.confidence), interval(*found.rate.both)
+    if found.unseen is not None:
+        yield (
+            f"What is known about the traffic leaves the rate {times(found.rate)}, because no lane change was seen at "
+            f"{found.unseen.where}, where {share(found.unseen.share)} of this rate arises; with the sampling error "
+            f"{both} per test."
+        )
+    else:
+        yield (
+            f"The traffic, as far as {found.environment} is known, moves the rate by {times(found.rate)} ({level} of "
+            f"{n} replicates); with the sampling error it is {both} per test."
+        )
+    for name, each in found.ratios.items():
+        ends = f"{ratio(each.both[0])} to {ratio(each.both[1])}"
+        yield f"The ratio to {name} moves by {times(each)}; with the sampling error it is {ends}."
+    if found.n_refused:
+        yield (
+            f"{found.n_refused} of {n} replicates cannot be answered from these tests, and count as whatever makes an "
+            "interval wider."
+        )
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A number, or a block, by how it is ``known``, and the factors of rate and ratio at the two ends of it.
+
+    ``values`` are its ends, of a block none. ``off`` is by how much a reference driver's rate comes out wrong at most.
+    A factor is NaN where the tests cannot answer it, and ``note`` says why.
+    """
+
+    what: str
+    known: Literal["fitted", "assumed"]
+    values: tuple[float, float] | None
+    rate: tuple[Number, Number]
+    ratio: tuple[Number, Number]
+    off: Number
+    note: str = ""
+
+    @property
+    def span(self) -> float:
+        """How far the rate moves, on a logarithmic scale; below 0 where the tests do not say it."""
+        return max((abs(math.log(end)) for end in self.rate if end > 0.0), default=-1.0)
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Content of ``sensitivity.json``: bars, the longest first, and the driver whose ratio they are about."""
+
+    campaign_hash: str
+    environment: str
+    driver: str
+    bars: tuple[Bar, ...] = ()
+
+    @property
+    def shown(self) -> list[Bar]:
+        """Bars of which these tests say something."""
+        return [bar for bar in self.bars if bar.span >= 0.0]

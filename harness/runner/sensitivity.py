@@ -1,0 +1,127 @@
+"""What the answer of a stored run hangs on: by how much it moves where a number of its traffic is not known.
+
+Fitted numbers move by their standard errors or, where the environment names replicates, in blocks, as those of a block
+were fitted together. Assumed numbers move over the range that is stated for them. Each move is answered by the run's
+own tests and few paths (`harness.runner.other_traffic`): with the shells' new probabilities, and crash shares within
+shells as they were. Of numbers that change what happens after a cut-in the shares tell nothing but what the reference
+drivers show: by how much their rates, which are known there, would come out wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from harness.errors import CampaignError
+from harness.estimators.estimate import finite_json
+from harness.estimators.traffic import Bar, Sensitivity
+from harness.progress import Progress
+from harness.records.folder import SENSITIVITY, write_sealed
+from harness.runner.other_traffic import Moved, Nearby, Tested, environment_with, nearby, read_replicates
+from harness.traffic.loading import load_parameters
+from harness.traffic.parameters import EnvironmentParameters
+
+BLOCKS = {
+    "initial state": ("initial_state",),
+    "free driving": ("free_driving",),
+    "car following": ("car_following", "guard"),
+    "cut-in": ("cut_in", "hazard_table", "acceptance_steps"),
+    "lead of cut-ins": ("lateral",),
+}
+"""Sections whose numbers are fitted together."""
+N_REPLICATES = 50
+CONFIDENCE, QUANTILE = 0.9, 1.645
+_OPTION = "harness sensitivity"
+_WHY = {True: "laws that give no probabilities", False: "unlike what was tested"}
+
+
+@dataclass(frozen=True)
+class Move:
+    """Environments of a `Bar`, by the numbers that are other in each."""
+
+    what: str
+    known: Literal["fitted", "assumed"]
+    values: tuple[float, float] | None
+    settings: Sequence[Mapping[str, float]]
+
+
+def sensitivity(
+    folder: str | Path, *, ranges: Mapping[str, tuple[float, float]] | None = None, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Write ``sensitivity.json`` into the folder of a run of shells, and return its content (`Sensitivity`).
+
+    ``ranges`` of numbers, by ``section.name``, are taken besides those that the environment states.
+
+    Raises `HarnessError`: the folder is no run of shells, a number is not there, or nothing is said to be uncertain.
+    """
+    folder, progress = Path(folder), progress or Progress()
+    tested = Tested.of(folder, progress, _OPTION)
+    settings = tested.here.campaign.environment
+    parameters = load_parameters(settings)
+    asked = list(moves(settings.parameters, parameters, ranges or {}))
+    if not asked:
+        found = f"{settings.parameters}, of which no number has a standard error (se) or a range"
+        mend = "State one, e.g. --range cut_in.ignore_share=0.001:0.08."
+        raise CampaignError(_OPTION, found, "numbers that are said to be uncertain", mend)
+    traffic = [environment_with(tested.here, parameters, each) for move in asked for each in move.settings]
+    environments = [each for each in traffic if each is not None]
+    progress.stage("other traffic", len(environments))
+    answered = nearby(tested, tested.here, Moved(tested.design, tested.design), environments, progress)
+    results = iter([None if each is None else next(answered) for each in traffic])
+    bars = [_bar(move, [next(results) for _ in move.settings]) for move in asked]
+    drivers = [each.name for each in tested.design.references]
+    content = finite_json(
+        Sensitivity(
+            tested.manifest["campaign_hash"],
+            Path(settings.parameters).stem,
+            drivers[0] if drivers else "",
+            tuple(sorted(bars, key=lambda bar: -bar.span)),
+        )
+    )
+    write_sealed(folder / SENSITIVITY, content)
+    return content
+
+
+def moves(name: str, parameters: EnvironmentParameters, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Move]:
+    """What is said to be uncertain of an environment, a shipped name or a file, and numbers with stated ``ranges``."""
+    known = parameters.values()
+    stated = {key.replace(".", "__"): ends for key, ends in ranges.items()}
+    if unknown := sorted(set(stated) - set(known)):
+        mend = f"Its numbers are named section.name, such as {next(reversed(known)).replace('__', '.')}."
+        raise CampaignError("--range", unknown[0].replace("__", "."), f"a number of {name}", mend)
+    blocks = {section: block for block, sections in BLOCKS.items() for section in sections}
+    if parameters.replicates is not None:
+        rows = read_replicates(name, parameters)[:N_REPLICATES]
+        for block in BLOCKS:
+            columns = [key for key in rows[0] if blocks.get(key.split("__")[0]) == block]
+            if columns:
+                yield Move(block, "fitted", None, [{key: row[key] for key in columns} for row in rows])
+    for key, number in parameters.numbers().items():
+        what, value, se, ends = key.replace("__", "."), number.value, number.se, stated.get(key, number.range)
+        if ends is not None:
+            yield Move(what, "assumed", (ends[0], ends[1]), [{key: end} for end in ends])
+        elif se is not None and parameters.replicates is None:
+            ends = value - QUANTILE * se, value + QUANTILE * se
+            yield Move(what, "fitted", ends, [{key: end} for end in ends])
+
+
+def _bar(move: Move, results: Sequence[Nearby | None]) -> Bar:
+    found = [each for each in results if each is not None and not each.refused]
+    off = max((each.off for each in results if each is not None), default=np.nan)
+    note = " and ".join(sorted({_WHY[each is None] for each in results if each is None or each.refused}))
+    if move.values is None:
+        tail = (1.0 - CONFIDENCE) / 2.0
+        columns = np.array([(each.rate, each.ratio) for each in found]).T
+        known = len(found) >= (1.0 - tail) * len(results)
+        ends = np.quantile(columns, [tail, 1.0 - tail], axis=1) if known else np.full((2, 2), np.nan)
+    else:
+        ends = np.full((2, 2), np.nan)
+        for place, each in enumerate(results):
+            if each is not None and not each.refused:
+                ends[place] = each.rate, each.ratio
+    (rate_low, ratio_low), (rate_high, ratio_high) = ends.tolist()
+    return Bar(move.what, move.known, move.values, (rate_low, rate_high), (ratio_low, ratio_high), float(off), note)

@@ -1,0 +1,106 @@
+"""What fitted traffic leaves open of an answer: known where rates are in proportion, and told where it is not."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from harness.cli import main
+from harness.errors import HarnessError
+from harness.estimators.traffic import uncertain
+from harness.pool import moved
+from harness.runner.other_traffic import estimate_in_other_traffic
+from harness.traffic.parameters import SHIPPED_FOLDER
+from tests.stored_runs import copy_of, estimates
+
+SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
+LOOK = "cut_in__ignore_share"
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch, tmp_path):
+    """Paths enough for these tests, kept where no other test does."""
+    monkeypatch.setattr(moved, "N_PATHS", 512)
+    monkeypatch.setattr(moved, "cache_root", lambda: tmp_path / "cache")
+
+
+def fitted(folder: Path, **columns: list[float]) -> str:
+    """The shipped environment with replicates."""
+    pq.write_table(pa.table(columns), folder / "replicates.parquet")
+    text = SHIPPED.replace("version: 1\n", "version: 1\nreplicates: replicates.parquet\n", 1)
+    (folder / "mine.yaml").write_text(text)
+    return str(folder / "mine.yaml")
+
+
+def test_the_rate_moves_with_the_share_that_does_not_look_and_the_ratio_does_not(stored_run, tmp_path):
+    folder = stored_run("shells-twin")
+    mine = fitted(tmp_path, **{LOOK: [0.005, 0.01, 0.015, 0.02, 0.03]})
+    content = estimate_in_other_traffic(folder, mine)
+    traffic, stored = content["traffic"], estimates(folder)["estimates"]["shells"]
+    assert (traffic["n_replicates"], traffic["n_refused"], traffic["unseen"]) == (5, 0, None)
+    assert traffic["rate"]["times"] == pytest.approx([0.5, 3.0], rel=0.01)
+    assert traffic["rate"]["value"] == pytest.approx(stored["crash_rate"])
+    assert traffic["rate"]["sampling"] == pytest.approx([stored["ci_low"], stored["ci_high"]])
+    assert traffic["ratios"]["r157-cc"]["times"] == pytest.approx([1.0, 1.0], rel=0.005)
+    keys = [row["key"] for row in content["answer"]["rows"]]
+    assert keys[keys.index("ratio") + 1 :][:2] == ["traffic", "traffic_ratio"]
+    assert "5 replicates" in content["scope"]
+
+
+def test_what_was_found_once_is_not_looked_for_again(stored_run, tmp_path, monkeypatch):
+    folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.005, 0.02]})
+    first = estimate_in_other_traffic(folder, mine)
+    monkeypatch.setattr(moved.FewPaths, "_walk", None)
+    assert estimate_in_other_traffic(folder, mine) == first
+
+
+def test_replicates_that_tests_cannot_answer_leave_the_interval_open(stored_run, tmp_path):
+    """One in which the AV closes in faster than in any test, one whose laws are none."""
+    columns = {"initial_state__r2dot_min_mps": [-10.0, -16.0, -10.0], "cut_in__intercept": [-8.7, -8.7, 900.0]}
+    traffic = estimate_in_other_traffic(stored_run("shells-twin"), fitted(tmp_path, **columns))["traffic"]
+    assert (traffic["n_replicates"], traffic["n_refused"]) == (3, 2)
+    assert traffic["rate"]["times"] == [0.0, None]
+
+
+def test_the_folder_keeps_the_answer_of_its_own_traffic_alone(stored_run, tmp_path, capsys):
+    folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
+    mine = fitted(tmp_path, **{LOOK: [0.005, 0.02]})
+    assert main(["estimate", str(folder), "--environment", mine, "--write"]) == 0
+    assert "  traffic  " in capsys.readouterr().out
+    assert json.loads((folder / "estimates.json").read_text())["traffic"]["n_replicates"] == 2
+    assert main(["report", str(folder)]) == 0
+    assert "(fitted)" in (folder / "report.html").read_text()
+    (tmp_path / "mine.yaml").write_text(Path(mine).read_text().replace("{value: 0.01,", "{value: 0.02,"))
+    assert main(["estimate", str(folder), "--environment", mine, "--write"]) == 2
+    assert "with other numbers" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("columns", "found"),
+    [({"cut_in__look": [0.1]}, "column cut_in__look"), ({LOOK: []}, "no rows"), (None, "no such file")],
+)
+def test_replicates_that_are_none_are_refused(stored_run, tmp_path, columns, found):
+    mine = fitted(tmp_path, **(columns or {}))
+    if columns is None:
+        (tmp_path / "replicates.parquet").unlink()
+    with pytest.raises(HarnessError, match=found):
+        estimate_in_other_traffic(stored_run("shells-twin"), mine)
+
+
+def test_both_errors_add_as_squares_of_distances_on_a_logarithmic_scale():
+    factors = np.exp(np.linspace(-1.0, 1.0, 201))
+    found = uncertain(2e-7, (1e-7, 4e-7), factors, 0, 0.9)
+    assert found.times == pytest.approx((math.exp(-0.9), math.exp(0.9)))
+    ends = math.exp(math.hypot(math.log(2.0), 0.9))
+    assert found.both == pytest.approx((2e-7 / ends, 2e-7 * ends))
+    assert uncertain(2e-7, (0.0, 4e-7), factors, 0, 0.9).both[0] == 0.0
+    assert uncertain(0.0, (0.0, 4e-7), factors, 0, 0.9).both == pytest.approx((0.0, 4e-7 * math.exp(0.9)))
+    assert uncertain(2e-7, (1e-7, 4e-7), factors, 11, 0.9).times == (0.0, math.inf)  # above 5 %
+    only = uncertain(2e-7, (1e-7, 4e-7), factors, 0, 0.9, from_below=False)
+    assert (only.times[0], only.both[0]) == (0.0, 0.0)

@@ -1,0 +1,99 @@
+"""What an answer hangs on: a rate that is in proportion to one number, and hardly moves with others."""
+
+from __future__ import annotations
+
+import json
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from harness.campaign.sections import EnvironmentSettings
+from harness.cli import main
+from harness.pool import moved
+from harness.runner.sensitivity import moves, sensitivity
+from harness.traffic.loading import load_parameters
+from harness.traffic.parameters import SHIPPED_FOLDER
+from tests.stored_runs import copy_of, manifest
+
+SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch, tmp_path):
+    """Paths enough for these tests, kept where no other test does."""
+    monkeypatch.setattr(moved, "N_PATHS", 512)
+    monkeypatch.setattr(moved, "cache_root", lambda: tmp_path / "cache")
+
+
+@pytest.fixture
+def folder(stored_run, tmp_path):
+    """A run that may be changed."""
+    return copy_of(stored_run("shells-twin"), tmp_path / "run")
+
+
+def test_the_rate_is_in_proportion_to_who_does_not_look_and_the_ratio_is_not(folder):
+    ranges = {"cut_in.accept_ttc_s": (7.0, 8.0), "cut_in.ignore_share": (0.005, 0.04)}
+    content = sensitivity(folder, ranges=ranges)
+    look, accept = content["bars"]  # the longest first
+    assert (look["what"], look["known"], look["values"]) == ("cut_in.ignore_share", "assumed", [0.005, 0.04])
+    assert look["rate"] == pytest.approx([0.5, 4.0], rel=0.01)
+    assert look["ratio"] == pytest.approx([1.0, 1.0], rel=0.005)
+    assert accept["rate"] == pytest.approx([1.0, 1.0], abs=0.03)
+    assert content["campaign_hash"] == manifest(folder)["campaign_hash"]
+
+
+def test_a_number_whose_end_the_tests_say_nothing_of_has_one_end(folder):
+    """There the AV closes in faster than in any test."""
+    (bar,) = sensitivity(folder, ranges={"initial_state.r2dot_min_mps": (-16.0, -10.0)})["bars"]
+    assert bar["rate"] == [None, pytest.approx(1.0)]
+    assert bar["note"] == "unlike what was tested"
+
+
+def test_the_page_shows_the_tornado_of_these_tests_and_of_no_others(folder, capsys):
+    assert main(["sensitivity", str(folder), "--range", "cut_in.ignore_share=0.005:0.02", "--json"]) == 0
+    content, page = json.loads(capsys.readouterr().out), folder / "report.html"
+    assert "plot-sensitivity" in page.read_text()
+    assert (folder / "plots" / "sensitivity.svg").is_file()
+    (folder / "sensitivity.json").write_text(json.dumps({**content, "campaign_hash": "0" * 16}))
+    assert main(["report", str(folder)]) == 0
+    assert "plot-sensitivity" not in page.read_text()
+
+
+def test_what_was_fitted_together_moves_together(tmp_path):
+    """Replicates move a block at a time; a standard error moves a number where there are none."""
+    columns = {
+        "cut_in__intercept": [-8.0, -9.0],
+        "cut_in__ignore_share": [0.01, 0.02],
+        "free_driving__df": [15.0, 17.0],
+    }
+    pq.write_table(pa.table(columns), tmp_path / "rows.parquet")
+    fitted = SHIPPED.replace("df: {value: 16.0, source: ndd}", "df: {value: 16.0, source: fitted, se: 2.0}")
+    (tmp_path / "one.yaml").write_text(fitted)
+    (tmp_path / "both.yaml").write_text(fitted.replace("version: 1\n", "version: 1\nreplicates: rows.parquet\n", 1))
+    found = {}
+    for name in ("one", "both"):
+        file = str(tmp_path / f"{name}.yaml")
+        parameters = load_parameters(EnvironmentSettings(parameters=file))
+        found[name] = {move.what: move.settings for move in moves(file, parameters, {})}
+    assert found["one"] == {"free_driving.df": [{"free_driving__df": pytest.approx(16.0 + k * 3.29)} for k in (-1, 1)]}
+    assert found["both"] == {
+        "free driving": [{"free_driving__df": 15.0}, {"free_driving__df": 17.0}],
+        "cut-in": [
+            {"cut_in__intercept": -8.0, "cut_in__ignore_share": 0.01},
+            {"cut_in__intercept": -9.0, "cut_in__ignore_share": 0.02},
+        ],
+    }
+
+
+@pytest.mark.parametrize(
+    ("option", "found"),
+    [
+        ("cut_in.look=0:1", "cut_in.look"),
+        ("cut_in.ignore_share=0.1", "no two numbers"),
+        (None, "no number has a standard error"),
+    ],
+)
+def test_what_is_not_said_to_be_uncertain_is_refused(folder, capsys, option, found):
+    assert main(["sensitivity", str(folder), *(["--range", option] if option else [])]) == 2
+    assert found in capsys.readouterr().err
