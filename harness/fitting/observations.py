@@ -17,10 +17,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import ndimage
 
 from harness.errors import TrajectoryError
 from harness.fitting.table import Mapping, Recording, recordings
+from harness.fitting.tracks import (
+    USUAL_RANGE,
+    FitRange,
+    Scene,
+    States,
+    Track,
+    durations_s,
+    noise_of,
+    slopes,
+    track_of,
+)
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 
@@ -36,8 +46,6 @@ AT_RISK = np.dtype(
 )
 LEADS = _dtype("lead_s", "lateral_speed_mps")
 
-IN_VIEW_M = 100.0
-"""Nobody is behind where so much of the road behind is seen."""
 INITIAL_EVERY_S = 20
 CLOSING_TTC_S = 8.0
 LONGEST_LEAD_S = 10.0
@@ -55,19 +63,6 @@ FEWEST_CHANGES = 20
 LEAST_CLOSING_S = 1.0
 OTHER_SIDE = 10.0
 """Times as much closing in on the other side that it must be the one that is meant."""
-
-
-class FitRange(NamedTuple):
-    """States that laws are fitted to."""
-
-    v_min_mps: float = 20.0
-    v_max_mps: float = 40.0
-    r1_min_m: float = 0.0
-    r1_max_m: float = 115.0
-
-
-USUAL_RANGE = FitRange()
-"""That of the shipped environments."""
 
 
 class Tally(NamedTuple):
@@ -160,7 +155,7 @@ def observations(
 
 def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observations:
     """Observations of one recording, whatever they are worth (`require_enough`)."""
-    track, flickers = _track(recording)
+    track, flickers = track_of(recording)
     n = track.second
     changes = np.flatnonzero(track.crosses(-1) & track.fitted)
     chosen = track.fitted & (track.frame % n == 0)
@@ -168,13 +163,13 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
     chosen[changes] = True
     rows = np.flatnonzero(chosen & track.has_lane(-1))
     whole = track.frame[rows] % n == 0
-    scene = _Scene(track, chosen)
+    scene = Scene(track, chosen)
     state, other = scene.states(rows, -1, fit_range), scene.states(other_rows, 1, fit_range)
-    duration_s = _durations(track, rows)
+    duration_s = durations_s(track, rows)
 
     second = whole & track.same_run(rows, n)
     acceleration = np.full(rows.size, np.nan)
-    acceleration[second] = _slopes(track, rows[second])
+    acceleration[second] = slopes(track, rows[second])
     seen = (state.leader >= 0) | (track.s[rows] + fit_range.r1_max_m <= track.road_end[track.road[rows]])
     since = track.frame[rows] - track.frame[np.searchsorted(track.vehicle, track.vehicle[rows])]
     crosses = np.isin(rows, changes)
@@ -218,7 +213,7 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         _records(INITIAL, columns, whole & state.behind & (since // n % INITIAL_EVERY_S == 0)),
         _records(AT_RISK, columns, state.at_risk),
         leads,
-        _noise(track),
+        noise_of(track),
         tally,
     )
 
@@ -231,200 +226,10 @@ def _records(dtype: np.dtype[np.void], columns: dict[str, RecordArray], inside: 
     return out
 
 
-# -- rows, runs and neighbours --
-
-
-class _Track(NamedTuple):
-    """Columns of a recording, sorted by vehicle and frame; a run is a vehicle in one lane without a gap in time."""
-
-    vehicle: IntArray
-    frame: IntArray
-    road: IntArray
-    lane: IntArray
-    s: FloatArray
-    v: FloatArray
-    length: FloatArray
-    lateral: FloatArray
-    fitted: BoolArray
-    piece: IntArray
-    """Number of the part of a vehicle's track without a gap in time."""
-    run: IntArray
-    road_begin: FloatArray
-    road_end: FloatArray
-    """By road: how far it is seen."""
-    rate_hz: float
-
-    @property
-    def second(self) -> int:
-        """Frames of a second."""
-        return round(self.rate_hz)
-
-    def begins(self) -> IntArray:
-        """First rows of vehicles."""
-        return np.flatnonzero(np.diff(self.vehicle, prepend=-1))
-
-    def crosses(self, side: int) -> BoolArray:
-        """Rows (n,) after which the vehicle is in the next lane."""
-        same = np.diff(self.piece, append=-1) == 0
-        return np.asarray(same & (np.diff(self.lane, append=0) == side))
-
-    def has_lane(self, side: int) -> BoolArray:
-        """Rows (n,) beside a lane in which somebody drives in this recording."""
-        lanes = self.lane - self.lane.min() + 1
-        at = self.road * (lanes.max() + 2) + lanes
-        return np.asarray(np.isin(at + side, np.unique(at)))
-
-    def same_run(self, rows: IntArray, frames: int) -> BoolArray:
-        """Whether a vehicle stays in its lane so long after some rows (m,)."""
-        last = np.minimum(rows + frames, self.run.size - 1)
-        return np.asarray((self.run[last] == self.run[rows]) & (last == rows + frames))
-
-    def gap(self, leader: IntArray, follower: IntArray) -> FloatArray:
-        """Bumper to bumper; infinite where one of them is -1."""
-        gap = self.s[leader] - self.s[follower] - 0.5 * (self.length[leader] + self.length[follower])
-        return np.where((leader >= 0) & (follower >= 0), gap, np.inf)
-
-    def rate(self, leader: IntArray, follower: IntArray) -> FloatArray:
-        """Speed of the leader minus that of the follower; 0 where one of them is -1."""
-        return np.where((leader >= 0) & (follower >= 0), self.v[leader] - self.v[follower], 0.0)
-
-
-def _track(recording: Recording) -> tuple[_Track, int]:
-    """Columns with lanes smoothed, and how often a lane came back within a second."""
-    rows = recording.rows
-    vehicle, frame, lane = (rows[name].to_numpy() for name in ("vehicle", "frame", "lane"))
-    road, s, n = rows.road.to_numpy(), rows.s_m.to_numpy(), round(recording.rate_hz)
-    piece = _numbers((np.diff(vehicle) != 0) | (np.diff(frame) != 1))
-    lane, flickers = _smoothed(lane, piece, n)
-    run = _numbers((np.diff(piece) != 0) | (np.diff(lane) != 0))
-    begin, end = np.array([(s[road == each].min(), s[road == each].max()) for each in range(int(road.max()) + 1)]).T
-    v, length, lateral, fitted = (rows[each].to_numpy() for each in ("speed_mps", "length_m", "lateral_m", "fitted"))
-    rate_hz = recording.rate_hz
-    track = _Track(vehicle, frame, road, lane, s, v, length, lateral, fitted, piece, run, begin, end, rate_hz)
-    return track, flickers
-
-
-def _numbers(breaks: BoolArray) -> IntArray:
-    """Number of the part that each row (n,) is in, between breaks (n - 1,)."""
-    return np.append(0, np.cumsum(breaks))
-
-
-def _smoothed(lane: IntArray, piece: IntArray, second: int) -> tuple[IntArray, int]:
-    """Lanes (n,) as the median of two seconds where one came back within one, and how often that was."""
-    run = _numbers((np.diff(piece) != 0) | (np.diff(lane) != 0))
-    first = np.flatnonzero(np.diff(run, prepend=-1))
-    frames = np.diff(first, append=lane.size)
-    at, of = lane[first], piece[first]
-    back = np.zeros(first.size, np.bool_)
-    back[1:-1] = (of[:-2] == of[2:]) & (at[:-2] == at[2:]) & (frames[1:-1] < second)
-    out = lane.copy()
-    for each in np.unique(of[back]):
-        part = slice(*np.searchsorted(piece, [each, each + 1]))
-        out[part] = ndimage.median_filter(lane[part], 2 * second + 1, mode="nearest")
-    return out, int(back.sum())
-
-
-class _Scene:
-    """Who drives where at the moments of some rows."""
-
-    def __init__(self, track: _Track, chosen: BoolArray) -> None:
-        at = np.flatnonzero(np.isin(track.frame, np.unique(track.frame[chosen])))
-        lanes = track.lane - track.lane.min() + 1
-        frames = track.frame - track.frame.min()
-        self._track = track
-        self._spot = (track.road * (frames.max() + 1) + frames) * (lanes.max() + 2) + lanes
-        self._s = track.s - track.s.min()
-        self._span = float(self._s.max() + 1.0)
-        place = self._spot[at] * self._span + self._s[at]
-        order = np.argsort(place, kind="stable")
-        self._place, self._at = place[order], at[order]
-
-    def neighbours(self, rows: IntArray, side: int) -> tuple[IntArray, IntArray]:
-        """Rows (m,) of the next vehicles ahead of and behind the centre of some, in a lane beside; -1 for none."""
-        spot = self._spot[rows] + side
-        i = np.searchsorted(self._place, spot * self._span + self._s[rows], side="right")
-        ahead = self._at[np.minimum(i, self._at.size - 1)]
-        behind = self._at[np.maximum(i - 1, 0)]
-        return (
-            np.where((i < self._at.size) & (self._spot[ahead] == spot), ahead, -1),
-            np.where((i > 0) & (self._spot[behind] == spot), behind, -1),
-        )
-
-    def states(self, rows: IntArray, side: int, fit_range: FitRange) -> _States:
-        """States of some rows (m,) towards the lane beside."""
-        track, fit = self._track, fit_range
-        v = track.v[rows]
-        leader, _ = self.neighbours(rows, 0)
-        r1 = track.gap(leader, rows)
-        fits = (v >= fit.v_min_mps) & (v <= fit.v_max_mps)
-        follows = (leader >= 0) & (r1 <= fit.r1_max_m)
-        behind = follows & fits & (r1 > max(fit.r1_min_m, 0.0))
-        ahead, after = self.neighbours(rows, side)
-        r2, r2dot = track.gap(rows, after), track.rate(rows, after)
-        ttc_s = np.full(rows.size, np.inf)
-        closing = r2dot < 0.0
-        ttc_s[closing] = r2[closing] / -r2dot[closing]
-        seen = (after >= 0) | (track.s[rows] - track.road_begin[track.road[rows]] >= IN_VIEW_M)
-        at_risk = behind & (r2 > 0.0) & (track.gap(ahead, rows) > 0.0) & seen
-        return _States(leader, r1, track.rate(leader, rows), fits, follows, behind, r2, r2dot, ttc_s, at_risk)
-
-
-class _States(NamedTuple):
-    """States of rows (m,) towards the lane on one side."""
-
-    leader: IntArray
-    """Its row, or -1."""
-    r1: FloatArray
-    r1dot: FloatArray
-    fits: BoolArray
-    """Whether the speed is within the fit range."""
-    follows: BoolArray
-    """Whether R1 is."""
-    behind: BoolArray
-    """Both, without overlap."""
-    r2: FloatArray
-    r2dot: FloatArray
-    ttc_s: FloatArray
-    at_risk: BoolArray
-    """Behind a leader, nobody alongside, and seen who comes from behind."""
-
-
-def _durations(track: _Track, rows: IntArray) -> FloatArray:
-    """Time (s) that each of some rows (m,) stands for: what of its run is nearest to it."""
-    run, frame = track.run[rows], track.frame[rows].astype(np.float64)
-    alone = np.flatnonzero(np.diff(track.run, prepend=-1))
-    first, last = track.frame[alone].astype(np.float64), track.frame[np.append(alone[1:], track.run.size) - 1]
-    goes_on = np.diff(track.piece[alone], append=-1) == 0  # in another lane, half a frame later
-    begin = first[run] - 0.5 * np.append(False, goes_on[:-1])[run]
-    end = last[run] + 0.5 * goes_on[run]
-    same = np.diff(run) == 0
-    middle = 0.5 * (frame[1:] + frame[:-1])
-    begin[1:][same], end[:-1][same] = middle[same], middle[same]
-    return np.asarray(end - begin) / track.rate_hz
-
-
-def _slopes(track: _Track, rows: IntArray) -> FloatArray:
-    """Slope (m/s²) of a line through the speeds of the second that begins at each of some rows (m,)."""
-    since = np.arange(track.second + 1) - track.second / 2
-    weights = since / (since @ since) * track.rate_hz
-    slopes = np.zeros(rows.size)
-    for i, weight in enumerate(weights):
-        slopes += weight * track.v[rows + i]
-    return slopes
-
-
-def _noise(track: _Track) -> float:
-    """Standard deviation (m/s²) of slopes by white noise, which third differences show as no motion does."""
-    same = track.piece[3:] == track.piece[:-3]
-    third = np.diff(track.v, 3)[same]
-    since = np.arange(track.second + 1) - track.second / 2
-    return float(np.sqrt(third @ third / max(third.size, 1) / 20.0 / (since @ since)) * track.rate_hz)
-
-
 # -- lateral motion --
 
 
-def _leads(track: _Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
+def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
     """Leads of some crossings (rows before them); how many go without lateral motion, and how many at another time.
 
     The onset is where a line, level before and straight from there to the crossing, comes nearest to the lateral
@@ -473,7 +278,7 @@ def _slope(x: FloatArray, y: FloatArray) -> float:
 # -- is it enough? --
 
 
-def _overlap(recording: Recording, rows: IntArray, state: _States, overlaps: BoolArray) -> str:
+def _overlap(recording: Recording, rows: IntArray, state: States, overlaps: BoolArray) -> str:
     """The first two vehicles that overlap, in words; empty if none do."""
     if not overlaps.any():
         return ""
