@@ -281,8 +281,11 @@ def motorway(folder: Path, *, environments: Sequence[str]) -> None:
     rows = installed_rows()
     folder.mkdir(parents=True, exist_ok=True)
     write(trajectories_of(rows), table := folder / "trajectories.parquet")
-    seen = joined(each for each, _ in observations([table], load_mapping(mirror=True)))
-    written = page(seen, figures(seen, laws))
+    sides = {}
+    for side in ("left", "right"):
+        seen = joined(each for each, _ in observations([table], load_mapping(mirror=side == "left")))
+        sides[side] = seen, figures(seen, laws)
+    written = page(sides)
     write_bytes(folder / "motorway.md", written.encode())
     click.echo(written)
 

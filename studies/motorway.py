@@ -274,6 +274,8 @@ def figures(seen: Observations, environments: Mapping[str, Environment]) -> list
             add(f"{kind}: below {limit:g} m/s² (%)", harder, pmf_mean(pmf, 100.0 * (limit - 0.1 > ACCELERATIONS_MPS2)))
 
     def lane_changes(words: str, here: BoolArray) -> None:
+        if not (changes & freely).any():
+            return
         share = _share(int((changes & here & freely).sum()), int((changes & freely).sum()))
         add(
             f"lane changes {words} (%)",
@@ -326,11 +328,16 @@ def _expected(laws: Laws, here: BoolArray, changes: BoolArray, freely: BoolArray
 
 
 def _mean(values: NDArray[Any], cluster: IntArray, weight: FloatArray | float = 1.0) -> Interval:
-    """Mean of values over weights, sums of both (n,), and its interval; clusters are independent."""
+    """Mean of values over weights, sums of both (n,), and its interval; clusters are independent.
+
+    Where all values are 0, they are taken to be shares in per cent.
+    """
     _, of = np.unique(cluster, return_inverse=True)
     top, bottom = np.bincount(of, values), np.bincount(of, np.broadcast_to(weight, values.shape))
     mean = float(top.sum() / bottom.sum())
     error = Z * float(np.sqrt(np.square(top - mean * bottom).sum()) / bottom.sum())
+    if not top.any():  # never seen in any cluster
+        return 0.0, 0.0, 100.0 * (1.0 - TAIL ** (1.0 / top.size))
     return mean, mean - error, mean + error
 
 
@@ -353,22 +360,31 @@ def _median(values: FloatArray) -> Interval:
     return float(np.median(values)), float(ordered[low]), float(ordered[min(high, n - 1)])
 
 
-def page(seen: Observations, found: Sequence[Figure]) -> str:
-    """The figures as Markdown."""
-    names = list(found[0].of)
-    hours, tally = seen.tally.driven_s / 3600.0, seen.tally
+def page(sides: Mapping[str, tuple[Observations, Sequence[Figure]]]) -> str:
+    """The figures of lane changes to each side as Markdown."""
     lines = [
         "# Motorway trajectories beside traffic that is simulated",
         "",
-        f"DLR Highway Traffic: {tally.vehicles:,} vehicles beside a target lane, {hours:.1f} vehicle-hours, "
-        f"{tally.changes:,} lane changes to it. Seen are figures with 90 % intervals; by chance alone one in ten "
-        "environments that are right would lie outside.",
-        "",
-        "| | seen | " + " | ".join(names) + " |",
-        "| --- | --- |" + " --- |" * len(names),
+        "DLR Highway Traffic, with 90 % intervals: by chance alone one in ten figures of traffic that is right would "
+        "lie outside. Counts of lane changes are expected at the level of those where nobody closes in within "
+        f"{FREELY_S:g} s.",
     ]
-    for each in found:
-        cells = [f"{value:.3g} {'agrees' if each.agrees(name) else '**does not**'}" for name, value in each.of.items()]
-        lines.append(f"| {each.words} | {each.seen:.3g} ({each.low:.3g} … {each.high:.3g}) | {' | '.join(cells)} |")
-    agreeing = (f"{name} agrees in {sum(each.agrees(name) for each in found)} of {len(found)}" for name in names)
-    return "\n".join([*lines, "", "; ".join(agreeing) + ".", ""])
+    for side, (seen, found) in sides.items():
+        names, tally = list(found[0].of), seen.tally
+        lines += [
+            "",
+            f"## To the {side}",
+            "",
+            f"{tally.vehicles:,} vehicles beside a lane to the {side}, {tally.driven_s / 3600.0:.1f} vehicle-hours, "
+            f"{tally.changes:,} lane changes to it.",
+            "",
+            "| | seen | " + " | ".join(names) + " |",
+            "| --- | --- |" + " --- |" * len(names),
+        ]
+        for each in found:
+            seen_here = f"{each.seen:.3g} ({each.low:.3g} … {each.high:.3g})"
+            said = [f"{value:.3g}{' agrees' * each.agrees(name)}" for name, value in each.of.items()]
+            lines.append(f"| {' | '.join([each.words, seen_here, *said])} |")
+        agreeing = (f"{name} agrees in {sum(each.agrees(name) for each in found)} of {len(found)}" for name in names)
+        lines += ["", "; ".join(agreeing) + "."]
+    return "\n".join([*lines, ""])

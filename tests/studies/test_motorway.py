@@ -89,8 +89,9 @@ def test_traffic_agrees_with_the_environment_it_was_made_by_rather_than_with_ano
     other.write_text(text, encoding="utf-8")
     out = tmp_path / "out"
     assert main(["motorway", "--out", str(out), "-e", MADE_OF, "-e", str(other)]) == 0
-    lines = (out / "motorway.md").read_text(encoding="utf-8").splitlines()
-    agrees = {row.split("|")[1].strip(): ["agrees" in each for each in row.split("|")[3:5]] for row in lines[6:-2]}
+    left = (out / "motorway.md").read_text(encoding="utf-8").split("## ")[1]
+    rows = [line.split("|") for line in left.splitlines() if line.startswith("| ")][2:]
+    agrees = {row[1].strip(): ["agrees" in each for each in row[3:5]] for row in rows}
     own, others = np.array(list(agrees.values())).T
     assert len(own) == 21
     assert own.sum() >= 15  # nine in ten, but for noise of measurement and what goes on after the first state
