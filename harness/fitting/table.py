@@ -410,14 +410,16 @@ def _check_units(recording: Recording) -> None:
         found = f"speeds {ratio:.3g} times the change of positions{words}"
         mend = "Say their units in a mapping (units: {s_m: ft}); s_m must rise as one drives."
         raise TrajectoryError(where, found, "m and m/s of one motion", mend)
-    median = float(np.median(v))
-    if not -0.5 < median < FASTEST_MEDIAN_MPS:
-        mend = "Are they feet or km/h, or negative? Say units in a mapping: {s_m: ft, speed_mps: ft/s, length_m: ft}."
-        raise TrajectoryError(where, f"a median speed of {median:.4g} m/s", "0 to 70 m/s", mend)
-    length = float(np.median(rows.length_m))
-    if not USUAL_LENGTH_M[0] <= length <= USUAL_LENGTH_M[1]:
-        mend = "Are they feet? Say so in a mapping: units: {length_m: ft}. Is the column the width?"
-        raise TrajectoryError(where, f"a median length of {length:.3g} m", "2.5 to 10 m", mend)
+    speed, length = float(np.median(v)), float(np.median(rows.length_m))
+    feet = length > USUAL_LENGTH_M[1]
+    if not -0.5 < speed < FASTEST_MEDIAN_MPS:
+        found = f"a median speed of {speed:.4g} m/s" + (f" and a median length of {length:.3g} m: feet" if feet else "")
+        mend = "Say units in a mapping, such as units: {s_m: ft, speed_mps: ft/s, length_m: ft}; none is negative."
+        raise TrajectoryError(where, found, "0 to 70 m/s", mend)
+    if feet or length < USUAL_LENGTH_M[0]:
+        mend = "Say so in a mapping: units: {length_m: ft}." if feet else "Is the column that of the width?"
+        found = f"a median length of {length:.3g} m{': feet' if feet else ''}"
+        raise TrajectoryError(where, found, "2.5 to 10 m", mend)
     lag_s = _lag(begin, frame, vehicle, way_m * recording.rate_hz, v, n) / recording.rate_hz
     if abs(lag_s) >= LEAST_LAG_S:
         found = f"speeds that belong to positions of {abs(lag_s):.1f} s {'earlier' if lag_s > 0 else 'later'}"

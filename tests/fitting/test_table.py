@@ -83,10 +83,11 @@ REFUSED = {
     "mph": (changed(speed_mps=ROWS.speed_mps / 0.44704), "speeds in mph"),
     "feet throughout": (
         lambda: ROWS.assign(**{each: ROWS[each] * FEET for each in ("s_m", "speed_mps", "length_m")}),
-        "a median speed of",
+        "a median speed of .* and a median length of .*: feet",
     ),
-    "lengths in feet": (changed(length_m=ROWS.length_m * FEET), r"median length of 15\.\d m"),
+    "lengths in feet": (changed(length_m=ROWS.length_m * FEET), r"median length of 15\.\d m: feet"),
     "milliseconds": (changed(time_s=ROWS.time_s * 1000), "units: {time_s: ms}"),
+    "widths": (changed(length_m=1.9), "the width"),
     "backwards": (changed(s_m=-ROWS.s_m), "positions that fall where vehicles drive forward"),
     "backwards throughout": (changed(s_m=-ROWS.s_m, speed_mps=-ROWS.speed_mps), "median speed of -"),
     "mirrored": (fast_lanes, "mirror: true"),
