@@ -82,11 +82,11 @@ def bv_accelerations(states, u=(), *, follows):
     return pmf, cap, drawn
 
 
-def cut_in_terms(states, level=1.0):
+def cut_in_terms(states, level=1.0, env=None):
     """Opportunity, acceptance and hazard of one step; states have all five columns: (n, 3)."""
     states = np.atleast_2d(np.asarray(states, float))
     out = np.empty((len(states), 3))
-    _cut_in(states, environment(level), out)
+    _cut_in(states, env or environment(level), out)
     return out
 
 

@@ -47,9 +47,7 @@ class Tables(NamedTuple):
 
 def tables_hash(environment: Environment, drivers: RecordArray, challenge: str) -> str:
     """Hash of what the surrogates' tables depend on; the level of lane changing is not among it."""
-    numbers = {
-        name: environment.numbers[name].item() for name in environment.numbers.dtype.fields or () if name != "level"
-    }
+    numbers = {name: value for name, value in environment.content().items() if name != "level"}
     surrogates = [[driver[name].item() for name in MODEL_FIELDS] for driver in drivers]
     content = json.dumps([_FORMAT, challenge, numbers, AFTER, BEFORE, MODEL_FIELDS, surrogates, LEVELS], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:24]

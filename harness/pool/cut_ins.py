@@ -152,7 +152,7 @@ class Pool:
 
 def environment_hash(environment: Environment) -> str:
     """Hash of all numbers of an environment, level of lane changing and hold time included."""
-    numbers = {name: environment.numbers[name].item() for name in environment.numbers.dtype.names or ()}
+    numbers = environment.content()
     if (lateral := environment.lateral).present:
         numbers["lateral"] = [lateral.distance_m, lateral.cumulative.tolist()]
     return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:24]

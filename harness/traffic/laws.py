@@ -21,7 +21,7 @@ hazards (`harness.episode.path.weigh_cut_ins`), pools of shells too (`harness.po
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -48,18 +48,39 @@ _T_PER_UNIT = 32.0
 _BELOW_ONE = 1.0 - 2.0**-53
 
 
+class Wish(NamedTuple):
+    """Logarithm of the wish to change lanes (per second): a sum of functions of v_BV, R1 and R1dot.
+
+    Each (n, 2) has knots and values, between which it is linear, and outside of which it is constant. Where they are
+    empty the wish has a formula.
+    """
+
+    v: FloatArray
+    r1: FloatArray
+    r1dot: FloatArray
+
+
 class Environment(NamedTuple):
     """All that kernels need of the environment.
 
     ``numbers`` is the parameter record; ``noise_t`` (2, 4097, 2) are the tables of Student's t for free driving and car
     following; ``brake_cumulative`` (31,) is the cumulative distribution of braking in free driving; ``lateral`` says
-    how long cut-ins show themselves.
+    how long cut-ins show themselves. ``wish`` and ``accepted`` (n, 2), upper ends of times to collision and shares, are
+    tables in place of formulas, or empty.
     """
 
     numbers: Record
     noise_t: FloatArray
     brake_cumulative: FloatArray
     lateral: LateralMotion
+    wish: Wish
+    accepted: FloatArray
+
+    def content(self) -> dict[str, Any]:
+        """All numbers but those of the lateral motion, for hashes; tables only where they are."""
+        tables = {**self.wish._asdict(), "accepted": self.accepted}
+        numbers = {name: self.numbers[name].item() for name in self.numbers.dtype.names or ()}
+        return numbers | {name: table.tolist() for name, table in tables.items() if table.size}
 
 
 class AccelerationLaw(NamedTuple):
@@ -76,7 +97,7 @@ class AccelerationLaw(NamedTuple):
     brake_share: float
 
 
-def build_environment(numbers: Record, lateral: LateralMotion) -> Environment:
+def build_environment(numbers: Record, lateral: LateralMotion, wish: Wish, accepted: FloatArray) -> Environment:
     """Tables of an environment from its parameter record."""
     braking = np.where(
         numbers["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2,
@@ -86,7 +107,7 @@ def build_environment(numbers: Record, lateral: LateralMotion) -> Environment:
     cumulative = np.cumsum(braking) / braking.sum()
     cumulative[-1] = 1.0
     noise_t = np.stack([t_table(float(numbers[name])) for name in ("free_driving__df", "car_following__df")])
-    return Environment(numbers, noise_t, cumulative, lateral)
+    return Environment(numbers, noise_t, cumulative, lateral, wish, accepted)
 
 
 def t_table(df: float) -> FloatArray:
@@ -234,9 +255,27 @@ def guard_cap(state: State, environment: Environment) -> int:
 
 
 @compiled_inline
+def piecewise_linear(x: float, table: FloatArray) -> float:
+    """Value at ``x`` of a function that is linear between the knots of ``table`` (n, 2), and constant beyond them."""
+    last = table.shape[0] - 1
+    if x >= table[last, 0]:
+        return float(table[last, 1])
+    i = 0
+    while i < last and table[i, 0] <= x:
+        i += 1
+    if i == 0:
+        return float(table[0, 1])
+    x0, y0 = table[i - 1, 0], table[i - 1, 1]
+    return float(y0 + (x - x0) * (table[i, 1] - y0) / (table[i, 0] - x0))
+
+
+@compiled_inline
 def opportunity(state: State, environment: Environment) -> float:
     """OL, the rate per one-second decision at which BV wants to leave its lane, times the campaign's level."""
-    n = environment.numbers
+    n, table = environment.numbers, environment.wish
+    if table.v.shape[0] > 0:
+        log_wish = piecewise_linear(state.v_bv_mps, table.v) + piecewise_linear(state.r1_m, table.r1)
+        return float(n.level * math.exp(log_wish + piecewise_linear(state.r1dot_mps, table.r1dot)))
     u = fit_u(state.v_bv_mps, environment)
     gap = clamp(state.r1_m, n.fit_range__r1_min_m, n.fit_range__r1_max_m)
     q = clamp(state.r1dot_mps, -n.cut_in__rate_clamp_mps, n.cut_in__rate_clamp_mps) / n.cut_in__rate_scale_mps
@@ -254,9 +293,14 @@ def opportunity(state: State, environment: Environment) -> float:
 @compiled_inline
 def acceptance(r2: float, r2dot: float, environment: Environment) -> float:
     """Share of wished lane changes carried out in front of an AV that closes from R2 at -R2dot."""
-    n = environment.numbers
+    n, steps = environment.numbers, environment.accepted
     if r2 <= 0.0:
         return 0.0
+    if steps.shape[0] > 0:
+        step = 0
+        while r2 >= -r2dot * steps[step, 0] and step < steps.shape[0] - 1:
+            step += 1
+        return float(steps[step, 1])
     accept = 1.0
     if r2dot < 0.0:
         ttc = r2 / (-r2dot)

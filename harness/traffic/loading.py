@@ -52,10 +52,10 @@ def load_environment(settings: EnvironmentSettings, parameters: EnvironmentParam
     level, hold_s, lead_s = settings.lane_change_level, settings.acceleration_hold_s, settings.cut_in_lead_s
     given = parameters or load_parameters(settings)
     numbers = parameter_record(given, lane_change_level=level, hold_s=hold_s)
-    if lead_s is None:
-        return build_environment(numbers, given.lateral_motion())
-    distance_m = given.lateral_motion().distance_m
-    return build_environment(numbers, constant_lead(lead_s, distance_m))
+    lateral = given.lateral_motion()
+    if lead_s is not None:
+        lateral = constant_lead(lead_s, lateral.distance_m)
+    return build_environment(numbers, lateral, given.wish(), given.accepted())
 
 
 def require_sound_laws(environment: Environment, file: str) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -15,14 +17,17 @@ from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
 from harness.traffic.lateral import LateralMotion, constant_lead, log_normal_speed
+from harness.traffic.laws import Wish
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
-from harness.vocabulary import ACCELERATIONS_MPS2, Record
+from harness.vocabulary import ACCELERATIONS_MPS2, FloatArray, Record
 
 SHIPPED_FOLDER = Path(__file__).parent
 FIXED = {"step_s": STEP_S, "vehicle_length_m": VEHICLE_LENGTH_M}
 """What the compiled motion and SUMO's network are made for: no file can change it, but campaigns' hashes contain it."""
 LONGEST_LEAD_S = 10.0
 _SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
+_AXES = (("v_mps", "v_log"), ("r1_m", "r1_log"), ("r1dot_mps", "r1dot_log"))
+_NOT_IN_RECORD = ("lateral__", "hazard_table__", "acceptance_steps__")
 
 
 class Number(Section):
@@ -48,12 +53,13 @@ class Number(Section):
 
 
 def _within(low: float, high: float) -> AfterValidator:
-    """Refuse a value outside of [low, high]."""
+    """Refuse a value, or an end of its range, outside of [low, high]."""
 
     def checked(number: Number) -> Number:
-        if not low <= number.value <= high:
-            expected = f"a number from {low:g} to {high:g}"
-            raise broken_rule("value", f"{number.value:g}", expected, "Correct the value.")
+        for key, values in (("value", [number.value]), ("range", number.range or [])):
+            if outside := [each for each in values if not low <= each <= high]:
+                expected = f"{'a number' if key == 'value' else 'numbers'} from {low:g} to {high:g}"
+                raise broken_rule(key, f"{outside[0]:g}", expected, "Correct the value.")
         return number
 
     return AfterValidator(checked)
@@ -194,20 +200,96 @@ class Guard(Section):
 
 
 class CutIn(Section):
-    """Hazard of the cut-in."""
+    """Hazard of the cut-in; coefficients in whose place there is a table are left out (`REPLACED`)."""
 
-    intercept: Coefficient
-    u: Coefficient
-    log_gap: Coefficient
-    rate: Coefficient
-    rate_squared: Coefficient
-    u_squared: Coefficient
-    rate_scale_mps: Scale
-    rate_clamp_mps: Speed
-    ignore_share: Share
-    accept_ttc_s: Time
-    accept_scale_s: Scale
+    intercept: Coefficient | None = None
+    u: Coefficient | None = None
+    log_gap: Coefficient | None = None
+    rate: Coefficient | None = None
+    rate_squared: Coefficient | None = None
+    u_squared: Coefficient | None = None
+    rate_scale_mps: Scale | None = None
+    rate_clamp_mps: Speed | None = None
+    ignore_share: Share | None = None
+    accept_ttc_s: Time | None = None
+    accept_scale_s: Scale | None = None
     max_probability_1s: Annotated[Number, _within(1e-6, 0.5)]
+
+
+_ACCEPTANCE = ("ignore_share", "accept_ttc_s", "accept_scale_s")
+REPLACED = {
+    "hazard_table": tuple(name for name in CutIn.model_fields if name not in (*_ACCEPTANCE, "max_probability_1s")),
+    "acceptance_steps": _ACCEPTANCE,
+}
+"""Coefficients of ``cut_in`` in whose place a table may stand."""
+
+
+def _rising(knots: list[Number]) -> list[Number]:
+    for before, after in pairwise(each.value for each in knots):
+        if not before < after:
+            raise broken_rule("", f"{after:g} after {before:g}", "numbers that rise", "Sort them, each once.")
+    return knots
+
+
+_LENGTH = Field(min_length=1, max_length=64)
+Knots = Annotated[list[Rate], _LENGTH, AfterValidator(_rising)]
+Gaps = Annotated[list[Gap], _LENGTH, AfterValidator(_rising)]
+LogHazards = Annotated[list[LogScale], _LENGTH]
+
+
+def _require_one_each(self: Section, key: str, of: str, more: int = 0) -> None:
+    numbers, wanted = getattr(self, key), len(getattr(self, of)) + more
+    if numbers is not None and len(numbers) != wanted:
+        expected = f"{wanted}, one for each of {of}" + " and one beyond" * more
+        raise broken_rule(key, f"{len(numbers)} numbers", expected, "Add what is missing, or delete what is too much.")
+
+
+class HazardTable(Section):
+    """Logarithm of the wish to change lanes (per second): three functions, linear between knots, that are added."""
+
+    v_mps: Knots
+    v_log: LogHazards
+    r1_m: Gaps
+    r1_log: LogHazards
+    r1dot_mps: Knots
+    r1dot_log: LogHazards
+
+    @model_validator(mode="after")
+    def _one_value_per_knot(self) -> Self:
+        for knots, logs in _AXES:
+            _require_one_each(self, logs, knots)
+        return self
+
+    def wish(self) -> Wish:
+        """As kernels read it."""
+        return Wish(*(np.column_stack([_values(getattr(self, name)) for name in axis]) for axis in _AXES))
+
+
+class AcceptanceSteps(Section):
+    """Share of wished lane changes carried out, by time to collision with the AV: below each of ``ttc_s``, and above.
+
+    ``events`` were seen in each step, and ``exposure`` of them would have been expected if each wish were carried out.
+    """
+
+    ttc_s: Annotated[list[Annotated[Number, _within(0.01, 100.0)]], _LENGTH, AfterValidator(_rising)]
+    share: list[Annotated[Number, _within(1e-12, 1.0)]]
+    events: list[Annotated[int, Field(ge=0)]] | None = None
+    exposure: list[Annotated[float, Field(ge=0.0)]] | None = None
+
+    @model_validator(mode="after")
+    def _one_share_per_step(self) -> Self:
+        _require_one_each(self, "share", "ttc_s", 1)
+        for key in ("events", "exposure"):
+            _require_one_each(self, key, "share")
+        return self
+
+    def steps(self) -> FloatArray:
+        """Upper ends (s) and shares (n, 2), as kernels read them."""
+        return np.column_stack([[*_values(self.ttc_s), math.inf], _values(self.share)])
+
+
+def _values(numbers: Sequence[Number]) -> list[float]:
+    return [each.value for each in numbers]
 
 
 class Lateral(Section):
@@ -247,8 +329,24 @@ class EnvironmentParameters(Section):
     car_following: CarFollowing
     guard: Guard
     cut_in: CutIn
+    hazard_table: HazardTable | None = None
+    acceptance_steps: AcceptanceSteps | None = None
     lateral: Lateral | None = None
     replicates: str | None = None
+
+    @model_validator(mode="after")
+    def _one_law_each(self) -> Self:
+        """Wish and acceptance have a formula or a table."""
+        for table, names in REPLACED.items():
+            absent = getattr(self, table) is None
+            wrong = [name for name in names if (getattr(self.cut_in, name) is None) == absent]
+            if wrong and absent:
+                expected = f"all coefficients of the formula, or a section {table}"
+                raise broken_rule("cut_in", f"neither {', '.join(wrong)} nor {table}", expected, "Add what is missing.")
+            if wrong:
+                found = f"{', '.join(wrong)} besides the section {table}"
+                raise broken_rule("cut_in", found, "one of both: the table takes their place", "Delete one of both.")
+        return self
 
     @model_validator(mode="after")
     def _av_has_a_speed(self) -> Self:
@@ -290,6 +388,14 @@ class EnvironmentParameters(Section):
             place |= {"value": value, "range": None}
         return type(self).model_validate(content)
 
+    def wish(self) -> Wish:
+        """Table of the wish to change lanes; empty where it has a formula."""
+        return Wish(*np.empty((3, 0, 2))) if self.hazard_table is None else self.hazard_table.wish()
+
+    def accepted(self) -> FloatArray:
+        """Steps of the acceptance (n, 2); none where it has a formula."""
+        return np.empty((0, 2)) if self.acceptance_steps is None else self.acceptance_steps.steps()
+
     def lateral_motion(self) -> LateralMotion:
         """How long cut-ins show themselves."""
         return constant_lead() if self.lateral is None else self.lateral.motion()
@@ -300,9 +406,13 @@ class EnvironmentParameters(Section):
 
 
 def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: float, hold_s: float) -> Record:
-    """The numbers as kernels read them: ``section__name``, lane-changing ``level``, ``hold_steps``, ``max_steps``."""
-    read = {name: value for name, value in parameters.values().items() if not name.startswith("lateral__")}
-    numbers = {**read, "level": lane_change_level}
+    """The numbers as kernels read them: ``section__name``, lane-changing ``level``, ``hold_steps``, ``max_steps``.
+
+    Coefficients in whose place there is a table are no numbers: records of all environments are of one type.
+    """
+    absent = {f"cut_in__{name}": math.nan for names in REPLACED.values() for name in names}
+    given = {**absent, **parameters.values(), "level": lane_change_level}
+    numbers = {name: value for name, value in given.items() if not name.startswith(_NOT_IN_RECORD)}
     steps = {"hold_steps": round(hold_s / STEP_S), "max_steps": round(numbers["scenario__duration_s"] / STEP_S)}
     dtype = [*((name, "f8") for name in numbers), *((name, "i8") for name in steps)]
     record: Record = np.array([(*numbers.values(), *steps.values())], dtype)[0]

@@ -1,9 +1,12 @@
 """The parameter file: every number reaches the kernels, a wrong one is named; how long cut-ins show themselves."""
 
+import copy
 import math
+from itertools import product
 
 import numpy as np
 import pytest
+import yaml
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.yaml_text import read_yaml
@@ -11,8 +14,8 @@ from harness.errors import CampaignError
 from harness.traffic import lateral as of_lateral
 from harness.traffic.lateral import constant_lead, lateral_position, log_normal_speed, perceived_in
 from harness.traffic.loading import load_environment, load_parameters
-from harness.traffic.parameters import SHIPPED_FOLDER
-from tests.kernels import alone
+from harness.traffic.parameters import REPLACED, SHIPPED_FOLDER, EnvironmentParameters
+from tests.kernels import alone, cut_in_terms
 
 PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
 SHIPPED = SHIPPED_FOLDER / f"{PAPER}.yaml"
@@ -114,6 +117,72 @@ def test_a_lateral_section_that_says_too_little_or_too_much_is_refused(mine, num
     said = refusal(mine(TEXT + "lateral:\n" + "".join(lines)))
     assert "lateral" in said
     assert found in said
+
+
+# -- tables in place of formulas, and what is known of numbers --
+
+
+def of(values, **more):
+    return [{"value": value, "source": "fitted", **more} for value in values]
+
+
+def tabled(**changes):
+    """The shipped numbers with tables: a wish by three knots each, and six steps of acceptance."""
+    content = copy.deepcopy(DATA)
+    for name in [each for names in REPLACED.values() for each in names]:
+        del content["cut_in"][name]
+    knots = {"v_mps": [20.0, 30.0, 40.0], "r1_m": [0.0, 20.0, 110.0], "r1dot_mps": [-8.0, 0.0, 8.0]}
+    logs = {"v_log": [-8.0, -9.0, -8.0], "r1_log": [0.0, -2.0, -3.5], "r1dot_log": [1.0, 0.0, 1.5]}
+    content["hazard_table"] = {name: of(values) for name, values in (knots | logs).items()}
+    steps = {"ttc_s": of([1.0, 2.0, 3.0, 5.0, 8.0]), "share": of([0.01, 0.02, 0.03, 0.1, 0.5, 1.0], se=0.1)}
+    content["acceptance_steps"] = {**steps, "events": [0, 0, 1, 2, 9, 90], "exposure": [30.0] * 6}
+    for path, value in changes.items():
+        section, name = path.split("__")
+        content[section][name] = value
+    return content
+
+
+def test_a_table_reaches_the_kernels_linear_between_its_knots_and_constant_beyond(mine):
+    given = load_environment(mine(yaml.safe_dump(tabled())))
+    assert given.numbers.dtype == load_environment(EnvironmentSettings()).numbers.dtype  # kernels are compiled once
+    states = [(30.0, 20.0, 0.0), (25.0, 10.0, 4.0), (50.0, 200.0, -20.0), (0.0, -1.0, 99.0)]
+    approaches = [(9.9, -10.0), (10.0, -10.0), (24.9, -10.0), (1e3, -10.0), (5.0, 0.0), (5.0, 3.0), (0.0, -1.0)]
+    numbers = cut_in_terms([(*state, *approach) for state, approach in product(states, approaches)], env=given)
+    log_wish = [-9.0 - 2.0, -8.5 - 1.0 + 0.75, -8.0 - 3.5 + 1.0, -8.0 + 1.5]
+    accepted = [0.01, 0.02, 0.03, 1.0, 1.0, 1.0, 0.0]
+    np.testing.assert_allclose(numbers[:, :2], list(product(np.exp(log_wish), accepted)), rtol=1e-12)
+
+
+def test_other_values_make_another_environment_and_what_is_known_of_them_does_not():
+    known = EnvironmentParameters.model_validate(tabled())
+    values = known.values()
+    assert values["acceptance_steps__share__4"] == 0.5
+    assert {name for name in values if name.startswith("cut_in")} == {"cut_in__max_probability_1s"}
+    moved = known.with_values({"acceptance_steps__share__4": 0.6, "free_driving__df": 9})
+    changes = {name for name, value in moved.values().items() if value != values[name]}
+    assert changes == {"acceptance_steps__share__4", "free_driving__df"}
+    noted = {"acceptance_steps__events": None, "guard__margin_m": {**DATA["guard"]["margin_m"], "range": [0.5, 2.0]}}
+    same = EnvironmentParameters.model_validate({**tabled(**noted), "replicates": "many.parquet"})
+    assert same.content_hash() == known.content_hash() != moved.content_hash()
+    assert same.with_values({"guard__margin_m": 3.0}).values()["guard__margin_m"] == 3.0  # also beyond its range
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (tabled(acceptance_steps__share=of([0.5] * 5)), "acceptance_steps.share"),
+        (tabled(acceptance_steps__share=of([0.0] * 6)), "acceptance_steps.share.0.value"),
+        (tabled(acceptance_steps__events=[1, 2]), "acceptance_steps.events"),
+        (tabled(hazard_table__v_mps=of([20.0, 20.0, 30.0])), "hazard_table.v_mps"),
+        (tabled(hazard_table__r1_log=of([0.0, 1.0])), "hazard_table.r1_log"),
+        (tabled(cut_in__ignore_share={"value": 0.1, "source": "user"}), "ignore_share besides"),
+        (tabled() | {"hazard_table": None}, "u, log_gap"),
+        (tabled(guard__margin_m={"value": 1.0, "source": "user", "range": [2.0, 3.0]}), "guard.margin_m.range"),
+        (tabled(guard__margin_m={"value": 1.0, "source": "user", "range": [-2.0, 3.0]}), "guard.margin_m.range"),
+    ],
+)
+def test_tables_and_ranges_that_do_not_fit_are_refused_where_they_stand(mine, content, named):
+    assert named in str(refusal(mine(yaml.safe_dump(content))))
 
 
 # -- leads: by known answers, files by their rules, hashes that stay where nothing is said --
