@@ -49,8 +49,10 @@ LEADS = _dtype("lead_s", "lateral_speed_mps")
 INITIAL_EVERY_S = 20
 CLOSING_TTC_S = 8.0
 LONGEST_LEAD_S = 10.0
-SHORTEST_LANE_S = 0.5
-"""Of straight driving before the onset of lateral motion: else its beginning was not seen."""
+SEEN_BEFORE_S = 4.5
+"""Crossings that were not seen in their lane so long have no lead: longer leads would be missed more often."""
+LEVEL_S = 0.5
+"""A motion that begins so soon after the first row that is looked at may have begun before."""
 LATERAL_WINDOW_S = 0.5
 """Half of the time over which the lateral speed at a crossing is a slope."""
 STRAIGHT_MPS = 0.1
@@ -125,7 +127,7 @@ class Observations:
         infinite and 0 where nobody is behind. A row that ``changes`` is the state of a crossing to the target lane.
     leads : RecordArray
         `LEADS`: time from onset of lateral motion to crossing, and lateral speed at it; empty without lateral
-        positions.
+        positions. Of leads above 4 s it may be known only that they are.
     noise_mps2 : float
         Standard deviation of the error of ``acceleration_mps2`` by noise of measurement that frames do not share.
     tally : Tally
@@ -233,7 +235,8 @@ def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
     """Leads of some crossings (rows before them); how many go without lateral motion, and how many at another time.
 
     The onset is where a line, level before and straight from there to the crossing, comes nearest to the lateral
-    positions: as the law has it, which moves BV at a constant lateral speed. Where a track begins later, there is none.
+    positions: as the law has it, which moves BV at a constant lateral speed. Where none is seen, the lead is the time
+    in which it was looked for, at least `SEEN_BEFORE_S`.
     """
     found, straight, shifted = [], 0, 0
     moves = (np.diff(track.lane) != 0) & (np.diff(track.vehicle) == 0)
@@ -247,6 +250,7 @@ def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
         reach = reach[(track.run[reach] == track.run[row]) & np.isfinite(track.lateral[reach])]
         if near.size < window or reach.size < 2 * window:
             continue
+        before_s = (reach - row - 0.5) / track.rate_hz
         speed = _slope(near / track.rate_hz, track.lateral[near])
         road, lane = where = int(track.road[row]), int(track.lane[row])
         if where not in middle:
@@ -255,10 +259,10 @@ def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
         off_m = abs(track.lateral[reach[-1]] - middle[where])
         straight += int(abs(speed) < STRAIGHT_MPS)
         shifted += int(STRAIGHT_MPS <= abs(speed) < off_m / SHIFTED_S)
-        before_s = (reach - row - 0.5) / track.rate_hz
-        onset = _onset(before_s, track.lateral[reach])
-        if onset - before_s[0] >= SHORTEST_LANE_S:
-            found.append((track.vehicle[row], -onset, abs(speed)))
+        if before_s[0] <= -SEEN_BEFORE_S:
+            onset = _onset(before_s, track.lateral[reach])
+            lead_s = -onset if onset - before_s[0] >= LEVEL_S else -before_s[0]
+            found.append((track.vehicle[row], lead_s, abs(speed)))
     return np.array(found, LEADS), straight, shifted
 
 

@@ -87,3 +87,15 @@ def test_flicker_of_lanes_makes_no_lane_change(tmp_path):
     with pytest.raises(TrajectoryError, match="come back within a second"):
         require_enough(smoothed, "rows.parquet")
     assert joined(flickering, "leads")["lead_s"].size
+
+
+def test_long_leads_are_missed_no_more_often_than_short_ones(tmp_path):
+    """Only crossings seen for a while count, whatever their lead; one whose onset was not seen is a long one."""
+    rows = overtaking(3.0)
+    whole = joined(observed(rows, tmp_path)[0], "leads")["lead_s"]
+    crossing = rows[(rows.vehicle_id == 1) & (rows.lane == 0)].groupby("recording_id").time_s.min()
+    assert whole.size == (crossing > 4.5).sum()
+    since = rows.time_s - rows.recording_id.map(crossing)
+    late = rows[(crossing.reindex(rows.recording_id).to_numpy() > 4.6) & (since > -4.65)]
+    slow = late.assign(lateral_m=np.where(late.vehicle_id == 1, 1.8 - 0.3 * since[late.index], late.lateral_m))
+    assert (joined(observed(slow, tmp_path)[0], "leads")["lead_s"] >= 4.5).all()
