@@ -65,7 +65,7 @@ BROKEN_RULES = (
     ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.5}", "testing.alpha", 3, "SM-I, SM-II, SM-III"),
     ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
     ("environment:\n  parameters: gone.yaml", "environment.parameters", 3, "a parameter file"),
-    ("environment:\n  parameters: ndd-overtaking-2", "environment.parameters", 3, "Did you mean"),
+    ("environment:\n  parameters: ndd-overtaking-3", "environment.parameters", 3, "Did you mean"),
     ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),
     ("av:\n  traci: {command: 'x {host}'}", "av.traci.command", 3, "Double a brace"),
     ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "hold_speed"),
