@@ -25,7 +25,8 @@ from harness.pool.moved import FewPaths
 from harness.pool.shells import design_shells
 from harness.progress import Progress
 from harness.resolved import Resolved, resolve
-from harness.runner.other_traffic import Moved, environment_with, read_replicates
+from harness.runner.other_traffic import read_replicates
+from harness.runner.stored_shells import Moved, environment_with
 from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER
 from harness.vehicles.library import OF_TRAFFIC

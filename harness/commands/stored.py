@@ -66,11 +66,15 @@ def estimate(
 
     With --environment the shells' probabilities in other traffic are found in the twin (25 s), and crash shares within
     shells are taken to be the same there. Traffic in which they cannot be is refused. Replicates of fitted traffic take
-    a second each, once; with --write, in the run's own traffic, estimates.json and the page tell what they leave open.
+    a second each, once: the answer tells what they leave open, and with --write, in the run's own traffic, so do
+    estimates.json and the page. DIR may be that of a comparison, too.
     """
     if environment is not None:
         if estimators:
             raise click.UsageError("--environment does not go with -e: tests of shells alone can be moved.")
+        if (folder / COMPARISON).is_file():
+            _compared_elsewhere(folder, environment, confidence, as_json=as_json)
+            return
         from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
         with shown_progress() as bar:
@@ -94,6 +98,20 @@ def estimate(
         print_answer(content, folder, page if environment is None and page.is_file() else None)
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
+
+
+def _compared_elsewhere(folder: Path, environment: str, confidence: float | None, *, as_json: bool) -> None:
+    """What two vehicles' stored tests say of other traffic."""
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+
+    with shown_progress() as bar:
+        from harness.runner.other_traffic import compare_in_other_traffic  # noqa: PLC0415 - keeps --help fast
+
+        content = compare_in_other_traffic(folder, environment, confidence=confidence, progress=bar)
+    if as_json:
+        print_json(content)
+    else:
+        say(*content["sentences"])
 
 
 def _ranges(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:

@@ -109,20 +109,13 @@ def times(of: Uncertain) -> str:
     return f"at most × {high}" if math.isfinite(of.times[1]) else "no limit"
 
 
-def sentences(found: TrafficError) -> Iterator[str]:
+def sentences(found: TrafficError, of: str = "the vehicle") -> Iterator[str]:
     """The same in words, for estimates.json and the page."""
     n, level, both = found.n_replicates, share(found.confidence), interval(*found.rate.both)
-    if found.unseen is not None:
-        yield (
-            f"What is known about the traffic leaves the rate {times(found.rate)}, because no lane change was seen at "
-            f"{found.unseen.where}, where {share(found.unseen.share)} of this rate arises; with the sampling error "
-            f"{both} per test."
-        )
-    else:
-        yield (
-            f"The traffic, as far as {found.environment} is known, moves the rate by {times(found.rate)} ({level} of "
-            f"{n} replicates); with the sampling error it is {both} per test."
-        )
+    yield (
+        f"The traffic, as far as {found.environment} is known, moves the rate of {of} by {times(found.rate)} ({level} "
+        f"of {n} replicates{because(found)}); with the sampling error it is {both} per test."
+    )
     for name, each in found.ratios.items():
         ends = f"{ratio(each.both[0])} to {ratio(each.both[1])}"
         yield f"The ratio to {name} moves by {times(each)}; with the sampling error it is {ends}."
@@ -131,6 +124,13 @@ def sentences(found: TrafficError) -> Iterator[str]:
             f"{found.n_refused} of {n} replicates cannot be answered from these tests, and count as whatever makes an "
             "interval wider."
         )
+
+
+def because(found: TrafficError) -> str:
+    """Why there is an upper limit alone."""
+    if (unseen := found.unseen) is None:
+        return ""
+    return f", since no lane change was seen at {unseen.where}, where {share(unseen.share)} of the rate arises"
 
 
 @dataclass(frozen=True)

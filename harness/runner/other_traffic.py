@@ -1,118 +1,50 @@
-"""What the tests of a stored run say of other traffic: the shells' probabilities there, and crash shares as they were.
-
-Traffic decides how probable a cut-in is; what a vehicle makes of one, only through what LV and BV do afterwards, and
-through which cut-ins of a shell there are. Crash shares within shells are taken to be the same. The reference drivers,
-of which no shell is made, tell how far that holds: their rates follow by the same rule, and are known besides. Traffic
-with cut-ins that no test stands for is refused.
+"""What a stored run says of other traffic, of traffic that was fitted, and of what is assumed about its own.
 
 Traffic that was fitted names replicates: environments that other trajectories of the same kind would have given. Each
-is answered by the same tests, from few paths that are the same in all of them (`harness.pool.moved`).
+is answered by the same tests, from few paths that are the same in all of them (`harness.runner.stored_shells`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from harness.campaign.campaign import Campaign
 from harness.campaign.files import shipped_or_own
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.block import Block
 from harness.estimators.estimate import finite_json
-from harness.estimators.likelihood import Level, likelihood_limit
-from harness.estimators.shells import Shells as SeenShells
+from harness.estimators.pairs import PairedShells, paired_estimate
 from harness.estimators.traffic import TrafficError, rows, sentences, uncertain
 from harness.numbers import share
-from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.moved import FewPaths
-from harness.pool.shells import acceleration_limit, design_shells
+from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import read_manifest, read_table
-from harness.records.reader import read_campaign
+from harness.records.folder import read_table
 from harness.resolved import Resolved, resolve
-from harness.runner.stored import stored_blocks
+from harness.runner.stored_shells import (
+    ELSEWHERE,
+    OPTION,
+    Moved,
+    Nearby,
+    StoredShells,
+    environment_with,
+    moved_to,
+    nearby,
+    ratio_of,
+)
 from harness.sampling import distance_per_test_m
-from harness.sampling.shells import Shells
 from harness.strata import ShellDesign
-from harness.traffic.laws import Environment
-from harness.traffic.loading import load_environment, load_parameters, require_sound_laws
+from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
-from harness.vocabulary import STATE_COLUMNS, EstimatorName, FloatArray, IntArray
+from harness.vocabulary import EstimatorName
 
-MOST_BEYOND = 0.01
-"""Share of the probability in a shell, as it crashes, that may lie where no cut-in of the old pool does [assumed]."""
-SAME_POOL = 0.05
-"""How far a pool that another version has built may differ [assumed]."""
-MOST_OFF = 0.1
-"""How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
 NOT_LOOKING = "cut_in__ignore_share"
-_OPTION = "--environment"
-_ELSEWHERE = "Run the campaign in that environment, into another folder."
-
-
-@dataclass(frozen=True, eq=False)
-class Tested:
-    """A stored run of shells: the traffic ``here`` that it was tested in, its strata, and their pool.
-
-    ``manifest`` is the run's.
-    """
-
-    folder: Path
-    manifest: Mapping[str, Any]
-    here: Resolved
-    design: ShellDesign
-    pool: Pool
-
-    @classmethod
-    def of(cls, folder: str | Path, progress: Progress, option: str = _OPTION) -> Tested:
-        """Raises `HarnessError`: the folder is no run of shells, or its pool cannot be made again."""
-        folder = Path(folder)
-        manifest = read_manifest(folder)
-        campaign = read_campaign(folder, manifest, check_files=True)
-        _require_shells(campaign, option)
-        here = resolve(campaign)
-        design, pool = Shells.stored_design(folder), campaign_pool(here, progress)
-        rebuilt = design_shells(pool, acceleration_limit(campaign.av))
-        if design.strata != rebuilt.strata or not np.allclose(design.p, rebuilt.p, rtol=SAME_POOL):
-            mend = "Use the version of the harness (manifest.json) and the surrogate library that it was made with."
-            raise RunFolderError(
-                str(folder), f"tests of pool {design.pool}", f"shells as those of pool {pool.key}", mend
-            )
-        return cls(folder, manifest, here, design, pool)
-
-    @property
-    def limit_mps2(self) -> float:
-        """Hardest acceleration of the vehicle."""
-        return acceleration_limit(self.here.campaign.av)
-
-    @cached_property
-    def blocks(self) -> list[Block]:
-        """Its tests."""
-        return list(stored_blocks(self.folder, moments=False))
-
-    @cached_property
-    def seen(self) -> SeenShells:
-        """Its tests, counted."""
-        seen = SeenShells()
-        for block in self.blocks:
-            seen.add(block)
-        return seen
-
-    def rate(self, p: FloatArray) -> float:
-        """Crash rate where strata have probabilities (S,); its upper limit where no test crashed."""
-        tally = self.seen.tally
-        if tally.crashes.any():
-            return float(p @ tally.share)
-        worst = tally.failed_as_crashes()
-        return likelihood_limit(p, worst.crashes, worst.tests, Level.two_sided(0.9), 1.0)
 
 
 def estimate_in_other_traffic(
@@ -131,13 +63,13 @@ def estimate_in_other_traffic(
     Raises `HarnessError`: the folder is no run of shells, the environment is wrong, or the tests say nothing of it.
     """
     progress = progress or Progress()
-    tested = Tested.of(folder, progress)
+    tested = StoredShells.of(folder, progress)
     campaign = tested.here.campaign
     there = resolve(campaign.replaced(("environment", "parameters"), environment))
     if own and environment_hash(there.environment) != tested.pool.environment:
         expected = "the environment that the folder's tests were run in: estimates.json is of that"
-        raise CampaignError(f"{_OPTION} with --write", f"{environment}, with other numbers", expected, _ELSEWHERE)
-    moved = _moved(tested, there, environment, progress)
+        raise CampaignError(f"{OPTION} with --write", f"{environment}, with other numbers", expected, ELSEWHERE)
+    moved = moved_to(tested, there, environment, progress)
     keys = tested.manifest if moved.is_same else ("retraced", "repeated")
     told: dict[str, Any] = {key: tested.manifest[key] for key in keys if key in tested.manifest}
     told |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_per_test_m(there.environment)}
@@ -159,107 +91,90 @@ def estimate_in_other_traffic(
     return content
 
 
-def _moved(tested: Tested, there: Resolved, name: str, progress: Progress) -> Moved:
-    """The strata with the probabilities of other traffic; refused where the tests say nothing of it."""
-    if environment_hash(there.environment) == tested.pool.environment:
-        return Moved(tested.design, tested.design)
-    _require_same_kind(tested.here, there, name)
-    progress.stage("pool of the other traffic", None)
-    elsewhere = campaign_pool(there, progress, order=tested.pool.names)
-    moved = Moved.of(tested.design, design_shells(elsewhere, tested.limit_mps2), name)
-    off, beyond = moved.reference_error(), _share_beyond(tested.pool, elsewhere, tested.blocks)
-    if beyond > MOST_BEYOND or off > MOST_OFF:
-        found = f"traffic where {share(beyond)} of the crashes are in cut-ins unlike any that was tested"
-        if beyond <= MOST_BEYOND:
-            found = f"traffic for which the rate of a reference driver would come out wrong by {share(off)}"
-        expected = f"at most {share(MOST_BEYOND)} and {share(MOST_OFF)}: crash shares within shells must stay the same"
-        raise CampaignError(_OPTION, found, expected, _ELSEWHERE)
-    return moved
-
-
-@dataclass(frozen=True)
-class Nearby:
-    """Some traffic beside another: probabilities of the strata ``p`` (S,), and by what rates move from there to here.
-
-    ``rate`` is the vehicle's factor, ``references`` (R,) are those of the drivers, which are known, ``off`` by how much
-    one of these comes out wrong at most, and ``beyond`` the share of the crashes in cut-ins unlike any tested.
-    """
-
-    p: FloatArray
-    rate: float
-    references: FloatArray
-    off: float
-    beyond: float
-
-    @property
-    def ratio(self) -> float:
-        """The factor of the ratio to the first reference driver."""
-        return self.rate / float(self.references[0]) if self.references.size else math.nan
-
-    @property
-    def refused(self) -> bool:
-        """Whether the tests do not say it."""
-        return self.off > MOST_OFF or self.beyond > MOST_BEYOND
-
-
-def nearby(
-    tested: Tested, there: Resolved, moved: Moved, environments: Sequence[Environment], progress: Progress
-) -> Iterator[Nearby]:
-    """Traffic close to that of ``there``, by few paths."""
-    paths = FewPaths(there, tested.pool, tested.design, tested.limit_mps2, progress)
-    (base,), p, shares = paths.of([there.environment]), moved.there.p, moved.reference_shares()
-    tally, n_surrogates = tested.seen.tally, len(tested.pool.names)
-    crash_share = tally.share if tally.crashes.any() else np.ones_like(p)
-    for found in paths.of(environments):
-        now = p * _ratio(found.p, base.p)
-        known = _ratio(found.rate[n_surrogates:], base.rate[n_surrogates:])
-        off = np.abs(_ratio(_ratio(now @ shares, p @ shares), known) - 1.0)
-        crashing = now * crash_share
-        beyond = float(crashing @ (1.0 - _ratio(found.p - found.beyond, found.p)) / crashing.sum())
-        beyond += found.untested / found.p.sum()
-        yield Nearby(now, tested.rate(now) / tested.rate(p), known, float(off.max(initial=0.0)), beyond)
-
-
-def _ratio(a: FloatArray, b: FloatArray) -> FloatArray:
-    """1 where there is nothing to compare with."""
-    return np.divide(a, b, out=np.ones_like(b), where=b > 0.0)
-
-
 def traffic_error(
-    tested: Tested, there: Resolved, moved: Moved, content: Mapping[str, Any], progress: Progress
+    tested: StoredShells, there: Resolved, moved: Moved, content: Mapping[str, Any], progress: Progress
 ) -> TrafficError | None:
     """What the replicates of the traffic ``there`` leave open of an answer; None where it has none.
 
     Raises `HarnessError`: their file is missing or wrong.
     """
+    if (found := _answered([tested], there, moved, progress)) is None:
+        return None
+    (near,), n = found
+    estimate, confidence = content["estimates"]["shells"], content["confidence"]
+    times, n_refused = np.array([each.rate for each in near]), n - len(near)
+    sampling = estimate["ci_low"], estimate["ci_high"]
+    if not estimate["n_crashes"]:
+        sampling = 0.0, estimate["upper_bound"]
+    of_rate = uncertain(estimate["crash_rate"], sampling, times, n_refused, confidence)
+    ratios = {}
+    for r, driver in enumerate(tested.design.references):
+        for each in estimate["details"]["references"]:
+            if each["reference"] == driver.name:
+                ends, moves = _ends(each), times / np.array([one.references[r] for one in near])
+                ratios[driver.name] = uncertain(each["ratio"], ends, moves, n_refused, confidence)
+    return TrafficError(_name(there), confidence, n, n_refused, of_rate, ratios)
+
+
+def compare_in_other_traffic(
+    folder: str | Path, environment: str, *, confidence: float | None = None, progress: Progress | None = None
+) -> dict[str, Any]:
+    """What the stored tests of a comparison say of both vehicles in other traffic, and its replicates of their ratio.
+
+    Keys are ``traffic``, a `TrafficError` of A with its ratio to B unless B has not crashed, ``b``, the rate of B, and
+    ``sentences``. Raises `HarnessError` as `estimate_in_other_traffic` does, and where there are no replicates.
+    """
+    progress = progress or Progress()
+    sides = [StoredShells.of(Path(folder) / side, progress) for side in ("a", "b")]
+    there = resolve(sides[0].here.campaign.replaced(("environment", "parameters"), environment))
+    moved = [moved_to(side, there, environment, progress) for side in sides]
+    pairs = PairedShells(moved[0].there)
+    for side, tested in enumerate(sides):
+        for block in tested.blocks:
+            pairs.add(side, moved[side].block(block))
+    confidence = confidence or there.campaign.stop.confidence
+    told = paired_estimate(pairs.first(np.minimum(pairs.tests(0), pairs.tests(1))), confidence)
+    if (found := _answered(sides, there, moved[0], progress)) is None:
+        expected = "an environment that names replicates, as `harness fit` writes them"
+        raise CampaignError(OPTION, f"{environment}, which names none", expected, "Compare in that environment.")
+    near, n = found
+    times, n_refused = [np.array([each.rate for each in of]) for of in near], n - len(near[0])
+    a, b = (
+        uncertain(of.crash_rate, (of.ci_low, of.ci_high), factors, n_refused, confidence)
+        for of, factors in zip((told.a, told.b), times, strict=True)
+    )
+    ratios = {}
+    if told.b.n_crashes:
+        ratios["B"] = uncertain(told.free["ratio"], _ends(told.free), times[0] / times[1], n_refused, confidence)
+    error = TrafficError(_name(there), confidence, n, n_refused, a, ratios)
+    return {"traffic": finite_json(error), "b": finite_json(b), "sentences": list(sentences(error, "A"))}
+
+
+def _answered(
+    sides: Sequence[StoredShells], there: Resolved, moved: Moved, progress: Progress
+) -> tuple[list[list[Nearby]], int] | None:
+    """What each run says of the replicates that all can answer, and how many there are; None without any."""
     settings = there.campaign.environment
     parameters = load_parameters(settings)
     if parameters.replicates is None:
         return None
     values = read_replicates(settings.parameters, parameters)
-    estimate = content["estimates"]["shells"]
-    unseen = None
-    progress.stage("replicates of the traffic", len(values))
     environments = [each for row in values if (each := environment_with(there, parameters, row)) is not None]
-    found = [each for each in nearby(tested, there, moved, environments, progress) if not each.refused]
-    n_refused, confidence = len(values) - len(found), content["confidence"]
-    if not found:
+    progress.stage("replicates of the traffic", len(sides) * len(environments))
+    found = [list(nearby(tested, there, moved, environments, progress)) for tested in sides]
+    kept = [row for row in zip(*found, strict=True) if not any(each.refused for each in row)]
+    if not kept:
         expected = "replicates that these tests can answer"
-        raise CampaignError(_OPTION, f"{len(values)} replicates, of which none can be", expected, _ELSEWHERE)
-    times, references = np.array([each.rate for each in found]), np.array([each.references for each in found])
-    sampling = estimate["ci_low"], estimate["ci_high"]
-    if not estimate["n_crashes"]:
-        sampling = 0.0, estimate["upper_bound"]
-    of_rate = uncertain(estimate["crash_rate"], sampling, times, n_refused, confidence, from_below=unseen is None)
-    ratios = {}
-    for r, driver in enumerate(tested.design.references):
-        for each in estimate["details"]["references"]:
-            if each["reference"] == driver.name:
-                ends = each["ratio_low"] or 0.0, math.inf if each["ratio_high"] is None else each["ratio_high"]
-                moves = times / references[:, r]
-                ratios[driver.name] = uncertain(each["ratio"], ends, moves, n_refused, confidence)
-    name = Path(settings.parameters).stem
-    return TrafficError(name, confidence, len(values), n_refused, of_rate, ratios, unseen)
+        raise CampaignError(OPTION, f"{len(values)} replicates, of which none can be", expected, ELSEWHERE)
+    return [list(of) for of in zip(*kept, strict=True)], len(values)
+
+
+def _ends(of: Mapping[str, Any]) -> tuple[float, float]:
+    return of["ratio_low"] or 0.0, math.inf if of["ratio_high"] is None else of["ratio_high"]
+
+
+def _name(there: Resolved) -> str:
+    return Path(there.campaign.environment.parameters).stem
 
 
 def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progress) -> dict[str, Any] | None:
@@ -275,7 +190,7 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
     if None in ends:
         return None
     base, *moved = paths.of([traffic.environment, *filter(None, ends)])
-    times = [_ratio(each.p, base.p).tolist() for each in moved]
+    times = [ratio_of(each.p, base.p).tolist() for each in moved]
     name = NOT_LOOKING.replace("__", ".")
     return {"name": name, "value": number.value, "ends": list(number.range), "times": times}
 
@@ -309,127 +224,3 @@ def read_replicates(name: str, parameters: EnvironmentParameters) -> list[dict[s
         raise RunFolderError(str(path), found, f"replicates of the numbers of {file.name}, by section__name", again)
     rows: list[dict[str, float]] = table.to_pylist()
     return rows
-
-
-def environment_with(
-    there: Resolved, parameters: EnvironmentParameters, values: Mapping[str, float]
-) -> Environment | None:
-    """The traffic ``there`` with other numbers; None where they give no laws."""
-    settings = there.campaign.environment
-    try:
-        environment = load_environment(settings, parameters.with_values(values))
-        require_sound_laws(environment, settings.parameters)
-    except (CampaignError, ValueError):
-        return None
-    return environment
-
-
-def _require_shells(campaign: Campaign, option: str) -> None:
-    if campaign.sampling.strata and not campaign.has_baseline_runs:
-        return
-    found = f"tests by {campaign.testing.method}"
-    if campaign.sampling.strata:
-        found = "a vehicle that acts before the cut-in: its cut-ins follow from its own runs"
-    expected = "tests of shells, of a vehicle that holds its speed until the cut-in"
-    raise CampaignError(option, found, expected, _ELSEWHERE)
-
-
-def _require_same_kind(here: Resolved, there: Resolved, name: str) -> None:
-    """Cut-ins of one step are seen by nobody beforehand: shells mean something else there."""
-    takes_time = [each.environment.lateral.present for each in (here, there)]
-    if takes_time[0] != takes_time[1]:
-        was, now = ("take time" if each else "are one step" for each in takes_time)
-        expected = f"traffic as that of the tests, in which they {was}"
-        raise CampaignError(_OPTION, f"{name}, in which cut-ins {now}", expected, _ELSEWHERE)
-
-
-@dataclass(frozen=True, eq=False)
-class Moved:
-    """Strata as they were ``tested``, and the same, ``there``, with the probabilities of other traffic."""
-
-    tested: ShellDesign
-    there: ShellDesign
-
-    @classmethod
-    def of(cls, tested: ShellDesign, new: ShellDesign, environment: str) -> Moved:
-        """Cells of the new design are those of the old by stratum and reference drivers; a `CampaignError` if not."""
-        keys = [_keys(each) for each in (tested, new)]
-        p = np.zeros(len(keys[0]))
-        for key, of_cell in zip(keys[1], new.cell_p.tolist(), strict=True):
-            alike = [key, *((key[0], other) for s, other in keys[0] if s == key[0])]
-            place = next((keys[0].index(each) for each in alike if each in keys[0]), None)
-            if place is None:
-                found = f"{environment}, whose shell {key[0]} was never tested (probability {of_cell:.3g})"
-                mend = _ELSEWHERE
-                raise CampaignError(_OPTION, found, f"shells among {', '.join(tested.strata)}", mend)
-            p[place] += of_cell
-        there = replace(
-            tested,
-            pool=new.pool,
-            cell_p=p,
-            n_paths=new.n_paths,
-            p_cut_in=new.p_cut_in,
-            p_unreachable=new.p_unreachable,
-            reference_rate=new.reference_rate,
-            reference_square=new.reference_square,
-        )
-        return cls(tested, there)
-
-    def block(self, block: Block) -> Block:
-        """Tests as they count there: a path's probability of cut-ins is taken to change as that of all paths."""
-        old, new = self.tested.cell_p, self.there.cell_p
-        times = np.divide(new, old, out=np.zeros_like(new), where=old > 0.0)
-        columns = {**block.columns, "cell_mass": block.cell_mass * times}
-        drawn = replace(block.drawn, shells=self.there)
-        with np.errstate(divide="ignore"):
-            log_weight = np.log(self.there.p[block.stratum])
-        return replace(block, columns=columns, drawn=drawn, log_weight=log_weight)
-
-    @property
-    def is_same(self) -> bool:
-        """Whether the traffic is that of the tests."""
-        return self.tested is self.there
-
-    def reference_shares(self) -> FloatArray:
-        """Share of each stratum on which each reference driver crashes, as it was tested, shape (S, R)."""
-        old = self.tested
-        crashing = old.joined.T @ np.array([old.cell_p * old.crashes_too(r) for r in range(len(old.references))]).T
-        shares: FloatArray = np.divide(
-            crashing, old.p[:, None], out=np.zeros_like(crashing), where=old.p[:, None] > 0.0
-        )
-        return shares
-
-    def reference_error(self) -> float:
-        """By how much the rate of a reference driver comes out wrong at most, by its shares of strata."""
-        told, known = self.there.p @ self.reference_shares(), self.there.reference_rate
-        return float(np.max(np.abs(told[known > 0.0] / known[known > 0.0] - 1.0), initial=0.0))
-
-
-def _keys(design: ShellDesign) -> list[tuple[str, int]]:
-    names = [design.strata[s] for s in design.cell_stratum]
-    return list(zip(names, design.cell_references, strict=True))
-
-
-def _share_beyond(old: Pool, new: Pool, blocks: list[Block]) -> float:
-    """Share of crashes in cut-ins whose initial state is beyond all those of the same shell that were there."""
-    design = blocks[0].drawn.shells
-    assert design is not None
-    tests, crashes = (np.zeros(len(design.strata)) for _ in range(2))
-    for block in blocks:
-        np.add.at(tests, block.stratum, 1.0)
-        np.add.at(crashes, block.stratum[block.crash], 1.0)
-    weight = design.p * (crashes / np.maximum(tests, 1.0))
-    beyond = {name: _beyond(old, new, shell) for shell, name in enumerate(old.names)}
-    shares: FloatArray = np.array([beyond.get(name, 0.0) for name in design.strata])
-    return float(weight @ shares / weight.sum()) if weight.any() else float(shares.max(initial=0.0))
-
-
-def _beyond(old: Pool, new: Pool, shell: int) -> float:
-    rows: list[IntArray] = [np.flatnonzero(pool.shell == shell) for pool in (old, new)]
-    if not all(each.size for each in rows):
-        return 0.0
-    outside = np.zeros(rows[1].size, np.bool_)
-    for name in STATE_COLUMNS:
-        was, now = (pool.cut_ins.state[name][each] for pool, each in zip((old, new), rows, strict=True))
-        outside |= (now < was.min()) | (now > was.max())
-    return float(outside.mean())

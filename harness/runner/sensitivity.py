@@ -2,7 +2,7 @@
 
 Fitted numbers move by their standard errors or, where the environment names replicates, in blocks, as those of a block
 were fitted together. Assumed numbers move over the range that is stated for them. Each move is answered by the run's
-own tests and few paths (`harness.runner.other_traffic`): with the shells' new probabilities, and crash shares within
+own tests and few paths (`harness.runner.stored_shells`): with the shells' new probabilities, and crash shares within
 shells as they were. Of numbers that change what happens after a cut-in the shares tell nothing but what the reference
 drivers show: by how much their rates, which are known there, would come out wrong.
 """
@@ -21,7 +21,8 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
-from harness.runner.other_traffic import Moved, Nearby, Tested, environment_with, nearby, read_replicates
+from harness.runner.other_traffic import read_replicates
+from harness.runner.stored_shells import Moved, Nearby, StoredShells, environment_with, nearby
 from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import EnvironmentParameters
 
@@ -59,7 +60,7 @@ def sensitivity(
     Raises `HarnessError`: the folder is no run of shells, a number is not there, or nothing is said to be uncertain.
     """
     folder, progress = Path(folder), progress or Progress()
-    tested = Tested.of(folder, progress, _OPTION)
+    tested = StoredShells.of(folder, progress, _OPTION)
     settings = tested.here.campaign.environment
     parameters = load_parameters(settings)
     asked = list(moves(settings.parameters, parameters, ranges or {}))

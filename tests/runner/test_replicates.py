@@ -13,11 +13,18 @@ import pytest
 
 from harness.cli import main
 from harness.errors import HarnessError
+from harness.estimators.answer import estimate_blocks
 from harness.estimators.traffic import uncertain
 from harness.pool import moved
-from harness.runner.other_traffic import estimate_in_other_traffic
+from harness.progress import Progress
+from harness.resolved import resolve
+from harness.runner.compare import compare_campaigns
+from harness.runner.other_traffic import assumed, estimate_in_other_traffic
+from harness.runner.stored_shells import StoredShells
 from harness.traffic.parameters import SHIPPED_FOLDER
-from tests.stored_runs import copy_of, estimates
+from tests.golden.campaigns import COMPARED
+from tests.in_process import one_process, without_page
+from tests.stored_runs import copy_of, estimates, golden
 
 SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
 LOOK = "cut_in__ignore_share"
@@ -79,6 +86,39 @@ def test_the_folder_keeps_the_answer_of_its_own_traffic_alone(stored_run, tmp_pa
     (tmp_path / "mine.yaml").write_text(Path(mine).read_text().replace("{value: 0.01,", "{value: 0.02,"))
     assert main(["estimate", str(folder), "--environment", mine, "--write"]) == 2
     assert "with other numbers" in capsys.readouterr().err
+
+
+def test_the_ratio_of_two_vehicles_hardly_moves(tmp_path, capsys):
+    shared, other = COMPARED
+    with one_process(), without_page():
+        compare_campaigns(
+            golden("shells-twin", *shared), golden("shells-twin", *shared, other), tmp_path / "pair", workers=1
+        )
+    mine = fitted(tmp_path, **{LOOK: [0.005, 0.02]})
+    assert main(["estimate", str(tmp_path / "pair"), "--environment", mine, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    compared = json.loads((tmp_path / "pair" / "compare.json").read_text())
+    assert found["traffic"]["rate"]["times"] == pytest.approx([0.5, 2.0], rel=0.01)
+    assert found["traffic"]["rate"]["value"] == pytest.approx(compared["a"]["crash_rate"])
+    of_both = found["traffic"]["ratios"]["B"]
+    assert of_both["times"] == pytest.approx([1.0, 1.0], rel=0.01)
+    assert of_both["value"] == pytest.approx(compared["ratio"])
+    assert of_both["sampling"] == pytest.approx([compared["ratio_low"], compared["ratio_high"]])
+
+
+def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
+    """The rate is in proportion to the share that does not look, in its range; without a crash its limit is."""
+    text = SHIPPED.replace("{value: 0.01, source: assumed}", "{value: 0.01, source: assumed, range: [0.005, 0.08]}")
+    (tmp_path / "mine.yaml").write_text(text)
+    tested = StoredShells.of(stored_run("shells-twin"), Progress())
+    there = resolve(tested.here.campaign.replaced(("environment", "parameters"), str(tmp_path / "mine.yaml")))
+    found = assumed(there, tested.pool, tested.design, Progress())
+    assert (found["name"], found["value"], found["ends"]) == ("cut_in.ignore_share", 0.01, [0.005, 0.08])
+    content = estimate_blocks(tested.blocks, there.campaign, {**tested.manifest, "assumed": found})
+    (row,) = [row for row in content["answer"]["rows"] if row["key"] == "assumed"]
+    assert (row["value"], row["remark"]) == ("at most × 8.0 (assumed)", "if 8.0 % do not look")
+    assert "0.50 or 8.00 times this one" in content["scope"]
+    assert assumed(tested.here, tested.pool, tested.design, Progress()) is None
 
 
 @pytest.mark.parametrize(

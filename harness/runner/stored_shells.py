@@ -1,0 +1,300 @@
+"""A stored run of shells in other traffic: the shells' probabilities there, and crash shares as they were.
+
+Traffic decides how probable a cut-in is; what a vehicle makes of one, only through what LV and BV do afterwards, and
+through which cut-ins of a shell there are. Crash shares within shells are taken to be the same. The reference drivers,
+of which no shell is made, tell how far that holds: their rates follow by the same rule, and are known besides. Traffic
+with cut-ins that no test stands for is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.campaign.campaign import Campaign
+from harness.errors import CampaignError, RunFolderError
+from harness.estimators.block import Block
+from harness.estimators.likelihood import Level, likelihood_limit
+from harness.estimators.shells import Shells as SeenShells
+from harness.numbers import share
+from harness.pool.build import campaign_pool
+from harness.pool.cut_ins import Pool, environment_hash
+from harness.pool.moved import FewPaths
+from harness.pool.shells import acceleration_limit, design_shells
+from harness.progress import Progress
+from harness.records.folder import read_manifest
+from harness.records.reader import read_campaign
+from harness.resolved import Resolved, resolve
+from harness.runner.stored import stored_blocks
+from harness.sampling.shells import Shells
+from harness.strata import ShellDesign
+from harness.traffic.laws import Environment
+from harness.traffic.loading import load_environment, require_sound_laws
+from harness.traffic.parameters import EnvironmentParameters
+from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray
+
+MOST_BEYOND = 0.01
+"""Share of the probability in a shell, as it crashes, that may lie where no cut-in of the old pool does [assumed]."""
+SAME_POOL = 0.05
+"""How far a pool that another version has built may differ [assumed]."""
+MOST_OFF = 0.1
+"""How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
+OPTION = "--environment"
+ELSEWHERE = "Run the campaign in that environment, into another folder."
+
+
+@dataclass(frozen=True, eq=False)
+class StoredShells:
+    """A stored run of shells: the traffic ``here`` that it was tested in, its strata, and their pool.
+
+    ``manifest`` is the run's.
+    """
+
+    folder: Path
+    manifest: Mapping[str, Any]
+    here: Resolved
+    design: ShellDesign
+    pool: Pool
+
+    @classmethod
+    def of(cls, folder: str | Path, progress: Progress, option: str = OPTION) -> StoredShells:
+        """Raises `HarnessError`: the folder is no run of shells, or its pool cannot be made again."""
+        folder = Path(folder)
+        manifest = read_manifest(folder)
+        campaign = read_campaign(folder, manifest, check_files=True)
+        _require_shells(campaign, option)
+        here = resolve(campaign)
+        design, pool = Shells.stored_design(folder), campaign_pool(here, progress)
+        rebuilt = design_shells(pool, acceleration_limit(campaign.av))
+        if design.strata != rebuilt.strata or not np.allclose(design.p, rebuilt.p, rtol=SAME_POOL):
+            mend = "Use the version of the harness (manifest.json) and the surrogate library that it was made with."
+            raise RunFolderError(
+                str(folder), f"tests of pool {design.pool}", f"shells as those of pool {pool.key}", mend
+            )
+        return cls(folder, manifest, here, design, pool)
+
+    @property
+    def limit_mps2(self) -> float:
+        """Hardest acceleration of the vehicle."""
+        return acceleration_limit(self.here.campaign.av)
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Its tests."""
+        return list(stored_blocks(self.folder, moments=False))
+
+    @cached_property
+    def seen(self) -> SeenShells:
+        """Its tests, counted."""
+        seen = SeenShells()
+        for block in self.blocks:
+            seen.add(block)
+        return seen
+
+    def rate(self, p: FloatArray) -> float:
+        """Crash rate where strata have probabilities (S,); its upper limit where no test crashed."""
+        tally = self.seen.tally
+        if tally.crashes.any():
+            return float(p @ tally.share)
+        worst = tally.failed_as_crashes()
+        return likelihood_limit(p, worst.crashes, worst.tests, Level.two_sided(0.9), 1.0)
+
+
+def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progress) -> Moved:
+    """The strata with the probabilities of other traffic; refused where the tests say nothing of it."""
+    if environment_hash(there.environment) == tested.pool.environment:
+        return Moved(tested.design, tested.design)
+    _require_same_kind(tested.here, there, name)
+    progress.stage("pool of the other traffic", None)
+    elsewhere = campaign_pool(there, progress, order=tested.pool.names)
+    moved = Moved.of(tested.design, design_shells(elsewhere, tested.limit_mps2), name)
+    off, beyond = moved.reference_error(), _share_beyond(tested.pool, elsewhere, tested.blocks)
+    if beyond > MOST_BEYOND or off > MOST_OFF:
+        found = f"traffic where {share(beyond)} of the crashes are in cut-ins unlike any that was tested"
+        if beyond <= MOST_BEYOND:
+            found = f"traffic for which the rate of a reference driver would come out wrong by {share(off)}"
+        expected = f"at most {share(MOST_BEYOND)} and {share(MOST_OFF)}: crash shares within shells must stay the same"
+        raise CampaignError(OPTION, found, expected, ELSEWHERE)
+    return moved
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """Some traffic beside another: probabilities of the strata ``p`` (S,), and by what rates move from there to here.
+
+    ``rate`` is the vehicle's factor, ``references`` (R,) are those of the drivers, which are known, ``off`` by how much
+    one of these comes out wrong at most, and ``beyond`` the share of the crashes in cut-ins unlike any tested.
+    """
+
+    p: FloatArray
+    rate: float
+    references: FloatArray
+    off: float
+    beyond: float
+
+    @property
+    def ratio(self) -> float:
+        """The factor of the ratio to the first reference driver."""
+        return self.rate / float(self.references[0]) if self.references.size else math.nan
+
+    @property
+    def refused(self) -> bool:
+        """Whether the tests do not say it."""
+        return self.off > MOST_OFF or self.beyond > MOST_BEYOND
+
+
+def nearby(
+    tested: StoredShells, there: Resolved, moved: Moved, environments: Sequence[Environment], progress: Progress
+) -> Iterator[Nearby]:
+    """Traffic close to that of ``there``, by few paths."""
+    paths = FewPaths(there, tested.pool, tested.design, tested.limit_mps2, progress)
+    (base,), p, shares = paths.of([there.environment]), moved.there.p, moved.reference_shares()
+    tally, n_surrogates = tested.seen.tally, len(tested.pool.names)
+    crash_share = tally.share if tally.crashes.any() else np.ones_like(p)
+    for found in paths.of(environments):
+        now = p * ratio_of(found.p, base.p)
+        known = ratio_of(found.rate[n_surrogates:], base.rate[n_surrogates:])
+        off = np.abs(ratio_of(ratio_of(now @ shares, p @ shares), known) - 1.0)
+        crashing = now * crash_share
+        new = _share(found.beyond, found.p) - _share(base.beyond, base.p)  # ends of a sample are not those of a law
+        beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum()) + found.untested / found.p.sum()
+        yield Nearby(now, tested.rate(now) / tested.rate(p), known, float(off.max(initial=0.0)), beyond)
+
+
+def _share(part: FloatArray, whole: FloatArray) -> FloatArray:
+    return np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0.0)
+
+
+def ratio_of(a: FloatArray, b: FloatArray) -> FloatArray:
+    """1 where there is nothing to compare with."""
+    return np.divide(a, b, out=np.ones_like(b), where=b > 0.0)
+
+
+def environment_with(
+    there: Resolved, parameters: EnvironmentParameters, values: Mapping[str, float]
+) -> Environment | None:
+    """The traffic ``there`` with other numbers; None where they give no laws."""
+    settings = there.campaign.environment
+    try:
+        environment = load_environment(settings, parameters.with_values(values))
+        require_sound_laws(environment, settings.parameters)
+    except (CampaignError, ValueError):
+        return None
+    return environment
+
+
+def _require_shells(campaign: Campaign, option: str) -> None:
+    if campaign.sampling.strata and not campaign.has_baseline_runs:
+        return
+    found = f"tests by {campaign.testing.method}"
+    if campaign.sampling.strata:
+        found = "a vehicle that acts before the cut-in: its cut-ins follow from its own runs"
+    expected = "tests of shells, of a vehicle that holds its speed until the cut-in"
+    raise CampaignError(option, found, expected, ELSEWHERE)
+
+
+def _require_same_kind(here: Resolved, there: Resolved, name: str) -> None:
+    """Cut-ins of one step are seen by nobody beforehand: shells mean something else there."""
+    takes_time = [each.environment.lateral.present for each in (here, there)]
+    if takes_time[0] != takes_time[1]:
+        was, now = ("take time" if each else "are one step" for each in takes_time)
+        expected = f"traffic as that of the tests, in which they {was}"
+        raise CampaignError(OPTION, f"{name}, in which cut-ins {now}", expected, ELSEWHERE)
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """Strata as they were ``tested``, and the same, ``there``, with the probabilities of other traffic."""
+
+    tested: ShellDesign
+    there: ShellDesign
+
+    @classmethod
+    def of(cls, tested: ShellDesign, new: ShellDesign, environment: str) -> Moved:
+        """Cells of the new design are those of the old by stratum and reference drivers; a `CampaignError` if not."""
+        keys = [_keys(each) for each in (tested, new)]
+        p = np.zeros(len(keys[0]))
+        for key, of_cell in zip(keys[1], new.cell_p.tolist(), strict=True):
+            alike = [key, *((key[0], other) for s, other in keys[0] if s == key[0])]
+            place = next((keys[0].index(each) for each in alike if each in keys[0]), None)
+            if place is None:
+                found = f"{environment}, whose shell {key[0]} was never tested (probability {of_cell:.3g})"
+                mend = ELSEWHERE
+                raise CampaignError(OPTION, found, f"shells among {', '.join(tested.strata)}", mend)
+            p[place] += of_cell
+        there = replace(
+            tested,
+            pool=new.pool,
+            cell_p=p,
+            n_paths=new.n_paths,
+            p_cut_in=new.p_cut_in,
+            p_unreachable=new.p_unreachable,
+            reference_rate=new.reference_rate,
+            reference_square=new.reference_square,
+        )
+        return cls(tested, there)
+
+    def block(self, block: Block) -> Block:
+        """Tests as they count there: a path's probability of cut-ins is taken to change as that of all paths."""
+        old, new = self.tested.cell_p, self.there.cell_p
+        times = np.divide(new, old, out=np.zeros_like(new), where=old > 0.0)
+        columns = {**block.columns, "cell_mass": block.cell_mass * times}
+        drawn = replace(block.drawn, shells=self.there)
+        with np.errstate(divide="ignore"):
+            log_weight = np.log(self.there.p[block.stratum])
+        return replace(block, columns=columns, drawn=drawn, log_weight=log_weight)
+
+    @property
+    def is_same(self) -> bool:
+        """Whether the traffic is that of the tests."""
+        return self.tested is self.there
+
+    def reference_shares(self) -> FloatArray:
+        """Share of each stratum on which each reference driver crashes, as it was tested, shape (S, R)."""
+        old = self.tested
+        crashing = old.joined.T @ np.array([old.cell_p * old.crashes_too(r) for r in range(len(old.references))]).T
+        shares: FloatArray = np.divide(
+            crashing, old.p[:, None], out=np.zeros_like(crashing), where=old.p[:, None] > 0.0
+        )
+        return shares
+
+    def reference_error(self) -> float:
+        """By how much the rate of a reference driver comes out wrong at most, by its shares of strata."""
+        told, known = self.there.p @ self.reference_shares(), self.there.reference_rate
+        return float(np.max(np.abs(told[known > 0.0] / known[known > 0.0] - 1.0), initial=0.0))
+
+
+def _keys(design: ShellDesign) -> list[tuple[str, int]]:
+    names = [design.strata[s] for s in design.cell_stratum]
+    return list(zip(names, design.cell_references, strict=True))
+
+
+def _share_beyond(old: Pool, new: Pool, blocks: list[Block]) -> float:
+    """Share of crashes in cut-ins whose initial state is beyond all those of the same shell that were there."""
+    design = blocks[0].drawn.shells
+    assert design is not None
+    tests, crashes = (np.zeros(len(design.strata)) for _ in range(2))
+    for block in blocks:
+        np.add.at(tests, block.stratum, 1.0)
+        np.add.at(crashes, block.stratum[block.crash], 1.0)
+    weight = design.p * (crashes / np.maximum(tests, 1.0))
+    beyond = {name: _beyond(old, new, shell) for shell, name in enumerate(old.names)}
+    shares: FloatArray = np.array([beyond.get(name, 0.0) for name in design.strata])
+    return float(weight @ shares / weight.sum()) if weight.any() else float(shares.max(initial=0.0))
+
+
+def _beyond(old: Pool, new: Pool, shell: int) -> float:
+    rows: list[IntArray] = [np.flatnonzero(pool.shell == shell) for pool in (old, new)]
+    if not all(each.size for each in rows):
+        return 0.0
+    outside = np.zeros(rows[1].size, np.bool_)
+    for name in STATE_COLUMNS:
+        was, now = (pool.cut_ins.state[name][each] for pool, each in zip((old, new), rows, strict=True))
+        outside |= (now < was.min()) | (now > was.max())
+    return float(outside.mean())
