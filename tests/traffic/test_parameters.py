@@ -1,6 +1,5 @@
 """The parameter file: every number reaches the kernels, a wrong one is named; how long cut-ins show themselves."""
 
-import copy
 import math
 from itertools import product
 
@@ -9,18 +8,16 @@ import pytest
 import yaml
 
 from harness.campaign.sections import EnvironmentSettings
-from harness.campaign.yaml_text import read_yaml
 from harness.errors import CampaignError
 from harness.traffic import lateral as of_lateral
 from harness.traffic.lateral import constant_lead, lateral_position, log_normal_speed, perceived_in
 from harness.traffic.loading import load_environment, load_parameters
-from harness.traffic.parameters import REPLACED, SHIPPED_FOLDER, EnvironmentParameters
+from harness.traffic.parameters import EnvironmentParameters
 from tests.kernels import alone, cut_in_terms
+from tests.traffic.tables import DATA, SHIPPED, of, tabled
 
 PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
-SHIPPED = SHIPPED_FOLDER / f"{PAPER}.yaml"
 TEXT = SHIPPED.read_text(encoding="utf-8")
-DATA, _ = read_yaml(SHIPPED)
 NUMBERS = [(section, name) for section, numbers in DATA.items() if isinstance(numbers, dict) for name in numbers]
 NOT_NUMBERS = [".nan", "-.inf", "'1'", "true", "null", "1" + "0" * 400]
 DF = "  df: {value: 16.0, source: ndd}"
@@ -120,26 +117,6 @@ def test_a_lateral_section_that_says_too_little_or_too_much_is_refused(mine, num
 
 
 # -- tables in place of formulas, and what is known of numbers --
-
-
-def of(values, **more):
-    return [{"value": value, "source": "fitted", **more} for value in values]
-
-
-def tabled(**changes):
-    """The shipped numbers with tables: a wish by three knots each, and six steps of acceptance."""
-    content = copy.deepcopy(DATA)
-    for name in [each for names in REPLACED.values() for each in names]:
-        del content["cut_in"][name]
-    knots = {"v_mps": [20.0, 30.0, 40.0], "r1_m": [0.0, 20.0, 110.0], "r1dot_mps": [-8.0, 0.0, 8.0]}
-    logs = {"v_log": [-8.0, -9.0, -8.0], "r1_log": [0.0, -2.0, -3.5], "r1dot_log": [1.0, 0.0, 1.5]}
-    content["hazard_table"] = {name: of(values) for name, values in (knots | logs).items()}
-    steps = {"ttc_s": of([1.0, 2.0, 3.0, 5.0, 8.0]), "share": of([0.01, 0.02, 0.03, 0.1, 0.5, 1.0], se=0.1)}
-    content["acceptance_steps"] = {**steps, "events": [0, 0, 1, 2, 9, 90], "exposure": [30.0] * 6}
-    for path, value in changes.items():
-        section, name = path.split("__")
-        content[section][name] = value
-    return content
 
 
 def test_a_table_reaches_the_kernels_linear_between_its_knots_and_constant_beyond(mine):

@@ -18,6 +18,7 @@ import libsumo
 import numpy as np
 import pytest
 
+from harness.campaign.yaml_text import yaml_text
 from harness.episode.loop import Shard
 from harness.resolved import resolve
 from harness.sampling import prepare
@@ -25,6 +26,7 @@ from harness.vehicles.kinematics import STEP_S, next_position
 from harness.vocabulary import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED, STATE_DTYPE, VEHICLES
 from harness.worlds.twin import TwinWorld
 from tests.episode.twin_runs import TWO
+from tests.traffic.tables import tabled
 from tests.worlds.running import smoke
 
 
@@ -181,18 +183,25 @@ JOBS = {
 
 
 @pytest.fixture(scope="module")
-def recordings() -> dict[str, tuple[list[Motion], np.ndarray]]:
-    with ProcessPoolExecutor(1, get_context("spawn")) as process:
-        return dict(zip(JOBS, process.map(record, JOBS.values()), strict=True))
+def jobs(tmp_path_factory) -> dict[str, Job]:
+    file = tmp_path_factory.mktemp("traffic") / "tabled.yaml"
+    file.write_text(yaml_text(tabled()))
+    return {**JOBS, "tables_of_traffic": Job((FORCED, f"environment.parameters={file}"), EPISODES, 32)}
 
 
 @pytest.fixture(scope="module")
-def twins() -> dict[str, Shard]:
+def recordings(jobs) -> dict[str, tuple[list[Motion], np.ndarray]]:
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+        return dict(zip(jobs, process.map(record, jobs.values()), strict=True))
+
+
+@pytest.fixture(scope="module")
+def twins(jobs) -> dict[str, Shard]:
     # Another number of cells than SUMO has: an episode must not know in which cell it runs, or beside whom.
-    return {name: run_episodes(job, TwinWorld(48)) for name, job in JOBS.items()}
+    return {name: run_episodes(job, TwinWorld(48)) for name, job in jobs.items()}
 
 
-@pytest.mark.parametrize("name", JOBS)
+@pytest.mark.parametrize("name", [*JOBS, "tables_of_traffic"])
 def test_sumo_and_twin_agree_in_every_bit(name, recordings, twins):
     motions, outcome = recordings[name]
     assert differences(motions, motions_computed(twins[name])) == {}

@@ -1,0 +1,49 @@
+"""Environments with tables in place of formulas."""
+
+import copy
+from typing import Any
+
+import numpy as np
+
+from harness.campaign.yaml_text import read_yaml
+from harness.traffic.parameters import REPLACED, SHIPPED_FOLDER
+
+SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
+DATA, _ = read_yaml(SHIPPED)
+
+
+def of(values, **more):
+    return [{"value": float(value), "source": "fitted", **more} for value in values]
+
+
+def tabled(**changes: Any) -> dict[str, Any]:
+    """The paper's numbers with tables: a wish by three knots each, and six steps of acceptance."""
+    content = copy.deepcopy(DATA)
+    for name in [each for names in REPLACED.values() for each in names]:
+        del content["cut_in"][name]
+    knots = {"v_mps": [20.0, 30.0, 40.0], "r1_m": [0.0, 20.0, 110.0], "r1dot_mps": [-8.0, 0.0, 8.0]}
+    logs = {"v_log": [-8.0, -9.0, -8.0], "r1_log": [0.0, -2.0, -3.5], "r1dot_log": [1.0, 0.0, 1.5]}
+    content["hazard_table"] = {name: of(values) for name, values in (knots | logs).items()}
+    steps = {"ttc_s": of([1.0, 2.0, 3.0, 5.0, 8.0]), "share": of([0.01, 0.02, 0.03, 0.1, 0.5, 1.0], se=0.1)}
+    content["acceptance_steps"] = {**steps, "events": [0, 0, 1, 2, 9, 90], "exposure": [30.0] * 6}
+    for path, value in changes.items():
+        section, name = path.split("__")
+        content[section][name] = value
+    return content
+
+
+def as_tables(share: float) -> dict[str, Any]:
+    """Tables that say what the paper's formula of the wish does, and accept all from 8 s on, and a share below."""
+    c = {name: number["value"] for name, number in DATA["cut_in"].items()}
+    v, r1, r1dot = np.linspace(20.0, 40.0, 41), np.expm1(np.linspace(0.0, np.log(116.0), 41)), np.linspace(-10, 10, 41)
+    u, q = (v - 30.0) / 10.0, r1dot / 5.0
+    logs = {
+        "v": c["intercept"] + c["u"] * u + c["u_squared"] * u**2,
+        "r1": c["log_gap"] * np.log1p(r1),
+        "r1dot": c["rate"] * q + c["rate_squared"] * q**2,
+    }
+    content = tabled(acceptance_steps__events=None, acceptance_steps__exposure=None)
+    content["hazard_table"] = {"v_mps": of(v), "r1_m": of(r1), "r1dot_mps": of(r1dot)}
+    content["hazard_table"] |= {f"{name}_log": of(values) for name, values in logs.items()}
+    content["acceptance_steps"] = {"ttc_s": of([8.0]), "share": of([share, 1.0])}
+    return content
