@@ -20,6 +20,7 @@ from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooMany
 from harness.estimators.short_answer import lines
 from harness.numbers import interval, words
 from harness.runner.stored import estimate_run
+from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
 from tests.stored_runs import SCENARIOS, copy_of, estimates, manifest, sets
@@ -47,7 +48,8 @@ def test_check_prints_a_campaign_file(capsys, tmp_path):
     assert main(["check", SMOKE, "--set", "stop.rhw=0.2"]) == 0
     output = capsys.readouterr().out
     (tmp_path / "resolved.yaml").write_text(output)
-    assert load_campaign(tmp_path / "resolved.yaml") == load_campaign(SMOKE, ["stop.rhw=0.2"])
+    resolved = load_campaign(tmp_path / "resolved.yaml")
+    assert resolved == load_campaign(SMOKE, ["stop.rhw=0.2", f"pool.library={OF_TRAFFIC[True]}"])
     assert "#   most tests: 400,000" in output
     assert main(["check", SMOKE, "--json"]) == 0
     output = json.loads(capsys.readouterr().out)

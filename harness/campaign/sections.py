@@ -89,7 +89,7 @@ def listed(names: Iterable[str]) -> str:
 class EnvironmentSettings(Section):
     """The naturalistic driving environment."""
 
-    parameters: str = Field("ndd-overtaking-1", description="name of a shipped parameter file, or a path to your own")
+    parameters: str = Field("ndd-overtaking-2", description="name of a shipped parameter file, or a path to your own")
     lane_change_level: Positive = Field(
         1.0,
         le=1e8,

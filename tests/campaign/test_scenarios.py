@@ -148,7 +148,7 @@ SHIPPED = {
     "overtaking_nde": "71294e917364cdb2",
     "overtaking_recursive": "a43f69057d98143b",
     "overtaking_shells": "5eabd80673e0bac0",
-    "smoke": "5eabd80673e0bac0",
+    "smoke": "582a19c68c5c5abe",
 }
 PANEL = "6f6894f12ed359ea"
 CHANGED = [
