@@ -48,10 +48,14 @@ class Uncertain:
 
 @dataclass(frozen=True)
 class Unseen:
-    """Where in time to collision (``where``) no lane change was seen, and the share of the rate that arises there."""
+    """Where in time to collision (``where``) no lane change was seen, and the share of the rate that arises there.
+
+    ``steps`` are those of the acceptance.
+    """
 
     where: str
     share: float
+    steps: tuple[int, ...]
 
 
 @dataclass(frozen=True)

@@ -7,20 +7,21 @@ is answered by the same tests, from few paths that are the same in all of them (
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import gammainc, gammaincinv
 
 from harness.campaign.files import shipped_or_own
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
-from harness.estimators.traffic import TrafficError, rows, sentences, uncertain
-from harness.numbers import share
+from harness.estimators.traffic import CARRIES, TrafficError, Unseen, rows, sentences, uncertain
+from harness.numbers import plain, share
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.moved import FewPaths
 from harness.pool.shells import acceleration_limit
@@ -41,10 +42,13 @@ from harness.runner.stored_shells import (
 from harness.sampling import distance_per_test_m
 from harness.strata import ShellDesign
 from harness.traffic.loading import load_parameters
-from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
+from harness.traffic.parameters import SHIPPED_FOLDER, AcceptanceSteps, EnvironmentParameters
 from harness.vocabulary import EstimatorName
 
 NOT_LOOKING = "cut_in__ignore_share"
+_STEP = "acceptance_steps__share__"
+ONE_SIDED = 0.95
+"""Quantile of a step's share that no replicate has drawn."""
 
 
 def estimate_in_other_traffic(
@@ -98,7 +102,8 @@ def traffic_error(
 
     Raises `HarnessError`: their file is missing or wrong.
     """
-    if (found := _answered([tested], there, moved, progress)) is None:
+    unseen = _unseen(tested, there, moved, progress)
+    if (found := _answered([tested], there, moved, progress, unseen)) is None:
         return None
     (near,), n = found
     estimate, confidence = content["estimates"]["shells"], content["confidence"]
@@ -106,14 +111,14 @@ def traffic_error(
     sampling = estimate["ci_low"], estimate["ci_high"]
     if not estimate["n_crashes"]:
         sampling = 0.0, estimate["upper_bound"]
-    of_rate = uncertain(estimate["crash_rate"], sampling, times, n_refused, confidence)
+    of_rate = uncertain(estimate["crash_rate"], sampling, times, n_refused, confidence, from_below=unseen is None)
     ratios = {}
     for r, driver in enumerate(tested.design.references):
         for each in estimate["details"]["references"]:
             if each["reference"] == driver.name:
                 ends, moves = _ends(each), times / np.array([one.references[r] for one in near])
                 ratios[driver.name] = uncertain(each["ratio"], ends, moves, n_refused, confidence)
-    return TrafficError(_name(there), confidence, n, n_refused, of_rate, ratios)
+    return TrafficError(_name(there), confidence, n, n_refused, of_rate, ratios, unseen)
 
 
 def compare_in_other_traffic(
@@ -134,24 +139,66 @@ def compare_in_other_traffic(
             pairs.add(side, moved[side].block(block))
     confidence = confidence or there.campaign.stop.confidence
     told = paired_estimate(pairs.first(np.minimum(pairs.tests(0), pairs.tests(1))), confidence)
-    if (found := _answered(sides, there, moved[0], progress)) is None:
+    unseen = _unseen(sides[0], there, moved[0], progress)
+    if (found := _answered(sides, there, moved[0], progress, unseen)) is None:
         expected = "an environment that names replicates, as `harness fit` writes them"
         raise CampaignError(OPTION, f"{environment}, which names none", expected, "Compare in that environment.")
     near, n = found
     times, n_refused = [np.array([each.rate for each in of]) for of in near], n - len(near[0])
     a, b = (
-        uncertain(of.crash_rate, (of.ci_low, of.ci_high), factors, n_refused, confidence)
+        uncertain(of.crash_rate, (of.ci_low, of.ci_high), factors, n_refused, confidence, from_below=unseen is None)
         for of, factors in zip((told.a, told.b), times, strict=True)
     )
     ratios = {}
     if told.b.n_crashes:
         ratios["B"] = uncertain(told.free["ratio"], _ends(told.free), times[0] / times[1], n_refused, confidence)
-    error = TrafficError(_name(there), confidence, n, n_refused, a, ratios)
+    error = TrafficError(_name(there), confidence, n, n_refused, a, ratios, unseen)
     return {"traffic": finite_json(error), "b": finite_json(b), "sentences": list(sentences(error, "A"))}
 
 
+def _unseen(tested: StoredShells, there: Resolved, moved: Moved, progress: Progress) -> Unseen | None:
+    """Steps of acceptance in which no lane change was seen, of those that carry a notable part of the rate.
+
+    What a step carries is what its share of the wishes moves: a rate is linear in it.
+    """
+    parameters = load_parameters(there.campaign.environment)
+    steps = parameters.acceptance_steps
+    if parameters.replicates is None or steps is None or steps.events is None or steps.exposure is None:
+        return None
+    empty = [step for step, events in enumerate(steps.events) if not events]
+    halves = [{f"{_STEP}{step}": 0.5 * steps.share[step].value} for step in empty]
+    halved = [environment_with(there, parameters, each) for each in halves]
+    found = nearby(tested, there, moved, [each for each in halved if each is not None], progress)
+    known = [step for step, each in zip(empty, halved, strict=True) if each is not None]
+    carried = {step: 2.0 * (1.0 - each.rate) for step, each in zip(known, found, strict=True)}
+    carried = {step: part for step, part in carried.items() if part > CARRIES}
+    return Unseen(_where(steps, carried), min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
+
+
+def _where(steps: AcceptanceSteps, some: Collection[int]) -> str:
+    """Times to collision of steps, neighbours together: ``TTC < 2 s``, ``TTC 3 to 5 s``."""
+    ends = [0.0, *(each.value for each in steps.ttc_s), math.inf]
+    low = [plain(ends[step]) for step in some if step - 1 not in some]
+    high = [plain(ends[step + 1]) for step in some if step + 1 not in some]
+    between = (f"TTC {a} to {b} s" if float(a) else f"TTC < {b} s" for a, b in zip(low, high, strict=True))
+    return " and ".join(between).replace("to inf s", "s and more")
+
+
+def _as_if_unseen(row: Mapping[str, float], steps: AcceptanceSteps, unseen: Sequence[int]) -> dict[str, float]:
+    """A replicate with what zero events leave open upwards, in place of the draw that is right in the mean.
+
+    Draws are of (½)-gamma quantiles over the exposure; the same quantile of 1-gamma is what no event at all refuses.
+    """
+    moved = dict(row)
+    for step in unseen:
+        name, exposure = f"{_STEP}{step}", (steps.exposure or ())[step]
+        below = float(gammainc(0.5, row[name] * exposure)) if name in row else ONE_SIDED
+        moved[name] = min(float(gammaincinv(1.0, below)) / exposure, 1.0) if exposure > 0.0 else 1.0
+    return moved
+
+
 def _answered(
-    sides: Sequence[StoredShells], there: Resolved, moved: Moved, progress: Progress
+    sides: Sequence[StoredShells], there: Resolved, moved: Moved, progress: Progress, unseen: Unseen | None
 ) -> tuple[list[list[Nearby]], int] | None:
     """What each run says of the replicates that all can answer, and how many there are; None without any."""
     settings = there.campaign.environment
@@ -159,6 +206,8 @@ def _answered(
     if parameters.replicates is None:
         return None
     values = read_replicates(settings.parameters, parameters)
+    if unseen is not None and parameters.acceptance_steps is not None:
+        values = [_as_if_unseen(row, parameters.acceptance_steps, unseen.steps) for row in values]
     environments = [each for row in values if (each := environment_with(there, parameters, row)) is not None]
     progress.stage("replicates of the traffic", len(sides) * len(environments))
     found = [list(nearby(tested, there, moved, environments, progress)) for tested in sides]

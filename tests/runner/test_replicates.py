@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,28 @@ def test_the_ratio_of_two_vehicles_hardly_moves(tmp_path, capsys):
     assert of_both["times"] == pytest.approx([1.0, 1.0], rel=0.01)
     assert of_both["value"] == pytest.approx(compared["ratio"])
     assert of_both["sampling"] == pytest.approx([compared["ratio_low"], compared["ratio_high"]])
+
+
+def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run, tmp_path):
+    """Shares of the wishes that are much as those of the tests' traffic, none of them seen below 2 s."""
+    ends, shares, n = (1, 2, 3, 5, 8), (0.01, 0.01, 0.01, 0.01, 0.02, 1.0), [0, 0, 2, 3, 9, 1000]
+    listed = [", ".join(f"{{value: {each}, source: fitted}}" for each in of) for of in (ends, shares)]
+    steps = "acceptance_steps: {{ttc_s: [{}], share: [{}], events: {}, exposure: {}}}".format(*listed, n, [50.0] * 6)
+    replaced = re.compile(r"  (ignore_share|accept_ttc_s|accept_scale_s):")
+    text = "\n".join([*(line for line in SHIPPED.splitlines() if not replaced.match(line)), steps])
+    a, names = 0.02, [f"acceptance_steps__share__{step}" for step in (0, 1)]
+    pq.write_table(pa.table({name: [a] for name in names}), tmp_path / "rows.parquet")
+    (tmp_path / "mine.yaml").write_text(text.replace("version: 1", "version: 1\nreplicates: rows.parquet", 1))
+    content = estimate_in_other_traffic(stored_run("shells-twin"), str(tmp_path / "mine.yaml"))
+    traffic = content["traffic"]
+    assert traffic["unseen"]["where"] == "TTC < 2 s"
+    assert (part := traffic["unseen"]["share"]) > 0.9
+    far = -math.log1p(-math.erf(math.sqrt(a * 50.0))) / 50.0  # the same quantile, of what zero events refuse
+    assert traffic["rate"]["times"] == [0.0, pytest.approx(1.0 + part * (far / 0.01 - 1.0), rel=0.01)]
+    (row,) = [row for row in content["answer"]["rows"] if row["key"] == "traffic"]
+    assert row["value"].startswith("at most × ")
+    assert row["remark"] == "no lane change seen at TTC < 2 s"
+    assert "since no lane change was seen at TTC < 2 s, where " in content["scope"]
 
 
 def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
