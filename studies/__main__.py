@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,14 +38,15 @@ _workers_option = click.option("--workers", type=click.IntRange(min=1), help="Pr
         f"{_ME} case scenarios/case_study/study.yaml --out runs/quick --quick",
         f"{_ME} rnot runs/nde runs/forced",
         f"{_ME} alarm runs/mixture",
+        f"{_ME} traffic",
     ),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 def cli() -> None:
     """Studies of the methods behind `harness`, for those who develop or doubt them; run from a checkout.
 
-    Exit codes are those of `harness`: 0 done; 2 the file or the call is wrong, or the records do not allow what was
-    asked for; 3 the alarm is raised; 130 interrupted by Ctrl-C.
+    Exit codes are those of `harness`: 0 done; 1 traffic is not as published; 2 the file or the call is wrong, or the
+    records do not allow what was asked for; 3 the alarm is raised; 130 interrupted by Ctrl-C.
     """
 
 
@@ -250,6 +251,43 @@ def trajectories(environment: str, file: Path, *, hours: float, seed: int, level
     table = simulate(load_environment(settings), hours, seed, ALIKE if exact else Differences())
     write(table, file)
     click.echo(f"{file}: {len(table):,} rows")
+
+
+@cli.command(
+    short_help="Put an environment beside what is published about cut-ins and lane changes.",
+    epilog=examples(f"{_ME} traffic", f"{_ME} traffic ndd-overtaking-1", f"{_ME} traffic my-traffic.yaml --json"),
+    context_settings={"show_default": True},
+)
+@click.argument("environment", metavar="[ENVIRONMENT]", default="ndd-overtaking-2")
+@json_option
+@click.pass_context
+def traffic(ctx: click.Context, environment: str, *, as_json: bool) -> None:
+    """Compare ENVIRONMENT, a shipped name or a file of your own, with published figures (studies/published.yaml).
+
+    Each line has the figure, the model's number and what that has to lie in, with the reason; "-" where the scenario
+    or the level of lane changing does not allow to ask. The exit code is 1 where one fails.
+    """
+    from harness.estimators.estimate import finite_json  # noqa: PLC0415 - slow to import
+    from studies.traffic import beside_published  # noqa: PLC0415
+
+    rows = beside_published(environment)
+    failed = [row for row in rows if row["verdict"] == "fail"]
+    if as_json:
+        print_json(finite_json(rows))
+    else:
+        print_table(f"{Path(environment).stem} beside what is published", [_figure_row(row) for row in rows])
+        click.echo("\n".join(sorted({f"{row['source']}: {row['reference']}" for row in rows})))
+        held = sum(row["verdict"] == "pass" for row in rows)
+        click.echo(f"{held} pass, {len(failed)} fail, {len(rows) - held - len(failed)} not held")
+    if failed:
+        ctx.exit(1)
+
+
+def _figure_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A line of the table for the terminal."""
+    within = "" if row["within"] is None else "{:.3g} to {:.3g}".format(*row["within"])
+    named = {"figure": f"{row['figure']} ({row['unit']})", "published": str(row["published"]), "model": row["model"]}
+    return {**named, "within": within, "": row["verdict"], "because": row["remark"], "source": row["source"]}
 
 
 @cli.command(

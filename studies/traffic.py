@@ -1,0 +1,205 @@
+"""An environment beside what is published about cut-ins and lane changes (`published.yaml`), with pass or fail.
+
+Where a figure comes from traffic unlike the scenario's, whose tests begin with an AV that closes in by 5 to 10 m/s, its
+conditions are taken: the law of acceptance is asked at the closing speeds that were seen, of gaps that are equally
+likely up to the sensor's view. What depends on the scenario is asked of naturalistic paths.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy import stats
+from scipy.optimize import brentq
+
+from harness.campaign.files import read_model
+from harness.campaign.problems import broken_rule
+from harness.campaign.sections import EnvironmentSettings, Section
+from harness.compiled import unboxed
+from harness.pool.walk import write_script
+from harness.traffic.laws import Environment, InitialStates
+from harness.traffic.loading import evaluate_laws, load_environment
+from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import ACCELERATIONS_MPS2, BV, LV, N_ACCELERATIONS, FloatArray
+
+PUBLISHED = Path(__file__).with_name("published.yaml")
+N_PATHS, SEED = 4096, 1
+BOUND = "not_looking_bound_percent"
+
+
+class Quantiles(Section):
+    """Of a distribution that is taken as normal."""
+
+    p5: float
+    p95: float
+
+
+class Approach(Section):
+    """What traffic the published cut-ins were seen in."""
+
+    speed_mps: float
+    headway_s: float
+    closing_mps: Quantiles
+    n_closing: int
+    ttc_s: float
+
+
+class Figure(Section):
+    """A published number, the model's name of it, and what the model's has to lie in, or why that is not asked."""
+
+    what: str
+    unit: str
+    source: str
+    model: str
+    published: float | str
+    within: Annotated[list[float | str], Field(min_length=2, max_length=2)] | None = None
+    why: str = ""
+    not_held: str = ""
+
+    @model_validator(mode="after")
+    def _says_why(self) -> Self:
+        if (self.within is None) == (not self.not_held) or (self.within is not None) == (not self.why):
+            mend = "Say why nothing is asked of the model, or what its number has to lie in, and why."
+            raise broken_rule("within", "not the keys of one of both", "within and why, or not_held", mend)
+        return self
+
+
+class Published(Section):
+    """The table of what is published."""
+
+    sources: dict[str, str]
+    approach: Approach
+    figures: list[Figure]
+
+
+def beside_published(environment: str, published: Path = PUBLISHED) -> list[dict[str, Any]]:
+    """Rows of an environment (shipped name or file): each figure, the model's number, and ``pass``, ``fail`` or ``-``.
+
+    Raises `CampaignError`: a file is missing or wrong.
+    """
+    table = read_model(published, Published)
+    found = model_figures(load_environment(EnvironmentSettings(parameters=environment)), table.approach)
+    rows = []
+    for figure in table.figures:
+        value, verdict, within = found[figure.model], "-", None
+        if figure.within is not None:
+            low, high = (found[end] if isinstance(end, str) else end for end in figure.within)
+            verdict, within = "pass" if low <= value <= high else "fail", [low, high]
+        rows.append(
+            {
+                "figure": figure.what,
+                "unit": figure.unit,
+                "published": figure.published,
+                "model": value,
+                "within": within,
+                "verdict": verdict,
+                "remark": figure.why or figure.not_held,
+                "source": figure.source,
+                "reference": table.sources[figure.source],
+            }
+        )
+    return rows
+
+
+def model_figures(environment: Environment, approach: Approach) -> dict[str, float]:
+    """What an environment says of the figures, by name."""
+    return {**_leads(environment), **_cut_ins(environment, approach), **_scenario(environment, approach)}
+
+
+def _leads(environment: Environment) -> dict[str, float]:
+    """Quantiles of the time from onset to overlap, of twice that, and of the lateral speed."""
+    distance_m, cumulative = environment.lateral
+    upto_s = STEP_S * (np.arange(cumulative.size) + 0.5)
+
+    def lead(percent: int) -> float:
+        return float(np.interp(percent / 100, cumulative, upto_s)) if environment.lateral.present else 0.0
+
+    def speed(percent: int) -> float:
+        return distance_m / lead(100 - percent) if environment.lateral.present else np.inf
+
+    return {
+        **{f"lead_p{p}_s": lead(p) for p in (1, 5, 50, 95)},
+        "duration_p50_s": 2.0 * lead(50),
+        **{f"lateral_p{p}_mps": speed(p) for p in (50, 95, 99)},
+    }
+
+
+def _cut_ins(environment: Environment, approach: Approach) -> dict[str, float]:
+    """The law of acceptance at published closing speeds, with equally likely gaps up to the sensor's view."""
+    low, high = approach.closing_mps.p5, approach.closing_mps.p95
+    sd = (high - low) / (2.0 * stats.norm.isf(0.05))
+    closing = stats.norm.ppf((np.arange(200) + 0.5) / 200, 0.5 * (low + high), sd)
+    longest = approach.headway_s * approach.speed_mps
+    gaps = longest * (np.arange(240) + 0.5) / 240
+    pairs = np.column_stack([np.tile(gaps, closing.size), np.repeat(-closing, gaps.size)])
+    accepted = _laws(environment, np.empty((0, 3)), pairs)[1].reshape(closing.size, gaps.size)
+    share = accepted / accepted.sum(1, keepdims=True)
+    headway = np.cumsum(share.mean(0))
+    quantile = {f"headway_p{p}_s": float(np.interp(p / 100, headway, gaps)) / approach.speed_mps for p in (5, 50, 95)}
+    below = (gaps < approach.ttc_s * closing[:, None])[closing > 0.0]
+    looks = _laws(environment, np.empty((0, 3)), np.array([[1e-3, -1.0]]))[1][0]
+    of_lookers = np.maximum(accepted - looks, 0.0)[closing > 0.0] / (1.0 - looks)
+
+    def ttc_below(not_looking: float) -> float:
+        each = not_looking + (1.0 - not_looking) * of_lookers
+        return float(((each * below).sum(1) / each.sum(1)).mean())
+
+    bound = 1.0 - 0.05 ** (1.0 / approach.n_closing)
+    most = brentq(lambda i: ttc_below(i) - bound, 0.0, 1.0) if ttc_below(1.0) > bound > ttc_below(0.0) else np.nan
+    return {
+        **quantile,
+        "ttc_below_percent": 100.0 * ttc_below(looks),
+        "not_looking_percent": 100.0 * float(looks),
+        BOUND: 100.0 * float(most),
+    }
+
+
+def _scenario(environment: Environment, approach: Approach) -> dict[str, float]:
+    """Cut-ins of naturalistic paths whose AV keeps its speed, and lane changes per km where nobody is behind."""
+    index = np.arange(N_PATHS)
+    start = InitialStates(environment.numbers).draw(SEED, 0, N_PATHS)
+    script = write_script(SEED, index, np.full(N_PATHS, -1), start, environment)
+    hold, n_steps = int(environment.numbers["hold_steps"]), int(environment.numbers["max_steps"])
+    initial = {LV: np.maximum(start["v_bv_mps"] + start["r1dot_mps"], 0.0), BV: start["v_bv_mps"]}
+    x, v = {}, {}
+    for vehicle, maneuvers in ((LV, script.lv), (BV, script.bv)):
+        steps = STEP_S * np.repeat(ACCELERATIONS_MPS2[maneuvers], hold, axis=1)[:, :n_steps]
+        speed = np.maximum(initial[vehicle][:, None] + np.cumsum(steps, axis=1), 0.0)
+        v[vehicle] = np.column_stack([initial[vehicle], speed])
+        driven = np.cumsum(0.5 * STEP_S * (v[vehicle][:, 1:] + v[vehicle][:, :-1]), axis=1)
+        x[vehicle] = np.column_stack([np.zeros(N_PATHS), driven])
+    v_av = (start["v_bv_mps"] - start["r2dot_mps"])[:, None]
+    r1 = start["r1_m"][:, None] + x[LV] - x[BV]
+    r2 = start["r2_m"][:, None] + x[BV] - v_av * STEP_S * np.arange(n_steps + 1)
+    real = np.logical_and.accumulate((r1 > 0.0) & (np.arange(n_steps + 1) < hold * script.n_bv[:, None]), axis=1)
+    every = np.s_[:, ::hold]  # decisions are per second
+    there = real[every]
+    states = np.column_stack([each[every][there] for each in (v[BV], r1, v[LV] - v[BV])])
+    behind = np.column_stack([each[every][there] for each in (r2, v[BV] - v_av)])
+    wished, accepted = _laws(environment, states, behind)
+    beside = behind[:, 0] > 0.0
+    weight, gap, closing = (wished * accepted)[beside], behind[beside, 0], -behind[beside, 1]
+    headway = gap / (states[beside, 0] + closing)
+    seen = (closing > 0.0) & (headway < approach.headway_s)
+    order = np.argsort(closing)
+    return {
+        "scenario_ttc_below_percent": 100.0 * _share(weight[seen], (gap < approach.ttc_s * closing)[seen]),
+        "scenario_closing_percent": 100.0 * _share(weight, closing > 0.0),
+        "scenario_closing_p50_mps": float(np.interp(0.5, np.cumsum(weight[order]) / weight.sum(), closing[order])),
+        "lane_changes_per_km": float(1e3 * wished.sum() / states[:, 0].sum()),
+    }
+
+
+def _share(weight: FloatArray, of: FloatArray) -> float:
+    return float(weight @ of / weight.sum())
+
+
+def _laws(environment: Environment, states: FloatArray, approaches: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Wishes to change lanes per second in states (n, 3), and shares accepted (m,) in approaches (m, 2)."""
+    pmf, scale = np.empty((2, len(states), N_ACCELERATIONS)), np.empty((2, len(states)))
+    wished, accepted = np.empty(len(states)), np.empty(len(approaches))
+    evaluate_laws(states, approaches, unboxed(environment), pmf, scale, wished, accepted)
+    return wished, accepted
