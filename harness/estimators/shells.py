@@ -298,6 +298,16 @@ class Shells:
         rates = zip(self._design.references, self._design.reference_rate, strict=True)
         return next((each.name for each, rate in rates if rate > 0.0), None)
 
+    def expected(self, limit: float, driver: str | None, statement: str) -> float:
+        """Crashes that these tests of a statement would have brought at a limit, spread evenly over its strata.
+
+        The limit is a crash rate, or a multiple of a reference ``driver``'s.
+        """
+        design, strata = self._design, slice(0, self._design.n_within(statement))
+        if driver is not None:
+            limit *= float(design.reference_rate[[each.name for each in design.references].index(driver)])
+        return limit * int(self.tally.tests[strata].sum()) / float(design.p[strata].sum())
+
     def beside(self, driver: str, statement: str, level: Level) -> tuple[float, float]:
         """Limits of a statement's rate over that of a reference driver; any where crashes lie on too few paths."""
         design = self._design

@@ -45,22 +45,25 @@ MARGIN_LOOKS = 6
 """A margin is decided at a level that leaves out so many times less than the campaign's, as it is looked at after each
 round. Measured where B's rate is 1 + margin times A's, by looks from 40 to 3,000 pairs: docs/compare.md."""
 Verdict = Literal["accepted", "rejected", "undecided"]
-DECISION_THRESHOLDS = ((500, 4.5), (2_000, 3.4), (20_000, 4.5), (200_000, 5.0), (math.inf, 5.5))
-"""Below so many tests, the threshold of the likelihood ratio at which a limit is decided with an error of 5 % a side.
+DECISION_THRESHOLDS = ((2.5, 4.5), (10.0, 3.4), (100.0, 4.5), (1_000.0, 5.0), (math.inf, 5.5))
+"""Below so many crashes, the threshold of the likelihood ratio at which a limit is decided with an error of 5 % a side.
 
-Calibrated by replication where limit = truth, looked at after every round and in the midst of each (docs/gate.md): the
-error is spent where vehicles at half and at twice the limit are decided. Few tests need more than some more: then one
-crash in a shell of small share decides."""
+They are those expected at the limit if tests and crashes were spread evenly over all strata, whatever traffic and
+vehicle are: n tests of strata of probability P expect n limit/P. Calibrated by replication where limit = truth, looked
+at after every round and in the midst of each (docs/gate.md): the error is spent where vehicles at half and at twice the
+limit are decided. Few tests need more than some more: then one crash in a shell of small share decides."""
 DECISION_TAIL = 0.05
 """Error a side for which the thresholds are."""
 
 
-def decision_level(n: int, confidence: float) -> Level:
-    """At which a look at n tests decides, so that all looks together err in (1 - confidence)/2 of campaigns a side.
+def decision_level(expected: float, confidence: float) -> Level:
+    """At which a look decides, so that all looks together err in (1 - confidence)/2 of campaigns a side.
+
+    ``expected`` crashes see `DECISION_THRESHOLDS`.
 
     The threshold is one for few crashes and many; the pool's error has the quantile that belongs to it.
     """
-    threshold = next(threshold for most, threshold in DECISION_THRESHOLDS if n < most)
+    threshold = next(threshold for most, threshold in DECISION_THRESHOLDS if expected < most)
     threshold = max(threshold + math.log(2.0 * DECISION_TAIL / (1.0 - confidence)), 0.5)
     return Level(threshold, math.sqrt(2.0 * threshold))
 
@@ -264,7 +267,7 @@ class RoundRule(Rule):
     """Looks at the crash rate from shells after each round, or whether it is below a limit.
 
     ``held`` is the number of tests that the run folder holds: before them nothing is given up, whatever is asked for
-    now. A limit is decided by ``level_at`` a number of tests and a confidence, whatever the budget: a run that is
+    now. A limit is decided by ``level_at`` an expected number of crashes and a confidence, whatever the budget: a run that is
     continued is looked at where it would have been without the break, and once more where that was.
     """
 
@@ -304,8 +307,8 @@ class RoundRule(Rule):
 
     def _beside(self, seen: Shells, limit: float, driver: str | None) -> Decision:
         """What is known about a limit after these tests, at the level of decisions."""
-        n = int(seen.tally.tests.sum())
-        level, statement = self.level_at(n, self._confidence), self._statement
+        n, statement = int(seen.tally.tests.sum()), self._statement
+        level = self.level_at(seen.expected(limit, driver, statement), self._confidence)
         ends = seen.limits_of(statement, level)[1:3] if driver is None else seen.beside(driver, statement, level)
         confidence, contradicted = (1.0 + self._confidence) / 2.0, seen.contradicts(statement)
         return Decision(limit, statement, confidence, *ends, contradicted, n, driver=driver)
@@ -316,7 +319,7 @@ class RoundRule(Rule):
         if found is None or not found.is_final:
             key, limit, driver = accept.asked
             found, unmet = self._beside(seen, limit, driver), (f"accept.{key} ({limit:g})",)
-            rhw = seen.limits_of(self._statement, self.level_at(n, self._confidence)).rhw
+            rhw = seen.limits_of(self._statement, Level.two_sided(self._confidence)).rhw
             self.look = Look(rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
         return found.is_final and n >= self._held
 

@@ -84,6 +84,11 @@ class Experiment(Section):
         description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate "
         "in the super-population; at 1 both verdicts are wrong, and each is judged",
     )
+    verdicts: list[Positive] = Field(
+        [],
+        description="judge decisions, too: limits as multiples of the rate of `beside`, the same for each vehicle; "
+        "which verdict is wrong follows from its own ratio",
+    )
     beside: str | None = Field(None, description="decide limits beside this reference driver: accept.times_reference")
     budgets: list[Whole] = Field([], description="numbers of tests within which limits are judged, and stop.episodes")
     levels: list[Positive] = Field([], description="further levels at which the same tests of shells are judged")
@@ -103,6 +108,8 @@ class Experiment(Section):
 
     def nominal_of(self, result: str) -> float:
         """`nominal`, or the further level that a result is at."""
+        if result.startswith("limit "):
+            return (1.0 + self.campaign.stop.confidence) / 2.0
         return next((level for level in self.levels if result.endswith(f" at {level:g}")), self.nominal)
 
     @property
@@ -149,12 +156,13 @@ class Experiment(Section):
         names += [(f"pairs.{name}", one, held) for name, pair in self.pairs.items() for one in (pair.a, pair.b)]
         names += [("estimators", name, SAMPLING[method].estimators) for name in self.results]
         names += [("campaign.world.engine", self.campaign.world.engine, ["twin"])]
-        for key in ("adversaries", "pairs", "limits"):
+        for key in ("adversaries", "pairs", "limits", "verdicts"):
             names += [("campaign.testing.method", method, ["shells"])] * bool(getattr(self, key))
         names += [
             (f"adversaries.{name}", name, ["a name that avs has not"]) for name in {*self.adversaries} & {*self.avs}
         ]
         names += [("limits", "limits for pairs", ["limits for single vehicles"])] * bool(self.limits and self.pairs)
+        names += [("beside", "none", ["a reference driver, for verdicts"])] * bool(self.verdicts and not self.beside)
         for name, av in self.avs.items():
             driven = "a built-in model" if isinstance(av.parameters, BuiltInParameters) else f"av.{av.source}"
             if av.acts_before_cut_in and method == "shells":  # it walks the paths of its pools first

@@ -135,6 +135,8 @@ def judge(subject: Subject, result: str, rows: Sequence[Row], confidence: float)
         "reached": float(table.reached.mean()),
         "alarm": float((table.n_crashes_outside > 0).mean()),
         "refused": float(table.refused.mean()),
+        "low_median": float(table.ci_low.median()),
+        "high_median": float(table.ci_high.median()),
     }
 
 

@@ -204,7 +204,7 @@ class FormerRule(RoundRule):
     """A sibling of the rule of decisions: limits of the interval, which allow for no look but one."""
 
     @staticmethod
-    def level_at(_n: int, confidence: float) -> Level:
+    def level_at(_expected: float, confidence: float) -> Level:
         """That of the interval."""
         return Level.two_sided(confidence)
 
@@ -239,8 +239,8 @@ class ShellCampaign(_Drawn):
 
     Judged are all statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
     crash rate, all of these are decided instead, as by ``accept``, and judged within each of the ``budgets``; what is
-    tested next depends on neither. They may be multiples of the rate of a reference driver, ``beside``. ``siblings``
-    see `FORMER`; and intervals of vehicles that act before the cut-in are made by pairs of tests alone, see `OnRuns`.
+    tested next depends on neither. They may be multiples of the rate of a reference driver, ``beside``, and ``estimated``
+    says whether intervals are judged besides. ``siblings`` see `FORMER`; and intervals of vehicles that act before the cut-in are made by pairs of tests alone, see `OnRuns`.
     """
 
     limits: Mapping[float, float] = field(default_factory=dict)
@@ -248,9 +248,13 @@ class ShellCampaign(_Drawn):
     siblings: bool = False
     beside: str | None = None
     levels: Sequence[float] = ()
+    estimated: bool = False
 
     def _replicate(self, replication: int, drawn: Sequence[DrawnPool], rng: np.random.Generator) -> Iterator[Row]:
-        return (self._decide if self.limits else self._estimate)(replication, drawn[0], rng)
+        if self.limits:
+            yield from self._decide(replication, drawn[0], rng)
+        if self.estimated or not self.limits:
+            yield from self._estimate(replication, drawn[0], rng)
 
     def _decide(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
         rules: dict[tuple[float, str], RoundRule] = {}

@@ -147,6 +147,7 @@ def _of_shells(
     ``beyond`` is the share of that rate beyond the boundary of each statement, ``unit`` what limits are multiples of.
     """
     limits, budgets = {factor: factor * own_rate / unit for factor in experiment.limits}, experiment.all_budgets
+    limits |= {limit * unit / own_rate: limit for limit in experiment.verdicts}
     decisions = [result for pair in product(limits, budgets) for result in limit_at(*pair)]
     outside = {result_of(each): share for each, share in beyond.items()}
     outside |= dict.fromkeys(decisions, outside.get(result_of(campaign.testing.shells.statement), 0.0))
@@ -154,7 +155,7 @@ def _of_shells(
     others |= dict.fromkeys([BOUND, *decisions], Known.exactly(own_rate))
     others |= {bound_outside(each): Known(share * own_rate, 0.0, own_rate) for each, share in beyond.items()}
     subject = Subject(name, known[RATE], others, outside, **more)
-    more_of = experiment.siblings, experiment.beside, experiment.levels
+    more_of = experiment.siblings, experiment.beside, experiment.levels, bool(experiment.verdicts)
     return subject, ShellCampaign(campaign, draw, seed, limits, budgets, *more_of)
 
 
