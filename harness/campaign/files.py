@@ -207,7 +207,7 @@ def names_a_campaign(path: str | Path) -> bool:
     return suffix not in (".py", ".fmu") and (Path(path).exists() or ("/" in text and ":" not in text))
 
 
-QUICK = {"rhw": 0.3, "below_reference": 0.2}
+QUICK = {"rhw": 0.3, "below_reference": 0.3}
 """When a vehicle without a campaign has been tested enough."""
 
 

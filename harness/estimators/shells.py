@@ -314,9 +314,7 @@ class Shells:
         r = [each.name for each in design.references].index(driver)
         if design.reference_rate[r] <= 0.0 or paths_that_count(design.p, self.tally) < FEWEST_PATHS:
             return 0.0, math.inf
-        cells, n = self._cells, design.n_within(statement)
-        low, high = (_beside(design, tests, r, n, level) for tests in (cells, cells.failed_as_crashes()))
-        return low[0], high[1]
+        return _beside(design, self._cells, r, design.n_within(statement), level)
 
     def more_tests(self, statement: str, level: Level, rhw: float, more_runs: float) -> float:
         """How many times as many tests of each stratum, crashing as often, would leave a relative half-width.
@@ -448,14 +446,13 @@ class BesideReference:
 
 def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideReference, ...]:
     """The vehicle beside each reference of a design; ``cells`` are its tests by the design's cells."""
-    found, own, worst = [], float(design.p @ cells.joined(design.joined).share), cells.failed_as_crashes()
+    found, own = [], float(design.p @ cells.joined(design.joined).share)
     for r, reference in enumerate(design.references):
         crashes_too = design.crashes_too(r)
         rate, square = float(design.reference_rate[r]), float(design.reference_square[r])
         if rate == 0.0:  # a reference that crashes nowhere on these paths is nothing to compare with
             continue
-        low, high = (_beside(design, tests, r, design.p.size, level) for tests in (cells, worst))
-        ratio = own / rate if rate > 0.0 else math.nan, low[0], high[1]
+        ratio = own / rate if rate > 0.0 else math.nan, *_beside(design, cells, r, design.p.size, level)
         preventable = preventable_share(design.cell_p, cells, ~crashes_too, design.n_independent, level)
         error = math.sqrt(max(square - rate * rate, 0.0) / design.n_independent)
         who = reference.name, reference.described, reference.delay_s
@@ -465,11 +462,16 @@ def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideRef
 
 def _beside(design: ShellDesign, cells: Tally, r: int, n_strata: int, level: Level) -> tuple[float, float]:
     """Limits of the rate of the first strata over that of a reference."""
-    strata = slice(0, n_strata)
-    with_reference = design.joined.T @ (cells.crash_mass @ design.crashes_too(r))
+    strata, p = slice(0, n_strata), design.p[:n_strata]
     moments = float(design.reference_rate[r]), float(design.reference_square[r])
-    own = cells.joined(design.joined).part(strata)
-    return rate_ratio_limits(design.p[strata], own, with_reference[strata], moments, design.n_independent, level)
+
+    def limits(tests: Tally) -> tuple[float, float]:
+        with_reference = design.joined.T @ (tests.crash_mass @ design.crashes_too(r))
+        own = tests.joined(design.joined).part(strata)
+        return rate_ratio_limits(p, own, with_reference[strata], moments, design.n_independent, level)
+
+    low, high = limits(cells)
+    return low, high if (worst := cells.failed_as_crashes()) is cells else limits(worst)[1]
 
 
 def rate_ratio_limits(
