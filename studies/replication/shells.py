@@ -239,8 +239,9 @@ class ShellCampaign(_Drawn):
 
     Judged are all statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
     crash rate, all of these are decided instead, as by ``accept``, and judged within each of the ``budgets``; what is
-    tested next depends on neither. They may be multiples of the rate of a reference driver, ``beside``, and ``estimated``
-    says whether intervals are judged besides. ``siblings`` see `FORMER`; and intervals of vehicles that act before the cut-in are made by pairs of tests alone, see `OnRuns`.
+    tested next depends on neither. They may be multiples of the rate of a reference driver, ``beside``; with
+    ``estimated`` intervals are judged besides. ``siblings`` see `FORMER`; and intervals of vehicles that act before the
+    cut-in are made by pairs of tests alone, see `OnRuns`.
     """
 
     limits: Mapping[float, float] = field(default_factory=dict)
