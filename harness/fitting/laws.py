@@ -1,0 +1,524 @@
+"""The laws of traffic, fitted to observations.
+
+Initial states and accelerations are fitted in the shipped families, the former as densities, the latter by the
+probabilities of the 31 accelerations, so that a law is fitted as it is drawn from. The hazard of a lane change is the
+exponential of a sum of piecewise linear functions of v, R1 and R1dot: Σ log h over lane changes - Σ h Δt over all
+seconds at risk, where nobody closes in within `FREE_TTC_S`. Below that, k lane changes where E = Σ h Δt were wished
+give the share that is accepted.
+
+Where the data do not tell a number, it keeps the value of the ``base``, a shipped environment.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import optimize, sparse, special
+
+from harness.fitting.maximum import Maximum, Prior, maximise
+from harness.fitting.observations import AT_RISK, FOLLOWING, FREE, INITIAL, LEADS, Observations
+from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, BoolArray, FloatArray, IntArray, RecordArray
+
+Base = Mapping[str, float]
+"""Numbers of an environment by ``section__name``."""
+FREE_TTC_S = 8.0
+TTC_EDGES_S = np.array([1.0, 2.0, 3.0, 5.0, FREE_TTC_S])
+FEWEST = {"initial": 100, "free": 500, "following": 500, "leads": 20}
+"""Rows from which a law is fitted [assumed]."""
+FEWEST_RECORDINGS = 10
+"""From so many on recordings are the clusters, not vehicles [assumed]."""
+OUTLIERS = 1e-4
+"""Share of gaps that may lie anywhere in the fit range: the shifted log-normal law rules short ones out [assumed]."""
+KNOTS = np.array([0.02, 0.2, 0.5, 0.8, 0.98])
+"""Quantiles, at lane changes and at risk in the mean, between which the log-hazard is straight."""
+SMOOTH = 1.0, 3.0
+"""Standard deviations of the log-hazard's bends, as change over a quarter of the range, and of its steps [assumed]."""
+HAZARD_OF = ("v_mps", "r1_m", "r1dot_mps")
+_TINY = 1e-300
+
+
+@dataclass(frozen=True, eq=False)
+class Traffic:
+    """Observations of all recordings; ``vehicle`` numbers vehicles throughout, ``recording`` (vehicles,) says where."""
+
+    free: RecordArray
+    following: RecordArray
+    initial: RecordArray
+    at_risk: RecordArray
+    leads: RecordArray
+    recording: IntArray
+
+    @classmethod
+    def of(cls, observations: Iterable[Observations]) -> Traffic:
+        """Put recordings together."""
+        parts: dict[str, list[RecordArray]] = {name: [] for name in _DTYPES}
+        vehicles, recording = 0, []
+        for i, each in enumerate(observations):
+            arrays = {name: getattr(each, name).copy() for name in _DTYPES}
+            n = 1 + max((int(rows["vehicle"].max()) for rows in arrays.values() if rows.size), default=-1)
+            for name, rows in arrays.items():
+                rows["vehicle"] += vehicles
+                parts[name].append(rows)
+            vehicles += n
+            recording += [i] * n
+        joined = {name: np.concatenate([np.empty(0, _DTYPES[name]), *rows]) for name, rows in parts.items()}
+        return cls(**joined, recording=np.asarray(recording, np.int64))
+
+    @property
+    def by_recording(self) -> bool:
+        """Whether recordings, and not vehicles, are resampled."""
+        return np.unique(self.recording).size >= FEWEST_RECORDINGS
+
+    @cached_property
+    def cluster(self) -> IntArray:
+        """Cluster of each vehicle."""
+        return self.recording if self.by_recording else np.arange(self.recording.size)
+
+    def members(self, rows: RecordArray, cell: IntArray | None = None) -> tuple[sparse.csr_array, IntArray]:
+        """How often each row, or each ``cell`` of alike rows, is seen of each vehicle; and the vehicles' clusters."""
+        cell = np.arange(rows.size) if cell is None else cell
+        shape = (self.recording.size, int(cell.max()) + 1)
+        return sparse.csr_array((np.ones(rows.size), (rows["vehicle"], cell)), shape=shape), self.cluster
+
+
+_DTYPES = {"free": FREE, "following": FOLLOWING, "initial": INITIAL, "at_risk": AT_RISK, "leads": LEADS}
+
+
+@dataclass(frozen=True, eq=False)
+class FittedLaw:
+    """Numbers of a law: ``names`` (m,), and their ``values`` (…, m) from coefficients (…, p)."""
+
+    names: tuple[str, ...]
+    values: Callable[[FloatArray], FloatArray]
+    maximum: Maximum
+    rows: int
+
+    @property
+    def estimate(self) -> dict[str, float]:
+        """The numbers."""
+        return dict(zip(self.names, self.values(self.maximum.theta).tolist(), strict=True))
+
+    @cached_property
+    def std_error(self) -> dict[str, float]:
+        """Of each number, by clusters; 0 where it was kept."""
+        theta = self.maximum.theta
+        steps = 1e-5 * np.eye(theta.size)
+        slopes = (self.values(theta + steps) - self.values(theta - steps)) / 2e-5
+        variance = ((slopes.T @ self.maximum.covariance()) * slopes.T).sum(axis=1)
+        return dict(zip(self.names, np.sqrt(np.maximum(variance, 0.0)).tolist(), strict=True))
+
+
+def _df(eta: FloatArray) -> FloatArray:
+    """Degrees of freedom from their coefficient: at least 2."""
+    return 2.0 + np.exp(np.minimum(eta, 6.9))
+
+
+def _scaled(base: Base, v: FloatArray) -> FloatArray:
+    """U of the fits."""
+    return np.asarray((v - base["fit_range__v_centre_mps"]) / base["fit_range__v_scale_mps"])
+
+
+def _columns(n: int, *columns: FloatArray | float) -> FloatArray:
+    return np.column_stack([np.broadcast_to(column, n) for column in columns])
+
+
+# -- initial states --
+
+
+def fit_speed(traffic: Traffic, base: Base) -> FittedLaw | None:
+    """v_BV: skew-normal, truncated to the fit range."""
+    rows, names = traffic.initial, ("v_location_mps", "v_scale_mps", "v_shape")
+    if rows.size < FEWEST["initial"]:
+        return None
+    ends = base["fit_range__v_min_mps"], base["fit_range__v_max_mps"]
+
+    def log_likelihood(
+        rows: RecordArray, location: FloatArray, log_scale: FloatArray, shape: FloatArray
+    ) -> FloatArray:
+        scale = np.exp(log_scale)
+        z = (rows["v_mps"] - location) / scale
+        ends_z = [(end - location[:1]) / scale[:1] for end in ends]  # the same for all rows
+        below, upto = (special.ndtr(end) - 2.0 * special.owens_t(end, shape[:1]) for end in ends_z)
+        return np.asarray(special.log_ndtr(shape * z) - 0.5 * z * z - log_scale - np.log(upto - below))
+
+    location, scale, shape = (base[f"initial_state__{name}"] for name in names)
+    mean, sd = float(rows["v_mps"].mean()), float(rows["v_mps"].std())
+    starts = [np.array([mean + side * sd, math.log(sd * (1.0 + 0.5 * abs(side))), -2.0 * side]) for side in (-1, 0, 1)]
+    prior = Prior.of([location, math.log(scale), shape], [10.0, 1.0, 4.0])
+    ones = [np.ones((rows.size, 1))] * 3
+    found = maximise(log_likelihood, rows, ones, *traffic.members(rows), prior, [prior.centre, *starts])
+    return _law("initial_state", names, found, rows, {1: np.exp})
+
+
+def fit_gap(traffic: Traffic, base: Base) -> FittedLaw | None:
+    """R1 given v_BV: shifted log-normal, truncated to the fit range."""
+    rows = traffic.initial
+    names = ("r1_shift_m", "r1_shift_u_m", "r1_log_mean", "r1_log_mean_u", "r1_log_sd", "r1_log_sd_u")
+    if rows.size < FEWEST["initial"]:
+        return None
+    least, most = base["fit_range__r1_min_m"], base["fit_range__r1_max_m"]
+
+    def log_likelihood(rows: RecordArray, shift: FloatArray, mean: FloatArray, log_sd: FloatArray) -> FloatArray:
+        def below(gap: FloatArray | float) -> FloatArray:
+            z = (np.log(np.maximum(gap - shift, 1e-9)) - mean) * np.exp(-log_sd)
+            return np.asarray(special.ndtr(z))
+
+        inside = np.maximum(below(most) - below(least), _TINY)
+        p = (below(rows["r1_m"] + 0.5) - below(rows["r1_m"] - 0.5)) / inside  # a density has a peak without bound
+        return np.log((1.0 - OUTLIERS) * p + OUTLIERS / (most - least))
+
+    design = _columns(rows.size, 1.0, _scaled(base, rows["v_mps"]))
+    centre = np.array([base[f"initial_state__{name}"] for name in names])
+    prior = Prior.of(centre.tolist(), [5.0, 5.0, 1.5, 1.0, 1.0, 1.0])
+    logs = np.log(rows["r1_m"] + 1.0)
+    plain = np.array([0.0, 0.0, logs.mean(), 0.0, math.log(logs.std()), 0.0])
+    found = maximise(log_likelihood, rows, [design] * 3, *traffic.members(rows), prior, [centre, plain])
+    return _law("initial_state", names, found, rows)
+
+
+def fit_rate(traffic: Traffic, base: Base) -> FittedLaw | None:
+    """R1dot given v_BV and R1: Student's t, given that R1 is not closed within the smallest time to collision."""
+    least_s = base["initial_state__r1dot_min_ttc_s"]
+    rows = traffic.initial[traffic.initial["r1dot_mps"] > -traffic.initial["r1_m"] / least_s]
+    location = ("location_mps", "location_u", "location_w", "location_uw", "location_uu")
+    names = tuple(f"r1dot_{each}" for each in (*location, "log_scale", "log_scale_u", "log_scale_w", "log_scale_ww"))
+    if rows.size < FEWEST["initial"]:
+        return None
+
+    def log_likelihood(rows: RecordArray, mean: FloatArray, log_scale: FloatArray, eta: FloatArray) -> FloatArray:
+        df, scale = _df(eta), np.exp(-log_scale)
+        z = (rows["r1dot_mps"] - mean) * scale
+        slowest = (-rows["r1_m"] / least_s - mean) * scale
+        peak = np.log(special.poch(0.5 * df, 0.5)) - 0.5 * np.log(df * math.pi)
+        log_density = peak - 0.5 * (df + 1.0) * np.log1p(z * z / df) - log_scale
+        return np.asarray(log_density - np.log(np.maximum(special.stdtr(df, -slowest), _TINY)))
+
+    u = _scaled(base, rows["v_mps"])
+    w = (rows["r1_m"] - base["fit_range__r1_centre_m"]) / base["fit_range__r1_scale_m"]
+    designs = [_columns(rows.size, 1.0, u, w, u * w, u * u), _columns(rows.size, 1.0, u, w, w * w)]
+    centre = [base[f"initial_state__{name}"] for name in names]
+    prior = Prior.of([*centre, math.log(base["initial_state__r1dot_df"] - 2.0)], [3.0] * 5 + [1.5, 1.0, 1.0, 1.0, 1.5])
+    designs.append(np.ones((rows.size, 1)))
+    found = maximise(log_likelihood, rows, designs, *traffic.members(rows), prior)
+    return _law("initial_state", (*names, "r1dot_df"), found, rows, {len(names): _df})
+
+
+def _law(
+    section: str,
+    names: Sequence[str],
+    found: Maximum | None,
+    rows: RecordArray,
+    transforms: Mapping[int, Callable[[FloatArray], FloatArray]] | None = None,
+) -> FittedLaw | None:
+    """A law whose numbers are its coefficients, some of them transformed."""
+
+    def values(theta: FloatArray) -> FloatArray:
+        out = np.array(theta)
+        for i, transform in (transforms or {}).items():
+            out[..., i] = transform(theta[..., i])
+        return out
+
+    named = tuple(f"{section}__{name}" for name in names)
+    return None if found is None else FittedLaw(named, values, found, rows.size)
+
+
+# -- accelerations --
+
+
+def bins(acceleration_mps2: FloatArray) -> IntArray:
+    """Which of the 31 accelerations each is counted as; the tails belong to the end points."""
+    nearest = np.rint((acceleration_mps2 - ACCELERATIONS_MPS2[0]) / 0.2)
+    return np.clip(nearest, 0, N_ACCELERATIONS - 1).astype(np.int64)
+
+
+def _t_between(low: FloatArray, high: FloatArray, df: FloatArray) -> FloatArray:
+    """P(low < T ≤ high), with all its digits in the tails."""
+    flipped = low > 0.0
+    below, upto = np.where(flipped, -high, low), np.where(flipped, -low, high)
+    return np.asarray(special.stdtr(df, upto) - special.stdtr(df, below))
+
+
+def _in_bin(rows: RecordArray, mean: FloatArray, log_scale: FloatArray, df: FloatArray) -> FloatArray:
+    """Probability of the ``bin`` of each row, all above its ``cap`` being moved to that."""
+    k, scale = rows["bin"], np.exp(-log_scale)
+    edge = ACCELERATIONS_MPS2[k] + 0.1
+    low = np.where(k == 0, -np.inf, (edge - 0.2 - mean) * scale)
+    high = np.where(k == rows["cap"], np.inf, (edge - mean) * scale)
+    return _t_between(low, high, df)
+
+
+_BINNED = np.dtype([("bin", np.int64), ("cap", np.int64)])
+
+
+def _binned(k: IntArray, cap: IntArray | int) -> RecordArray:
+    out = np.empty(k.size, _BINNED)
+    out["bin"], out["cap"] = np.minimum(k, cap), cap
+    return out
+
+
+def fit_free_driving(traffic: Traffic, base: Base) -> FittedLaw | None:
+    """Accelerations in free driving: Student's t, and a share that brakes."""
+    rows = traffic.free
+    names = ("location_mps2", "log_scale", "log_scale_u", "log_scale_uu", "df", "brake_logit", "brake_logit_u")
+    names = (*names, "brake_slope_s2pm")
+    if rows.size < FEWEST["free"]:
+        return None
+    # Rows of about the same speed and the same acceleration are one: there are some thousand kinds.
+    v = np.rint(4.0 * rows["v_mps"]).astype(np.int64)
+    kinds, cell = np.unique(v * N_ACCELERATIONS + bins(rows["acceleration_mps2"]), return_inverse=True)
+    u, k = _scaled(base, kinds // N_ACCELERATIONS / 4.0), kinds % N_ACCELERATIONS
+    brakes = ACCELERATIONS_MPS2 <= base["free_driving__brake_max_mps2"] + 1e-9
+
+    def log_likelihood(
+        rows: RecordArray,
+        mean: FloatArray,
+        log_scale: FloatArray,
+        eta: FloatArray,
+        logit: FloatArray,
+        slope: FloatArray,
+    ) -> FloatArray:
+        share = special.expit(logit)
+        powers = np.exp(slope[:, None] * ACCELERATIONS_MPS2[brakes])
+        braking = np.where(brakes[rows["bin"]], np.exp(slope * ACCELERATIONS_MPS2[rows["bin"]]), 0.0)
+        p = (1.0 - share) * _in_bin(rows, mean, log_scale, _df(eta)) + share * braking / powers.sum(axis=1)
+        return np.log(np.maximum(p, _TINY))
+
+    one, linear = np.ones((k.size, 1)), _columns(k.size, 1.0, u)
+    designs = [one, _columns(k.size, 1.0, u, u * u), one, linear, one]
+    centre = [base[f"free_driving__{name}"] for name in names]
+    centre[4] = math.log(centre[4] - 2.0)
+    prior = Prior.of(centre, [0.5, 1.5, 1.0, 1.0, 1.5, 3.0, 2.0, 1.0])
+    binned = _binned(k, N_ACCELERATIONS - 1)
+    found = maximise(log_likelihood, binned, designs, *traffic.members(rows, cell), prior)
+    return _law("free_driving", names, found, rows, {4: _df})
+
+
+def follows(rows: RecordArray, base: Base) -> tuple[RecordArray, FloatArray, FloatArray, BoolArray]:
+    """What car following needs: bins and caps, designs of mean (n, 6) and log scale (n, 2), and rows that are used.
+
+    The mean's coefficients are those of R1dot and R1, three of the gap's polynomial in u, and the closing gain.
+    """
+    r1, r1dot = rows["r1_m"], rows["r1dot_mps"]
+    used = r1 >= base["car_following__near_gap_m"]
+    room = np.maximum(r1 - base["car_following__standstill_m"], base["car_following__smallest_gap_m"])
+    needed = r1dot * r1dot / (2.0 * room)
+    closing = (r1dot < 0.0) & (needed > base["car_following__closing_threshold_mps2"])
+    u = _scaled(base, rows["v_mps"])
+    mean = _columns(rows.size, r1dot, r1, -1.0, -u, -u * u, 0.0)
+    mean[closing] = 0.0
+    mean[closing, -1] = -needed[closing]
+    scale = _columns(rows.size, 1.0, np.minimum(np.abs(r1dot), base["car_following__rate_cap_mps"]))
+    binned = _binned(bins(rows["acceleration_mps2"]), guard_caps(r1, r1dot, base))
+    return binned, mean, scale, used
+
+
+def guard_caps(r1: FloatArray, r1dot: FloatArray, base: Base) -> IntArray:
+    """Largest acceleration that the guard allows, by its number (`harness.traffic.laws.guard_cap`)."""
+    h, own = base["guard__horizon_s"], base["guard__own_braking_mps2"]
+    cap = np.full(r1.size, -1)
+    for acceleration in ACCELERATIONS_MPS2:
+        closing = acceleration + base["guard__lead_braking_mps2"]
+        rate = np.maximum(0.0, closing * h - r1dot)
+        cap += r1 + r1dot * h - 0.5 * closing * h * h - rate * rate / (2.0 * own) >= base["guard__margin_m"]
+    return np.maximum(cap, 0)
+
+
+def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
+    """Accelerations behind a leader, within the guard, which is kept as the near-standstill is."""
+    binned, mean, scale, used = follows(traffic.following, base)
+    rows = traffic.following[used]
+    if rows.size < FEWEST["following"]:
+        return None
+    n = {key.removeprefix("car_following__"): value for key, value in base.items()}
+    v0, dv = base["fit_range__v_centre_mps"], base["fit_range__v_scale_mps"]
+    median, slope, bend = n["median_gap_m"], n["median_gap_v"], n["median_gap_vv"]
+    gaps = np.array([median + slope * v0 + bend * v0 * v0, (slope + 2.0 * bend * v0) * dv, bend * dv * dv])
+    centre = [n["gain_rate_per_s"], n["gain_gap_per_s2"], *(n["gain_gap_per_s2"] * gaps), n["closing_gain"]]
+    centre += [n["log_scale"], n["log_scale_rate"], math.log(n["df"] - 2.0)]
+    prior = Prior.of(centre, [0.5, 0.01, 0.3, 0.3, 0.3, 1.0, 1.5, 1.0, 1.5])
+
+    def log_likelihood(rows: RecordArray, mean: FloatArray, log_scale: FloatArray, eta: FloatArray) -> FloatArray:
+        return np.log(np.maximum(_in_bin(rows, mean, log_scale, _df(eta)), _TINY))
+
+    def values(theta: FloatArray) -> FloatArray:
+        rate, gain, b0, b1, b2, closing, log_scale, log_scale_rate, eta = np.moveaxis(theta, -1, 0)
+        gain = np.maximum(gain, 1e-5)
+        g0, g1, g2 = b0 / gain, b1 / gain / dv, b2 / gain / dv**2
+        gap = g0 - g1 * v0 + g2 * v0 * v0, g1 - 2.0 * g2 * v0, g2
+        numbers = np.maximum(rate, 0.0), gain, *gap, np.maximum(closing, 0.0), _df(eta), log_scale, log_scale_rate
+        return np.stack(np.broadcast_arrays(*numbers), axis=-1)
+
+    def fitted(kept: BoolArray | None = None) -> Maximum | None:
+        designs = [mean[used], scale[used], np.ones((rows.size, 1))]
+        return maximise(log_likelihood, binned[used], designs, *traffic.members(rows), prior, kept=kept)
+
+    found = fitted()
+    if found is not None and found.theta[1] < 3.0 * math.sqrt(found.covariance()[1, 1]):
+        found = fitted(np.arange(prior.centre.size) == 1)  # gaps are divided by it
+    names = ("gain_rate_per_s", "gain_gap_per_s2", "median_gap_m", "median_gap_v", "median_gap_vv", "closing_gain")
+    named = tuple(f"car_following__{name}" for name in (*names, "df", "log_scale", "log_scale_rate"))
+    return None if found is None else FittedLaw(named, values, found, rows.size)
+
+
+# -- lane changes --
+
+
+@dataclass(frozen=True, eq=False)
+class HazardTable:
+    """Log-hazard (per second): intercept, and the effects of v, R1 and R1dot at ``knots``, 0 at the middle one."""
+
+    knots: tuple[FloatArray, FloatArray, FloatArray]
+    maximum: Maximum
+
+    @property
+    def middles(self) -> tuple[int, int, int]:
+        """Which knot of each has no effect."""
+        first, second, third = (knots.size // 2 for knots in self.knots)
+        return first, second, third
+
+    def design(self, rows: RecordArray) -> FloatArray:
+        """What coefficients are multiplied by in some states (n,): (n, p)."""
+        return _hats(self.knots, rows)
+
+    def hazard(self, rows: RecordArray) -> FloatArray:
+        """Rate (1/s), (n,) in states (n,), at which drivers wish to change lanes."""
+        return np.exp(self.design(rows) @ self.maximum.theta)
+
+    def effects(self, theta: FloatArray) -> list[FloatArray]:
+        """Log-hazards (…, knots) of v, with the intercept, and of R1 and R1dot, from coefficients (…, p)."""
+        out, at = [], 1
+        for knots, middle in zip(self.knots, self.middles, strict=True):
+            part = theta[..., at : at + knots.size - 1]
+            none = np.zeros((*theta.shape[:-1], 1))
+            out.append(np.concatenate([part[..., :middle], none, part[..., middle:]], axis=-1))
+            at += knots.size - 1
+        out[0] = out[0] + theta[..., :1]
+        return out
+
+
+def _hats(knots: Sequence[FloatArray], rows: RecordArray) -> FloatArray:
+    columns = [np.ones(rows.size)]
+    for name, at in zip(HAZARD_OF, knots, strict=True):
+        columns += [np.interp(rows[name], at, hat) for j, hat in enumerate(np.eye(at.size)) if j != at.size // 2]
+    return np.column_stack(columns)
+
+
+def _knots(rows: RecordArray, name: str) -> FloatArray:
+    """Rounded quantiles, at crossings and at risk in the mean; at least a twentieth of their range apart."""
+    at = 0.5 * (np.quantile(rows[name], KNOTS) + np.quantile(rows[name][rows["changes"]], KNOTS))
+    found = np.round(at, 1)
+    apart = np.diff(found, prepend=-np.inf) > 0.05 * (found[-1] - found[0])
+    return found[apart] if apart.sum() > 1 else found[0] + np.array([0.0, 1.0])
+
+
+def fit_hazard(traffic: Traffic) -> HazardTable | None:
+    """Hazard of a lane change where nobody closes in within `FREE_TTC_S`."""
+    rows = traffic.at_risk[traffic.at_risk["ttc_s"] > FREE_TTC_S]
+    n_changes = int(rows["changes"].sum())
+    if not n_changes:
+        return None
+    knots = tuple(_knots(rows, name) for name in HAZARD_OF)
+
+    def log_likelihood(rows: RecordArray, eta: FloatArray) -> FloatArray:
+        rate = -np.log1p(-np.minimum(np.exp(eta), 0.5))  # decided once a second (`harness.traffic.laws`)
+        return np.asarray(np.where(rows["changes"], np.log(rate), 0.0) - rate * rows["duration_s"])
+
+    mean = math.log(n_changes / rows["duration_s"].sum())
+    penalties = [sparse.csr_array([[0.01]]), *(_penalty(each) for each in knots)]
+    weights = sparse.block_diag(penalties).toarray()
+    centre = np.zeros(weights.shape[1])
+    centre[0] = mean
+    prior = Prior(centre, weights, smooths=True)
+    found = maximise(log_likelihood, rows, [_hats(knots, rows)], *traffic.members(rows), prior)
+    return None if found is None else HazardTable((knots[0], knots[1], knots[2]), found)
+
+
+def _penalty(knots: FloatArray) -> FloatArray:
+    """Pseudo-observations of an effect at its knots but the middle one: bends and steps about 0."""
+    identity = np.eye(knots.size)
+    slopes = np.diff(identity, axis=0) / np.diff(knots)[:, None]
+    bends = np.diff(slopes, axis=0) * (knots[-1] - knots[0]) / 4.0
+    weights = np.vstack([bends / SMOOTH[0], np.diff(identity, axis=0) / SMOOTH[1]])
+    return np.delete(weights, knots.size // 2, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Acceptance:
+    """Lane changes by time to collision with the vehicle behind, in the bins that `TTC_EDGES_S` are between.
+
+    ``events`` (6,) are those seen, ``exposure`` (6,) those that were wished: the hazard summed over time. ``design``
+    holds rows of the hazard (n, p) in all bins but the last, with ``bin`` and ``duration_s`` (n,).
+    """
+
+    events: IntArray
+    exposure: FloatArray
+    design: FloatArray
+    bin: IntArray
+    duration_s: FloatArray
+
+    @classmethod
+    def of(cls, traffic: Traffic, hazard: HazardTable) -> Acceptance:
+        """Count."""
+        rows = traffic.at_risk
+        at = np.searchsorted(TTC_EDGES_S, rows["ttc_s"], side="right")
+        n = TTC_EDGES_S.size + 1
+        events = np.bincount(at[rows["changes"]], minlength=n)
+        exposure = np.bincount(at, hazard.hazard(rows) * rows["duration_s"], minlength=n)
+        near = at < n - 1
+        return cls(events, exposure, hazard.design(rows[near]), at[near], rows["duration_s"][near])
+
+    def exposures(self, theta: FloatArray) -> FloatArray:
+        """Wished lane changes (b, 5) in all bins but the last, for coefficients (b, p) of the hazard."""
+        hazard = np.exp(self.design @ theta.T) * self.duration_s[:, None]
+        return np.asarray(np.stack([hazard[self.bin == j].sum(axis=0) for j in range(TTC_EDGES_S.size)], axis=1))
+
+    @property
+    def shares(self) -> FloatArray:
+        """Estimates (6,), at most 1, which do not fall as the time grows; half an event stands for none."""
+        near = accepted_shares(self.events[:-1].astype(np.float64), self.exposure[:-1])
+        return np.append(near, 1.0)
+
+
+def accepted_shares(events: FloatArray, exposure: FloatArray) -> FloatArray:
+    """Shares (…, k) of counts (…, k), at most 1, that do not fall from bin to bin.
+
+    Drivers are taken to accept a shorter time no more often than a longer one: bins that contradict it are joined.
+    """
+    weights = np.maximum(exposure, 1e-12)
+    raw = events / weights
+    rows = [
+        optimize.isotonic_regression(y, weights=w).x
+        for y, w in zip(raw.reshape(-1, raw.shape[-1]), weights.reshape(-1, raw.shape[-1]), strict=True)
+    ]
+    shares = np.array(rows).reshape(raw.shape)
+    none = shares <= 0.0
+    half = 0.5 / np.maximum((weights * none).sum(axis=-1, keepdims=True), 1e-12)
+    following = np.where(none, np.inf, shares).min(axis=-1, keepdims=True)
+    return np.minimum(np.where(none, np.minimum(half, following), shares), 1.0)
+
+
+def fit_leads(traffic: Traffic, distance_m: float, longest_s: float) -> FittedLaw | None:
+    """Time from onset of lateral motion to overlap: log-normal, cut off at the longest, in steps."""
+    rows = traffic.leads
+    if rows.size < FEWEST["leads"]:
+        return None
+    edge = longest_s - 0.5 * STEP_S
+
+    def log_likelihood(rows: RecordArray, mean: FloatArray, log_sd: FloatArray) -> FloatArray:
+        lead = np.minimum(rows["lead_s"], longest_s)
+        low, high = np.maximum(lead - 0.5 * STEP_S, _TINY), np.where(lead >= edge, np.inf, lead + 0.5 * STEP_S)
+        z = [(np.log(np.minimum(each, 1e300)) - mean) * np.exp(-log_sd) for each in (np.minimum(low, edge), high)]
+        flipped = z[0] > 0.0
+        below, upto = np.where(flipped, -z[1], z[0]), np.where(flipped, -z[0], z[1])
+        return np.log(np.maximum(special.ndtr(upto) - special.ndtr(below), _TINY))
+
+    logs = np.log(np.clip(rows["lead_s"], STEP_S, longest_s))
+    prior = Prior.of([float(logs.mean()), math.log(max(float(logs.std()), 0.05))], [3.0, 2.0])
+    found = maximise(log_likelihood, rows, [np.ones((rows.size, 1))] * 2, *traffic.members(rows), prior)
+    transforms = {0: lambda mean: distance_m * np.exp(-mean), 1: np.exp}
+    return _law("lateral", ("speed_median_mps", "speed_log_sd"), found, rows, transforms)

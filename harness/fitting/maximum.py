@@ -1,0 +1,205 @@
+"""Maximum likelihood for laws whose numbers enter through few predictors, with the influence of each cluster.
+
+A law's log-likelihood of a row depends on its predictors (location, log scale …); each is a design matrix times
+coefficients of its own. Derivatives by predictors are differences, those by coefficients follow from the designs, so
+that Newton's method needs few evaluations whatever the number of coefficients is.
+
+A weak prior (*pseudo-observations*, ``weights · (θ - centre)`` standard normal) keeps directions that the data say
+nothing about near a known law. It counts as data: its share of the curvature is part of the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg, sparse
+
+from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
+
+LogLikelihood = Callable[..., FloatArray]
+"""Of rows (n,), from their data, a structured array (n,), and one array (n,) per predictor."""
+MOSTLY_PRIOR = 0.5
+"""Share of a number's information from the prior above which the data do not tell it [assumed]."""
+MOST_LEVERAGE = 0.5
+"""Influences of vehicles are divided by what they leave to others, as HC3 does: else few rows look too precise."""
+_STEP = 1e-3
+_MOST_ROUNDS = 200
+_ROWS_AT_FIRST = 20_000
+_FIXED = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Pseudo-observations ``weights @ (θ - centre)``, each standard normal: weights (m, p), centre (p,).
+
+    Where it ``smooths``, it is part of the law, and no number keeps its centre.
+    """
+
+    centre: FloatArray
+    weights: FloatArray
+    smooths: bool = False
+
+    def fixed(self, kept: BoolArray) -> Prior:
+        """The same, and no room for coefficients (p,) that are kept."""
+        return replace(self, weights=self.weights * np.where(kept, _FIXED, 1.0))
+
+    @property
+    def precision(self) -> FloatArray:
+        """Inverse of its covariance, (p, p)."""
+        return self.weights.T @ self.weights
+
+    @classmethod
+    def of(cls, centre: Sequence[float], spread: Sequence[float]) -> Prior:
+        """Coefficients that are independent, with these standard deviations."""
+        return cls(np.asarray(centre, np.float64), np.diag(1.0 / np.asarray(spread, np.float64)))
+
+
+@dataclass(frozen=True, eq=False)
+class Maximum:
+    """Where a likelihood is largest.
+
+    ``theta`` (p,); ``influence`` (clusters, p): what seeing a cluster once more moves it by, to first order; ``noise``
+    (p, m): the same for a standard normal change of each pseudo-observation. ``told`` (p,): numbers
+    that the data tell; the others have kept the prior's centre and do not move.
+    """
+
+    theta: FloatArray
+    influence: FloatArray
+    noise: FloatArray
+    told: BoolArray
+
+    def covariance(self) -> FloatArray:
+        """Sandwich by clusters, (p, p)."""
+        n = max(len(self.influence), 2)
+        return self.influence.T @ self.influence * (n / (n - 1.0)) + self.noise @ self.noise.T
+
+
+def maximise(
+    log_likelihood: LogLikelihood,
+    rows: RecordArray,
+    designs: Sequence[FloatArray],
+    members: sparse.csr_array,
+    clusters: IntArray,
+    prior: Prior,
+    starts: Sequence[FloatArray] = (),
+    *,
+    kept: BoolArray | None = None,
+) -> Maximum | None:
+    """Maximum of Σ counts · log-likelihood + prior; None if it is not found.
+
+    ``rows`` (n,) are the data; ``designs`` are (n, p_k), one per predictor, their coefficients one after the other in
+    θ; ``members`` (vehicles, n) says how often each row is seen of each vehicle, and ``clusters`` (vehicles,) to
+    which cluster it belongs. The best of several starts counts.
+    Coefficients that are ``kept`` (p,) stay at the prior's centre.
+    """
+    kept = np.zeros(prior.centre.size, np.bool_) if kept is None else kept.copy()
+    whole = _Sum(log_likelihood, rows, designs, members, prior.fixed(kept))
+    thinned = whole.thinned() if rows.size > 2 * _ROWS_AT_FIRST else whole
+    found = [thinned.climb(start) for start in (starts or [prior.centre])]
+    best = max((each for each in found if each is not None), key=lambda each: each[1], default=None)
+    if best is not None and thinned is not whole:
+        best = whole.climb(best[0])
+    while best is not None:
+        theta, _ = best
+        scores, curvature = whole.derivatives(theta)
+        inverse = linalg.inv(curvature)
+        silent = ~kept & (np.diag(inverse) * np.diag(prior.precision) > MOSTLY_PRIOR)
+        if prior.smooths or not silent.any():
+            weights = prior.weights * ~kept
+            moves = scores @ inverse
+            leverage = np.minimum((moves * scores).sum(axis=1), MOST_LEVERAGE)
+            moves *= ~kept / (1.0 - leverage[:, None])
+            influence = np.zeros((int(clusters.max()) + 1, theta.size))
+            np.add.at(influence, clusters, moves)
+            return Maximum(theta, influence, (inverse @ weights.T) * ~kept[:, None], ~kept)
+        kept |= silent
+        whole.prior = prior.fixed(kept)
+        best = whole.climb(np.where(kept, prior.centre, theta))
+    return None
+
+
+class _Sum:
+    def __init__(
+        self,
+        log_likelihood: LogLikelihood,
+        rows: RecordArray,
+        designs: Sequence[FloatArray],
+        members: sparse.csr_array,
+        prior: Prior,
+    ) -> None:
+        self._row, self._rows, self._designs, self._members = log_likelihood, rows, designs, members
+        self.prior = prior
+        self._counts = np.asarray(members.sum(axis=0)).ravel()
+        self._ends = np.cumsum([design.shape[1] for design in designs])
+
+    def thinned(self) -> _Sum:
+        """Of some of the rows, which stand for all."""
+        n = self._rows.size
+        few = np.arange(0, n, n // _ROWS_AT_FIRST)
+        designs = [design[few] for design in self._designs]
+        return _Sum(self._row, self._rows[few], designs, self._members[:, few] * (n / few.size), self.prior)
+    def _predictors(self, theta: FloatArray) -> list[FloatArray]:
+        parts = np.split(theta, self._ends[:-1])
+        return [design @ part for design, part in zip(self._designs, parts, strict=True)]
+
+    def value(self, theta: FloatArray) -> float:
+        """Penalised log-likelihood; -inf where it is not defined."""
+        with np.errstate(all="ignore"):
+            value = self._counts @ self._row(self._rows, *self._predictors(theta))
+            off = self.prior.weights @ (theta - self.prior.centre)
+            value -= 0.5 * float(off @ off)
+        return float(value) if np.isfinite(value) else -np.inf
+
+    def derivatives(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scores of vehicles (v, p), without the prior, and minus the second derivative (p, p), with it."""
+        eta = self._predictors(theta)
+        k = len(eta)
+
+        def at(*moved: int) -> FloatArray:
+            shifted = list(eta)
+            for each in moved:  # ±(predictor + 1)
+                shifted[abs(each) - 1] = shifted[abs(each) - 1] + np.sign(each) * _STEP
+            return self._row(self._rows, *shifted)
+
+        with np.errstate(all="ignore"):
+            middle, up, down = at(), [at(j + 1) for j in range(k)], [at(-j - 1) for j in range(k)]
+            first = [(up[j] - down[j]) / (2.0 * _STEP) for j in range(k)]
+            second = [[middle] * k for _ in range(k)]
+            for i in range(k):
+                second[i][i] = (up[i] + down[i] - 2.0 * middle) / _STEP**2
+                for j in range(i):
+                    both = at(i + 1, j + 1) + at(-i - 1, -j - 1) + 2.0 * middle
+                    second[i][j] = second[j][i] = (both - up[i] - up[j] - down[i] - down[j]) / (2.0 * _STEP**2)
+        scores = np.hstack([self._members @ (self._designs[j] * first[j][:, None]) for j in range(k)])
+        blocks = [
+            [-self._designs[i].T @ (self._designs[j] * (self._counts * second[i][j])[:, None]) for j in range(k)]
+            for i in range(k)
+        ]
+        return scores, np.block(blocks) + self.prior.precision
+
+    def climb(self, theta: FloatArray) -> tuple[FloatArray, float] | None:
+        """Newton's method, damped where the likelihood is not concave; the maximum and its value, None if not there."""
+        value, damping = self.value(theta), 0.0
+        if not np.isfinite(value):
+            return None
+        scale = self.prior.precision
+        for _ in range(_MOST_ROUNDS):
+            scores, curvature = self.derivatives(theta)
+            slope = scores.sum(axis=0) - scale @ (theta - self.prior.centre)
+            while True:
+                try:
+                    step = linalg.cho_solve(linalg.cho_factor(curvature + damping * scale), slope)
+                except (linalg.LinAlgError, ValueError):
+                    step = None
+                if step is not None and (risen := self.value(theta + step)) >= value - 1e-9 * abs(value):
+                    break
+                damping = max(4.0 * damping, 1e-2)
+                if damping > 1e12:
+                    return None
+            gain, theta, value = slope @ step, theta + step, risen
+            if gain < 1e-6 and damping == 0.0:
+                return theta, value
+            damping = 0.0 if damping < 0.1 else damping / 16.0
+        return None
