@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import optimize, sparse, special
+from scipy import linalg, optimize, sparse, special
 
 from harness.fitting.maximum import Maximum, Prior, maximise
 from harness.fitting.observations import AT_RISK, FOLLOWING, FREE, INITIAL, LEADS, Observations
@@ -38,6 +38,7 @@ KNOTS = np.array([0.02, 0.2, 0.5, 0.8, 0.98])
 """Quantiles, at lane changes and at risk in the mean, between which the log-hazard is straight."""
 SMOOTH = 1.0, 3.0
 """Standard deviations of the log-hazard's bends, as change over a quarter of the range, and of its steps [assumed]."""
+Knots = tuple[FloatArray, FloatArray, FloatArray]
 HAZARD_OF = ("v_mps", "r1_m", "r1dot_mps")
 _TINY = 1e-300
 
@@ -123,6 +124,10 @@ def _scaled(base: Base, v: FloatArray) -> FloatArray:
     return np.asarray((v - base["fit_range__v_centre_mps"]) / base["fit_range__v_scale_mps"])
 
 
+def _log(p: FloatArray) -> FloatArray:
+    return np.asarray(np.log(np.maximum(p, _TINY)))
+
+
 def _columns(n: int, *columns: FloatArray | float) -> FloatArray:
     return np.column_stack([np.broadcast_to(column, n) for column in columns])
 
@@ -137,9 +142,7 @@ def fit_speed(traffic: Traffic, base: Base) -> FittedLaw | None:
         return None
     ends = base["fit_range__v_min_mps"], base["fit_range__v_max_mps"]
 
-    def log_likelihood(
-        rows: RecordArray, location: FloatArray, log_scale: FloatArray, shape: FloatArray
-    ) -> FloatArray:
+    def log_likelihood(rows: RecordArray, location: FloatArray, log_scale: FloatArray, shape: FloatArray) -> FloatArray:
         scale = np.exp(log_scale)
         z = (rows["v_mps"] - location) / scale
         ends_z = [(end - location[:1]) / scale[:1] for end in ends]  # the same for all rows
@@ -170,7 +173,7 @@ def fit_gap(traffic: Traffic, base: Base) -> FittedLaw | None:
 
         inside = np.maximum(below(most) - below(least), _TINY)
         p = (below(rows["r1_m"] + 0.5) - below(rows["r1_m"] - 0.5)) / inside  # a density has a peak without bound
-        return np.log((1.0 - OUTLIERS) * p + OUTLIERS / (most - least))
+        return _log((1.0 - OUTLIERS) * p + OUTLIERS / (most - least))
 
     design = _columns(rows.size, 1.0, _scaled(base, rows["v_mps"]))
     centre = np.array([base[f"initial_state__{name}"] for name in names])
@@ -181,8 +184,11 @@ def fit_gap(traffic: Traffic, base: Base) -> FittedLaw | None:
     return _law("initial_state", names, found, rows)
 
 
-def fit_rate(traffic: Traffic, base: Base) -> FittedLaw | None:
-    """R1dot given v_BV and R1: Student's t, given that R1 is not closed within the smallest time to collision."""
+def fit_rate(traffic: Traffic, base: Base, df: float | None = None) -> FittedLaw | None:
+    """R1dot given v_BV and R1: Student's t, given that R1 is not closed within the smallest time to collision.
+
+    Its degrees of freedom are fitted unless they are given.
+    """
     least_s = base["initial_state__r1dot_min_ttc_s"]
     rows = traffic.initial[traffic.initial["r1dot_mps"] > -traffic.initial["r1_m"] / least_s]
     location = ("location_mps", "location_u", "location_w", "location_uw", "location_uu")
@@ -196,15 +202,17 @@ def fit_rate(traffic: Traffic, base: Base) -> FittedLaw | None:
         slowest = (-rows["r1_m"] / least_s - mean) * scale
         peak = np.log(special.poch(0.5 * df, 0.5)) - 0.5 * np.log(df * math.pi)
         log_density = peak - 0.5 * (df + 1.0) * np.log1p(z * z / df) - log_scale
-        return np.asarray(log_density - np.log(np.maximum(special.stdtr(df, -slowest), _TINY)))
+        return log_density - _log(special.stdtr(df, -slowest))
 
     u = _scaled(base, rows["v_mps"])
     w = (rows["r1_m"] - base["fit_range__r1_centre_m"]) / base["fit_range__r1_scale_m"]
     designs = [_columns(rows.size, 1.0, u, w, u * w, u * u), _columns(rows.size, 1.0, u, w, w * w)]
     centre = [base[f"initial_state__{name}"] for name in names]
-    prior = Prior.of([*centre, math.log(base["initial_state__r1dot_df"] - 2.0)], [3.0] * 5 + [1.5, 1.0, 1.0, 1.0, 1.5])
+    eta = math.log((df or base["initial_state__r1dot_df"]) - 2.0)
+    prior = Prior.of([*centre, eta], [3.0] * 5 + [1.5, 1.0, 1.0, 1.0, 1.5])
     designs.append(np.ones((rows.size, 1)))
-    found = maximise(log_likelihood, rows, designs, *traffic.members(rows), prior)
+    kept = (np.arange(prior.centre.size) == len(names)) & (df is not None)
+    found = maximise(log_likelihood, rows, designs, *traffic.members(rows), prior, kept=kept)
     return _law("initial_state", (*names, "r1dot_df"), found, rows, {len(names): _df})
 
 
@@ -233,7 +241,7 @@ def _law(
 def bins(acceleration_mps2: FloatArray) -> IntArray:
     """Which of the 31 accelerations each is counted as; the tails belong to the end points."""
     nearest = np.rint((acceleration_mps2 - ACCELERATIONS_MPS2[0]) / 0.2)
-    return np.clip(nearest, 0, N_ACCELERATIONS - 1).astype(np.int64)
+    return np.asarray(np.clip(nearest, 0, N_ACCELERATIONS - 1), np.int64)
 
 
 def _t_between(low: FloatArray, high: FloatArray, df: FloatArray) -> FloatArray:
@@ -264,15 +272,15 @@ def _binned(k: IntArray, cap: IntArray | int) -> RecordArray:
 def fit_free_driving(traffic: Traffic, base: Base) -> FittedLaw | None:
     """Accelerations in free driving: Student's t, and a share that brakes."""
     rows = traffic.free
-    names = ("location_mps2", "log_scale", "log_scale_u", "log_scale_uu", "df", "brake_logit", "brake_logit_u")
-    names = (*names, "brake_slope_s2pm")
+    t = ("location_mps2", "log_scale", "log_scale_u", "log_scale_uu", "df")
+    names = (*t, "brake_logit", "brake_logit_u", "brake_slope_s2pm")
     if rows.size < FEWEST["free"]:
         return None
     # Rows of about the same speed and the same acceleration are one: there are some thousand kinds.
     v = np.rint(4.0 * rows["v_mps"]).astype(np.int64)
     kinds, cell = np.unique(v * N_ACCELERATIONS + bins(rows["acceleration_mps2"]), return_inverse=True)
     u, k = _scaled(base, kinds // N_ACCELERATIONS / 4.0), kinds % N_ACCELERATIONS
-    brakes = ACCELERATIONS_MPS2 <= base["free_driving__brake_max_mps2"] + 1e-9
+    brakes = base["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2
 
     def log_likelihood(
         rows: RecordArray,
@@ -286,7 +294,7 @@ def fit_free_driving(traffic: Traffic, base: Base) -> FittedLaw | None:
         powers = np.exp(slope[:, None] * ACCELERATIONS_MPS2[brakes])
         braking = np.where(brakes[rows["bin"]], np.exp(slope * ACCELERATIONS_MPS2[rows["bin"]]), 0.0)
         p = (1.0 - share) * _in_bin(rows, mean, log_scale, _df(eta)) + share * braking / powers.sum(axis=1)
-        return np.log(np.maximum(p, _TINY))
+        return _log(p)
 
     one, linear = np.ones((k.size, 1)), _columns(k.size, 1.0, u)
     designs = [one, _columns(k.size, 1.0, u, u * u), one, linear, one]
@@ -325,7 +333,7 @@ def guard_caps(r1: FloatArray, r1dot: FloatArray, base: Base) -> IntArray:
         closing = acceleration + base["guard__lead_braking_mps2"]
         rate = np.maximum(0.0, closing * h - r1dot)
         cap += r1 + r1dot * h - 0.5 * closing * h * h - rate * rate / (2.0 * own) >= base["guard__margin_m"]
-    return np.maximum(cap, 0)
+    return np.asarray(np.maximum(cap, 0), np.int64)
 
 
 def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
@@ -343,7 +351,7 @@ def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
     prior = Prior.of(centre, [0.5, 0.01, 0.3, 0.3, 0.3, 1.0, 1.5, 1.0, 1.5])
 
     def log_likelihood(rows: RecordArray, mean: FloatArray, log_scale: FloatArray, eta: FloatArray) -> FloatArray:
-        return np.log(np.maximum(_in_bin(rows, mean, log_scale, _df(eta)), _TINY))
+        return _log(_in_bin(rows, mean, log_scale, _df(eta)))
 
     def values(theta: FloatArray) -> FloatArray:
         rate, gain, b0, b1, b2, closing, log_scale, log_scale_rate, eta = np.moveaxis(theta, -1, 0)
@@ -368,40 +376,44 @@ def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
 # -- lane changes --
 
 
-@dataclass(frozen=True, eq=False)
-class HazardTable:
-    """Log-hazard (per second): intercept, and the effects of v, R1 and R1dot at ``knots``, 0 at the middle one."""
+def fit_hazard(traffic: Traffic) -> tuple[FittedLaw, Knots] | None:
+    """Hazard of a lane change where nobody closes in within `FREE_TTC_S`, and the knots of v, R1 and R1dot.
 
-    knots: tuple[FloatArray, FloatArray, FloatArray]
-    maximum: Maximum
+    Coefficients are an intercept and effects at all knots but the middle one of each.
+    """
+    rows = traffic.at_risk[traffic.at_risk["ttc_s"] > FREE_TTC_S]
+    n_changes = int(rows["changes"].sum())
+    if not n_changes:
+        return None
+    first, second, third = (_knots(rows, name) for name in HAZARD_OF)
+    knots = first, second, third
 
-    @property
-    def middles(self) -> tuple[int, int, int]:
-        """Which knot of each has no effect."""
-        first, second, third = (knots.size // 2 for knots in self.knots)
-        return first, second, third
+    def log_likelihood(rows: RecordArray, eta: FloatArray) -> FloatArray:
+        rate = -np.log1p(-np.minimum(np.exp(eta), 0.5))  # decided once a second (`harness.traffic.laws`)
+        return np.asarray(np.where(rows["changes"], np.log(rate), 0.0) - rate * rows["duration_s"])
 
-    def design(self, rows: RecordArray) -> FloatArray:
-        """What coefficients are multiplied by in some states (n,): (n, p)."""
-        return _hats(self.knots, rows)
-
-    def hazard(self, rows: RecordArray) -> FloatArray:
-        """Rate (1/s), (n,) in states (n,), at which drivers wish to change lanes."""
-        return np.exp(self.design(rows) @ self.maximum.theta)
-
-    def effects(self, theta: FloatArray) -> list[FloatArray]:
-        """Log-hazards (…, knots) of v, with the intercept, and of R1 and R1dot, from coefficients (…, p)."""
-        out, at = [], 1
-        for knots, middle in zip(self.knots, self.middles, strict=True):
-            part = theta[..., at : at + knots.size - 1]
+    def values(theta: FloatArray) -> FloatArray:
+        effects, at = [], 1
+        for each in knots:
+            part, middle = theta[..., at : at + each.size - 1], each.size // 2
             none = np.zeros((*theta.shape[:-1], 1))
-            out.append(np.concatenate([part[..., :middle], none, part[..., middle:]], axis=-1))
-            at += knots.size - 1
-        out[0] = out[0] + theta[..., :1]
-        return out
+            effects += [part[..., :middle], none, part[..., middle:]]
+            at += each.size - 1
+        effects[:3] = [effect + theta[..., :1] for effect in effects[:3]]  # of v, with the intercept
+        return np.concatenate(effects, axis=-1)
+
+    weights = linalg.block_diag(np.array([[0.01]]), *(_penalty(each) for each in knots))
+    centre = np.zeros(weights.shape[1])
+    centre[0] = math.log(n_changes / rows["duration_s"].sum())
+    prior = Prior(centre, weights, smooths=True)
+    found = maximise(log_likelihood, rows, [hazard_design(knots, rows)], *traffic.members(rows), prior)
+    axes = zip(("v_log", "r1_log", "r1dot_log"), knots, strict=True)
+    names = tuple(f"hazard_table__{name}__{i}" for name, each in axes for i in range(each.size))
+    return None if found is None else (FittedLaw(names, values, found, rows.size), knots)
 
 
-def _hats(knots: Sequence[FloatArray], rows: RecordArray) -> FloatArray:
+def hazard_design(knots: Knots, rows: RecordArray) -> FloatArray:
+    """What coefficients of the log-hazard are multiplied by in some states (n,): (n, p)."""
     columns = [np.ones(rows.size)]
     for name, at in zip(HAZARD_OF, knots, strict=True):
         columns += [np.interp(rows[name], at, hat) for j, hat in enumerate(np.eye(at.size)) if j != at.size // 2]
@@ -411,35 +423,17 @@ def _hats(knots: Sequence[FloatArray], rows: RecordArray) -> FloatArray:
 def _knots(rows: RecordArray, name: str) -> FloatArray:
     """Rounded quantiles, at crossings and at risk in the mean; at least a twentieth of their range apart."""
     at = 0.5 * (np.quantile(rows[name], KNOTS) + np.quantile(rows[name][rows["changes"]], KNOTS))
-    found = np.round(at, 1)
-    apart = np.diff(found, prepend=-np.inf) > 0.05 * (found[-1] - found[0])
-    return found[apart] if apart.sum() > 1 else found[0] + np.array([0.0, 1.0])
-
-
-def fit_hazard(traffic: Traffic) -> HazardTable | None:
-    """Hazard of a lane change where nobody closes in within `FREE_TTC_S`."""
-    rows = traffic.at_risk[traffic.at_risk["ttc_s"] > FREE_TTC_S]
-    n_changes = int(rows["changes"].sum())
-    if not n_changes:
-        return None
-    knots = tuple(_knots(rows, name) for name in HAZARD_OF)
-
-    def log_likelihood(rows: RecordArray, eta: FloatArray) -> FloatArray:
-        rate = -np.log1p(-np.minimum(np.exp(eta), 0.5))  # decided once a second (`harness.traffic.laws`)
-        return np.asarray(np.where(rows["changes"], np.log(rate), 0.0) - rate * rows["duration_s"])
-
-    mean = math.log(n_changes / rows["duration_s"].sum())
-    penalties = [sparse.csr_array([[0.01]]), *(_penalty(each) for each in knots)]
-    weights = sparse.block_diag(penalties).toarray()
-    centre = np.zeros(weights.shape[1])
-    centre[0] = mean
-    prior = Prior(centre, weights, smooths=True)
-    found = maximise(log_likelihood, rows, [_hats(knots, rows)], *traffic.members(rows), prior)
-    return None if found is None else HazardTable((knots[0], knots[1], knots[2]), found)
+    found = [round(float(at[0]), 1)]
+    for each in np.round(at[1:], 1).tolist():
+        if each - found[-1] > 0.05 * (at[-1] - at[0]):
+            found.append(each)
+    return np.array(found)
 
 
 def _penalty(knots: FloatArray) -> FloatArray:
     """Pseudo-observations of an effect at its knots but the middle one: bends and steps about 0."""
+    if knots.size == 1:
+        return np.empty((0, 0))
     identity = np.eye(knots.size)
     slopes = np.diff(identity, axis=0) / np.diff(knots)[:, None]
     bends = np.diff(slopes, axis=0) * (knots[-1] - knots[0]) / 4.0
@@ -462,15 +456,17 @@ class Acceptance:
     duration_s: FloatArray
 
     @classmethod
-    def of(cls, traffic: Traffic, hazard: HazardTable) -> Acceptance:
+    def of(cls, traffic: Traffic, hazard: FittedLaw, knots: Knots) -> Acceptance:
         """Count."""
         rows = traffic.at_risk
+        design = hazard_design(knots, rows)
         at = np.searchsorted(TTC_EDGES_S, rows["ttc_s"], side="right")
         n = TTC_EDGES_S.size + 1
-        events = np.bincount(at[rows["changes"]], minlength=n)
-        exposure = np.bincount(at, hazard.hazard(rows) * rows["duration_s"], minlength=n)
+        events = np.bincount(at[rows["changes"]], minlength=n).astype(np.int64)
+        wished = np.exp(design @ hazard.maximum.theta) * rows["duration_s"]
         near = at < n - 1
-        return cls(events, exposure, hazard.design(rows[near]), at[near], rows["duration_s"][near])
+        exposure = np.bincount(at, wished, minlength=n).astype(np.float64)
+        return cls(events, exposure, design[near], at[near].astype(np.int64), rows["duration_s"][near])
 
     def exposures(self, theta: FloatArray) -> FloatArray:
         """Wished lane changes (b, 5) in all bins but the last, for coefficients (b, p) of the hazard."""
@@ -482,6 +478,12 @@ class Acceptance:
         """Estimates (6,), at most 1, which do not fall as the time grows; half an event stands for none."""
         near = accepted_shares(self.events[:-1].astype(np.float64), self.exposure[:-1])
         return np.append(near, 1.0)
+
+    @property
+    def std_errors(self) -> FloatArray:
+        """Of the shares (6,), as counts vary; 0 of the last."""
+        near = np.sqrt(self.events[:-1] + 0.5) / np.maximum(self.exposure[:-1], 1e-12)
+        return np.append(np.minimum(near, 1.0), 0.0)
 
 
 def accepted_shares(events: FloatArray, exposure: FloatArray) -> FloatArray:
@@ -515,10 +517,13 @@ def fit_leads(traffic: Traffic, distance_m: float, longest_s: float) -> FittedLa
         z = [(np.log(np.minimum(each, 1e300)) - mean) * np.exp(-log_sd) for each in (np.minimum(low, edge), high)]
         flipped = z[0] > 0.0
         below, upto = np.where(flipped, -z[1], z[0]), np.where(flipped, -z[0], z[1])
-        return np.log(np.maximum(special.ndtr(upto) - special.ndtr(below), _TINY))
+        return _log(special.ndtr(upto) - special.ndtr(below))
 
     logs = np.log(np.clip(rows["lead_s"], STEP_S, longest_s))
     prior = Prior.of([float(logs.mean()), math.log(max(float(logs.std()), 0.05))], [3.0, 2.0])
     found = maximise(log_likelihood, rows, [np.ones((rows.size, 1))] * 2, *traffic.members(rows), prior)
-    transforms = {0: lambda mean: distance_m * np.exp(-mean), 1: np.exp}
-    return _law("lateral", ("speed_median_mps", "speed_log_sd"), found, rows, transforms)
+
+    def speed(mean: FloatArray) -> FloatArray:
+        return distance_m * np.exp(-mean)
+
+    return _law("lateral", ("speed_median_mps", "speed_log_sd"), found, rows, {0: speed, 1: np.exp})

@@ -140,6 +140,7 @@ class _Sum:
         few = np.arange(0, n, n // _ROWS_AT_FIRST)
         designs = [design[few] for design in self._designs]
         return _Sum(self._row, self._rows[few], designs, self._members[:, few] * (n / few.size), self.prior)
+
     def _predictors(self, theta: FloatArray) -> list[FloatArray]:
         parts = np.split(theta, self._ends[:-1])
         return [design @ part for design, part in zip(self._designs, parts, strict=True)]

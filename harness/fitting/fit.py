@@ -1,0 +1,161 @@
+"""Traffic fitted to trajectories: all laws, and the environment that they make."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from harness.campaign.sections import EnvironmentSettings
+from harness.errors import CampaignError, TrajectoryError
+from harness.fitting.laws import (
+    FREE_TTC_S,
+    TTC_EDGES_S,
+    Acceptance,
+    FittedLaw,
+    Knots,
+    Traffic,
+    fit_car_following,
+    fit_free_driving,
+    fit_gap,
+    fit_hazard,
+    fit_leads,
+    fit_rate,
+    fit_speed,
+    hazard_design,
+)
+from harness.progress import Progress
+from harness.traffic.loading import load_environment, require_sound_laws
+from harness.traffic.parameters import REPLACED, EnvironmentParameters
+from harness.vocabulary import FloatArray
+
+HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0)
+"""Degrees of freedom of R1dot that are tried until LV keeps within what SUMO's lanes allow; fitted at first."""
+DIGITS = 6
+_WHAT = {
+    "speed": "speeds of BV",
+    "gap": "gaps to LV",
+    "rate": "speed differences to LV",
+    "free driving": "accelerations in free driving",
+    "car following": "accelerations behind a leader",
+    "lead": "leads of lane changes",
+}
+"""Laws that may keep those of the base."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Traffic as it was fitted.
+
+    Attributes
+    ----------
+    base : EnvironmentParameters
+        Environment whose numbers are kept where nothing is fitted; ``base_name`` is its name.
+    laws : dict of str to FittedLaw
+        Those that were fitted, the hazard among them.
+    kept : dict of str to str
+        Why a law keeps that of the base, by what it is of.
+    knots : Knots
+        Of the hazard.
+    acceptance : Acceptance
+        Lane changes by time to collision.
+    environment : EnvironmentParameters
+        The result.
+    """
+
+    traffic: Traffic
+    base: EnvironmentParameters
+    base_name: str
+    laws: dict[str, FittedLaw]
+    kept: dict[str, str]
+    knots: Knots
+    acceptance: Acceptance
+    environment: EnvironmentParameters
+
+    def hazard_at(self, rows: Any) -> FloatArray:
+        """Rate (1/s) at which lane changes are wished in some states (n,)."""
+        return np.exp(hazard_design(self.knots, rows) @ self.laws["hazard"].maximum.theta)
+
+
+def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, where: str, progress: Progress) -> Fit:
+    """Fit all laws.
+
+    Raises `TrajectoryError`: no hazard can be fitted, or the laws are none that tests can be drawn from; ``where``
+    names the files.
+    """
+    numbers = base.values()
+    settings = EnvironmentSettings()
+    progress.stage("fitting laws", len(_WHAT) + 1)
+
+    def done(law: FittedLaw | None) -> FittedLaw | None:
+        progress.advance(1)
+        return law
+
+    lateral = [numbers.get(f"lateral__{name}", math.nan) for name in ("distance_m", "longest_lead_s")]
+    found = {
+        "speed": done(fit_speed(traffic, numbers)),
+        "gap": done(fit_gap(traffic, numbers)),
+        "rate": done(fit_rate(traffic, numbers)),
+        "free driving": done(fit_free_driving(traffic, numbers)),
+        "car following": done(fit_car_following(traffic, numbers)),
+        "lead": done(None if np.isnan(lateral).any() else fit_leads(traffic, lateral[0], lateral[1])),
+    }
+    hazard = fit_hazard(traffic)
+    if hazard is None:
+        found_words = f"no lane change of which nobody closes in within {FREE_TTC_S:g} s"
+        raise TrajectoryError(where, found_words, "20 or more", "Take more recordings.")
+    acceptance = Acceptance.of(traffic, *hazard)
+    for df in HEAVIEST_TAILS:
+        if df is not None:
+            found["rate"] = fit_rate(traffic, numbers, df)
+        laws = {name: law for name, law in found.items() if law is not None} | {"hazard": hazard[0]}
+        try:
+            environment = _environment(base, laws, hazard[1], acceptance)
+            require_sound_laws(load_environment(settings, environment), where)
+        except CampaignError as error:
+            problem = error
+            continue
+        kept = {_WHAT[name]: "too few, or of no such form" for name, law in found.items() if law is None}
+        if df is not None:
+            kept["degrees of freedom of R1dot"] = f"{df:g}: with heavier tails LV would exceed 100 m/s"
+        return Fit(traffic, base, base_name, laws, kept, hazard[1], acceptance, environment)
+    mend = f"What was read does not look like motorway traffic; see docs/fit.md. {problem.mend}"
+    raise TrajectoryError(
+        where, f"laws that no test can be drawn from: {problem.where}, {problem.found}", problem.expected, mend
+    )
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _environment(
+    base: EnvironmentParameters, laws: dict[str, FittedLaw], knots: Knots, acceptance: Acceptance
+) -> EnvironmentParameters:
+    """The base with fitted numbers in place, and tables in place of what they replace."""
+    content: dict[str, Any] = base.model_dump(exclude_none=True)
+    for names in REPLACED.values():
+        for name in names:
+            content["cut_in"].pop(name, None)
+    tables: dict[str, Any] = {"hazard_table": {}, "acceptance_steps": {}}
+    for name, at in zip(("v_mps", "r1_m", "r1dot_mps"), knots, strict=True):
+        tables["hazard_table"][name] = [{"value": knot, "source": "derived"} for knot in at.tolist()]
+    for law in laws.values():
+        for path, value in law.estimate.items():
+            section, key, *place = path.split("__")
+            se = law.std_error[path]
+            number = {"value": _rounded(value), "source": "fitted", "se": _rounded(se)}
+            if place:
+                tables[section].setdefault(key, []).append(number)
+            elif se > 0.0:
+                content[section][key] = number
+    edges = [{"value": edge, "source": "assumed"} for edge in TTC_EDGES_S.tolist()]
+    shares = zip(acceptance.shares.tolist(), acceptance.std_errors.tolist(), strict=True)
+    steps = [{"value": _rounded(share), "source": "fitted", "se": _rounded(se)} for share, se in shares]
+    steps[-1] = {"value": 1.0, "source": "assumed", "note": "the hazard is that of who has nobody closing in"}
+    exposure = [_rounded(each) for each in acceptance.exposure.tolist()]
+    counted = {"events": acceptance.events.tolist(), "exposure": exposure}
+    tables["acceptance_steps"] = {"ttc_s": edges, "share": steps, **counted}
+    return EnvironmentParameters.model_validate({**content, **tables})

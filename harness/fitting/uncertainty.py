@@ -1,0 +1,66 @@
+"""Replicates of fitted traffic.
+
+A replicate is what other trajectories of the same kind would have given: clusters (recordings, or vehicles where there
+are few) are drawn anew with replacement, and each law moves by the influence of those drawn more or less often than
+once (one-step bootstrap: θ + Σ (w_c - 1) influence_c). Few clusters spread their mean as Student's t does. Lane changes
+in front of somebody who closes in are counts: accepted shares are drawn as gamma(k + 1/2) over exposure.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from harness.campaign.sections import EnvironmentSettings
+from harness.errors import CampaignError, TrajectoryError
+from harness.fitting.fit import Fit
+from harness.fitting.laws import TTC_EDGES_S, accepted_shares
+from harness.progress import Progress
+from harness.traffic.loading import load_environment, require_sound_laws
+from harness.vocabulary import FloatArray
+
+REPLICATES = 200
+MOST_DRAWS = 5
+"""Times as many replicates as are wanted are drawn, should some of them give no laws."""
+_SHARES = tuple(f"acceptance_steps__share__{j}" for j in range(TTC_EDGES_S.size))
+
+
+def replicates(fit: Fit, n: int, seed: int, progress: Progress) -> dict[str, FloatArray]:
+    """Numbers that vary, by their flat names, in n replicates (n,) whose laws can be drawn from.
+
+    Raises `TrajectoryError`: too many have none.
+    """
+    random = np.random.default_rng(seed)
+    settings, good = EnvironmentSettings(), []
+    progress.stage("replicates", n)
+    for _ in range(MOST_DRAWS):
+        drawn = _draw(fit, n, random)
+        for row in zip(*drawn.values(), strict=True):
+            try:
+                moved = fit.environment.with_values(dict(zip(drawn, row, strict=True)))
+                require_sound_laws(load_environment(settings, moved), "replicate")
+            except (CampaignError, ValueError):
+                continue
+            good.append(row)
+            progress.advance(1)
+            if len(good) == n:
+                return dict(zip(drawn, np.array(good).T, strict=True))
+    found = f"{len(good)} of {MOST_DRAWS * n} replicates with laws that tests can be drawn from"
+    raise TrajectoryError("replicates", found, f"{n}", "Take more recordings, or fewer replicates: --replicates.")
+
+
+def _draw(fit: Fit, n: int, random: np.random.Generator) -> dict[str, list[float]]:
+    n_clusters = int(fit.traffic.cluster.max()) + 1
+    times = random.multinomial(n_clusters, np.full(n_clusters, 1.0 / n_clusters), n) - 1.0
+    few = max(n_clusters - 1, 1)
+    times *= np.sqrt(n_clusters / few * few / random.chisquare(few, n))[:, None]
+    drawn: dict[str, list[float]] = {}
+    for name, law in fit.laws.items():
+        theta, noise = law.maximum.theta, law.maximum.noise
+        moved = theta + times @ law.maximum.influence + random.standard_normal((n, noise.shape[1])) @ noise.T
+        values = law.values(moved)
+        drawn |= {key: values[:, i].tolist() for i, key in enumerate(law.names) if law.std_error[key] > 0.0}
+        if name == "hazard":
+            counts = random.gamma(fit.acceptance.events[:-1] + 0.5, size=(n, len(_SHARES)))
+            shares = accepted_shares(counts, fit.acceptance.exposures(moved))
+            drawn |= {key: shares[:, j].tolist() for j, key in enumerate(_SHARES)}
+    return drawn
