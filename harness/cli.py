@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import click
 
 from harness.commands.campaigns import av_check, check, compare, pool, run, schema, setup
+from harness.commands.fitting import fit
 from harness.commands.options import examples
 from harness.commands.printing import go_on_unread, show_error, show_interrupted, system_error, usage_error
 from harness.commands.stored import estimate, export, replay, report, sensitivity
@@ -41,7 +42,7 @@ def cli() -> None:
 
 
 _TESTING = check, av_check, run, compare, pool, estimate, sensitivity, report, replay, export
-for command in (*_TESTING, schema, setup):
+for command in (*_TESTING, fit, schema, setup):
     cli.add_command(command)
 
 

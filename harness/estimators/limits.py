@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import betaincinv, ndtri
+from scipy.special import betaincinv, gammaincinv, ndtri
 
 from harness.vocabulary import FloatArray
 
@@ -23,6 +23,13 @@ def clopper_pearson(
     low = np.where(k > 0, betaincinv(np.maximum(k, 0.5), n - k + 1.0, tail), 0.0)
     high = np.where(worst < n, betaincinv(worst + 1.0, np.maximum(n - worst, 0.5), 1.0 - tail), 1.0)
     return low, high
+
+
+def garwood(counts: ArrayLike, tail: float) -> tuple[FloatArray, FloatArray]:
+    """Exact limits of Poisson means (n,), leaving out the probability ``tail`` at each end (F. Garwood, 1936)."""
+    k = np.asarray(counts, dtype=np.float64)
+    low = np.where(k > 0, gammaincinv(np.maximum(k, 0.5), tail), 0.0)
+    return low, np.asarray(gammaincinv(k + 1.0, 1.0 - tail), np.float64)
 
 
 def skewed_distances(std_error: float, third_moment: float, tail: float) -> tuple[float, float]:

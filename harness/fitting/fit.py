@@ -147,10 +147,14 @@ def _environment(
             section, key, *place = path.split("__")
             se = law.std_error[path]
             number = {"value": _rounded(value), "source": "fitted", "se": _rounded(se)}
+            if place and se == 0.0:  # the knot that effects are relative to
+                number = {"value": 0.0, "source": "derived"}
             if place:
                 tables[section].setdefault(key, []).append(number)
             elif se > 0.0:
                 content[section][key] = number
+    if "lead" in laws:
+        content["lateral"]["longest_lead_s"].pop("note", None)  # it says what share is cut off in the base
     edges = [{"value": edge, "source": "assumed"} for edge in TTC_EDGES_S.tolist()]
     shares = zip(acceptance.shares.tolist(), acceptance.std_errors.tolist(), strict=True)
     steps = [{"value": _rounded(share), "source": "fitted", "se": _rounded(se)} for share, se in shares]

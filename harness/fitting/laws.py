@@ -71,9 +71,14 @@ class Traffic:
         return cls(**joined, recording=np.asarray(recording, np.int64))
 
     @property
+    def n_recordings(self) -> int:
+        """With vehicles that were observed."""
+        return int(np.unique(self.recording).size)
+
+    @property
     def by_recording(self) -> bool:
         """Whether recordings, and not vehicles, are resampled."""
-        return np.unique(self.recording).size >= FEWEST_RECORDINGS
+        return self.n_recordings >= FEWEST_RECORDINGS
 
     @cached_property
     def cluster(self) -> IntArray:

@@ -1,0 +1,72 @@
+"""Traffic of one's own: fitted to trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+from harness.commands.options import FILE, examples, json_option, quiet_option, written_file
+from harness.commands.printing import print_json, say
+
+
+@click.command(
+    short_help="Fit traffic to trajectories.",
+    epilog=examples(
+        "harness fit trajectories.parquet --out my-traffic.yaml",
+        "harness fit 01_tracks.csv 02_tracks.csv --mapping highd --out highway.yaml",
+        "harness run --set environment.parameters=my-traffic.yaml",
+        "harness estimate runs/mine --environment my-traffic.yaml",
+    ),
+)
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--out", type=FILE, required=True, callback=written_file(".yaml"), help="Environment file to write.")
+@click.option("--mapping", metavar="highd|ngsim|FILE.yaml", help="How columns are to be read, if not as below.")
+@click.option("--mirror", is_flag=True, help="Vehicles that close in from behind are on the left.")
+@click.option(
+    "--replicates", type=click.IntRange(min=2), default=200, show_default=True, help="Of the traffic, for its errors."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the replicates.")
+@quiet_option
+@json_option
+def fit(
+    files: Sequence[Path],
+    out: Path,
+    *,
+    mapping: str | None,
+    mirror: bool,
+    replicates: int,
+    seed: int,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Fit the traffic's laws to trajectories in CSV or Parquet FILEs, and write an environment file.
+
+    One row per vehicle and time, 10 Hz or more: vehicle_id, time_s, s_m (centre, along the road), speed_mps, lane (0 =
+    right), length_m; if known recording_id, lateral_m, class, direction. Leaders and followers are found by the tool.
+
+    Beside the environment file a page shows what was seen and fitted, and FILE.replicates.parquet holds environments
+    that other trajectories of the same kind would have given: `harness estimate --environment` tells by how much the
+    rate differs between them.
+    """
+    from harness.fitting.files import fit_files  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+
+    with shown_progress(quiet=quiet) as bar:
+        found = fit_files(
+            files, out, mapping=mapping, mirror=mirror or None, n_replicates=replicates, seed=seed, progress=bar
+        )
+    written = [str(found.environment), str(found.page), str(found.replicates)]
+    if as_json:
+        print_json({"files": written, **found.facts})
+        return
+    tally, traffic, steps = found.tally, found.fit.traffic, found.fit.acceptance
+    say(
+        f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h; "
+        f"{tally.used:,} lane changes used of {tally.changes:,}",
+        f"in front of somebody who closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes, "
+        f"{steps.exposure[:-1].sum():.1f} wished",
+        *(f"kept as in {found.fit.base_name}: {what} ({why})" for what, why in found.fit.kept.items()),
+        *written,
+    )

@@ -1,0 +1,146 @@
+"""`harness fit`: from files of trajectories to an environment file, its replicates and a page."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import yaml
+
+from harness.campaign.files import read_model
+from harness.errors import HarnessError
+from harness.fitting.fit import Fit, fit_traffic
+from harness.fitting.laws import Traffic
+from harness.fitting.observations import Observations, Tally, observations, require_enough
+from harness.fitting.page import page
+from harness.fitting.table import load_mapping
+from harness.fitting.tracks import FitRange
+from harness.fitting.uncertainty import REPLICATES, replicates
+from harness.progress import Progress
+from harness.records.folder import require_place, write_atomically, write_text
+from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
+
+BASE = "ndd-overtaking-2"
+"""What is not fitted stays as it is there."""
+SEED = 1
+
+
+@dataclass(frozen=True)
+class FittedFiles:
+    """What a fit has written, and what it is made of."""
+
+    environment: Path
+    replicates: Path
+    page: Path
+    fit: Fit
+    tally: Tally
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What was seen, and what was kept, for JSON."""
+        steps, traffic = self.fit.acceptance, self.fit.traffic
+        return {
+            "recordings": traffic.n_recordings,
+            "vehicles": self.tally.vehicles,
+            "hours": self.tally.driven_s / 3600.0,
+            "lane_changes": self.tally.used,
+            "resampled": "recordings" if traffic.by_recording else "vehicles",
+            "acceptance": {
+                "events": steps.events.tolist(),
+                "exposure": steps.exposure.tolist(),
+                "share": steps.shares.tolist(),
+            },
+            "kept": self.fit.kept,
+        }
+
+
+def fit_files(
+    files: Sequence[str | Path],
+    out: str | Path,
+    *,
+    mapping: str | None = None,
+    mirror: bool | None = None,
+    n_replicates: int = REPLICATES,
+    seed: int = SEED,
+    progress: Progress | None = None,
+) -> FittedFiles:
+    """Fit traffic to trajectories and write it: ``out`` (YAML), and beside it its replicates and a page.
+
+    ``mapping`` is ``highd``, ``ngsim`` or a YAML file; ``mirror``, if given, takes the place of what it says. The same
+    files and seed give the same bytes.
+
+    Raises `HarnessError`: a file, its mapping or what was read cannot be used, or ``out`` cannot be written.
+    """
+    progress, out = progress or Progress(), Path(out)
+    paths = [Path(file) for file in files]
+    read, where = load_mapping(mapping, mirror=mirror), ", ".join(map(str, paths))
+    if mapping is not None and out.exists() and Path(mapping).exists() and out.samefile(mapping):
+        raise HarnessError(f"--out {out}", "the mapping's own file", "another file", "Choose another name.")
+    require_place(out.parent)
+    base = read_model(SHIPPED_FOLDER / f"{BASE}.yaml", EnvironmentParameters)
+    numbers = base.values()
+    fit_range = FitRange(*(numbers[f"fit_range__{name}"] for name in FitRange._fields))
+
+    progress.stage("reading trajectories", 1000)
+    gathered: list[Observations] = []
+    tally, done = Tally(), 0
+    for each, share in observations(paths, read, fit_range):
+        gathered.append(each)
+        tally = tally.plus(each.tally)
+        progress.advance(round(1000 * share) - done)
+        done = round(1000 * share)
+    require_enough(tally, where)
+    fit = fit_traffic(Traffic.of(gathered), base, BASE, where, progress)
+    rows = replicates(fit, n_replicates, seed, progress)
+
+    beside = out.with_name(f"{out.stem}.replicates.parquet")
+    shown = out.with_suffix(".html")
+    write_atomically(beside, lambda temporary: pq.write_table(pa.table(rows), temporary, compression="zstd"))
+    write_text(shown, page(fit, tally, rows, out.name, paths))
+    write_text(out, _yaml(fit, tally, paths, beside.name, mapping, read.mirror))
+    return FittedFiles(out, beside, shown, fit, tally)
+
+
+def _yaml(fit: Fit, tally: Tally, files: Sequence[Path], beside: str, mapping: str | None, mirrored: bool) -> str:
+    """The environment file: where it comes from, then a number a line."""
+    from importlib.metadata import version  # noqa: PLC0415 - takes a while
+
+    clusters = "recordings" if fit.traffic.by_recording else "vehicles within recordings, which are few"
+    lines = [
+        f"Traffic fitted by harness {version('harness')} to {fit.traffic.n_recordings} recordings: "
+        f"{tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the target lane,",
+        f"{tally.used} lane changes to it. Standard errors (se) and replicates are by {clusters}.",
+        f"Numbers that are not fitted are those of {fit.base_name}. lane_change_level is 1 with this traffic.",
+        f"mapping: {mapping or 'that of the input table'}{', mirrored' if mirrored else ''}",
+        *(f"sha256 {_sha256(file)} {file.name}" for file in files),
+    ]
+    text = "".join(f"# {line}\n" for line in lines)
+    content: dict[str, Any] = fit.environment.model_dump(exclude_none=True)
+    for name, section in content.items():
+        if not isinstance(section, dict):
+            text += f"{name}: {section}\n"
+            continue
+        text += f"\n{name}:\n"
+        for key, number in section.items():
+            if isinstance(number, list) and isinstance(number[0], dict):
+                text += f"  {key}:\n" + "".join(f"    - {_flow(each)}\n" for each in number)
+            else:
+                text += f"  {key}: {_flow(number)}\n"
+    return f"{text}\nreplicates: {beside}\n"
+
+
+def _flow(value: Any) -> str:
+    if isinstance(value, dict):
+        value = {key: each for key, each in value.items() if each != ""}
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6, allow_unicode=True)
+    return text.strip()
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()[:16]

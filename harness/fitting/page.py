@@ -1,0 +1,288 @@
+"""The page of a fit: what was seen beside what was fitted, and the numbers with their standard errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from inspect import getmembers, isfunction
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special, stats
+
+from harness import numbers
+from harness.campaign.files import read_model
+from harness.campaign.sections import EnvironmentSettings
+from harness.compiled import compiled_threads, unboxed
+from harness.errors import printable
+from harness.estimators.limits import garwood
+from harness.fitting.fit import Fit
+from harness.fitting.laws import HAZARD_OF, TTC_EDGES_S, bins
+from harness.fitting.observations import Tally
+from harness.numbers import number
+from harness.report.drawing import Axis, Panel, Plot
+from harness.report.player import templates
+from harness.traffic import laws
+from harness.traffic.laws import Environment, InitialStates
+from harness.traffic.loading import load_environment
+from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
+from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, IntArray, RecordArray, State
+
+CONFIDENCE = 0.9
+SHIPPED = {"ndd-overtaking-1": "muted", "ndd-overtaking-2": "vermillion"}
+"""Environments that are drawn beside it, and their colours."""
+BIN_NAMES = ("0–1", "1–2", "2–3", "3–5", "5–8", "> 8")
+MOST_ROWS = 20_000
+OVER_S = 5
+SAME_MPS = 0.3
+"""Rows of a vehicle follow each other if its speed is that of the row before plus its acceleration."""
+_SEED = 1
+
+
+class Row(NamedTuple):
+    """A number of the environment, and what the base has."""
+
+    name: str
+    value: str
+    se: str
+    base: str
+    away: str
+
+
+def page(fit: Fit, tally: Tally, rows: Mapping[str, FloatArray], name: str, files: Sequence[Path]) -> str:
+    """The page, self-contained; ``rows`` are the replicates, ``name`` is that of the environment's file."""
+    environment = templates()
+    environment.filters.update(getmembers(numbers, isfunction))
+    shown = environment.get_template("fit.html.j2").render(
+        fit=fit,
+        tally=tally,
+        name=name,
+        files=[file.name for file in files],
+        n_replicates=len(next(iter(rows.values()))),
+        plots=list(_plots(fit)),
+        bins=list(_bins(fit)),
+        numbers=list(_numbers(fit)),
+        kept=fit.kept,
+    )
+    return printable(shown)
+
+
+def _numbers(fit: Fit) -> Iterator[Row]:
+    base, found = fit.base.values(), fit.environment.numbers()
+    for path, each in found.items():
+        if each.se is None or path.startswith(("hazard_table", "acceptance_steps")):
+            continue
+        was = base[path]
+        away = (each.value - was) / each.se if each.se > 0.0 else math.nan
+        yield Row(path.replace("__", "."), number(each.value), number(each.se, 2), number(was), f"{away:+.1f}")
+
+
+def _bins(fit: Fit) -> Iterator[tuple[str, int, str, str, str]]:
+    """Time to collision, lane changes seen and wished, the share, and its limits by itself."""
+    found = fit.acceptance
+    low, high = _limits(found.events, found.exposure)
+    for name, events, *row in zip(BIN_NAMES, found.events, found.exposure, found.shares, low, high, strict=True):
+        exposure, *shares = (number(float(each), 2) for each in row)
+        yield name, int(events), exposure, shares[0], " to ".join(shares[1:])
+
+
+def _limits(events: FloatArray | IntArray, exposure: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Of rates (n,), events over exposure, each by itself."""
+    low, high = garwood(events, 0.5 - 0.5 * CONFIDENCE)
+    per = np.maximum(exposure, 1e-12)
+    return low / per, high / per
+
+
+def _plots(fit: Fit) -> Iterator[Plot]:
+    yield _acceptance_plot(fit)
+    yield _hazard_plot(fit)
+    traffic = load_environment(EnvironmentSettings(), fit.environment)
+    if fit.traffic.initial.size:
+        yield _initial_plot(fit, traffic)
+    both = [(fit.traffic.free, "Free driving"), (fit.traffic.following, "Behind a leader")]
+    panels = [panel for rows, title in both if rows.size for panel in _acceleration_panels(rows, title, traffic)]
+    if panels:
+        alt = "Accelerations that were seen and those of the law, their autocorrelation, and changes of speed in 5 s."
+        caption = (
+            f"Left: accelerations of one second. Middle: the law draws each second anew, real drivers go on as they "
+            f"did. Right: what that makes of the change of speed in {OVER_S} s; where seen changes are larger, "
+            f"the law's LV and BV are more regular than real ones."
+        )
+        yield Plot("accelerations", panels, alt, caption)
+    if (lead := fit.laws.get("lead")) is not None:
+        yield _lead_plot(fit, lead.estimate["lateral__speed_log_sd"])
+
+
+def _histogram(values: FloatArray, edges: FloatArray) -> FloatArray:
+    return np.asarray(np.histogram(values, edges)[0] / max(values.size, 1) / np.diff(edges))
+
+
+def _acceptance_plot(fit: Fit) -> Plot:
+    found, edges = fit.acceptance, [0.0, *TTC_EDGES_S.tolist(), 12.0]
+    lowest = 1e-3
+    y = Axis("share of wished lane changes carried out", lowest, 3.0, log=True)
+    panel = Panel(
+        "Lane changes before somebody who closes in", Axis("time to collision, s", 0.0, 12.0), y, height=280.0
+    )
+    low, high = _limits(found.events, found.exposure)
+    panel.add(
+        "boxes",
+        "blue",
+        edges[:-1],
+        edges[1:],
+        np.clip(low, lowest, 3.0),
+        np.clip(high, lowest, 3.0),
+        opacity=0.18,
+        label=f"{numbers.share(CONFIDENCE)} limits, each bin by itself",
+    )
+    steps = np.repeat(edges, 2)[1:-1]
+    panel.add("line", "blue", steps, np.repeat(found.shares, 2), label="fitted")
+    times = np.linspace(0.05, 12.0, 240)
+    for name, colour in SHIPPED.items():
+        n = read_model(SHIPPED_FOLDER / f"{name}.yaml", EnvironmentParameters).values()
+        accept = special.expit((times - n["cut_in__accept_ttc_s"]) / n["cut_in__accept_scale_s"])
+        ignored = n["cut_in__ignore_share"]
+        panel.add("line", colour, times, ignored + (1.0 - ignored) * accept, dash="4 3", label=name)
+    alt = "Share of wished lane changes carried out, by time to collision with the vehicle behind, with limits."
+    caption = (
+        "A lane change is wished as often as with nobody closing in. Shares do not fall as the time grows: bins that "
+        "contradict it are joined. Nearly all crashes arise below 1.5 s; where no lane change was seen there, the data "
+        "give an upper limit alone."
+    )
+    return Plot("acceptance", [panel], alt, caption)
+
+
+def _hazard_plot(fit: Fit) -> Plot:
+    rows = fit.traffic.at_risk[fit.traffic.at_risk["ttc_s"] > TTC_EDGES_S[-1]]
+    rate, labels = fit.hazard_at(rows), ("speed of BV, m/s", "gap R1 to LV, m", "R1dot = v_LV − v_BV, m/s")
+    panels = []
+    for column, label in zip(HAZARD_OF, labels, strict=True):
+        edges = np.unique(np.quantile(rows[column], np.linspace(0.0, 1.0, 9)))
+        at = np.clip(np.searchsorted(edges, rows[column], side="right") - 1, 0, edges.size - 2)
+        seen, time_s, wished, middle = (
+            np.bincount(at, weights, edges.size - 1).astype(np.float64)
+            for weights in (rows["changes"], rows["duration_s"], rate * rows["duration_s"], rows[column])
+        )
+        middle /= np.maximum(np.bincount(at, minlength=edges.size - 1), 1)
+        per_1000_s = np.maximum(time_s, 1e-9) / 1000.0
+        low, high = _limits(seen, per_1000_s)
+        top = 1.1 * float(max(high.max(), (wished / per_1000_s).max()))
+        panel = Panel("", Axis(label, float(edges[0]), float(edges[-1])), Axis("lane changes per 1,000 s", 0.0, top))
+        panel.add("boxes", "blue", edges[:-1], edges[1:], low, high, opacity=0.18, label="seen, 90 % limits")
+        panel.add("line", "blue", middle, wished / per_1000_s, label="fitted")
+        panels.append(panel)
+    alt = "Rate of lane changes that was seen and fitted, by speed, gap and speed difference."
+    caption = "Where nobody closes in from behind within 8 s. The fit has all three at once."
+    return Plot("hazard", panels, alt, caption)
+
+
+def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
+    rows = fit.traffic.initial
+    drawn = InitialStates(traffic.numbers).from_uniforms(np.random.default_rng(_SEED).random((MOST_ROWS, 5)))
+    columns = (("v_mps", "v_bv_mps", "speed of BV, m/s"), ("r1_m", "r1_m", "gap R1 to LV, m"))
+    panels = []
+    for column, of, label in (*columns, ("r1dot_mps", "r1dot_mps", "R1dot, m/s")):
+        low, high = np.quantile(rows[column], [0.002, 0.998])
+        edges = np.linspace(low, high, 31)
+        seen, law = _histogram(rows[column], edges), _histogram(drawn[of], edges)
+        panel = Panel("", Axis(label, low, high), Axis("density", 0.0, 1.15 * float(max(seen.max(), law.max()))))
+        panel.add("boxes", "blue", edges[:-1], edges[1:], np.zeros(30), seen, opacity=0.3, label="seen")
+        panel.add("line", "vermillion", 0.5 * (edges[1:] + edges[:-1]), law, label="law")
+        panels.append(panel)
+    alt = "Histograms of initial states that were seen, and densities of the law."
+    return Plot("initial", panels, alt, "States behind a leader, one per vehicle and 20 s.")
+
+
+@compiled_threads
+def _pmfs(v: FloatArray, r1: FloatArray, r1dot: FloatArray, environment: Environment, out: FloatArray) -> None:
+    """Probabilities of accelerations (n, 31) in some states (n,); free driving where R1 is infinite."""
+    for i in range(v.size):
+        if math.isinf(r1[i]):
+            law = laws.free_driving(v[i], environment)
+        else:
+            law = laws.car_following(State(v[i], r1[i], r1dot[i], math.nan, math.nan), environment)
+        laws.acceleration_pmf(law, environment, out[i])
+
+
+def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) -> Iterator[Panel]:
+    step = -(-rows.size // MOST_ROWS)
+    some = rows[::step]
+    following = "r1_m" in (rows.dtype.names or ())
+    r1, r1dot = (some[name].copy() if following else np.full(some.size, np.inf) for name in ("r1_m", "r1dot_mps"))
+    pmf = np.empty((some.size, N_ACCELERATIONS))
+    _pmfs(some["v_mps"].copy(), r1, r1dot, unboxed(traffic), pmf)
+    law, seen = pmf.mean(axis=0), np.bincount(bins(rows["acceleration_mps2"]), minlength=N_ACCELERATIONS) / rows.size
+    lowest = 10.0 ** math.floor(math.log10(1.0 / rows.size))
+    a = Axis(
+        "acceleration of one second, m/s²", float(ACCELERATIONS_MPS2[0]) - 0.1, float(ACCELERATIONS_MPS2[-1]) + 0.1
+    )
+    panel = Panel(title, a, Axis("share", lowest, 1.0, log=True))
+    left = ACCELERATIONS_MPS2 - 0.1
+    panel.add(
+        "boxes",
+        "blue",
+        left,
+        left + 0.2,
+        np.full(law.size, lowest),
+        np.maximum(seen, lowest),
+        opacity=0.3,
+        label="seen",
+    )
+    panel.add("line", "vermillion", ACCELERATIONS_MPS2, np.maximum(law, lowest), label="law")
+    yield panel
+
+    first = _followed(rows, OVER_S)
+    panel = Panel("", Axis("seconds later", 0.0, float(OVER_S)), Axis("autocorrelation of accelerations", -0.2, 1.0))
+    acceleration = rows["acceleration_mps2"]
+    lags = np.arange(OVER_S)
+    if first.size > 1:
+        seen = np.array([np.corrcoef(acceleration[first], acceleration[first + lag])[0, 1] for lag in lags])
+        panel.add("line", "blue", lags, seen, label="seen")
+        panel.add("dots", "blue", lags, seen, 3.0)
+    panel.add("line", "vermillion", [0.0, 0.0, 1.0, OVER_S], [0.0, 1.0, 0.0, 0.0], label="law")
+    yield panel
+
+    random = np.random.default_rng(_SEED)
+    drawn = np.zeros(some.size)
+    for _ in range(OVER_S):
+        below = np.cumsum(pmf, axis=1)[:, :-1]
+        drawn += ACCELERATIONS_MPS2[(random.random((some.size, 1)) > below).sum(axis=1)]
+    changes = sum(acceleration[first + lag] for lag in lags) if first.size else np.empty(0)
+    ends = np.linspace(-8.0, 8.0, 33)
+    seen, law = (_histogram(np.clip(each, -8.0, 8.0), ends) for each in (np.asarray(changes), drawn))
+    lowest = 1e-4
+    y = Axis("density", lowest, 2.0 * max(float(seen.max()), float(law.max())), log=True)
+    panel = Panel("", Axis(f"change of speed in {OVER_S} s, m/s", -8.0, 8.0), y)
+    panel.add(
+        "boxes", "blue", ends[:-1], ends[1:], np.full(32, lowest), np.maximum(seen, lowest), opacity=0.3, label="seen"
+    )
+    panel.add(
+        "line", "vermillion", 0.5 * (ends[1:] + ends[:-1]), np.maximum(law, lowest), label="law, second by second"
+    )
+    yield panel
+
+
+def _followed(rows: RecordArray, n: int) -> IntArray:
+    """Rows that n - 1 more seconds of the same drive follow."""
+    v, a, vehicle = rows["v_mps"], rows["acceleration_mps2"], rows["vehicle"]
+    if rows.size < n:
+        return np.empty(0, np.int64)
+    goes_on = (vehicle[1:] == vehicle[:-1]) & (np.abs(v[1:] - v[:-1] - a[:-1]) < SAME_MPS)
+    length = np.lib.stride_tricks.sliding_window_view(goes_on, n - 1).all(axis=1)
+    return np.flatnonzero(length).astype(np.int64)
+
+
+def _lead_plot(fit: Fit, log_sd: float) -> Plot:
+    leads, n = fit.traffic.leads["lead_s"], fit.environment.values()
+    longest = n["lateral__longest_lead_s"]
+    median = n["lateral__distance_m"] / n["lateral__speed_median_mps"]
+    edges = np.linspace(0.0, longest, 26)
+    seen = _histogram(np.minimum(leads, longest - 1e-9), edges)
+    times = np.linspace(0.02, longest, 250)
+    law = stats.lognorm.pdf(times, log_sd, scale=median)
+    y = Axis("density", 0.0, 1.15 * float(max(seen.max(), law.max())))
+    panel = Panel("", Axis("from onset of lateral motion to overlap, s", 0.0, longest), y)
+    panel.add("boxes", "blue", edges[:-1], edges[1:], np.zeros(25), seen, opacity=0.3, label=f"seen ({leads.size})")
+    panel.add("line", "vermillion", times, law, label="law")
+    return Plot("leads", [panel], "Histogram of leads, and the law.", "What an attentive vehicle lives on.")
