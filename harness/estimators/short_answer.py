@@ -132,7 +132,7 @@ def _rows(
     shown, ends = best.crash_rate, interval(best.ci_low, best.ci_high)
     if not best.n_crashes or wide:
         less, shown = "< ", best.ci_high if best.n_crashes else best.upper_bound
-        ends = f"{number(best.crash_rate)} seen, ≥ {number(best.ci_low)}" if best.n_crashes else "no crash seen"
+        ends = f"{number(best.crash_rate)} seen" if best.n_crashes else "no crash seen"
     per_km = "" if not distance_km else f"{less}{number(shown * 1e6 / distance_km)} per million km"
     untested = any(each["p"] > 0.0 and not each["n_episodes"] for each in best.details.get("shells", ()))
     # A shell without tests adds nothing to the rate, and all of its probability to the upper limit.

@@ -177,6 +177,27 @@ def test_a_run_that_a_reference_driver_ends_is_held_to_the_level_of_decisions(n)
     assert 0 < sum(stopped) < 40
 
 
+@pytest.mark.parametrize(
+    ("tests", "statement", "driver", "expected"),
+    [
+        ([100, 100, 800], ASSUMPTION_FREE, None, 1_000 * 1e-7 / 3.2e-5),
+        ([100, 100, 80_000], ASSUMPTION_FREE, None, 80_200 * 1e-7 / 3.2e-5),
+        ([100, 100, 800], "library", None, 200 * 1e-7 / 1.2e-5),
+        ([100, 100, 800], ASSUMPTION_FREE, "r157-cc", 1_000 * 1e-7 * 2e-8 / 3.2e-5),
+    ],
+)
+def test_a_limits_threshold_follows_from_the_crashes_that_it_makes_expected(tests, statement, driver, expected):
+    """Ten times the tests where ten times as much lies outside: cut-ins that take time are no rarer decided."""
+    references = {"references": (Reference("r157-cc", "a driver"),), "reference_rate": np.array([2e-8])}
+    counted = Shells()
+    none = np.zeros(3, np.int64)
+    counted.count(
+        replace(DESIGN, **references, reference_square=np.array([1e-15])),
+        Tally(np.array(tests), none, none, np.zeros((3, 3)), np.zeros((3, 3))),
+    )
+    assert counted.expected(1e-7, driver, statement) == pytest.approx(expected)
+
+
 def test_every_round_is_looked_at_whatever_the_folder_holds():
     """So that the looks of a run are those of one with a larger budget; and none waits for the next e-fold."""
     for held in (0, 500):

@@ -92,10 +92,14 @@ adversaries: {hole: {of: idm, hole: 0.3}}
 
 
 def test_enumerated_vehicles_alone_and_compared(tmp_path, monkeypatch):
-    """A hole outside the boundary: the library's statement knows nothing of it, alone and in a comparison."""
+    """A hole outside the boundary: the library's statement knows nothing of it, alone and in a comparison.
+
+    Verdicts beside a reference driver are judged, too: which of them is wrong follows from the vehicle's ratio.
+    """
     monkeypatch.setattr(run, "worker_processes", lambda workers: Here())
     found = {}
-    for more in ("", "pairs: {pair: {a: idm, b: hole}}"):
+    decided = "verdicts: [3]\nbeside: r157-cc\nbudgets: [200]"
+    for more in (decided, "pairs: {pair: {a: idm, b: hole}}"):
         (tmp_path / "x.yaml").write_text(ENUMERATED + more)
         judgements = run.validate(load_experiment(tmp_path / "x.yaml"), tmp_path)
         found |= {(one["subject"], one["result"]): one for one in judgements}
@@ -104,6 +108,14 @@ def test_enumerated_vehicles_alone_and_compared(tmp_path, monkeypatch):
     assert {(one["result"], one["covered"]) for one in found.values() if not one["assumption_met"]} == {
         (w, 0) for w in wrong
     }
+    verdicts = {key: one for key, one in found.items() if key[1].startswith("limit ")}
+    assert {name for name, _ in verdicts} == {"idm", "hole"}
+    for (name, result), one in verdicts.items():
+        factor = 3.0 / found[name, "ratio to r157-cc"]["truth"]
+        assert float(result.split()[1]) == pytest.approx(factor, rel=0.3)
+        assert ("rejected" in result) == (factor > 1.0)
+        assert one["covered"] == one["replications"]
+    assert {one["reached"] for (name, _), one in verdicts.items() if name == "idm"} >= {1.0}
     beyond = found["hole", "shells, upper bound beyond library"]["truth"]
     assert found["pair", "difference"]["truth"] == pytest.approx(-beyond) != 0.0
 
@@ -182,6 +194,7 @@ def test_budgets_end_with_that_of_the_campaign(tmp_path):
         (ACTS + "pairs: {p: {a: c, b: c}}\n" + SHELLS, "pairs.p", "'c'"),
         ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\n" + FORCED, "campaign.testing.method", "forced"),
         ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\nlimits: [1]\n" + SHELLS, "limits", "pairs"),
+        ("avs: {a: {}}\nverdicts: [1]\n" + SHELLS, "beside", "none"),
         ("avs: {a: {before_cut_in: controller}}\n" + SHELLS, "avs.a", "a built-in model"),
         (SHELLS, "avs", "neither"),
         ("avs: {a: {}}\nchains: [rare]\n" + SHELLS, "avs", "both"),
