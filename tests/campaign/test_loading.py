@@ -13,6 +13,7 @@ import yaml
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import IDMParameters, Surrogate
 from harness.campaign.files import (
+    QUICK,
     SHIPPED_PANEL,
     SHIPPED_PARAMETERS,
     load_campaign,
@@ -268,8 +269,8 @@ def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, ow
     campaign = load_campaign(vehicle, ["seed=2"])
     av = json.loads(json.dumps(av).replace("{}", str(own)))
     own_player = {"traces": "crash"}
-    stop, testing = {"rhw": 0.3, "below_reference": 0.2}, {"method": "shells"}
-    assert campaign == Campaign(name=name, av=av, seed=2, testing=testing, stop=stop, records=own_player)
+    testing = {"method": "shells"}
+    assert campaign == Campaign(name=name, av=av, seed=2, testing=testing, stop=QUICK, records=own_player)
     assert load_campaign("mine.yaml", av=vehicle).av == campaign.av
 
 
