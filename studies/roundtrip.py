@@ -15,7 +15,7 @@ seen in sets that are enumerated.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,16 +26,20 @@ from scipy import stats
 
 from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
+from harness.compiled import unboxed
+from harness.fitting.fit import fit_traffic
+from harness.fitting.laws import Traffic
 from harness.fitting.observations import observations
 from harness.fitting.table import load_mapping
+from harness.fitting.uncertainty import replicates
 from harness.pool.build import take_aim
 from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
 from harness.records.folder import write_atomically
 from harness.resolved import resolve
-from harness.traffic.loading import load_environment, load_parameters
-from harness.traffic.parameters import EnvironmentParameters
-from harness.vocabulary import BoolArray, FloatArray
+from harness.traffic.loading import evaluate_laws, load_environment, load_parameters
+from harness.traffic.parameters import FIXED, REPLACED, EnvironmentParameters
+from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray
 from studies.trajectories import Differences, simulate, write
 
 TRAFFIC = EnvironmentSettings(parameters="ndd-overtaking-2", lane_change_level=1000.0)
@@ -44,6 +48,8 @@ FITTED = EnvironmentSettings(parameters="ndd-overtaking-2")
 DRIVERS = ("r157-cc", "late-500ms", "late-1s")
 CONFIDENCE = 0.9
 ESTIMATE, ERROR, REPLICATE = "estimate", "std_error", "replicate"
+SEEN = "seen"
+"""Lane changes of each step of acceptance are kept beside numbers."""
 KNOTS: dict[str, FloatArray] = {
     "v": np.arange(20.0, 40.1, 2.5),
     "r1": np.array([0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 80.0, 100.0, 115.0]),
@@ -62,11 +68,12 @@ def truth() -> EnvironmentParameters:
     return load_parameters(TRAFFIC).with_values({"cut_in__ignore_share": IGNORE_SHARE})
 
 
-def data_set(hours: float, seed: int, folder: Path) -> Path:
-    """A file of trajectories."""
-    path = folder / "trajectories.parquet"
-    write(simulate(load_environment(TRAFFIC, truth()), hours, seed, Differences()), path)
-    return path
+def traffic_of(hours: float, seed: int) -> Traffic:
+    """Observations of a data set, as the fit reads them from its file."""
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name, "trajectories.parquet")
+        write(simulate(load_environment(TRAFFIC, truth()), hours, seed, Differences()), path)
+        return Traffic.of(each for each, _ in observations([path], load_mapping()))
 
 
 def seed_of(hours: float, index: int) -> int:
@@ -96,7 +103,9 @@ class Drivers:
 
     def _of(self, environment: Any) -> FloatArray:
         paths = replace(self._paths, environment=environment).run(PILOT_PATHS, N_PATHS, Progress())
-        return np.array([np.where((paths.crashes >> bit) & 1 == 1, paths.mass, 0.0).sum() for bit in self._bits]) / N_PATHS
+        return (
+            np.array([np.where((paths.crashes >> bit) & 1 == 1, paths.mass, 0.0).sum() for bit in self._bits]) / N_PATHS
+        )
 
 
 # -- numbers of data sets, made comparable --
@@ -121,5 +130,256 @@ def log_hazard(rows: pd.DataFrame, state: Sequence[float]) -> FloatArray:
 
 
 def _listed(rows: pd.DataFrame, name: str) -> FloatArray:
-    columns = sorted((each for each in rows if each.startswith(f"{name}__")), key=lambda each: int(each.rsplit("__")[-1]))
+    columns = sorted(
+        (each for each in rows if each.startswith(f"{name}__")), key=lambda each: int(each.rsplit("__")[-1])
+    )
     return rows[columns].to_numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class Surrogate:
+    """Log crash rates of the drivers (d) near some numbers: Σ shares · ``masses`` · exp(gradient · (θ - middle)).
+
+    ``names`` (p,) are numbers that enter as they are; the hazard enters by its `effects`. ``gradient`` is
+    (d, p + effects), ``middle`` as long, ``masses`` (d, steps) the rates that a share of 1 would give each step.
+    """
+
+    names: tuple[str, ...]
+    middle: FloatArray
+    gradient: FloatArray
+    masses: FloatArray
+
+    def log_rates(self, rows: pd.DataFrame) -> FloatArray:
+        """Of rows of numbers: (n, d)."""
+        numbers = np.hstack([rows[list(self.names)].to_numpy(), effects(rows)])
+        return np.log(shares(rows) @ self.masses.T) + (numbers - self.middle) @ self.gradient.T
+
+
+def shares(rows: pd.DataFrame) -> FloatArray:
+    """Shares (n, steps) of lane changes that are carried out."""
+    return _listed(rows, "acceptance_steps__share")
+
+
+def surrogate(drivers: Drivers, sets: pd.DataFrame, progress: Progress) -> Surrogate:
+    """Enumerate around the mean of some estimates, by their standard deviations."""
+    middle = on_common_knots(sets)
+    base = parameters_of(middle)
+    hazards = [f"hazard_table__{axis}_log__{i}" for axis, knots in KNOTS.items() for i in range(knots.size)]
+    names = tuple(name for name in fitted_numbers(sets) if not name.startswith(("hazard_table", "acceptance_steps")))
+    spread = np.append(sets[list(names)].std().to_numpy(), np.full(len(hazards), 0.2))
+    numbers = base.values()
+    progress.stage("gradient of crash rates", len(spread) + N_STEPS)
+
+    def moved(name: str, by: float) -> FloatArray:
+        return drivers.rates(base.with_values({name: numbers[name] + by}))
+
+    gradient = []
+    for name, step in zip([*names, *hazards], spread.tolist(), strict=True):
+        up, down = moved(name, step), moved(name, -step)
+        gradient.append((np.log(up) - np.log(down)) / (2.0 * step))
+        progress.advance(1)
+    masses = []
+    for i in range(N_STEPS):
+        name = f"acceptance_steps__share__{i}"
+        half = -0.5 * numbers[name]
+        masses.append((drivers.rates(base) - moved(name, half)) / -half)
+        progress.advance(1)
+    place = np.append([numbers[name] for name in names], [numbers[name] for name in hazards])
+    return Surrogate(names, place, np.array(gradient).T, np.array(masses).T)
+
+
+def parameters_of(row: Mapping[str, Any]) -> EnvironmentParameters:
+    """Environment of a row of numbers."""
+    base = truth()
+    content = base.model_dump(exclude_none=True)
+    for section, names in REPLACED.items():
+        content[section] = {}
+        for name in names:
+            content["cut_in"].pop(name, None)
+    for path, value in row.items():
+        section, name, *place = path.split("__")
+        if section == SEEN:
+            continue
+        if place:
+            content[section].setdefault(name, []).append({"value": float(value), "source": "fitted"})
+        elif name not in FIXED:
+            content[section][name] = {"value": float(value), "source": "fitted"}
+    return EnvironmentParameters.model_validate(content)
+
+
+def on_common_knots(rows: pd.DataFrame) -> dict[str, float]:
+    """The mean of rows of numbers, with hazards at `KNOTS`."""
+    mean = rows[[name for name in rows if not name.startswith("hazard_table__")]].mean().to_dict()
+    logs = np.split(effects(rows).mean(axis=0), np.cumsum([knots.size for knots in KNOTS.values()])[:-1])
+    for (axis, knots), log in zip(KNOTS.items(), logs, strict=True):
+        mean |= {f"hazard_table__{HAZARD[axis]}__{i}": value for i, value in enumerate(knots.tolist())}
+        mean |= {f"hazard_table__{axis}_log__{i}": value for i, value in enumerate(log.tolist())}
+    return mean
+
+
+# -- data sets --
+
+
+def fit_data_set(hours: float, seed: int, n_replicates: int) -> pd.DataFrame:
+    """Rows of numbers by kind (index): the estimate, standard errors (NaN where none), replicates."""
+    traffic = traffic_of(hours, seed)
+    fit = fit_traffic(traffic, load_parameters(FITTED), FITTED.parameters, f"seed {seed}", Progress())
+    drawn = replicates(fit, n_replicates, seed, Progress())
+    numbers = fit.environment.values()
+    errors = {key: value for law in fit.laws.values() for key, value in law.std_error.items() if value > 0.0}
+    seen = {f"{SEEN}__{step}": count for step, count in enumerate(fit.acceptance.events.tolist())}
+    numbers |= seen
+    rows = pd.DataFrame([numbers, {**dict.fromkeys(numbers, np.nan), **errors}, *[numbers] * n_replicates])
+    rows.loc[2:, list(drawn)] = np.column_stack(list(drawn.values()))
+    rows.index = pd.Index([ESTIMATE, ERROR, *[REPLICATE] * n_replicates], name="kind")
+    return rows
+
+
+def fit_data_sets(folder: Path, hours: float, n: int, n_replicates: int, progress: Progress) -> None:
+    """Fit data sets that the folder does not have yet."""
+    progress.stage(f"data sets of {hours:g} vehicle-hours", n)
+    for index in range(n):
+        path = _kept(folder, hours, index)
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            rows = fit_data_set(hours, seed_of(hours, index), n_replicates)
+            write_atomically(path, rows.reset_index().to_parquet)
+        progress.advance(1)
+
+
+def _kept(folder: Path, hours: float, index: int) -> Path:
+    return folder / f"{hours:g}h" / f"{index:04d}.parquet"
+
+
+def kept_data_sets(folder: Path, hours: float) -> list[pd.DataFrame]:
+    """What the folder has."""
+    return [pd.read_parquet(path).set_index("kind") for path in sorted((folder / f"{hours:g}h").glob("*.parquet"))]
+
+
+# -- judgement --
+
+
+def coverage(covered: BoolArray) -> dict[str, Any]:
+    """Share of intervals (n,) that hold what they should, its 95 % interval, and the p-value of so few at `CONFIDENCE`."""
+    n, k = covered.size, int(covered.sum())
+    interval = stats.binomtest(k, n).proportion_ci(0.95)
+    p_value = float(stats.binom.cdf(k, n, CONFIDENCE))
+    return {"n": n, "coverage": k / n, "low": float(interval.low), "high": float(interval.high), "p_value": p_value}
+
+
+def _within(values: pd.DataFrame | FloatArray, true: Any) -> BoolArray:
+    """Whether truths are between the ends of replicates' intervals."""
+    low, high = np.quantile(np.asarray(values), [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], axis=0)
+    return np.asarray((low <= true) & (true <= high))
+
+
+def fitted_numbers(sets: pd.DataFrame) -> list[str]:
+    """Names of numbers that differ between data sets, but for knots."""
+    others = SEEN, *(f"hazard_table__{name}__" for name in HAZARD.values())
+    return [name for name in sets if not name.startswith(others) and sets[name].std() > 0.0]
+
+
+def judge_numbers(
+    sets: Sequence[pd.DataFrame], true: Mapping[str, float], mean: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    """Of each number: how often intervals hold the environment's (None for tables), and that of the mean law."""
+    z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2))
+    estimates = pd.DataFrame([each.loc[ESTIMATE] for each in sets])
+    errors = pd.DataFrame([each.loc[ERROR] for each in sets])
+    judged = []
+    for name in fitted_numbers(estimates):
+        if name.startswith("hazard_table"):
+            continue
+        told = errors[name].notna().to_numpy()
+        aims = {"environment": true.get(name), "mean_law": mean[name]}
+        row: dict[str, Any] = {
+            "number": name,
+            **aims,
+            "mean": float(estimates[name].mean()),
+            "spread": float(estimates[name].std()),
+            "std_error": float(errors[name].median()),
+            "kept": int((~told).sum()),
+        }
+        for aim, value in aims.items():
+            if value is None:
+                continue
+            if told.any():
+                off = (estimates[name] - value).abs().to_numpy()[told] / errors[name].to_numpy()[told]
+                row[f"{aim}_by_se"] = coverage(off <= z)
+            of_replicates = [_within(each.loc[REPLICATE, name], value) for each in sets]
+            row[f"{aim}_by_replicates"] = coverage(np.array(of_replicates)[told | ~told.any()])
+        judged.append(row)
+    for state in STATES:
+        values = [log_hazard(each.loc[[ESTIMATE, REPLICATE]], state) for each in sets]
+        aims = {
+            "mean_law": float(log_hazard(pd.DataFrame([mean]), state)[0]),
+            "environment": float(np.log(true_hazard(state))),
+        }
+        first = np.array([each[0] for each in values])
+        row = {"number": f"log-hazard at {state}", **aims, "mean": float(first.mean()), "spread": float(first.std())}
+        for aim, value in aims.items():
+            row[f"{aim}_by_replicates"] = coverage(np.array([_within(each[1:], value) for each in values]))
+        judged.append(row)
+    return judged
+
+
+def true_hazard(state: Sequence[float]) -> float:
+    """Rate (1/s) at which lane changes are wished in the environment."""
+    environment = load_environment(TRAFFIC, truth())
+    pmf, scale, chance = np.empty((2, 1, N_ACCELERATIONS)), np.empty((2, 1)), np.empty(1)
+    evaluate_laws(np.array([state]), np.empty((0, 2)), unboxed(environment), pmf, scale, chance, np.empty(0))
+    return float(-np.log1p(-chance[0]))
+
+
+def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray) -> dict[str, Any]:
+    """How often the replicates' intervals hold the crash rates of the environment, and ratios to the first driver."""
+    logs = [near.log_rates(each.loc[[ESTIMATE, REPLICATE]]) for each in sets]
+    judged: dict[str, Any] = {}
+    ratio = np.array([each - each[:, :1] for each in logs])
+    for d, driver in enumerate(DRIVERS):
+        for of, values, aim in (
+            ("rate", np.array(logs)[:, :, d], np.log(true[d])),
+            (f"ratio to {DRIVERS[0]}", ratio[:, :, d], np.log(true[d] / true[0])),
+        ):
+            if of != "rate" and d == 0:
+                continue
+            low, high = np.quantile(values[:, 1:], [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], axis=1)
+            judged[f"{driver}: {of}"] = {
+                "true": float(np.exp(aim)),
+                "interval": coverage((low <= aim) & (aim <= high)),
+                "upper_limit": coverage(aim <= high),
+                "median_estimate_over_true": float(np.exp(np.median(values[:, 0]) - aim)),
+                "median_factor": float(np.exp(np.median(0.5 * (high - low)))),
+            }
+    return judged
+
+
+def check(sets: Sequence[pd.DataFrame], near: Surrogate, drivers: Drivers, n: int) -> dict[str, float]:
+    """How far log rates of a few replicates of different sets come out wrong: root mean square, and most, by driver."""
+    off = []
+    for each in sets[:: max(len(sets) // n, 1)][:n]:
+        row = each.loc[[REPLICATE]].iloc[[0]]
+        off.append(near.log_rates(row)[0] - np.log(drivers.rates(parameters_of(row.iloc[0].to_dict()))))
+    return {"n": len(off), "root_mean_square": float(np.sqrt(np.square(off).mean())), "most": float(np.abs(off).max())}
+
+
+def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: int = 20) -> dict[str, Any]:
+    """All of it: the mean law is that of the largest sets."""
+    sets = {each: kept_data_sets(folder, each) for each in sorted(hours)}
+    largest = pd.DataFrame([each.loc[ESTIMATE] for each in sets[max(sets)]])
+    drivers, mean = Drivers(), on_common_knots(largest)
+    near = surrogate(drivers, largest, progress)
+    found: dict[str, Any] = {
+        "traffic": f"{TRAFFIC.parameters}, ignore_share {IGNORE_SHARE:g}, level {TRAFFIC.lane_change_level:g}"
+    }
+    of_mean = drivers.rates(parameters_of(mean)) / drivers.true
+    found["mean_law_over_environment"] = dict(zip(DRIVERS, of_mean.tolist(), strict=True))
+    for each, of in sets.items():
+        found[f"{each:g} vehicle-hours"] = {
+            "data_sets": len(of),
+            "without_an_event": [sum(of_set[f"{SEEN}__{i}"].iloc[0] == 0 for of_set in of) for i in range(N_STEPS)],
+            "rates": judge_rates(of, near, drivers.true),
+            "gradient": check(of, near, drivers, n_checked),
+            "numbers": judge_numbers(of, truth().values(), mean),
+        }
+    return found
