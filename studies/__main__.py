@@ -291,6 +291,38 @@ def _figure_row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @cli.command(
+    short_help="Fit simulated trajectories again and again: are errors and replicates true?",
+    epilog=examples(
+        f"{_ME} roundtrip --out runs/roundtrip                     # two hours on one core",
+        f"{_ME} roundtrip --out runs/quick --data-sets 20 --hours 10",
+    ),
+    context_settings={"show_default": True},
+)
+@_out_option
+@click.option("--hours", "hours", type=click.FloatRange(5), multiple=True, default=(10.0, 100.0), help="Of a data set.")
+@click.option("--data-sets", "n", type=click.IntRange(min=10), default=200, help="Of each size.")
+@click.option("--replicates", "n_replicates", type=click.IntRange(min=20), default=100, help="Of each data set.")
+@quiet_option
+def roundtrip(folder: Path, *, hours: Sequence[float], n: int, n_replicates: int, quiet: bool) -> None:
+    """Say how often the errors of `harness fit` hold what was put in: each fitted number, and crash rates.
+
+    Trajectories are those of `trajectories`, with vehicles that differ. Sets of 10 vehicle-hours share no recording,
+    larger ones are drawn from the same recordings. A second run goes on where the first was killed. The folder
+    receives roundtrip.json.
+    """
+    from harness.records.folder import write_json  # noqa: PLC0415 - keeps --help fast
+    from studies.roundtrip import fit_data_sets, judge, table  # noqa: PLC0415
+
+    with (bar := shown_progress(quiet=quiet)):
+        for each in hours:
+            fit_data_sets(folder, each, n, n_replicates, bar)
+        found = judge(folder, hours, bar)
+    write_json(folder / "roundtrip.json", found)
+    for words, rows in table(found).items():
+        print_table(words, rows)
+
+
+@cli.command(
     short_help="Put environments beside the motorway trajectories of the package tasi.",
     epilog=examples(
         f"pip install tasi==0.15.4 && {_ME} motorway --out runs/motorway",

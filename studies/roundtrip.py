@@ -14,8 +14,9 @@ seen in sets that are enumerated.
 
 from __future__ import annotations
 
+import functools
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,9 +28,10 @@ from scipy import stats
 from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
+from harness.errors import TrajectoryError
 from harness.fitting.fit import fit_traffic
 from harness.fitting.laws import Traffic
-from harness.fitting.observations import observations
+from harness.fitting.observations import Tally, observations, require_enough
 from harness.fitting.table import load_mapping
 from harness.fitting.uncertainty import replicates
 from harness.pool.build import take_aim
@@ -39,8 +41,8 @@ from harness.records.folder import write_atomically
 from harness.resolved import resolve
 from harness.traffic.loading import evaluate_laws, load_environment, load_parameters
 from harness.traffic.parameters import FIXED, REPLACED, EnvironmentParameters
-from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray
-from studies.trajectories import Differences, simulate, write
+from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray, RecordArray
+from studies.trajectories import RECORDING_H, Differences, simulate, write
 
 TRAFFIC = EnvironmentSettings(parameters="ndd-overtaking-2", lane_change_level=1000.0)
 IGNORE_SHARE = 0.1
@@ -59,6 +61,9 @@ KNOTS: dict[str, FloatArray] = {
 HAZARD = {"v": "v_mps", "r1": "r1_m", "r1dot": "r1dot_mps"}
 STATES = ((30.0, 40.0, 0.0), (25.0, 20.0, -2.0), (35.0, 60.0, 2.0), (30.0, 15.0, 0.0), (28.0, 80.0, -4.0))
 """States (v, R1, R1dot) whose hazards are judged."""
+SEED, PART_H = 10_000, 10.0
+RECORDINGS_OF_PART = round(PART_H / RECORDING_H)
+KINDS = ("free", "following", "initial", "at_risk", "leads")
 N_PATHS = 4096
 N_STEPS = 6
 
@@ -68,17 +73,51 @@ def truth() -> EnvironmentParameters:
     return load_parameters(TRAFFIC).with_values({"cut_in__ignore_share": IGNORE_SHARE})
 
 
-def traffic_of(hours: float, seed: int) -> Traffic:
-    """Observations of a data set, as the fit reads them from its file."""
+def simulated(folder: Path, n_parts: int, progress: Progress) -> Traffic:
+    """Observations of ``n_parts`` of 10 vehicle-hours, 20 recordings each, as a fit reads them from files; kept."""
+    progress.stage("trajectories", n_parts)
+    parts: list[Traffic] = []
+    for part in range(n_parts):
+        path = folder / "observations" / f"{part:04d}.npz"
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, functools.partial(_observe, part))
+        with np.load(path) as kept:
+            parts.append(Traffic(**{name: kept[name] for name in (*KINDS, "recording")}))
+        progress.advance(1)
+    vehicles = np.cumsum([0, *(part.recording.size for part in parts)])
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in KINDS}
+    for name in KINDS:
+        sizes = [getattr(part, name).size for part in parts]
+        joined[name]["vehicle"] += np.repeat(vehicles[:-1], sizes)
+    recording = np.concatenate([part.recording + RECORDINGS_OF_PART * i for i, part in enumerate(parts)])
+    return Traffic(**joined, recording=recording)
+
+
+def _observe(part: int, path: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
-        path = Path(name, "trajectories.parquet")
-        write(simulate(load_environment(TRAFFIC, truth()), hours, seed, Differences()), path)
-        return Traffic.of(each for each, _ in observations([path], load_mapping()))
+        file = Path(name, "trajectories.parquet")
+        write(simulate(load_environment(TRAFFIC, truth()), PART_H, SEED + part, Differences()), file)
+        traffic = Traffic.of(each for each, _ in observations([file], load_mapping()))
+    with path.open("wb") as out:
+        np.savez(out, recording=traffic.recording, **{kind: getattr(traffic, kind) for kind in KINDS})
 
 
-def seed_of(hours: float, index: int) -> int:
-    """Of a data set."""
-    return round(1000.0 * hours) + index
+def data_set(pool: Traffic, hours: float, index: int) -> Traffic:
+    """So many vehicle-hours of recordings: each is in one set of 10 alone, larger sets are drawn from all."""
+    n = round(hours / RECORDING_H)
+    if hours == PART_H:
+        chosen = np.arange(n) + n * index
+    else:
+        chosen = np.random.default_rng([SEED, index]).choice(int(pool.recording.max()) + 1, n, replace=False)
+    inside = np.isin(pool.recording, chosen)
+    number = np.cumsum(inside) - 1
+    kept: dict[str, RecordArray] = {}
+    for kind in KINDS:
+        rows: RecordArray = getattr(pool, kind)
+        kept[kind] = rows[inside[rows["vehicle"]]]
+        kept[kind]["vehicle"] = number[kept[kind]["vehicle"]]
+    return Traffic(**kept, recording=np.unique(pool.recording[inside], return_inverse=True)[1])
 
 
 # -- crash rates of known drivers --
@@ -130,10 +169,8 @@ def log_hazard(rows: pd.DataFrame, state: Sequence[float]) -> FloatArray:
 
 
 def _listed(rows: pd.DataFrame, name: str) -> FloatArray:
-    columns = sorted(
-        (each for each in rows if each.startswith(f"{name}__")), key=lambda each: int(each.rsplit("__")[-1])
-    )
-    return rows[columns].to_numpy()
+    places = [int(each.rsplit("__")[-1]) for each in map(str, rows) if each.startswith(f"{name}__")]
+    return rows[[f"{name}__{place}" for place in sorted(places)]].to_numpy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +219,7 @@ def surrogate(drivers: Drivers, sets: pd.DataFrame, progress: Progress) -> Surro
     for i in range(N_STEPS):
         name = f"acceptance_steps__share__{i}"
         half = -0.5 * numbers[name]
-        masses.append((drivers.rates(base) - moved(name, half)) / -half)
+        masses.append(np.maximum((drivers.rates(base) - moved(name, half)) / -half, 0.0))
         progress.advance(1)
     place = np.append([numbers[name] for name in names], [numbers[name] for name in hazards])
     return Surrogate(names, place, np.array(gradient).T, np.array(masses).T)
@@ -209,7 +246,8 @@ def parameters_of(row: Mapping[str, Any]) -> EnvironmentParameters:
 
 def on_common_knots(rows: pd.DataFrame) -> dict[str, float]:
     """The mean of rows of numbers, with hazards at `KNOTS`."""
-    mean = rows[[name for name in rows if not name.startswith("hazard_table__")]].mean().to_dict()
+    numbers = rows[[name for name in map(str, rows) if not name.startswith("hazard_table__")]]
+    mean = {str(name): float(value) for name, value in numbers.mean().items()}
     logs = np.split(effects(rows).mean(axis=0), np.cumsum([knots.size for knots in KNOTS.values()])[:-1])
     for (axis, knots), log in zip(KNOTS.items(), logs, strict=True):
         mean |= {f"hazard_table__{HAZARD[axis]}__{i}": value for i, value in enumerate(knots.tolist())}
@@ -220,30 +258,31 @@ def on_common_knots(rows: pd.DataFrame) -> dict[str, float]:
 # -- data sets --
 
 
-def fit_data_set(hours: float, seed: int, n_replicates: int) -> pd.DataFrame:
+def fit_data_set(traffic: Traffic, seed: int, n_replicates: int) -> pd.DataFrame:
     """Rows of numbers by kind (index): the estimate, standard errors (NaN where none), replicates."""
-    traffic = traffic_of(hours, seed)
-    fit = fit_traffic(traffic, load_parameters(FITTED), FITTED.parameters, f"seed {seed}", Progress())
+    fit = fit_traffic(traffic, load_parameters(FITTED), FITTED.parameters, f"data set {seed}", Progress())
     drawn = replicates(fit, n_replicates, seed, Progress())
     numbers = fit.environment.values()
     errors = {key: value for law in fit.laws.values() for key, value in law.std_error.items() if value > 0.0}
-    seen = {f"{SEEN}__{step}": count for step, count in enumerate(fit.acceptance.events.tolist())}
-    numbers |= seen
-    rows = pd.DataFrame([numbers, {**dict.fromkeys(numbers, np.nan), **errors}, *[numbers] * n_replicates])
+    numbers |= {f"{SEEN}__{step}": count for step, count in enumerate(fit.acceptance.events.tolist())}
+    rows = pd.DataFrame([numbers, {**dict.fromkeys(numbers, np.nan), **errors}, *[numbers] * n_replicates], dtype=float)
     rows.loc[2:, list(drawn)] = np.column_stack(list(drawn.values()))
     rows.index = pd.Index([ESTIMATE, ERROR, *[REPLICATE] * n_replicates], name="kind")
     return rows
 
 
 def fit_data_sets(folder: Path, hours: float, n: int, n_replicates: int, progress: Progress) -> None:
-    """Fit data sets that the folder does not have yet."""
-    progress.stage(f"data sets of {hours:g} vehicle-hours", n)
-    for index in range(n):
+    """Fit ``n`` data sets of so many vehicle-hours, those that the folder does not have yet."""
+    missing = [index for index in range(n) if not _kept(folder, hours, index).exists()]
+    if not missing:
+        return
+    pool = simulated(folder, n, progress)
+    progress.stage(f"fits of {hours:g} vehicle-hours", n, done=n - len(missing))
+    for index in missing:
         path = _kept(folder, hours, index)
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            rows = fit_data_set(hours, seed_of(hours, index), n_replicates)
-            write_atomically(path, rows.reset_index().to_parquet)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        rows = fit_data_set(data_set(pool, hours, index), index, n_replicates)
+        write_atomically(path, rows.reset_index().to_parquet)
         progress.advance(1)
 
 
@@ -260,23 +299,23 @@ def kept_data_sets(folder: Path, hours: float) -> list[pd.DataFrame]:
 
 
 def coverage(covered: BoolArray) -> dict[str, Any]:
-    """Share of intervals (n,) that hold what they should, its 95 % interval, and the p-value of so few at `CONFIDENCE`."""
+    """Share of intervals (n,) that hold what they should, its 95 % interval, and the p-value of so few."""
     n, k = covered.size, int(covered.sum())
     interval = stats.binomtest(k, n).proportion_ci(0.95)
     p_value = float(stats.binom.cdf(k, n, CONFIDENCE))
     return {"n": n, "coverage": k / n, "low": float(interval.low), "high": float(interval.high), "p_value": p_value}
 
 
-def _within(values: pd.DataFrame | FloatArray, true: Any) -> BoolArray:
+def _within(values: FloatArray, true: Any) -> BoolArray:
     """Whether truths are between the ends of replicates' intervals."""
-    low, high = np.quantile(np.asarray(values), [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], axis=0)
+    low, high = np.quantile(values, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], axis=0)
     return np.asarray((low <= true) & (true <= high))
 
 
 def fitted_numbers(sets: pd.DataFrame) -> list[str]:
     """Names of numbers that differ between data sets, but for knots."""
     others = SEEN, *(f"hazard_table__{name}__" for name in HAZARD.values())
-    return [name for name in sets if not name.startswith(others) and sets[name].std() > 0.0]
+    return [name for name in map(str, sets) if not name.startswith(others) and sets[name].std() > 0.0]
 
 
 def judge_numbers(
@@ -306,7 +345,7 @@ def judge_numbers(
             if told.any():
                 off = (estimates[name] - value).abs().to_numpy()[told] / errors[name].to_numpy()[told]
                 row[f"{aim}_by_se"] = coverage(off <= z)
-            of_replicates = [_within(each.loc[REPLICATE, name], value) for each in sets]
+            of_replicates = [_within(each.loc[[REPLICATE], name].to_numpy(), value) for each in sets]
             row[f"{aim}_by_replicates"] = coverage(np.array(of_replicates)[told | ~told.any()])
         judged.append(row)
     for state in STATES:
@@ -359,8 +398,49 @@ def check(sets: Sequence[pd.DataFrame], near: Surrogate, drivers: Drivers, n: in
     off = []
     for each in sets[:: max(len(sets) // n, 1)][:n]:
         row = each.loc[[REPLICATE]].iloc[[0]]
-        off.append(near.log_rates(row)[0] - np.log(drivers.rates(parameters_of(row.iloc[0].to_dict()))))
+        off.append(
+            near.log_rates(row)[0]
+            - np.log(drivers.rates(parameters_of({str(name): value for name, value in row.iloc[0].items()})))
+        )
     return {"n": len(off), "root_mean_square": float(np.sqrt(np.square(off).mean())), "most": float(np.abs(off).max())}
+
+
+def _shifted(table: pd.DataFrame, column: str, rows: int) -> pd.DataFrame:
+    moved = table.groupby(["recording_id", "vehicle_id"])[column].shift(rows)
+    return table.assign(**{column: moved}).dropna()
+
+
+FEET = 1.0 / 0.3048
+WRONG: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
+    "all in feet": lambda of: of.assign(**{name: of[name] * FEET for name in ("s_m", "speed_mps", "length_m")}),
+    "positions in feet": lambda of: of.assign(s_m=of.s_m * FEET),
+    "lengths in feet": lambda of: of.assign(length_m=of.length_m * FEET),
+    "speeds in km/h": lambda of: of.assign(speed_mps=of.speed_mps * 3.6),
+    "times in frames": lambda of: of.assign(time_s=(10.0 * of.time_s).round()),
+    "lanes mirrored": lambda of: of.assign(lane=1 - of.lane),
+    "speeds of 0.5 s before": lambda of: _shifted(of, "speed_mps", 5),
+    "lanes of 3 s before": lambda of: _shifted(of, "lane", 30),
+    "positions that fall": lambda of: of.assign(s_m=-of.s_m),
+    "widths for lengths": lambda of: of.assign(length_m=1.9),
+    "front bumpers for centres": lambda of: of.assign(s_m=of.s_m + 0.5 * of.length_m),
+}
+"""Ways in which a table can be misread."""
+
+
+def misread() -> dict[str, str]:
+    """What is said of tables that are read in a wrong way; of front bumpers nothing, where lengths are alike."""
+    table, found = simulate(load_environment(TRAFFIC, truth()), PART_H, SEED, Differences()), dict[str, str]()
+    for name, wrong in WRONG.items():
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "trajectories.parquet")
+            write(wrong(table), path)
+            try:
+                tally = functools.reduce(Tally.plus, (each.tally for each, _ in observations([path], load_mapping())))
+                require_enough(tally, path.name)
+                found[name] = "not noticed"
+            except TrajectoryError as error:
+                found[name] = error.found
+    return found
 
 
 def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: int = 20) -> dict[str, Any]:
@@ -373,13 +453,53 @@ def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: i
         "traffic": f"{TRAFFIC.parameters}, ignore_share {IGNORE_SHARE:g}, level {TRAFFIC.lane_change_level:g}"
     }
     of_mean = drivers.rates(parameters_of(mean)) / drivers.true
+    found["misread"] = misread()
     found["mean_law_over_environment"] = dict(zip(DRIVERS, of_mean.tolist(), strict=True))
     for each, of in sets.items():
         found[f"{each:g} vehicle-hours"] = {
             "data_sets": len(of),
-            "without_an_event": [sum(of_set[f"{SEEN}__{i}"].iloc[0] == 0 for of_set in of) for i in range(N_STEPS)],
+            "without_an_event": [int(sum(one[f"{SEEN}__{i}"].iloc[0] == 0 for one in of)) for i in range(N_STEPS)],
             "rates": judge_rates(of, near, drivers.true),
             "gradient": check(of, near, drivers, n_checked),
             "numbers": judge_numbers(of, truth().values(), mean),
         }
     return found
+
+
+def table(found: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """What was judged, as tables by their titles."""
+    tables: dict[str, list[dict[str, Any]]] = {
+        "Misread tables": [{"mapping": name, "found": words} for name, words in found["misread"].items()]
+    }
+    for size, of in found.items():
+        if not size.endswith(" vehicle-hours"):
+            continue
+        tables[f"Crash rates, {of['data_sets']} sets of {size}"] = [
+            {
+                "of": name,
+                "estimate / true": f"{rate['median_estimate_over_true']:.3g}",
+                "interval × ÷": f"{rate['median_factor']:.3g}",
+                "coverage": _shown(rate["interval"]),
+                "of upper limit": _shown(rate["upper_limit"]),
+            }
+            for name, rate in of["rates"].items()
+        ]
+        tables[f"Numbers, {size}"] = [
+            {
+                "number": row["number"],
+                "environment": f"{row['environment']:.4g}" if row.get("environment") is not None else "",
+                "mean": f"{row['mean']:.4g}",
+                "spread": f"{row['spread']:.2g}",
+                "std error": f"{row['std_error']:.2g}" if "std_error" in row else "",
+                **{aim: _shown(row[key]) if (key := f"{aim}_by_replicates") in row else "" for aim in AIMS},
+            }
+            for row in of["numbers"]
+        ]
+    return tables
+
+
+AIMS = "environment", "mean_law"
+
+
+def _shown(of: Mapping[str, float]) -> str:
+    return f"{of['coverage']:.3f} ({of['low']:.3f} … {of['high']:.3f})"

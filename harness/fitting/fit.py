@@ -31,7 +31,7 @@ from harness.traffic.loading import load_environment, require_sound_laws
 from harness.traffic.parameters import REPLACED, EnvironmentParameters
 from harness.vocabulary import FloatArray
 
-HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0)
+HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)
 """Degrees of freedom of R1dot that are tried until LV keeps within what SUMO's lanes allow; fitted at first."""
 DIGITS = 6
 _WHAT = {
@@ -153,6 +153,8 @@ def _environment(
                 tables[section].setdefault(key, []).append(number)
             elif se > 0.0:
                 content[section][key] = number
+            elif number["value"] != _rounded(content[section][key]["value"]):
+                content[section][key] = {"value": number["value"], "source": "assumed"}  # R1dot's tails
     if "lead" in laws:
         content["lateral"]["longest_lead_s"].pop("note", None)  # it says what share is cut off in the base
     edges = [{"value": edge, "source": "assumed"} for edge in TTC_EDGES_S.tolist()]
