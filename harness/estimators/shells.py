@@ -293,10 +293,10 @@ class Shells:
         return self._limits(self._design.n_within(statement), level)
 
     @property
-    def first_reference(self) -> str | None:
-        """The first reference driver of the library that crashes at all; None without one."""
-        rates = zip(self._design.references, self._design.reference_rate, strict=True)
-        return next((each.name for each, rate in rates if rate > 0.0), None)
+    def first_reference(self) -> tuple[str, float] | None:
+        """The first reference driver of the library that crashes at all, and its crash rate; None without one."""
+        rates = zip(self._design.references, self._design.reference_rate.tolist(), strict=True)
+        return next(((each.name, rate) for each, rate in rates if rate > 0.0), None)
 
     def expected(self, limit: float, driver: str | None, statement: str) -> float:
         """Crashes that these tests of a statement would have brought at a limit, spread evenly over its strata.

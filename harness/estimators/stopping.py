@@ -300,9 +300,14 @@ class RoundRule(Rule):
 
     def _below(self, seen: Shells) -> Decision | None:
         """That the rate is below the asked multiple of a reference driver's, at the level of decisions."""
-        if self._below_reference is None or self._target is None or (driver := seen.first_reference) is None:
+        limit, first = self._below_reference, seen.first_reference
+        if limit is None or self._target is None or first is None:
             return None
-        found = self._beside(seen, self._below_reference, driver)
+        driver, rate = first
+        # Limits of a ratio take a hundred times as long as those of a rate: most looks are far from an end.
+        if seen.limits_of(self._statement, Level.two_sided(self._confidence)).high > 2.0 * limit * rate:
+            return None
+        found = self._beside(seen, limit, driver)
         return found if found.verdict == "accepted" else None
 
     def _beside(self, seen: Shells, limit: float, driver: str | None) -> Decision:
