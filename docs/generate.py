@@ -275,6 +275,34 @@ def decisions(name: str = "gate") -> str:
     )
 
 
+def beside_table(name: str) -> str:
+    """Each vehicle beside the reference driver: what a run says, how often that holds, when it is decided; command."""
+    content = _result(name)
+    of_experiment = content["experiment"]
+    driver, soon = of_experiment["beside"], of_experiment["budgets"][0]
+    head = (
+        *("vehicle", f"times `{driver}`", "a run says (medians)", "tests", "holds: rate, ratio"),
+        *("decided after", f"within {soon:,}", "wrongly"),
+    )
+    rows = []
+    for vehicle, of in _by_result(content["judgements"]).items():
+        ratio, (early, late) = of[f"ratio to {driver}"], (of[key] for key in of if key.startswith("limit "))
+        low, high = (_two_digits_of(ratio[end]) for end in ("low_median", "high_median"))
+        after = f"{late['tests_median']:,.0f} tests" if late["reached"] > 0.5 else "–"
+        rows.append(
+            (
+                *(vehicle, _two_digits_of(ratio["truth"]), f"{low} to {high}" if float(low) else f"below {high}"),
+                *(f"{ratio['tests_median']:,.0f}", f"{of['shells']['coverage']:.3f}, {ratio['coverage']:.3f}"),
+                *(after, f"{early['reached']:.0%}", f"{1.0 - late['coverage']:.1%}"),
+            )
+        )
+    return f"{_table(head, rows)}\n{_command(name)} ([{name}.json](validation/{name}.json)).\n"
+
+
+def _two_digits_of(value: float) -> str:
+    return f"{value:.2g}"
+
+
 def _by_result(judgements: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for one in judgements:
@@ -383,6 +411,8 @@ PARTS: dict[str, Callable[[], str]] = {
     "coverage": coverage_table,
     "decisions": decisions,
     "decisions-beside": partial(decisions, "gate_beside"),
+    "decisions-2": partial(decisions, "gate_2"),
+    "beside": partial(beside_table, "traffic_2"),
 }
 """All generated parts by name."""
 

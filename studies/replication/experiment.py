@@ -34,7 +34,7 @@ class SuperPopulation(Section):
         65_536,
         ge=0,
         le=1 << 22,
-        description="independent paths that the truth is from; 0, of vehicles that act before: that of the former",
+        description="independent paths that the truth is from; 0, of single vehicles under shells: those of the pools",
     )
     pool_paths: Whole = Field(16_384, ge=256, le=1 << 20, description="paths of each pool; smoke.yaml has 32,768")
 

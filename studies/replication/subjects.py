@@ -86,10 +86,13 @@ def _holding(experiment: Experiment, progress: Progress) -> Iterator[Tested]:
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     drivers = Drivers.of(library, experiment.holding, see_onset=environment.lateral.present)
     together = [{pair.a, pair.b} & {*drivers.vehicles} for pair in pairs.values()]
+    enumerated = partial(enumerate_paths, environment, drivers, experiment.seed, size.paths, progress)
+    if campaign.testing.method == "shells" and not (pairs or size.reference_paths):
+        yield from _single(experiment, library, drivers, None, enumerated())
+        return
     truths = Truths(environment, drivers, experiment.seed + 1, size.reference_paths, progress, together)
     if campaign.testing.method == "shells":
-        pools = enumerate_paths(environment, drivers, experiment.seed, size.paths, progress)
-        yield from (_pairs if pairs else _single)(experiment, library, drivers, truths, pools)
+        yield from (_pairs if pairs else _single)(experiment, library, drivers, truths, enumerated())
         return
     for name in experiment.holding:
         tested = experiment.subject(name)
@@ -165,14 +168,15 @@ def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:
 
 
 def _single(
-    experiment: Experiment, library: Library, drivers: Drivers, truths: Truths, pools: SuperPopulation
+    experiment: Experiment, library: Library, drivers: Drivers, truths: Truths | None, pools: SuperPopulation
 ) -> Iterator[Tested]:
-    """Each vehicle, followed by the adversaries that are made of it."""
+    """Each vehicle, followed by the adversaries that are made of it; without ``truths`` the pools' own."""
     paths = experiment.super_population.pool_paths
     for name, av in experiment.holding.items():
         crashing = pools.crash_mass(drivers.vehicles[name])
         division = Division(library, pools, [crashing], paths, limit_mps2=acceleration_limit(av))
-        yield _vehicle(experiment, name, division.of_vehicle(crashing), truths.vehicle(name))
+        own = truths.vehicle(name) if truths else _exactly(of_vehicle(pools, crashing, drivers.references))
+        yield _vehicle(experiment, name, division.of_vehicle(crashing), own)
         for made_name, made in experiment.adversaries.items():
             if made.of == name:
                 of_adversary = division.as_adversary(made, crashing)

@@ -98,16 +98,17 @@ def test_enumerated_vehicles_alone_and_compared(tmp_path, monkeypatch):
     """
     monkeypatch.setattr(run, "worker_processes", lambda workers: Here())
     found = {}
-    decided = "verdicts: [3]\nbeside: r157-cc\nbudgets: [200]"
-    for more in (decided, "pairs: {pair: {a: idm, b: hole}}"):
+    decided = "verdicts: [3]\nbeside: r157-cc\nbudgets: [200]", ["super_population.reference_paths=0"]
+    for more, overrides in (decided, ("pairs: {pair: {a: idm, b: hole}}", [])):
         (tmp_path / "x.yaml").write_text(ENUMERATED + more)
-        judgements = run.validate(load_experiment(tmp_path / "x.yaml"), tmp_path)
+        judgements = run.validate(load_experiment(tmp_path / "x.yaml", overrides), tmp_path)
         found |= {(one["subject"], one["result"]): one for one in judgements}
     assert all(one["covered"] >= 6 for one in found.values() if one["assumption_met"])
     wrong = {"shells, library", "shells, need-based", "difference, conditional"}
     assert {(one["result"], one["covered"]) for one in found.values() if not one["assumption_met"]} == {
         (w, 0) for w in wrong
     }
+    assert found["idm", "shells"]["truth"] == found["idm", "shells, upper bound"]["truth"]  # that of the pools' paths
     verdicts = {key: one for key, one in found.items() if key[1].startswith("limit ")}
     assert {name for name, _ in verdicts} == {"idm", "hole"}
     for (name, result), one in verdicts.items():
