@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,7 +102,8 @@ def fit_files(
     beside = out.with_name(f"{out.stem}.replicates.parquet")
     shown = out.with_suffix(".html")
     write_atomically(beside, lambda temporary: pq.write_table(pa.table(rows), temporary, compression="zstd"))
-    write_text(shown, page(fit, tally, rows, out.name, paths))
+    noise_mps2 = math.sqrt(math.fsum(each.noise_mps2**2 for each in gathered) / len(gathered))
+    write_text(shown, page(fit, tally, noise_mps2, rows, out.name, paths))
     write_text(out, _yaml(fit, tally, paths, beside.name, mapping, read.mirror))
     return FittedFiles(out, beside, shown, fit, tally)
 

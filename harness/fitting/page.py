@@ -50,8 +50,13 @@ class Row(NamedTuple):
     away: str
 
 
-def page(fit: Fit, tally: Tally, rows: Mapping[str, FloatArray], name: str, files: Sequence[Path]) -> str:
-    """The page, self-contained; ``rows`` are the replicates, ``name`` is that of the environment's file."""
+def page(
+    fit: Fit, tally: Tally, noise_mps2: float, rows: Mapping[str, FloatArray], name: str, files: Sequence[Path]
+) -> str:
+    """The page, self-contained; ``rows`` are the replicates, ``name`` is that of the environment's file.
+
+    ``noise_mps2`` is what noise of measurement adds to the spread of accelerations.
+    """
     environment = templates()
     environment.filters.update(getmembers(numbers, isfunction))
     shown = environment.get_template("fit.html.j2").render(
@@ -63,7 +68,7 @@ def page(fit: Fit, tally: Tally, rows: Mapping[str, FloatArray], name: str, file
         plots=list(_plots(fit)),
         bins=list(_bins(fit)),
         numbers=list(_numbers(fit)),
-        kept=fit.kept,
+        noise_mps2=noise_mps2,
     )
     return printable(shown)
 
@@ -105,9 +110,8 @@ def _plots(fit: Fit) -> Iterator[Plot]:
     if panels:
         alt = "Accelerations that were seen and those of the law, their autocorrelation, and changes of speed in 5 s."
         caption = (
-            f"Left: accelerations of one second. Middle: the law draws each second anew, real drivers go on as they "
-            f"did. Right: what that makes of the change of speed in {OVER_S} s; where seen changes are larger, "
-            f"the law's LV and BV are more regular than real ones."
+            f"The law draws each second anew, real drivers go on as they did. Where the change of speed in {OVER_S} s "
+            f"that was seen is wider than the law's, its LV and BV are more regular than real ones."
         )
         yield Plot("accelerations", panels, alt, caption)
     if (lead := fit.laws.get("lead")) is not None:
@@ -121,7 +125,7 @@ def _histogram(values: FloatArray, edges: FloatArray) -> FloatArray:
 def _acceptance_plot(fit: Fit) -> Plot:
     found, edges = fit.acceptance, [0.0, *TTC_EDGES_S.tolist(), 12.0]
     lowest = 1e-3
-    y = Axis("share of wished lane changes carried out", lowest, 3.0, log=True)
+    y = Axis("share carried out", lowest, 3.0, log=True)
     panel = Panel(
         "Lane changes before somebody who closes in", Axis("time to collision, s", 0.0, 12.0), y, height=280.0
     )
@@ -233,14 +237,16 @@ def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) ->
     yield panel
 
     first = _followed(rows, OVER_S)
-    panel = Panel("", Axis("seconds later", 0.0, float(OVER_S)), Axis("autocorrelation of accelerations", -0.2, 1.0))
+    panel = Panel(
+        f"{title}, from second to second", Axis("seconds later", 0.0, float(OVER_S)), Axis("autocorrelation", -0.2, 1.0)
+    )
     acceleration = rows["acceleration_mps2"]
     lags = np.arange(OVER_S)
     if first.size > 1:
         seen = np.array([np.corrcoef(acceleration[first], acceleration[first + lag])[0, 1] for lag in lags])
         panel.add("line", "blue", lags, seen, label="seen")
         panel.add("dots", "blue", lags, seen, 3.0)
-    panel.add("line", "vermillion", [0.0, 0.0, 1.0, OVER_S], [0.0, 1.0, 0.0, 0.0], label="law")
+    panel.add("line", "vermillion", [0.0, 1.0, OVER_S], [1.0, 0.0, 0.0], label="law, but for its mean")
     yield panel
 
     random = np.random.default_rng(_SEED)
@@ -253,7 +259,7 @@ def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) ->
     seen, law = (_histogram(np.clip(each, -8.0, 8.0), ends) for each in (np.asarray(changes), drawn))
     lowest = 1e-4
     y = Axis("density", lowest, 2.0 * max(float(seen.max()), float(law.max())), log=True)
-    panel = Panel("", Axis(f"change of speed in {OVER_S} s, m/s", -8.0, 8.0), y)
+    panel = Panel(f"{title}, {OVER_S} s on end", Axis(f"change of speed in {OVER_S} s, m/s", -8.0, 8.0), y)
     panel.add(
         "boxes", "blue", ends[:-1], ends[1:], np.full(32, lowest), np.maximum(seen, lowest), opacity=0.3, label="seen"
     )
