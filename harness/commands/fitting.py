@@ -16,7 +16,7 @@ from harness.commands.printing import print_json, say
     epilog=examples(
         "harness fit trajectories.parquet --out my-traffic.yaml",
         "harness fit 01_tracks.csv 02_tracks.csv --mapping highd --out highway.yaml",
-        "harness run --set environment.parameters=my-traffic.yaml",
+        "harness run my_av.py:MyAV --set environment.parameters=my-traffic.yaml",
         "harness estimate runs/mine --environment my-traffic.yaml",
     ),
 )

@@ -14,7 +14,7 @@ from scipy import special, stats
 from harness import numbers
 from harness.campaign.files import read_model
 from harness.campaign.sections import EnvironmentSettings
-from harness.compiled import compiled_threads, unboxed
+from harness.compiled import unboxed
 from harness.errors import printable
 from harness.estimators.limits import garwood
 from harness.fitting.fit import Fit
@@ -23,11 +23,10 @@ from harness.fitting.observations import Tally
 from harness.numbers import number
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.player import templates
-from harness.traffic import laws
-from harness.traffic.laws import Environment, InitialStates
-from harness.traffic.loading import load_environment
+from harness.traffic.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
+from harness.traffic.loading import evaluate_laws, load_environment
 from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
-from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, IntArray, RecordArray, State
+from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, IntArray, RecordArray
 
 CONFIDENCE = 0.9
 SHIPPED = {"ndd-overtaking-1": "muted", "ndd-overtaking-2": "vermillion"}
@@ -198,24 +197,14 @@ def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
     return Plot("initial", panels, alt, "States behind a leader, one per vehicle and 20 s.")
 
 
-@compiled_threads
-def _pmfs(v: FloatArray, r1: FloatArray, r1dot: FloatArray, environment: Environment, out: FloatArray) -> None:
-    """Probabilities of accelerations (n, 31) in some states (n,); free driving where R1 is infinite."""
-    for i in range(v.size):
-        if math.isinf(r1[i]):
-            law = laws.free_driving(v[i], environment)
-        else:
-            law = laws.car_following(State(v[i], r1[i], r1dot[i], math.nan, math.nan), environment)
-        laws.acceleration_pmf(law, environment, out[i])
-
-
 def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) -> Iterator[Panel]:
     step = -(-rows.size // MOST_ROWS)
     some = rows[::step]
-    following = "r1_m" in (rows.dtype.names or ())
-    r1, r1dot = (some[name].copy() if following else np.full(some.size, np.inf) for name in ("r1_m", "r1dot_mps"))
-    pmf = np.empty((some.size, N_ACCELERATIONS))
-    _pmfs(some["v_mps"].copy(), r1, r1dot, unboxed(traffic), pmf)
+    names = rows.dtype.names or ()
+    states = np.column_stack([some[name] if name in names else np.zeros(some.size) for name in HAZARD_OF])
+    both, scale, wish = (np.empty((2, some.size, *shape)) for shape in ((N_ACCELERATIONS,), (), ()))
+    evaluate_laws(states, np.empty((0, 2)), unboxed(traffic), both, scale, wish[0], np.empty(0))
+    pmf = both[CAR_FOLLOWING if "r1_m" in names else FREE_DRIVING]
     law, seen = pmf.mean(axis=0), np.bincount(bins(rows["acceleration_mps2"]), minlength=N_ACCELERATIONS) / rows.size
     lowest = 10.0 ** math.floor(math.log10(1.0 / rows.size))
     a = Axis(
