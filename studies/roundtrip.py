@@ -30,7 +30,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
 from harness.errors import TrajectoryError
 from harness.fitting.fit import fit_traffic
-from harness.fitting.laws import Traffic
+from harness.fitting.laws import TTC_EDGES_S, Traffic
 from harness.fitting.observations import Tally, observations, require_enough
 from harness.fitting.table import load_mapping
 from harness.fitting.uncertainty import replicates
@@ -49,6 +49,8 @@ IGNORE_SHARE = 0.1
 FITTED = EnvironmentSettings(parameters="ndd-overtaking-2")
 DRIVERS = ("r157-cc", "late-500ms", "late-1s")
 CONFIDENCE = 0.9
+ENDS = 0.05, 0.95
+"""Of replicates: their k-th of n is taken as the k/(n + 1) quantile, for which one more replicate falls between."""
 ESTIMATE, ERROR, REPLICATE = "estimate", "std_error", "replicate"
 SEEN = "seen"
 """Lane changes of each step of acceptance are kept beside numbers."""
@@ -308,21 +310,21 @@ def coverage(covered: BoolArray) -> dict[str, Any]:
 
 def _within(values: FloatArray, true: Any) -> BoolArray:
     """Whether truths are between the ends of replicates' intervals."""
-    low, high = np.quantile(values, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], axis=0)
+    low, high = np.quantile(values, ENDS, axis=0, method="weibull")
     return np.asarray((low <= true) & (true <= high))
 
 
 def fitted_numbers(sets: pd.DataFrame) -> list[str]:
     """Names of numbers that differ between data sets, but for knots."""
     others = SEEN, *(f"hazard_table__{name}__" for name in HAZARD.values())
-    return [name for name in map(str, sets) if not name.startswith(others) and sets[name].std() > 0.0]
+    return [name for name in map(str, sets) if not name.startswith(others) and sets[name].std() > 1e-9]
 
 
 def judge_numbers(
     sets: Sequence[pd.DataFrame], true: Mapping[str, float], mean: Mapping[str, float]
 ) -> list[dict[str, Any]]:
     """Of each number: how often intervals hold the environment's (None for tables), and that of the mean law."""
-    z = float(stats.norm.ppf(0.5 + CONFIDENCE / 2))
+    z = float(stats.norm.ppf(ENDS[1]))
     estimates = pd.DataFrame([each.loc[ESTIMATE] for each in sets])
     errors = pd.DataFrame([each.loc[ERROR] for each in sets])
     judged = []
@@ -370,6 +372,20 @@ def true_hazard(state: Sequence[float]) -> float:
     return float(-np.log1p(-chance[0]))
 
 
+def true_shares(pool: Traffic) -> dict[str, float]:
+    """Share that the environment accepts of the lane changes that are wished in each step, in the moments at risk."""
+    risk = pool.at_risk
+    nobody = ~np.isfinite(risk["r2_m"])
+    states = np.column_stack([risk[name] for name in HAZARD.values()])
+    behind = np.column_stack([np.where(nobody, 1.0, risk[name]) for name in ("r2_m", "r2dot_mps")])
+    pmf, scale = np.empty((2, len(risk), N_ACCELERATIONS)), np.empty((2, len(risk)))
+    chance, accepted = np.empty((2, len(risk)))
+    evaluate_laws(states, behind, unboxed(load_environment(TRAFFIC, truth())), pmf, scale, chance, accepted)
+    wished, step = chance * risk["duration_s"], np.searchsorted(TTC_EDGES_S, risk["ttc_s"], side="right")
+    all_wished, done = (np.bincount(step, each, N_STEPS) for each in (wished, wished * accepted))
+    return {f"acceptance_steps__share__{i}": value for i, value in enumerate((done / all_wished).tolist())}
+
+
 def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray) -> dict[str, Any]:
     """How often the replicates' intervals hold the crash rates of the environment, and ratios to the first driver."""
     logs = [near.log_rates(each.loc[[ESTIMATE, REPLICATE]]) for each in sets]
@@ -382,7 +398,7 @@ def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray)
         ):
             if of != "rate" and d == 0:
                 continue
-            low, high = np.quantile(values[:, 1:], [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2], axis=1)
+            low, high = np.quantile(values[:, 1:], ENDS, axis=1, method="weibull")
             judged[f"{driver}: {of}"] = {
                 "true": float(np.exp(aim)),
                 "interval": coverage((low <= aim) & (aim <= high)),
@@ -449,6 +465,7 @@ def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: i
     largest = pd.DataFrame([each.loc[ESTIMATE] for each in sets[max(sets)]])
     drivers, mean = Drivers(), on_common_knots(largest)
     near = surrogate(drivers, largest, progress)
+    true = truth().values() | true_shares(simulated(folder, 1, progress))
     found: dict[str, Any] = {
         "traffic": f"{TRAFFIC.parameters}, ignore_share {IGNORE_SHARE:g}, level {TRAFFIC.lane_change_level:g}"
     }
@@ -461,7 +478,7 @@ def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: i
             "without_an_event": [int(sum(one[f"{SEEN}__{i}"].iloc[0] == 0 for one in of)) for i in range(N_STEPS)],
             "rates": judge_rates(of, near, drivers.true),
             "gradient": check(of, near, drivers, n_checked),
-            "numbers": judge_numbers(of, truth().values(), mean),
+            "numbers": judge_numbers(of, true, mean),
         }
     return found
 
