@@ -3,7 +3,7 @@
     python -m benchmarks.lateral_rates                          the table, some minutes
     python -m benchmarks.lateral_rates --paths 65536 --plot docs/images/lateral-ratio.png
 
-The same numbers, one lead at a time, to a relative error: harness pool scenarios/overtaking_shells.yaml
+The same numbers, one lead at a time, to a relative error: harness pool scenarios/smoke.yaml
 --set pool.library=benchmarks/lateral_rows.yaml --set environment.cut_in_lead_s=1.0
 """
 
@@ -23,9 +23,11 @@ from harness.traffic.loading import load_environment
 from harness.vehicles.library import load_library
 
 LIBRARY = Path(__file__).parent / "lateral_rows.yaml"
-PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
+PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-2"
 ENVIRONMENTS = {
-    **{f"{lead:g} s": EnvironmentSettings(parameters=PAPER, cut_in_lead_s=lead) for lead in (0.0, 0.5, 1.0, 1.5, 2.0)},
+    **{
+        f"{lead:g} s": EnvironmentSettings(parameters=LATERAL, cut_in_lead_s=lead) for lead in (0.0, 0.5, 1.0, 1.5, 2.0)
+    },
     "log-normal": EnvironmentSettings(parameters=LATERAL),
     "one step": EnvironmentSettings(parameters=PAPER),
 }
@@ -78,6 +80,9 @@ def plot(found: dict[str, tuple[np.ndarray, np.ndarray]], names: list[str], file
             axes.annotate(f"{value:.2g}", (value, place + shift), **where)
     axes.axvline(1.0, color="#444444", linewidth=0.9, linestyle=(0, (4, 3)))
     axes.set_xscale("log")
+    axes.set_xlim(0.1, 2.0)
+    axes.set_xticks(ticks := [0.1, 0.2, 0.5, 1.0, 2.0], [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
     axes.set_yticks(range(len(COMPARED)), list(COMPARED.values()))
     axes.set_ylim(len(COMPARED) - 0.4, -0.6)
     axes.set_xlabel("crash rate over that of the competent driver")
