@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from harness.fitting.fit import HEAVIEST_TAILS, fit_traffic
@@ -10,7 +12,25 @@ from harness.fitting.observations import observations
 from harness.fitting.table import load_mapping
 from harness.progress import Progress
 from harness.traffic.loading import load_environment, load_parameters
-from studies.roundtrip import FITTED, TRAFFIC
+from studies.roundtrip import (
+    ESTIMATE,
+    FITTED,
+    REPLICATE,
+    STATES,
+    TRAFFIC,
+    coverage,
+    data_set,
+    fit_data_sets,
+    judge_numbers,
+    kept_data_sets,
+    log_hazard,
+    on_common_knots,
+    parameters_of,
+    simulated,
+    true_hazard,
+    true_shares,
+    truth,
+)
 from studies.trajectories import simulate, write
 
 
@@ -25,3 +45,48 @@ def test_speed_differences_as_wide_as_on_motorways_are_fitted_with_lighter_tails
     df = fit.environment.values()["initial_state__r1dot_df"]
     assert df in HEAVIEST_TAILS[2:]
     assert df == pytest.approx(fit.laws["rate"].estimate["initial_state__r1dot_df"])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One data set of 10 vehicle-hours."""
+    made = tmp_path_factory.mktemp("roundtrip")
+    fit_data_sets(made, 10.0, 1, 40, Progress())
+    return made
+
+
+def test_a_data_set_is_fitted_once_and_near_what_was_put_in(folder: Path) -> None:
+    fit_data_sets(folder, 10.0, 1, 40, Progress())
+    (rows,) = kept_data_sets(folder, 10.0)
+    assert rows.index.value_counts()[REPLICATE] == 40
+    estimate = rows.loc[[ESTIMATE]]
+    for state in STATES:  # within four standard errors, which are 0.2 to 0.5
+        off = log_hazard(estimate, state)[0] - np.log(true_hazard(state))
+        assert abs(off) < 4.0 * log_hazard(rows.loc[[REPLICATE]], state).std()
+    mean = on_common_knots(estimate)
+    assert log_hazard(pd.DataFrame([mean]), (30.0, 30.0, -2.0)) == pytest.approx(
+        log_hazard(estimate, (30, 30, -2)), abs=0.1
+    )
+    kept = parameters_of({str(name): value for name, value in estimate.iloc[0].items()})
+    assert kept.values() == pytest.approx({name: estimate[name].iloc[0] for name in kept.values()})
+    judged = {row["number"]: row for row in judge_numbers([rows, rows * 1.5], truth().values(), mean)}
+    gap = judged["car_following__gain_rate_per_s"]["mean_law_by_se"]
+    assert (gap["n"], gap["coverage"]) == (2, 0.5)  # the second set is off by half
+
+
+def test_sets_of_a_part_share_no_recording_and_shares_are_those_put_in(folder: Path) -> None:
+    pool = simulated(folder, 1, Progress())
+    assert data_set(pool, 10.0, 0).at_risk.size == pool.at_risk.size
+    small = data_set(pool, 5.0, 3)
+    assert np.unique(small.recording).size == 10
+    found = list(true_shares(pool).values())
+    assert found[:3] == pytest.approx([0.1] * 3, abs=0.01)
+    assert found[3] < found[4] < found[5]
+    assert found[5] == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("n_covered", "refused"), [(200, False), (180, False), (160, True)])
+def test_coverage_is_too_low_where_chance_does_not_explain_it(n_covered: int, refused: bool) -> None:
+    found = coverage(np.arange(200) < n_covered)
+    assert found["coverage"] == n_covered / 200
+    assert (found["p_value"] < 0.001) == refused
