@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg, optimize, sparse, special
+from scipy import linalg, sparse, special
 
 from harness.fitting.maximum import Maximum, Prior, maximise
 from harness.fitting.observations import AT_RISK, FOLLOWING, FREE, INITIAL, LEADS, Observations
@@ -40,6 +40,8 @@ SMOOTH = 1.0, 3.0
 """Standard deviations of the log-hazard's bends, as change over a quarter of the range, and of its steps [assumed]."""
 Knots = tuple[FloatArray, FloatArray, FloatArray]
 HAZARD_OF = ("v_mps", "r1_m", "r1dot_mps")
+SMALLEST_SHARE = 1e-12
+"""Of lane changes that are accepted (`harness.traffic.parameters.AcceptanceSteps`)."""
 _TINY = 1e-300
 
 
@@ -480,33 +482,27 @@ class Acceptance:
 
     @property
     def shares(self) -> FloatArray:
-        """Estimates (6,), at most 1, which do not fall as the time grows; half an event stands for none."""
-        near = accepted_shares(self.events[:-1].astype(np.float64), self.exposure[:-1])
-        return np.append(near, 1.0)
+        """Estimates (6,), at most 1: half an event stands for none, but no share above those of longer times."""
+        events, exposure = self.events[:-1], np.maximum(self.exposure[:-1], 1e-12)
+        shares = np.append(np.minimum(np.maximum(events, 0.5) / exposure, 1.0), 1.0)
+        for step in np.flatnonzero(events == 0)[::-1]:
+            shares[step] = shares[step:].min()
+        return shares
+
+    def drawn(self, theta: FloatArray, random: np.random.Generator) -> FloatArray:
+        """Shares (b, 5) that the counts leave open, of hazards with coefficients (b, p).
+
+        Drivers accept a shorter time no more often than a longer one, but draws are not bound to it: where shares are
+        the same, as those of drivers who do not look are, they would come out too small for the shortest times.
+        """
+        counts = random.gamma(self.events[:-1] + 0.5, size=(len(theta), TTC_EDGES_S.size))
+        return np.clip(counts / np.maximum(self.exposures(theta), 1e-12), SMALLEST_SHARE, 1.0)
 
     @property
     def std_errors(self) -> FloatArray:
         """Of the shares (6,), as counts vary; 0 of the last."""
         near = np.sqrt(self.events[:-1] + 0.5) / np.maximum(self.exposure[:-1], 1e-12)
         return np.append(np.minimum(near, 1.0), 0.0)
-
-
-def accepted_shares(events: FloatArray, exposure: FloatArray) -> FloatArray:
-    """Shares (…, k) of counts (…, k), at most 1, that do not fall from bin to bin.
-
-    Drivers are taken to accept a shorter time no more often than a longer one: bins that contradict it are joined.
-    """
-    weights = np.maximum(exposure, 1e-12)
-    raw = events / weights
-    rows = [
-        optimize.isotonic_regression(y, weights=w).x
-        for y, w in zip(raw.reshape(-1, raw.shape[-1]), weights.reshape(-1, raw.shape[-1]), strict=True)
-    ]
-    shares = np.array(rows).reshape(raw.shape)
-    none = shares <= 0.0
-    half = 0.5 / np.maximum((weights * none).sum(axis=-1, keepdims=True), 1e-12)
-    following = np.where(none, np.inf, shares).min(axis=-1, keepdims=True)
-    return np.minimum(np.where(none, np.minimum(half, following), shares), 1.0)
 
 
 def fit_leads(traffic: Traffic, distance_m: float, longest_s: float) -> FittedLaw | None:

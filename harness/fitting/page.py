@@ -149,9 +149,8 @@ def _acceptance_plot(fit: Fit) -> Plot:
         panel.add("line", colour, times, ignored + (1.0 - ignored) * accept, dash="4 3", label=name)
     alt = "Share of wished lane changes carried out, by time to collision with the vehicle behind, with limits."
     caption = (
-        "A lane change is wished as often as with nobody closing in. Shares do not fall as the time grows: bins that "
-        "contradict it are joined. Nearly all crashes arise below 1.5 s; where no lane change was seen there, the data "
-        "give an upper limit alone."
+        "A lane change is wished as often as with nobody closing in. Nearly all crashes arise below 1.5 s; where no "
+        "lane change was seen there, the data give an upper limit alone."
     )
     return Plot("acceptance", [panel], alt, caption)
 

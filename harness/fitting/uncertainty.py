@@ -13,7 +13,7 @@ import numpy as np
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
 from harness.fitting.fit import Fit
-from harness.fitting.laws import TTC_EDGES_S, accepted_shares
+from harness.fitting.laws import TTC_EDGES_S
 from harness.progress import Progress
 from harness.traffic.loading import load_environment, require_sound_laws
 from harness.vocabulary import FloatArray
@@ -60,7 +60,6 @@ def _draw(fit: Fit, n: int, random: np.random.Generator) -> dict[str, list[float
         values = law.values(moved)
         drawn |= {key: values[:, i].tolist() for i, key in enumerate(law.names) if law.std_error[key] > 0.0}
         if name == "hazard":
-            counts = random.gamma(fit.acceptance.events[:-1] + 0.5, size=(n, len(_SHARES)))
-            shares = accepted_shares(counts, fit.acceptance.exposures(moved))
+            shares = fit.acceptance.drawn(moved, random)
             drawn |= {key: shares[:, j].tolist() for j, key in enumerate(_SHARES)}
     return drawn

@@ -5,13 +5,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import gamma
 
 from harness.fitting.fit import HEAVIEST_TAILS, fit_traffic
-from harness.fitting.laws import Traffic
+from harness.fitting.laws import Acceptance, Traffic
 from harness.fitting.observations import observations
 from harness.fitting.table import load_mapping
 from harness.progress import Progress
 from harness.traffic.loading import load_environment, load_parameters
+from harness.vocabulary import FloatArray
 from studies.roundtrip import (
     ESTIMATE,
     FITTED,
@@ -45,6 +47,22 @@ def test_speed_differences_as_wide_as_on_motorways_are_fitted_with_lighter_tails
     df = fit.environment.values()["initial_state__r1dot_df"]
     assert df in HEAVIEST_TAILS[2:]
     assert df == pytest.approx(fit.laws["rate"].estimate["initial_state__r1dot_df"])
+
+
+def test_shares_of_one_step_do_not_lean_on_those_of_others() -> None:
+    """More lane changes at the shortest times than at the next ones are chance, where nobody looks."""
+
+    class Counted(Acceptance):
+        def exposures(self, theta: FloatArray) -> FloatArray:
+            return np.broadcast_to(self.exposure[:-1], (len(theta), 5))
+
+    nothing = np.empty((0, 0)), np.empty(0, np.int64), np.empty(0)
+    counts = Counted(np.array([9, 1, 0, 13, 84, 900]), np.array([45.0, 45.0, 44.0, 78.0, 99.0, 900.0]), *nothing)
+    assert counts.shares == pytest.approx([9 / 45, 1 / 45, 0.5 / 44, 13 / 78, 84 / 99, 1.0])
+    drawn = counts.drawn(np.empty((20_000, 1)), np.random.default_rng(1))
+    for step, (k, exposure) in enumerate(zip(counts.events[:-1], counts.exposure, strict=False)):
+        expected = gamma.ppf([0.05, 0.95], k + 0.5) / exposure
+        assert np.quantile(drawn[:, step], [0.05, 0.95]) == pytest.approx(np.minimum(expected, 1.0), rel=0.1)
 
 
 @pytest.fixture(scope="module")
