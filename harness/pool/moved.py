@@ -30,9 +30,11 @@ from harness.traffic.laws import Environment
 from harness.vocabulary import STATE_COLUMNS, FloatArray
 
 N_PATHS = 4096
-FORMAT = 1
+FORMAT = 2
 """Raise it when the meaning of what is kept changes."""
 KEPT_EVERY = 20
+MARGIN = 0.05
+"""Of the range of a sample of cut-ins, by which another may lie beyond it [assumed]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,7 @@ class FewPaths:
             self._stratum[group] = stratum
         self._n_strata = len(design.strata)
         self._reaches_last = self._stratum[-1] >= 0
-        self._range = _ranges(pool)
+        self._range = ranges(pool)
         self._seen: dict[str, Moved] = {}
         self._aimed: Enumerator | None = None
         about = FORMAT, pool.key, environment_hash(resolved.environment), design.strata, settings.seed, N_PATHS
@@ -130,8 +132,11 @@ class FewPaths:
             write_bytes(self._file, parquet(pa.table({"environment": list(self._seen), "numbers": kept})))
 
 
-def _ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Smallest and largest value of each number of the initial states of the pool's cut-ins, by shell (D + 1,)."""
+def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Where the numbers of the initial states of the pool's cut-ins lie, by shell (D + 1,), with a margin.
+
+    A cut-in a little beyond the outermost of a sample is not unlike those in it.
+    """
     shell, n = pool.shell, len(pool.names) + 1
     found = {}
     for name in STATE_COLUMNS:
@@ -139,5 +144,7 @@ def _ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
         for s in np.unique(shell):
             values = pool.cut_ins.state[name][shell == s]
             low[s], high[s] = values.min(), values.max()
+            margin = MARGIN * (high[s] - low[s])
+            low[s], high[s] = low[s] - margin, high[s] + margin
         found[name] = low, high
     return found

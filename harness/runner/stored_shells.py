@@ -25,7 +25,7 @@ from harness.estimators.shells import Shells as SeenShells
 from harness.numbers import share
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool, environment_hash
-from harness.pool.moved import FewPaths
+from harness.pool.moved import FewPaths, ranges
 from harness.pool.shells import acceleration_limit, design_shells
 from harness.progress import Progress
 from harness.records.folder import read_manifest
@@ -37,7 +37,7 @@ from harness.strata import ShellDesign
 from harness.traffic.laws import Environment
 from harness.traffic.loading import load_environment, require_sound_laws
 from harness.traffic.parameters import EnvironmentParameters
-from harness.vocabulary import STATE_COLUMNS, FloatArray, IntArray
+from harness.vocabulary import FloatArray
 
 MOST_BEYOND = 0.01
 """Share of the probability in a shell, as it crashes, that may lie where no cut-in of the old pool does [assumed]."""
@@ -284,17 +284,9 @@ def _share_beyond(old: Pool, new: Pool, blocks: list[Block]) -> float:
         np.add.at(tests, block.stratum, 1.0)
         np.add.at(crashes, block.stratum[block.crash], 1.0)
     weight = design.p * (crashes / np.maximum(tests, 1.0))
-    beyond = {name: _beyond(old, new, shell) for shell, name in enumerate(old.names)}
+    outside = np.zeros(new.shell.size, np.bool_)
+    for name, (low, high) in ranges(old).items():
+        outside |= (new.cut_ins.state[name] < low[new.shell]) | (new.cut_ins.state[name] > high[new.shell])
+    beyond = {name: float(outside[rows].mean()) for s, name in enumerate(old.names) if (rows := new.shell == s).any()}
     shares: FloatArray = np.array([beyond.get(name, 0.0) for name in design.strata])
     return float(weight @ shares / weight.sum()) if weight.any() else float(shares.max(initial=0.0))
-
-
-def _beyond(old: Pool, new: Pool, shell: int) -> float:
-    rows: list[IntArray] = [np.flatnonzero(pool.shell == shell) for pool in (old, new)]
-    if not all(each.size for each in rows):
-        return 0.0
-    outside = np.zeros(rows[1].size, np.bool_)
-    for name in STATE_COLUMNS:
-        was, now = (pool.cut_ins.state[name][each] for pool, each in zip((old, new), rows, strict=True))
-        outside |= (now < was.min()) | (now > was.max())
-    return float(outside.mean())
