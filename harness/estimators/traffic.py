@@ -4,7 +4,8 @@ Replicates are environments that the same trajectories might as well have given.
 tests and the same paths (`harness.runner.other_traffic`); of the factors by which it moves, ``times`` are the quantiles
 that leave out as much on either side as the interval of the sampling error does. Both errors are independent: on a
 logarithmic scale their distances from the rate add as squares on either side (MOVER: Donner and Zou, Stat. Methods Med.
-Res. 21, 2012, 347). A replicate that could not be answered counts as whatever makes the interval wider.
+Res. 21, 2012, 347). What a reference driver's rate comes out wrong by in a replicate, the vehicle's may, too: it widens
+the factor to both sides. A replicate that could not be answered counts as whatever makes the interval wider.
 
 `Bar` and `Sensitivity` say by how much it moves with one number, or a block of them.
 """
@@ -62,25 +63,38 @@ class Unseen:
 class TrafficError:
     """What replicates of an ``environment`` say of a rate, and of its ratios by the names of others.
 
-    Of ``n_replicates`` ``n_refused`` could not be answered. With ``unseen`` there are upper limits alone.
+    Of ``n_replicates`` ``n_refused`` could not be answered; the others are taken to be ``off`` by so much in the mean.
+    With ``unseen`` there are upper limits alone.
     """
 
     environment: str
     confidence: float
     n_replicates: int
     n_refused: int
+    off: float
     rate: Uncertain
     ratios: Mapping[str, Uncertain]
     unseen: Unseen | None = None
 
 
 def uncertain(
-    value: float, sampling: Ends, factors: FloatArray, n_refused: int, confidence: float, *, from_below: bool = True
+    value: float,
+    sampling: Ends,
+    factors: FloatArray,
+    off: FloatArray,
+    n_refused: int,
+    confidence: float,
+    *,
+    from_below: bool = True,
 ) -> Uncertain:
-    """By the factors (B,) of replicates, each over that of the environment itself; else an upper limit alone."""
+    """By the factors (B,) of replicates, each over that of the environment itself, that may be ``off`` (B,) by so much.
+
+    Not ``from_below`` there is an upper limit alone.
+    """
     tail = round((1.0 - confidence) / 2.0, 12)  # so that it falls on one of them where it should
-    low = float(np.quantile(np.append(factors, np.zeros(n_refused)), tail, method="lower")) if from_below else 0.0
-    high = float(np.quantile(np.append(factors, np.full(n_refused, np.inf)), 1.0 - tail, method="higher"))
+    lower, upper = np.append(factors / (1.0 + off), np.zeros(n_refused)), factors * (1.0 + off)
+    low = float(np.quantile(lower, tail, method="lower")) if from_below else 0.0
+    high = float(np.quantile(np.append(upper, np.full(n_refused, np.inf)), 1.0 - tail, method="higher"))
     if value <= 0.0:
         return Uncertain(value, (low, high), sampling, (0.0, 0.0), (0.0, sampling[1] * high))
     environment = value * low, value * high
@@ -98,11 +112,15 @@ def _log(value: float) -> float:
 
 def rows(found: TrafficError) -> Iterator[Row]:
     """Lines of the short answer: of the rate, and of its ratio to the first of the others."""
-    why = "with sampling error" if found.unseen is None else f"no lane change seen at {found.unseen.where}"
-    yield Row("traffic", "traffic", f"{times(found.rate)} (fitted)", interval(*found.rate.both), why)
+    why = "with sampling error" if found.unseen is None else f"none seen at {found.unseen.where}"
+    yield Row("traffic", "traffic", f"{times(found.rate)} (fitted)", _ends(found), why)
     for name, each in list(found.ratios.items())[:1]:
         ends = f"{ratio(each.both[0])} to {ratio(each.both[1])}"
         yield Row("traffic_ratio", "traffic, × driver", f"{times(each)} (fitted)", ends, f"the ratio to {name}")
+
+
+def _ends(found: TrafficError) -> str:
+    return interval(*found.rate.both) if found.unseen is None else f"< {number(found.rate.both[1])}"
 
 
 def times(of: Uncertain) -> str:
@@ -115,7 +133,7 @@ def times(of: Uncertain) -> str:
 
 def sentences(found: TrafficError, of: str = "the vehicle") -> Iterator[str]:
     """The same in words, for estimates.json and the page."""
-    n, level, both = found.n_replicates, share(found.confidence), interval(*found.rate.both)
+    n, level, both = found.n_replicates, share(found.confidence), _ends(found)
     yield (
         f"The traffic, as far as {found.environment} is known, moves the rate of {of} by {times(found.rate)} ({level} "
         f"of {n} replicates{because(found)}); with the sampling error it is {both} per test."
@@ -123,11 +141,10 @@ def sentences(found: TrafficError, of: str = "the vehicle") -> Iterator[str]:
     for name, each in found.ratios.items():
         ends = f"{ratio(each.both[0])} to {ratio(each.both[1])}"
         yield f"The ratio to {name} moves by {times(each)}; with the sampling error it is {ends}."
-    if found.n_refused:
-        yield (
-            f"{found.n_refused} of {n} replicates cannot be answered from these tests, and count as whatever makes an "
-            "interval wider."
-        )
+    yield (
+        f"In each replicate the rate may be as wrong as that of a reference driver, which is known ({share(found.off)} "
+        f"in the mean); {found.n_refused} cannot be answered, and count as whatever makes an interval wider."
+    )
 
 
 def because(found: TrafficError) -> str:

@@ -43,7 +43,7 @@ from harness.sampling import distance_per_test_m
 from harness.strata import ShellDesign
 from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER, AcceptanceSteps, EnvironmentParameters
-from harness.vocabulary import EstimatorName
+from harness.vocabulary import EstimatorName, FloatArray
 
 NOT_LOOKING = "cut_in__ignore_share"
 _STEP = "acceptance_steps__share__"
@@ -107,18 +107,19 @@ def traffic_error(
         return None
     (near,), n = found
     estimate, confidence = content["estimates"]["shells"], content["confidence"]
-    times, n_refused = np.array([each.rate for each in near]), n - len(near)
+    times, off, n_refused = np.array([each.rate for each in near]), _off(near), n - len(near)
     sampling = estimate["ci_low"], estimate["ci_high"]
     if not estimate["n_crashes"]:
         sampling = 0.0, estimate["upper_bound"]
-    of_rate = uncertain(estimate["crash_rate"], sampling, times, n_refused, confidence, from_below=unseen is None)
+    about = off, n_refused, confidence
+    of_rate = uncertain(estimate["crash_rate"], sampling, times, *about, from_below=unseen is None)
     ratios = {}
     for r, driver in enumerate(tested.design.references):
         for each in estimate["details"]["references"]:
             if each["reference"] == driver.name:
                 ends, moves = _ends(each), times / np.array([one.references[r] for one in near])
-                ratios[driver.name] = uncertain(each["ratio"], ends, moves, n_refused, confidence)
-    return TrafficError(_name(there), confidence, n, n_refused, of_rate, ratios, unseen)
+                ratios[driver.name] = uncertain(each["ratio"], ends, moves, *about)
+    return TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), of_rate, ratios, unseen)
 
 
 def compare_in_other_traffic(
@@ -145,14 +146,16 @@ def compare_in_other_traffic(
         raise CampaignError(OPTION, f"{environment}, which names none", expected, "Compare in that environment.")
     near, n = found
     times, n_refused = [np.array([each.rate for each in of]) for of in near], n - len(near[0])
+    off = _off(near[0])  # the strata of both are the same
+    about = off, n_refused, confidence
     a, b = (
-        uncertain(of.crash_rate, (of.ci_low, of.ci_high), factors, n_refused, confidence, from_below=unseen is None)
+        uncertain(of.crash_rate, (of.ci_low, of.ci_high), factors, *about, from_below=unseen is None)
         for of, factors in zip((told.a, told.b), times, strict=True)
     )
     ratios = {}
     if told.b.n_crashes:
-        ratios["B"] = uncertain(told.free["ratio"], _ends(told.free), times[0] / times[1], n_refused, confidence)
-    error = TrafficError(_name(there), confidence, n, n_refused, a, ratios, unseen)
+        ratios["B"] = uncertain(told.free["ratio"], _ends(told.free), times[0] / times[1], *about)
+    error = TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), a, ratios, unseen)
     return {"traffic": finite_json(error), "b": finite_json(b), "sentences": list(sentences(error, "A"))}
 
 
@@ -216,6 +219,10 @@ def _answered(
         expected = "replicates that these tests can answer"
         raise CampaignError(OPTION, f"{len(values)} replicates, of which none can be", expected, ELSEWHERE)
     return [list(of) for of in zip(*kept, strict=True)], len(values)
+
+
+def _off(near: Sequence[Nearby]) -> FloatArray:
+    return np.array([each.off for each in near])
 
 
 def _ends(of: Mapping[str, Any]) -> tuple[float, float]:

@@ -45,6 +45,8 @@ SAME_POOL = 0.05
 """How far a pool that another version has built may differ [assumed]."""
 MOST_OFF = 0.1
 """How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
+FAR_OFF = 0.5
+"""The same in traffic close by, where each rate is taken to be as wrong as that [assumed]."""
 OPTION = "--environment"
 ELSEWHERE = "Run the campaign in that environment, into another folder."
 
@@ -146,7 +148,7 @@ class Nearby:
     @property
     def refused(self) -> bool:
         """Whether the tests do not say it."""
-        return self.off > MOST_OFF or self.beyond > MOST_BEYOND
+        return self.off > FAR_OFF or self.beyond > MOST_BEYOND
 
 
 def nearby(
