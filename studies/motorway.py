@@ -61,6 +61,8 @@ KINDS = ("free", "following", "initial", "at_risk", "leads")
 VEHICLES_OF_RECORDING = 10**6
 """More than any recording has."""
 FREELY_S = 8.0
+MOST_LIKELY = 0.5
+"""Probability of a lane change within a second, at most (``max_probability_1s``)."""
 BINS_S = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0)
 TAIL = 0.05
 Z = float(stats.norm.isf(TAIL))
@@ -209,7 +211,7 @@ class Laws(NamedTuple):
             InitialStates(environment.numbers).from_uniforms(np.random.default_rng(1).random((20_000, 5))),
             pmf_free[0],
             pmf[1],
-            chance * risk["duration_s"],
+            -np.log1p(-np.minimum(chance, MOST_LIKELY)) * risk["duration_s"],
             accepted,
             lead_s,
             lateral.distance_m / lead_s if lead_s > 0.0 else math.inf,

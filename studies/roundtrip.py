@@ -386,15 +386,19 @@ def true_shares(pool: Traffic) -> dict[str, float]:
     return {f"acceptance_steps__share__{i}": value for i, value in enumerate((done / all_wished).tolist())}
 
 
-def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray) -> dict[str, Any]:
-    """How often the replicates' intervals hold the crash rates of the environment, and ratios to the first driver."""
+def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray, of_mean: FloatArray) -> dict[str, Any]:
+    """How often the replicates' intervals hold crash rates and ratios to the first driver.
+
+    Those of the environment are ``true``, those of the mean law ``of_mean``, (drivers,) each: sets that share
+    recordings miss the former together where these have by chance too many lane changes of a kind, or too few.
+    """
     logs = [near.log_rates(each.loc[[ESTIMATE, REPLICATE]]) for each in sets]
     judged: dict[str, Any] = {}
     ratio = np.array([each - each[:, :1] for each in logs])
     for d, driver in enumerate(DRIVERS):
-        for of, values, aim in (
-            ("rate", np.array(logs)[:, :, d], np.log(true[d])),
-            (f"ratio to {DRIVERS[0]}", ratio[:, :, d], np.log(true[d] / true[0])),
+        for of, values, aim, mean in (
+            ("rate", np.array(logs)[:, :, d], np.log(true[d]), np.log(of_mean[d])),
+            (f"ratio to {DRIVERS[0]}", ratio[:, :, d], np.log(true[d] / true[0]), np.log(of_mean[d] / of_mean[0])),
         ):
             if of != "rate" and d == 0:
                 continue
@@ -403,6 +407,7 @@ def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray)
                 "true": float(np.exp(aim)),
                 "interval": coverage((low <= aim) & (aim <= high)),
                 "upper_limit": coverage(aim <= high),
+                "interval_of_mean_law": coverage((low <= mean) & (mean <= high)),
                 "median_estimate_over_true": float(np.exp(np.median(values[:, 0]) - aim)),
                 "median_factor": float(np.exp(np.median(0.5 * (high - low)))),
             }
@@ -476,7 +481,7 @@ def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: i
         found[f"{each:g} vehicle-hours"] = {
             "data_sets": len(of),
             "without_an_event": [int(sum(one[f"{SEEN}__{i}"].iloc[0] == 0 for one in of)) for i in range(N_STEPS)],
-            "rates": judge_rates(of, near, drivers.true),
+            "rates": judge_rates(of, near, drivers.true, of_mean),
             "gradient": check(of, near, drivers, n_checked),
             "numbers": judge_numbers(of, true, mean),
         }
@@ -498,6 +503,7 @@ def table(found: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
                 "interval × ÷": f"{rate['median_factor']:.3g}",
                 "coverage": _shown(rate["interval"]),
                 "of upper limit": _shown(rate["upper_limit"]),
+                "of the mean law": _shown(rate["interval_of_mean_law"]),
             }
             for name, rate in of["rates"].items()
         ]

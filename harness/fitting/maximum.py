@@ -22,6 +22,9 @@ LogLikelihood = Callable[..., FloatArray]
 """Of rows (n,), from their data, a structured array (n,), and one array (n,) per predictor."""
 MOSTLY_PRIOR = 0.5
 """Share of a number's information from the prior above which the data do not tell it [assumed]."""
+EXCLUDES = 2.0
+"""Loss of log-likelihood from which on the data exclude what would be kept, though they tell no other value [assumed]:
+of a share that was never seen they say that it is small."""
 MOST_LEVERAGE = 0.5
 """Influences of vehicles are divided by what they leave to others, as HC3 does: else few rows look too precise."""
 _STEP = 1e-3
@@ -106,7 +109,11 @@ def maximise(
         scores, curvature = whole.derivatives(theta)
         inverse = linalg.inv(curvature)
         silent = ~kept & (np.diag(inverse) * np.diag(prior.precision) > MOSTLY_PRIOR)
-        if prior.smooths or not silent.any():
+        simpler = None
+        if silent.any() and not prior.smooths:
+            whole.prior = prior.fixed(kept | silent)
+            simpler = whole.climb(np.where(kept | silent, prior.centre, theta))
+        if simpler is None or best[1] - simpler[1] > EXCLUDES:
             weights = prior.weights * ~kept
             moves = scores @ inverse
             leverage = np.minimum((moves * scores).sum(axis=1), MOST_LEVERAGE)
@@ -114,9 +121,7 @@ def maximise(
             influence = np.zeros((int(clusters.max()) + 1, theta.size))
             np.add.at(influence, clusters, moves)
             return Maximum(theta, influence, (inverse @ weights.T) * ~kept[:, None], ~kept)
-        kept |= silent
-        whole.prior = prior.fixed(kept)
-        best = whole.climb(np.where(kept, prior.centre, theta))
+        kept, best = kept | silent, simpler
     return None
 
 

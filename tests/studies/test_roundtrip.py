@@ -36,15 +36,23 @@ from studies.roundtrip import (
 from studies.trajectories import simulate, write
 
 
-def test_speed_differences_as_wide_as_on_motorways_are_fitted_with_lighter_tails(tmp_path: Path) -> None:
-    """With the base's tails LV would exceed 100 m/s: lighter ones are assumed, and written to the environment."""
+def test_traffic_is_fitted_whose_speed_differences_are_as_wide_as_on_motorways_and_that_hardly_brakes(
+    tmp_path: Path,
+) -> None:
+    """With the base's tails LV would exceed 100 m/s: lighter ones are assumed, and written to the environment.
+
+    What was never seen is not taken from the base where the data exclude it.
+    """
     environment = load_environment(TRAFFIC)
     numbers = environment.numbers.copy()
     numbers["initial_state__r1dot_log_scale"] = 1.2
+    numbers["free_driving__brake_logit"] = -12.0
     write(simulate(environment._replace(numbers=numbers), 5.0, 1), tmp_path / "wide.parquet")
     traffic = Traffic.of(each for each, _ in observations([tmp_path / "wide.parquet"], load_mapping()))
     fit = fit_traffic(traffic, load_parameters(FITTED), FITTED.parameters, "wide", Progress())
-    df = fit.environment.values()["initial_state__r1dot_df"]
+    found = fit.environment.values()
+    assert found["free_driving__brake_logit"] < load_parameters(FITTED).values()["free_driving__brake_logit"] - 1.0
+    df = found["initial_state__r1dot_df"]
     assert df in HEAVIEST_TAILS[2:]
     assert df == pytest.approx(fit.laws["rate"].estimate["initial_state__r1dot_df"])
 
