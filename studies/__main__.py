@@ -311,13 +311,13 @@ def roundtrip(folder: Path, *, hours: Sequence[float], n: int, n_replicates: int
     receives roundtrip.json.
     """
     from harness.records.folder import write_json  # noqa: PLC0415 - keeps --help fast
-    from studies.roundtrip import fit_data_sets, judge, table  # noqa: PLC0415
+    from studies.roundtrip import fit_data_sets, judge, rounded, table  # noqa: PLC0415
 
     with (bar := shown_progress(quiet=quiet)):
         for each in hours:
             fit_data_sets(folder, each, n, n_replicates, bar)
         found = judge(folder, hours, bar)
-    write_json(folder / "roundtrip.json", found)
+    write_json(folder / "roundtrip.json", rounded(found))
     for words, rows in table(found).items():
         print_table(words, rows)
 

@@ -338,9 +338,10 @@ def judge_numbers(
             **aims,
             "mean": float(estimates[name].mean()),
             "spread": float(estimates[name].std()),
-            "std_error": float(errors[name].median()),
             "kept": int((~told).sum()),
         }
+        if told.any():
+            row["std_error"] = float(errors[name].median())
         for aim, value in aims.items():
             if value is None:
                 continue
@@ -472,11 +473,12 @@ def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: i
     near = surrogate(drivers, largest, progress)
     true = truth().values() | true_shares(simulated(folder, 1, progress))
     found: dict[str, Any] = {
-        "traffic": f"{TRAFFIC.parameters}, ignore_share {IGNORE_SHARE:g}, level {TRAFFIC.lane_change_level:g}"
+        "command": "python -m studies roundtrip --out DIR",
+        "traffic": f"{TRAFFIC.parameters}, ignore_share {IGNORE_SHARE:g}, level {TRAFFIC.lane_change_level:g}",
     }
-    of_mean = drivers.rates(parameters_of(mean)) / drivers.true
+    of_mean = drivers.rates(parameters_of(mean))
     found["misread"] = misread()
-    found["mean_law_over_environment"] = dict(zip(DRIVERS, of_mean.tolist(), strict=True))
+    found["mean_law_over_environment"] = dict(zip(DRIVERS, (of_mean / drivers.true).tolist(), strict=True))
     for each, of in sets.items():
         found[f"{each:g} vehicle-hours"] = {
             "data_sets": len(of),
@@ -486,6 +488,15 @@ def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: i
             "numbers": judge_numbers(of, true, mean),
         }
     return found
+
+
+def rounded(content: Any) -> Any:
+    """The same with four digits of each number."""
+    if isinstance(content, dict):
+        return {key: rounded(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return [rounded(value) for value in content]
+    return float(f"{content:.4g}") if isinstance(content, float) else content
 
 
 def table(found: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
