@@ -29,6 +29,7 @@ from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
 from harness.errors import TrajectoryError
+from harness.estimators.traffic import ONE_LAW
 from harness.fitting.fit import fit_traffic
 from harness.fitting.laws import TTC_EDGES_S, Traffic
 from harness.fitting.observations import Tally, observations, require_enough
@@ -403,7 +404,8 @@ def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray,
         ):
             if of != "rate" and d == 0:
                 continue
-            low, high = np.quantile(values[:, 1:], ENDS, axis=1, method="weibull")
+            wider = np.log1p(ONE_LAW if of != "rate" else 0.0) * np.array([-1.0, 1.0])
+            low, high = np.quantile(values[:, 1:], ENDS, axis=1, method="weibull") + wider[:, None]
             judged[f"{driver}: {of}"] = {
                 "true": float(np.exp(aim)),
                 "interval": coverage((low <= aim) & (aim <= high)),

@@ -20,7 +20,7 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
-from harness.estimators.traffic import CARRIES, TrafficError, Unseen, rows, sentences, uncertain
+from harness.estimators.traffic import CARRIES, ONE_LAW, TrafficError, Unseen, rows, sentences, uncertain
 from harness.numbers import plain, share
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.moved import FewPaths
@@ -118,7 +118,7 @@ def traffic_error(
         for each in estimate["details"]["references"]:
             if each["reference"] == driver.name:
                 ends, moves = _ends(each), times / np.array([one.references[r] for one in near])
-                ratios[driver.name] = uncertain(each["ratio"], ends, moves, *about)
+                ratios[driver.name] = uncertain(each["ratio"], ends, moves, off + ONE_LAW, *about[1:])
     return TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), of_rate, ratios, unseen)
 
 
@@ -154,7 +154,7 @@ def compare_in_other_traffic(
     )
     ratios = {}
     if told.b.n_crashes:
-        ratios["B"] = uncertain(told.free["ratio"], _ends(told.free), times[0] / times[1], *about)
+        ratios["B"] = uncertain(told.free["ratio"], _ends(told.free), times[0] / times[1], off + ONE_LAW, *about[1:])
     error = TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), a, ratios, unseen)
     return {"traffic": finite_json(error), "b": finite_json(b), "sentences": list(sentences(error, "A"))}
 
