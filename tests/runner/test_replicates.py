@@ -15,7 +15,7 @@ import pytest
 from harness.cli import main
 from harness.errors import HarnessError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.traffic import uncertain
+from harness.estimators.traffic import ONE_LAW, uncertain
 from harness.pool import moved
 from harness.progress import Progress
 from harness.resolved import resolve
@@ -55,7 +55,7 @@ def test_the_rate_moves_with_the_share_that_does_not_look_and_the_ratio_does_not
     assert traffic["rate"]["times"] == pytest.approx([0.5, 3.0], rel=0.01)
     assert traffic["rate"]["value"] == pytest.approx(stored["crash_rate"])
     assert traffic["rate"]["sampling"] == pytest.approx([stored["ci_low"], stored["ci_high"]])
-    assert traffic["ratios"]["r157-cc"]["times"] == pytest.approx([1.0, 1.0], rel=0.005)
+    assert traffic["ratios"]["r157-cc"]["times"] == pytest.approx([1.0 / (1.0 + ONE_LAW), 1.0 + ONE_LAW], rel=0.005)
     keys = [row["key"] for row in content["answer"]["rows"]]
     assert keys[keys.index("ratio") + 1 :][:2] == ["traffic", "traffic_ratio"]
     assert "5 replicates" in content["scope"]
@@ -102,7 +102,7 @@ def test_the_ratio_of_two_vehicles_hardly_moves(tmp_path, capsys):
     assert found["traffic"]["rate"]["times"] == pytest.approx([0.5, 2.0], rel=0.01)
     assert found["traffic"]["rate"]["value"] == pytest.approx(compared["a"]["crash_rate"])
     of_both = found["traffic"]["ratios"]["B"]
-    assert of_both["times"] == pytest.approx([1.0, 1.0], rel=0.01)
+    assert of_both["times"] == pytest.approx([1.0 / (1.0 + ONE_LAW), 1.0 + ONE_LAW], rel=0.01)
     assert of_both["value"] == pytest.approx(compared["ratio"])
     assert of_both["sampling"] == pytest.approx([compared["ratio_low"], compared["ratio_high"]])
 
