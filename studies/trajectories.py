@@ -81,7 +81,7 @@ def simulate(environment: Environment, hours: float, seed: int, differences: Dif
     start["r2_m"], start["r2dot_mps"] = random.uniform(*BEHIND_M, n), -random.uniform(*CLOSING_MPS, n)
 
     n_steps = round(TRIPLE_S / STEP_S) - 1
-    x, v = np.empty((2, n, 3, n_steps + 1))
+    x, v = np.zeros((2, n, 3, n_steps + 1))
     cut, lead = np.full((2, n), -1)
     upto = np.zeros((n, 3), np.int64)
     drive(start, length, hazard, bias, spread, seed, unboxed(environment), x, v, cut, lead, upto)
