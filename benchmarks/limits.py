@@ -1,8 +1,8 @@
 """Which traffic a crash rate comes from: the figures of docs/limits.md, from a run of method shells.
 
-    harness run scenarios/overtaking_shells.yaml --out runs/limits --set world.engine=twin --set stop.rhw=null \
-        --set stop.min_crashes=null --set stop.episodes=40000 --set testing.shells.first_tests=3000 \
-        --set records.traces=none --set records.trace_share=0
+    harness run scenarios/smoke.yaml --out runs/limits --set world.engine=twin --set stop.rhw=null \
+        --set stop.below_reference=null --set stop.min_crashes=null --set stop.episodes=40000 \
+        --set testing.shells.first_tests=3000 --set records.traces=none --set records.trace_share=0
     python -m benchmarks.limits runs/limits
 
 Prints JSON, as it is kept in docs/validation/limits.json. Shares of the rate count a crash with its shell's probability
@@ -27,6 +27,8 @@ from harness.traffic.loading import load_environment
 
 FAST_MPS = 40.0
 """144 km/h: the end of the speeds that the traffic was fitted to."""
+SHORT_LEAD = 15
+"""Steps, 1.5 s from the onset of a cut-in to the overlap."""
 STATES = 1_000_000
 SEED = 20_240
 
@@ -51,6 +53,8 @@ def shares_of_rate(tests: pd.DataFrame, numbers: Any) -> dict[str, list[float]]:
         "gap_below_5_m": of_rate(tests, r2 < 5.0),
         "ttc_below_0.5_s": of_rate(tests, r2 / closing < 0.5),
         "ttc_below_1.5_s": of_rate(tests, r2 / closing < 1.5),
+        "ttc_at_onset_below_2_s": of_rate(tests, tests.onset_ttc_s < 2.0),
+        "lead_at_most_1.5_s": of_rate(tests, tests.lead_steps <= SHORT_LEAD),
         "crash_within_1_s": of_rate(tests, tests.crash_time_s - 0.1 * tests.cut_in_step <= 1.0),
         "av_above_144_kmph": of_rate(tests, tests.v_bv_mps - tests.r2dot_mps > FAST_MPS),
         "cut_in_ignores_the_av": of_rate(tests, ignore / (ignore + (1.0 - ignore) * accept)),
@@ -69,16 +73,15 @@ def shares_of_tests(numbers: Any) -> dict[str, float]:
 def limits(folder: Path) -> dict[str, Any]:
     """All figures."""
     tests = harness.read(folder).episodes()
-    numbers = load_environment(load_campaign(folder / "campaign.yaml").environment).numbers
+    traffic = load_environment(load_campaign(folder / "campaign.yaml").environment)
     estimate = json.loads((folder / "estimates.json").read_text(encoding="utf-8"))["estimates"]["shells"]
-    careful = estimate["details"]["shells"][0]
     return {
         "command": "python -m benchmarks.limits runs/limits",
         "crash_rate": estimate["crash_rate"],
         "n_crashes": estimate["n_crashes"],
-        "of_the_rate": {f"{careful['shell']}_crashes_too": [careful["contribution"] / estimate["crash_rate"], None]}
-        | shares_of_rate(tests, numbers),
-        "of_the_tests": shares_of_tests(numbers),
+        "of_the_rate": shares_of_rate(tests, traffic.numbers),
+        "of_the_tests": shares_of_tests(traffic.numbers),
+        "of_the_cut_ins": {"lead_at_most_1.5_s": float(traffic.lateral.cumulative[SHORT_LEAD])},
     }
 
 

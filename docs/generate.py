@@ -183,12 +183,13 @@ def _two_digits(value: float) -> int:
 
 LIMITS = {
     "cut_in_ignores_the_av": "BV does not look at the AV at all (share `ignore_share` of all lane changes)",
-    "ttc_below_1.5_s": "time to collision at the cut-in below 1.5 s",
-    "ttc_below_0.5_s": "time to collision at the cut-in below 0.5 s",
-    "gap_below_5_m": "gap R2 at the cut-in below 5 m",
-    "gap_below_2_m": "gap R2 at the cut-in below 2 m",
-    "crash_within_1_s": "crash within one second of the cut-in",
-    "brakes-8_crashes_too": "braking at 8 m/s² from the next 0.1 s on does not help (shell `brakes-8`)",
+    "lead_at_most_1.5_s": "at most 1.5 s from the onset to the overlap",
+    "ttc_at_onset_below_2_s": "time to collision at the onset below 2 s",
+    "ttc_below_1.5_s": "time to collision at the overlap below 1.5 s",
+    "ttc_below_0.5_s": "time to collision at the overlap below 0.5 s",
+    "gap_below_5_m": "gap R2 at the overlap below 5 m",
+    "gap_below_2_m": "gap R2 at the overlap below 2 m",
+    "crash_within_1_s": "crash within one second of the overlap",
     "av_above_144_kmph": "AV faster than 144 km/h",
 }
 """Figures of docs/limits.md, in words."""
@@ -201,11 +202,12 @@ def limits_table() -> str:
     for name, words in LIMITS.items():
         share, error = found["of_the_rate"][name]
         shown = f"{share:.1%}" if share < 0.999 else "> 99.9%"
-        rows.append((words, shown, "–" if error is None else f"{error:.1%}"))
-    fast = found["of_the_tests"]["av_above_144_kmph"]
+        rows.append((words, shown, f"{error:.1%}"))
+    fast, short = found["of_the_tests"]["av_above_144_kmph"], found["of_the_cut_ins"]["lead_at_most_1.5_s"]
     return _table(("cut-ins", "share of the crash rate", "± standard error"), rows) + (
-        f"\nOf the tests, {fast:.1%} have an AV faster than 144 km/h. Default vehicle, {found['crash_rate']:.3g} per "
-        f"test, {found['n_crashes']:,} sampled crashes. `{found['command']}`; its docstring says how.\n"
+        f"\nOf all cut-ins {short:.1%} take at most 1.5 s; in {fast:.1%} of the tests the AV is faster than 144 km/h. "
+        f"Default vehicle, {found['crash_rate']:.3g} per test, {found['n_crashes']:,} sampled crashes. "
+        f"`{found['command']}`; its docstring says how.\n"
     )
 
 
