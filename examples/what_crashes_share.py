@@ -52,4 +52,6 @@ def what_crashes_share(folder: str | Path) -> pd.DataFrame:
 
 
 if __name__ == "__main__":
-    print(what_crashes_share(sys.argv[1]).to_string(index=False))  # noqa: T201 - it is the answer
+    found = what_crashes_share(sys.argv[1])
+    none = "No crash to look at: of shells only those beyond the library's widest boundary are compared."
+    print(found.to_string(index=False) if found["share of crashes"].any() else none)  # noqa: T201 - it is the answer

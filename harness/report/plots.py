@@ -149,7 +149,7 @@ def shells_plot(found: ShownShells) -> Plot:
         right.add("text", "muted", min(width, widest / 1.3), row, label=text)
     for each in found.statements:
         if (boundary := each.n_shells - 0.5) < len(shells) - 0.5:
-            label = f"outside {each.boundary} ({each.name}) ↓"
+            label = f"outside {each.name} ↓"  # its boundary is the row above
             for panel, end in ((left, limit * max(left.room_before(label), 0.0)), (right, right.x.high)):
                 panel.add("line", "muted", [0.0, end], [boundary] * 2, dash=DASHED, width=1.0)
             left.add("text", "muted", limit, boundary, label=label)

@@ -128,6 +128,16 @@ def test_no_line_runs_through_a_label_and_no_tick_through_the_legend(runs):
     assert float(top) - 5.0 >= 32.0 + 15.0 * max(rows) + 3.0  # of texts 11 high that stand on a line 4 below
 
 
+def test_a_long_name_of_a_driver_is_not_cut(runs):
+    found, name = runs["shells"].shells, "blind-brakes-2-late-1s"
+    shells = [replace(found.shells[0], shell=name), *found.shells[1:]]
+    statements = [replace(each, boundary=name) for each in found.statements]
+    rates = shells_plot(replace(found, shells=shells, statements=statements)).panels[0]
+    labels = [mark.label for mark in rates.marks if mark.label.startswith("outside")]
+    assert labels
+    assert min(map(rates.room_before, labels)) > 0.0
+
+
 def test_a_shell_without_tests_is_said_so_and_runs_out_of_the_plot(runs):
     found = runs["shells_inside_only"].shells
     rates, widths = shells_plot(found).panels
