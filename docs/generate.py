@@ -252,29 +252,37 @@ def validated_table(name: str) -> str:
 FORMER = ", by the former rule"
 
 
-def decisions(name: str = "gate") -> str:
-    """What campaigns decided about limits at the rate itself, by rule, and in how many tests about others; command."""
+GATES = {"gate": "paper's; a rate", "gate_beside": "paper's; `r157-cc`", "gate_2": "default; `r157-cc`"}
+"""Replication experiments of decisions: their traffic, and what the limit is."""
+
+
+def decisions() -> str:
+    """How often campaigns decided wrongly about limits at the rate itself, and in how many tests about others."""
+    head = (
+        *("experiment", "traffic; limit", "vehicles × campaigns", "accepted, rejected", "by the former rule"),
+        *("tests: limit twice the rate", "half the rate"),
+    )
+    return f"{_table(head, [_decision_cells(name, of) for name, of in GATES.items()])}\n{_command('EXPERIMENT')}\n"
+
+
+def _decision_cells(name: str, of: str) -> tuple[str, ...]:
     content = _result(name)
     budget = content["experiment"]["campaign"]["stop"]["episodes"]
     by_vehicle = _by_result(content["judgements"])
 
-    def most(verdict: str, by: str = "") -> str:
-        result = f"limit 1 x rate, {verdict} within {budget:,} tests{by}"
-        return f"{max(100.0 * (1.0 - of[result]['coverage']) for of in by_vehicle.values()):.1f} %"
+    def most(by: str = "") -> str:
+        ways = (f"limit 1 x rate, {verdict} within {budget:,} tests{by}" for verdict in ("accepted", "rejected"))
+        errors = (max(100.0 * (1.0 - each[way]["coverage"]) for each in by_vehicle.values()) for way in ways)
+        return ", ".join(f"{error:.1f} %" for error in errors)
 
     def tests(way: str) -> str:
         found = {each: of[f"limit {way} within {budget:,} tests"] for each, of in by_vehicle.items()}
         medians = [one["tests_median"] for one in found.values() if one["reached"] > 0.5]
-        usual = found["idm"]["tests_median"]
-        return f"{min(medians):,.0f} to {max(medians):,.0f} tests (medians; default vehicle {usual:,.0f})"
+        return f"{min(medians):,.0f} to {max(medians):,.0f} ({found['idm']['tests_median']:,.0f})"
 
-    return (
-        f"Of {len(by_vehicle)} vehicles, {content['judgements'][0]['replications']} campaigns each, at most "
-        f"{most('accepted')} accepted and {most('rejected')} rejected; by the former rule "
-        f"{most('accepted', FORMER)} and {most('rejected', FORMER)}. A limit of twice the rate takes "
-        f"{tests('2 x rate, rejected')}, of half the rate {tests('0.5 x rate, accepted')}. "
-        f"{_command(name)} ([{name}.json](validation/{name}.json)).\n"
-    )
+    campaigns = f"{len(by_vehicle)} × {content['judgements'][0]['replications']}"
+    link = f"[`{name}`](validation/{name}.json)"
+    return (link, of, campaigns, most(), most(FORMER), tests("2 x rate, rejected"), tests("0.5 x rate, accepted"))
 
 
 def beside_table(name: str) -> str:
@@ -412,8 +420,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "validated-lateral": partial(validated_range, "lateral"),
     "coverage": coverage_table,
     "decisions": decisions,
-    "decisions-beside": partial(decisions, "gate_beside"),
-    "decisions-2": partial(decisions, "gate_2"),
     "beside": partial(beside_table, "traffic_2"),
 }
 """All generated parts by name."""
