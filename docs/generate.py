@@ -242,11 +242,13 @@ def validated_range(name: str) -> str:
     )
 
 
-def validated_table(name: str) -> str:
-    """Table of a replication experiment: what it judged without an assumption, a row for each vehicle; its command."""
-    head = ("vehicle or chain", "true rate", "bias", "coverage", "tests")
-    rows = [_validated_cells(one) for one in _result(name)["judgements"] if _is_headline(one)]
-    return f"{_table(head, rows)}\n{_command(name)}\n"
+def validated_table() -> str:
+    """Table of replication experiments: what each judged without an assumption, a row for each vehicle."""
+    rows = []
+    for name in VALIDATED:
+        (subject, *cells), *others = (_validated_cells(one) for one in _result(name)["judgements"] if _is_headline(one))
+        rows += [(f"`{name}`: {subject}", *cells), *others]
+    return _table(("vehicle", "true rate", "bias", "coverage", "tests"), rows)
 
 
 FORMER = ", by the former rule"
@@ -325,16 +327,21 @@ def coverage_table() -> str:
     kinds = ("assumption-free", "given a statement", "ratio to a reference", "preventable")
     rows = []
     for name, (key, values) in VARIED.items():
-        for value, file in zip(values, varied_files(name), strict=True):
+        found = []
+        for file in varied_files(name):
             lowest = dict.fromkeys(kinds, math.inf)
             for one in filter(_is_judged, _result(file)["judgements"]):
                 if "upper bound" in one["result"]:
                     continue  # has a table of its own
                 lowest[_kind(one)] = min(one["coverage"], lowest[_kind(one)])
-            variant = "" if value == values[0] else f", {key.rpartition('.')[2]} {value}"
-            cells = (f"{coverage:.3f}" if coverage < math.inf else "–" for coverage in lowest.values())
-            rows.append((f"`{name}`{variant}", *cells))
+            found.append(lowest)
+        variants = f", {key.rpartition('.')[2]} {', '.join(values)}" if key else ""
+        rows.append((f"`{name}`{variants}", *(", ".join(_coverage(of[kind]) for of in found) for kind in kinds)))
     return _table(("experiment", *kinds), rows)
+
+
+def _coverage(lowest: float) -> str:
+    return f"{lowest:.3f}" if lowest < math.inf else "–"
 
 
 def _kind(one: dict[str, Any]) -> str:
@@ -394,8 +401,7 @@ def methods_table() -> str:
         for one in _result(name)["judgements"]
         if one["subject"] == "idm" and _is_rate(one) and "shells, " not in one["result"]
     ]
-    files = ", ".join(f"`{name}`" for name in METHODS)
-    return _table(head, rows) + f"\n{_command('EXPERIMENT')}: {files}\n"
+    return _table(head, rows) + f"\nExperiments: {', '.join(f'`{name}`' for name in METHODS)}\n"
 
 
 def _method_cells(one: dict[str, Any]) -> tuple[str, ...]:
@@ -416,7 +422,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "limits": limits_table,
     **{f"columns-{name}": partial(columns_table, name) for name in SCHEMAS},
     **{f"results-{name}": partial(results_table, results) for name, results in RESULTS.items()},
-    **{f"validated-{name}": partial(validated_table, name) for name in VALIDATED},
+    "validated-acting": validated_table,
     "validated-lateral": partial(validated_range, "lateral"),
     "coverage": coverage_table,
     "decisions": decisions,
