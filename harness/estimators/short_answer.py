@@ -142,7 +142,7 @@ def _rows(
     rows += [_beside(each, acts=campaign.av.acts_before_cut_in, wide=wide) for each in beside]
     # Of an attentive vehicle little more is known than that it crashes less often than that driver: that comes first.
     yield from reversed(rows) if wide and beside and beside[0]["ratio_high"] < 1.0 else rows
-    if not beside and campaign.has_baseline_runs and not best.cautions:
+    if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
     if (moved := assumed_times(best, manifest)) is not None:
         high = number(moved[1] * (best.ci_high if best.n_crashes else best.upper_bound))

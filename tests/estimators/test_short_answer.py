@@ -167,6 +167,9 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
     [row] = [row for row in answer.rows if row.key == "ratio"]
     assert (row.value, row.remark) == ("no ratio", "such drivers never crash here")
     assert answer.scope.endswith("was tested, no crash seen, asked: ± 30 %; raise pool.cut_ins_per_shell")
+    forced = replace(read_run_folder(stored_run("forced-acting-twin")).headline, cautions=())  # asks no other driver
+    answer = short_answer(golden("forced-acting-twin"), forced, None, {}, None)
+    assert "ratio" not in {row.key for row in answer.rows}
 
 
 def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time(stored_run):
