@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
@@ -21,6 +22,7 @@ from studies.case_study.study import Made, Study
 
 UNSETTLED = "†"
 PAGE, CLAIMS = "case_study.md", "claims.json"
+_POWER = re.compile(r"([\d.]+)((?: \([^()]*\))?) × 10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)")
 
 
 def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Path, list[dict[str, Any]]]:
@@ -56,7 +58,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
     )
     answers = json.dumps({"conclusive": study.conclusive, "claims": claims}, indent=2, ensure_ascii=False)
     _write(folder / CLAIMS, f"{answers}\n".encode())
-    _write(folder / PAGE, page.encode())
+    _write(folder / PAGE, with_exponents(page).encode())
     return folder / PAGE, claims
 
 
@@ -152,6 +154,12 @@ def spans(of: Sequence[int]) -> str:
     first = [n for n in of if n - 1 not in of]
     last = [n for n in of if n + 1 not in of]
     return ", ".join(f"{a}–{b}" if a < b else str(a) for a, b in zip(first, last, strict=True))
+
+
+def with_exponents(page: str) -> str:
+    """``1.34 (1.33 to 1.36) × 10⁻⁷`` as ``1.34e-7 (1.33 to 1.36)``, as all pages of docs have it."""
+    ascii_digits = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+    return _POWER.sub(lambda found: f"{found[1]}e{found[3].translate(ascii_digits)}{found[2]}", page)
 
 
 def cell(text: str) -> str:

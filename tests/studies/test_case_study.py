@@ -13,7 +13,7 @@ from studies.__main__ import main
 from studies.case_study import tested
 from studies.case_study.counted import KnownMeans, spread
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
-from studies.case_study.page import claim_rows
+from studies.case_study.page import claim_rows, with_exponents
 from studies.case_study.repeated import variants_of
 from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
@@ -185,6 +185,12 @@ def test_neighbours_with_equal_answers_share_a_row():
     rows = list(claim_rows([{**claims[0], "verdict": "reproduced"}, *claims], "not reproduced"))
     assert rows[0] == ("2–3", "gain for α 0.5, 1.0", "11.5, 11.5", "1")
     assert [row[0] for row in rows[1:]] == ["4", "5"]
+
+
+def test_powers_of_ten_are_written_as_on_other_pages():
+    page = "1.34 (1.33 to 1.36) × 10⁻⁷ † | 6.06 × 10⁻⁸ (1.03 × 10⁻⁹ to 1.20 × 10⁻⁷) | 2.24 × 10⁸ | 30.0 (3.0 to 32.0)"
+    expected = "1.34e-7 (1.33 to 1.36) † | 6.06e-8 (1.03e-9 to 1.20e-7) | 2.24e8 | 30.0 (3.0 to 32.0)"
+    assert with_exponents(page) == expected
 
 
 @pytest.mark.parametrize(
