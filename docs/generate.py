@@ -112,10 +112,10 @@ def settings_reference() -> str:
         rows = _settings_rows(section)
         shared = {row: model_of[row] for row in rows if row in model_of}
         text.append(f"### `av.parameters` of `{model}`\n\n{_own_words(section)}")
-        text += [
-            f" As of `{other}`: {', '.join(row[0].split(':')[0].strip('`') for row in shared if shared[row] == other)}."
-            for other in dict.fromkeys(shared.values())
-        ]
+        for other in dict.fromkeys(shared.values()):
+            names = [row[0].split(":")[0].strip("`") for row in shared if shared[row] == other]
+            rest = PARAMETERS[other].model_fields.keys() - section.model_fields.keys()  # that it does not have
+            text.append(f" Others as of `{other}`." if not rest else f" As of `{other}`: {', '.join(names)}.")
         new = [row for row in rows if row not in shared]
         text.append(f"\n\n{_listed(new)}\n")
         model_of = dict.fromkeys(new, model) | model_of
