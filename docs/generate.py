@@ -229,7 +229,7 @@ def _command(name: str) -> str:
 
 
 def validated_range(name: str) -> str:
-    """What a replication experiment found without an assumption, over its vehicles; its command."""
+    """What a replication experiment found without an assumption, over its vehicles."""
     of = [one for one in _result(name)["judgements"] if _is_headline(one)]
 
     def span(key: str, form: str) -> str:
@@ -237,8 +237,7 @@ def validated_range(name: str) -> str:
 
     return (
         f"Of {len(of)} vehicles with true rates of {span('truth', '.3g')}: coverage {span('coverage', '.3f')}, bias "
-        f"{span('bias', '+.1%')}, {span('tests_median', ',.0f')} tests (medians). {_command(name)} "
-        f"([{name}.json](validation/{name}.json)).\n"
+        f"{span('bias', '+.1%')}, {span('tests_median', ',.0f')} tests (medians).\n"
     )
 
 
@@ -288,15 +287,12 @@ def _decision_cells(name: str, of: str) -> tuple[str, ...]:
 
 
 def beside_table(name: str) -> str:
-    """Each vehicle beside the reference driver: what a run says, how often that holds, when it is decided; command."""
+    """Each vehicle beside the reference driver: what a run says, when it is decided, how often both hold; command."""
     content = _result(name)
     of_experiment = content["experiment"]
     driver, soon = of_experiment["beside"], of_experiment["budgets"][0]
-    head = (
-        *("vehicle", f"times `{driver}`", "a run says (medians)", "tests", "holds: rate, ratio"),
-        *("decided after", f"within {soon:,}", "wrongly"),
-    )
-    rows = []
+    head = ("vehicle", f"times `{driver}`", "a run says (medians)", "tests", "decided after", f"within {soon:,}")
+    rows, least = [], {"rate": 1.0, "ratio": 1.0, "decision": 1.0}
     for vehicle, of in _by_result(content["judgements"]).items():
         ratio, (early, late) = of[f"ratio to {driver}"], (of[key] for key in of if key.startswith("limit "))
         low, high = (_two_digits_of(ratio[end]) for end in ("low_median", "high_median"))
@@ -304,11 +300,17 @@ def beside_table(name: str) -> str:
         rows.append(
             (
                 *(vehicle, _two_digits_of(ratio["truth"]), f"{low} to {high}" if float(low) else f"below {high}"),
-                *(f"{ratio['tests_median']:,.0f}", f"{of['shells']['coverage']:.3f}, {ratio['coverage']:.3f}"),
-                *(after, f"{early['reached']:.0%}", f"{1.0 - late['coverage']:.1%}"),
+                *(f"{ratio['tests_median']:,.0f}", after, f"{early['reached']:.0%}"),
             )
         )
-    return f"{_table(head, rows)}\n{_command(name)} ([{name}.json](validation/{name}.json)).\n"
+        found = zip(least, (of["shells"], ratio, late), strict=True)
+        least |= {key: min(least[key], one["coverage"]) for key, one in found}
+    return (
+        f"{_table(head, rows)}\n"
+        f"Coverage is at least {least['rate']:.3f} of the rate, {least['ratio']:.3f} of the ratio; at most "
+        f" {1.0 - least['decision']:.1%} of decisions are wrong. {_command(name)} "
+        f"([{name}.json](validation/{name}.json)).\n"
+    )
 
 
 def _two_digits_of(value: float) -> str:
