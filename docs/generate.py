@@ -308,7 +308,7 @@ def beside_table(name: str) -> str:
     return (
         f"{_table(head, rows)}\n"
         f"Coverage is at least {least['rate']:.3f} of the rate, {least['ratio']:.3f} of the ratio; at most "
-        f" {1.0 - least['decision']:.1%} of decisions are wrong. {_command(name)} "
+        f"{1.0 - least['decision']:.1%} of decisions are wrong. {_command(name)} "
         f"([{name}.json](validation/{name}.json)).\n"
     )
 
