@@ -1,7 +1,7 @@
 """How far crash shares within shells stay the same in other traffic, by drivers whose rates are known in both.
 
-    python -m benchmarks.other_traffic                        # eleven environments, seven drivers: 8 minutes
-    python -m benchmarks.other_traffic --relative-error 0.03  # rougher, in two
+    python -m benchmarks.other_traffic                        # 25 environments, eight drivers: 4 minutes
+    python -m benchmarks.other_traffic --relative-error 0.03  # rougher, in one
     python -m benchmarks.other_traffic --replicates mine.yaml # what is not known of fitted traffic: rates, and ratios
 
 Each driver is a reference driver of the library, of which no shell is made. Its rate in the other traffic is known by
@@ -11,15 +11,15 @@ the pool that is built there, and predicted as `harness estimate --environment` 
 from __future__ import annotations
 
 import argparse
-import re
 import tempfile
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from harness.campaign.files import load_campaign
-from harness.campaign.sections import EnvironmentSettings
 from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths
 from harness.pool.shells import design_shells
@@ -28,31 +28,39 @@ from harness.resolved import Resolved, resolve
 from harness.runner.other_traffic import read_replicates
 from harness.runner.stored_shells import Moved, environment_with
 from harness.traffic.loading import load_parameters
-from harness.traffic.parameters import SHIPPED_FOLDER
-from harness.vehicles.library import OF_TRAFFIC
 from harness.vehicles.library import SHIPPED_FOLDER as LIBRARIES
 
 IDM = {"model": "idm"}
 DRIVERS = {
     "idm": IDM,
+    "late-300ms": {**IDM, "reaction": {"delay_s": 0.3}},
     "late-600ms": {**IDM, "reaction": {"delay_s": 0.6}},
     "brakes-8": {**IDM, "parameters": {"min_acceleration_mps2": -8.0}},
     "brakes-6": {**IDM, "parameters": {"min_acceleration_mps2": -6.0}},
     "fvdm-6": {"model": "fvdm", "parameters": {"min_acceleration_mps2": -6.0}},
 }
+LOOK, ACCEPT, LEAD = "cut_in__ignore_share", "cut_in__accept_ttc_s", "lateral__speed"
 TRAFFIC = {
-    "ignore_share 0.05": {"ignore_share": 0.05},
-    "accept_ttc_s 5.1": {"accept_ttc_s": 5.1},
-    "ignore_share 0.1, accept_ttc_s 3": {"ignore_share": 0.1, "accept_ttc_s": 3.0},
-    "R1 by a quarter wider": {"r1_log_mean": 3.5},
-    "R1dot 1.2 times as wide": {"r1dot_log_scale": 0.17},
-    "hazard: rate 1.0": {"rate": 1.0},
-    "hazard: log_gap -1.5": {"log_gap": -1.5},
-    "hard braking 6 times as often": {"brake_logit": -3.0},
-    "noise of car following": {"log_scale_rate": 0.448},
-    "closing at 6 to 9 m/s": {"r2dot_min_mps": -9.0, "r2dot_max_mps": -6.0},
-    "v_BV 4 m/s slower": {"v_location_mps": 30.0},
+    "ignore_share 0.05": {LOOK: 0.05},
+    "accept_ttc_s 5.1": {ACCEPT: 5.1},
+    "ignore_share 0.1, accept_ttc_s 3": {LOOK: 0.1, ACCEPT: 3.0},
+    "R1 by a quarter wider": {"initial_state__r1_log_mean": 3.5},
+    "R1dot 1.2 times as wide": {"initial_state__r1dot_log_scale": 0.17},
+    "hazard: rate 1.0": {"cut_in__rate": 1.0},
+    "hazard: log_gap -1.5": {"cut_in__log_gap": -1.5},
+    "hard braking 6 times as often": {"free_driving__brake_logit": -3.0},
+    "noise of car following": {"car_following__log_scale_rate": 0.448},
+    "closing at 6 to 9 m/s": {"initial_state__r2dot_min_mps": -9.0, "initial_state__r2dot_max_mps": -6.0},
+    "v_BV 4 m/s slower": {"initial_state__v_location_mps": 30.0},
 }
+TAKES_TIME = TRAFFIC | {
+    "R1dot 1.2 times as wide": {"initial_state__r1dot_log_scale": 0.88},
+    "hard braking twice as often": {"free_driving__brake_logit": -4.8},
+    "lateral speed a tenth higher": {f"{LEAD}_median_mps": 0.95},
+    "lateral speed: log_sd 0.36": {f"{LEAD}_log_sd": 0.36},
+}
+SCENARIOS = {"scenarios/overtaking_shells.yaml": TRAFFIC, "scenarios/smoke.yaml": TAKES_TIME}
+"""Cut-ins of one step, and such that take time."""
 ENVELOPE_MPS2, BESIDE = 2.0, "r157-cc"
 
 
@@ -64,45 +72,46 @@ def main() -> None:
     if asked.replicates:
         spread(asked.replicates)
         return
-    error = asked.relative_error
-    shipped = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text(encoding="utf-8")
-    with tempfile.TemporaryDirectory() as name:
-        library, environment = Path(name, "library.yaml"), Path(name, "environment.yaml")
-        content = yaml.safe_load((LIBRARIES / "ladder-2.yaml").read_text(encoding="utf-8"))
-        content["references"] |= DRIVERS
-        library.write_text(yaml.safe_dump(content), encoding="utf-8")
+    for scenario, traffic in SCENARIOS.items():
+        moved(scenario, traffic, asked.relative_error)
 
-        def resolved(*more: str) -> Resolved:
-            changes = f"pool={{library: {library}, relative_error: {error}}}", *more
-            return resolve(load_campaign("scenarios/overtaking_shells.yaml", changes))
 
-        here = campaign_pool(resolved())
+def with_drivers(folder: str, campaign: str, *changes: str) -> Resolved:
+    """A campaign in whose library the drivers are references."""
+    traffic = resolve(load_campaign(campaign, changes))
+    content = yaml.safe_load((LIBRARIES / f"{traffic.campaign.pool.library}.yaml").read_text(encoding="utf-8"))
+    content["references"] |= DRIVERS
+    library = Path(folder, "library.yaml")
+    library.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return resolve(load_campaign(campaign, (*changes, f"pool.library={library}")))
+
+
+def moved(scenario: str, traffic: Mapping[str, Mapping[str, float]], error: float) -> None:
+    """By how much rates come out wrong in each traffic."""
+    with tempfile.TemporaryDirectory() as folder:
+        base = with_drivers(folder, scenario, f"pool.relative_error={error}")
+        here, parameters = campaign_pool(base), load_parameters(base.campaign.environment)
         tested = design_shells(here, ENVELOPE_MPS2)
-        print(f"{'traffic':34}" + "".join(f"{each.name:>12}" for each in tested.references), flush=True)
-        for words, values in TRAFFIC.items():
-            text = shipped
-            for key, value in values.items():
-                text = re.sub(rf"(\n  {key}: {{value: )[-0-9.]+", rf"\g<1>{value}", text, count=1)
-            environment.write_text(text, encoding="utf-8")
-            pool = campaign_pool(resolved(f"environment.parameters={environment}"), order=here.names)
-            there = Moved.of(tested, design_shells(pool, ENVELOPE_MPS2), words).there
-            off = []
-            for r, rate in enumerate(there.reference_rate):
-                shares = ((tested.cell_p * tested.crashes_too(r)) @ tested.joined) / np.where(tested.p > 0, tested.p, 1)
-                off.append(float(there.p @ shares) / rate - 1.0)
-            print(f"{words:34}" + "".join(f"{each:12.1%}" for each in off), flush=True)
+        name = base.campaign.environment.parameters
+        print(f"{name:34}" + "".join(f"{each.name:>12}" for each in tested.references), flush=True)
+        p, shares = tested.p, Moved(tested, tested).reference_shares()
+        means = (p @ shares**2) / (p @ shares)  # below `LEAST_SHARE` it would be refused
+        print(f"{'crashing share of shells':34}" + "".join(f"{each:12.2f}" for each in means), flush=True)
+        for words, values in traffic.items():
+            environment = environment_with(base, parameters, values)
+            if environment is None:
+                print(f"{words:34}  no laws", flush=True)
+                continue
+            pool = campaign_pool(replace(base, environment=environment), order=here.names)
+            there = Moved.of(tested, design_shells(pool, ENVELOPE_MPS2), words)
+            told, known = there.there.p @ there.reference_shares(), there.there.reference_rate
+            print(f"{words:34}" + "".join(f"{each:12.1%}" for each in told / known - 1.0), flush=True)
 
 
 def spread(environment: str) -> None:
     """Nine tenths of the replicates: by what rates of drivers move, and their ratios to the competent driver."""
-    with tempfile.TemporaryDirectory() as name:
-        takes_time = load_parameters(EnvironmentSettings(parameters=environment)).lateral_motion().present
-        content = yaml.safe_load((LIBRARIES / f"{OF_TRAFFIC[takes_time]}.yaml").read_text(encoding="utf-8"))
-        content["references"] |= DRIVERS
-        library = Path(name, "library.yaml")
-        library.write_text(yaml.safe_dump(content), encoding="utf-8")
-        changes = f"environment.parameters={environment}", f"pool.library={library}"
-        traffic = resolve(load_campaign("scenarios/smoke.yaml", changes))
+    with tempfile.TemporaryDirectory() as folder:
+        traffic = with_drivers(folder, "scenarios/smoke.yaml", f"environment.parameters={environment}")
         pool = campaign_pool(traffic)
         parameters = load_parameters(traffic.campaign.environment)
         rows = read_replicates(environment, parameters)

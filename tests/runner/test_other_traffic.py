@@ -9,6 +9,7 @@ import pytest
 
 from harness.cli import main
 from harness.errors import CampaignError
+from harness.runner import stored_shells
 from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.stored_runs import copy_of, estimates
@@ -63,6 +64,12 @@ def test_the_page_of_the_old_traffic_is_not_named_below_the_answer(stored_run, t
 def test_cut_ins_that_no_test_stands_for_are_refused(stored_run, tmp_path):
     with pytest.raises(CampaignError, match="unlike any that was tested"):
         answer(stored_run("shells-twin"), environment(tmp_path, r2dot_min_mps=-16.0))
+
+
+def test_a_vehicle_that_crashes_on_few_cut_ins_of_its_shells_is_refused(stored_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(stored_shells, "LEAST_SHARE", 1.1)
+    with pytest.raises(CampaignError, match="of the cut-ins of the shells that it crashes in"):
+        answer(stored_run("shells-twin"), environment(tmp_path, ignore_share=0.02))
 
 
 @pytest.mark.parametrize(
