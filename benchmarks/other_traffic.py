@@ -1,16 +1,19 @@
 """How far crash shares within shells stay the same in other traffic, by drivers whose rates are known in both.
 
-    python -m benchmarks.other_traffic                        # 25 environments, eight drivers: 4 minutes
-    python -m benchmarks.other_traffic --relative-error 0.03  # rougher, in one
+    python -m benchmarks.other_traffic                        # 25 environments, twelve drivers: 15 minutes
+    python -m benchmarks.other_traffic --relative-error 0.03  # rougher, in three
+    python -m benchmarks.other_traffic --runs FOLDER          # the same by tests, of three vehicles, in the default
     python -m benchmarks.other_traffic --replicates mine.yaml # what is not known of fitted traffic: rates, and ratios
 
 Each driver is a reference driver of the library, of which no shell is made. Its rate in the other traffic is known by
 the pool that is built there, and predicted as `harness estimate --environment` does: new probabilities, old shares.
+Rates of drivers that few of the pool's paths meet are known badly: standard errors stand beside them.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,15 +23,19 @@ import numpy as np
 import yaml
 
 from harness.campaign.files import load_campaign
+from harness.errors import HarnessError
 from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths
 from harness.pool.shells import design_shells
 from harness.progress import Progress
 from harness.resolved import Resolved, resolve
-from harness.runner.other_traffic import read_replicates
-from harness.runner.stored_shells import Moved, environment_with
+from harness.runner.other_traffic import estimate_in_other_traffic, read_replicates
+from harness.runner.run import run_campaign
+from harness.runner.stored_shells import MOST_OFF, Moved, environment_with
+from harness.strata import ShellDesign
 from harness.traffic.loading import load_parameters
 from harness.vehicles.library import SHIPPED_FOLDER as LIBRARIES
+from harness.vocabulary import FloatArray
 
 IDM = {"model": "idm"}
 DRIVERS = {
@@ -37,6 +44,10 @@ DRIVERS = {
     "late-600ms": {**IDM, "reaction": {"delay_s": 0.6}},
     "brakes-8": {**IDM, "parameters": {"min_acceleration_mps2": -8.0}},
     "brakes-6": {**IDM, "parameters": {"min_acceleration_mps2": -6.0}},
+    "brakes-5": {**IDM, "parameters": {"min_acceleration_mps2": -5.0}},
+    "brakes-45": {**IDM, "parameters": {"min_acceleration_mps2": -4.5}},
+    "late-800ms": {**IDM, "reaction": {"delay_s": 0.8}},
+    "sees-1m": {**IDM, "reaction": {"perceives_lateral_m": 1.0}},
     "fvdm-6": {"model": "fvdm", "parameters": {"min_acceleration_mps2": -6.0}},
 }
 LOOK, ACCEPT, LEAD = "cut_in__ignore_share", "cut_in__accept_ttc_s", "lateral__speed"
@@ -62,13 +73,25 @@ TAKES_TIME = TRAFFIC | {
 SCENARIOS = {"scenarios/overtaking_shells.yaml": TRAFFIC, "scenarios/smoke.yaml": TAKES_TIME}
 """Cut-ins of one step, and such that take time."""
 ENVELOPE_MPS2, BESIDE = 2.0, "r157-cc"
+TESTED = {
+    "late-300ms": ("av.reaction.delay_s=0.3",),
+    "late-600ms": ("av.reaction.delay_s=0.6",),
+    "r157-cc": ("av={model: r157-cc}",),
+}
+MORE = {"closing at 5 to 16 m/s": {"initial_state__r2dot_min_mps": -16.0}}
+"""Unlike what is tested elsewhere."""
+N_TESTS = 20_000
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--relative-error", type=float, default=0.01, help="of the pools (default: %(default)s)")
     parser.add_argument("--replicates", metavar="FILE", help="environment that names some: how far known rates spread")
+    parser.add_argument("--runs", metavar="FOLDER", help="where to run three vehicles, in the twin")
     asked = parser.parse_args()
+    if asked.runs:
+        by_tests(Path(asked.runs))
+        return
     if asked.replicates:
         spread(asked.replicates)
         return
@@ -92,11 +115,16 @@ def moved(scenario: str, traffic: Mapping[str, Mapping[str, float]], error: floa
         base = with_drivers(folder, scenario, f"pool.relative_error={error}")
         here, parameters = campaign_pool(base), load_parameters(base.campaign.environment)
         tested = design_shells(here, ENVELOPE_MPS2)
-        name = base.campaign.environment.parameters
-        print(f"{name:34}" + "".join(f"{each.name:>12}" for each in tested.references), flush=True)
+        names = [each.name for each in tested.references]
+        shipped = [r for r, name in enumerate(names) if name not in DRIVERS]
+
+        def show(words: str, numbers: FloatArray, form: str, after: str = "") -> None:
+            print(f"{words:34}" + "".join(f"{each:12{form}}" for each in numbers) + after, flush=True)
+
+        print(f"{base.campaign.environment.parameters:34}" + "".join(f"{name:>12}" for name in names), flush=True)
         p, shares = tested.p, Moved(tested, tested).reference_shares()
-        means = (p @ shares**2) / (p @ shares)  # below `LEAST_SHARE` it would be refused
-        print(f"{'crashing share of shells':34}" + "".join(f"{each:12.2f}" for each in means), flush=True)
+        show("crashing share of shells", (p @ shares**2) / (p @ shares), ".2f")  # refused below `LEAST_SHARE`
+        show("standard error of a rate", _error(tested), ".1%")
         for words, values in traffic.items():
             environment = environment_with(base, parameters, values)
             if environment is None:
@@ -105,7 +133,41 @@ def moved(scenario: str, traffic: Mapping[str, Mapping[str, float]], error: floa
             pool = campaign_pool(replace(base, environment=environment), order=here.names)
             there = Moved.of(tested, design_shells(pool, ENVELOPE_MPS2), words)
             told, known = there.there.p @ there.reference_shares(), there.there.reference_rate
-            print(f"{words:34}" + "".join(f"{each:12.1%}" for each in told / known - 1.0), flush=True)
+            off = told / known - 1.0
+            show(words, off, ".1%", "  refused" if np.abs(off[shipped]).max() > MOST_OFF else "")
+
+
+def _error(design: ShellDesign) -> FloatArray:
+    rate, square = design.reference_rate, design.reference_square
+    return np.asarray(np.sqrt(np.maximum(square / rate**2 - 1.0, 0.0) / design.n_paths))
+
+
+def by_tests(folder: Path) -> None:
+    """Answers of old tests over those of new ones in the other traffic; each has tests of its own."""
+    shipped = load_parameters(load_campaign("scenarios/smoke.yaml").environment)
+    fixed = "world.engine=twin", "stop.rhw=0.001", "stop.below_reference=null", f"stop.episodes={N_TESTS}"
+    print(f"{'':34}" + "".join(f"{vehicle:>12}" for vehicle in TESTED), flush=True)
+    for words, values in {"": {}, **TAKES_TIME, **MORE}.items():
+        environment = folder / "traffic.yaml"
+        environment.parent.mkdir(parents=True, exist_ok=True)
+        environment.write_text(yaml.safe_dump(shipped.with_values(values).model_dump(exclude_none=True)))
+        cells = []
+        for vehicle, changes in TESTED.items():
+            old, new = folder / vehicle, folder / f"{vehicle} {words}"
+            if not words:
+                run_campaign(load_campaign("scenarios/smoke.yaml", (*fixed, *changes)), old)
+                continue
+            try:
+                told = estimate_in_other_traffic(old, str(environment))
+            except HarnessError:
+                cells.append("refused")
+                continue
+            elsewhere = f"environment.parameters={environment}"
+            run_campaign(load_campaign("scenarios/smoke.yaml", (*fixed, *changes, elsewhere)), new)
+            known = json.loads((new / "estimates.json").read_text(encoding="utf-8"))
+            rates = [each["estimates"]["shells"]["crash_rate"] for each in (told, known)]
+            cells.append(f"{rates[0] / rates[1] - 1.0:.1%}")
+        print(f"{words:34}" + "".join(f"{cell:>12}" for cell in cells), flush=True)
 
 
 def spread(environment: str) -> None:

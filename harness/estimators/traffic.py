@@ -21,7 +21,7 @@ import numpy as np
 
 from harness.estimators.estimate import Number
 from harness.estimators.short_answer import Row
-from harness.numbers import interval, number, ratio, share
+from harness.numbers import MISSING, interval, number, ratio, share
 from harness.vocabulary import FloatArray
 
 CARRIES = 0.05
@@ -117,14 +117,31 @@ def _log(value: float) -> float:
 def rows(found: TrafficError) -> Iterator[Row]:
     """Lines of the short answer: of the rate, and of its ratio to the first of the others."""
     why = "with sampling error" if found.unseen is None else f"none seen at {found.unseen.where}"
+    if is_open(found):
+        why = f"{found.n_refused} of {found.n_replicates} replicates unlike what was tested"
     yield Row("traffic", "traffic", f"{times(found.rate)} (fitted)", _ends(found), why)
-    for name, each in list(found.ratios.items())[:1]:
-        ends = f"{ratio(each.both[0])} to {ratio(each.both[1])}"
-        yield Row("traffic_ratio", "traffic, × driver", f"{times(each)} (fitted)", ends, f"the ratio to {name}")
+    for name, each in list(found.ratios.items())[: 0 if is_open(found) else 1]:
+        yield Row(
+            "traffic_ratio", "traffic, × driver", f"{times(each)} (fitted)", _of_ratio(each), f"the ratio to {name}"
+        )
+
+
+def is_open(found: TrafficError) -> bool:
+    """Whether so many replicates could not be answered that nothing is said."""
+    return not math.isfinite(found.rate.times[1])
 
 
 def _ends(found: TrafficError) -> str:
+    if is_open(found):
+        return MISSING
     return interval(*found.rate.both) if found.unseen is None else f"< {number(found.rate.both[1])}"
+
+
+def _of_ratio(of: Uncertain) -> str:
+    low, high = of.both
+    if math.isfinite(high):
+        return f"{ratio(low)} to {ratio(high)}"
+    return f"at least {ratio(low)}" if low > 0.0 else "no limit"
 
 
 def times(of: Uncertain) -> str:
@@ -138,13 +155,18 @@ def times(of: Uncertain) -> str:
 def sentences(found: TrafficError, of: str = "the vehicle") -> Iterator[str]:
     """The same in words, for estimates.json and the page."""
     n, level, both = found.n_replicates, share(found.confidence), _ends(found)
+    if is_open(found):
+        yield (
+            f"{found.n_refused} of {n} replicates of {found.environment} are unlike what was tested, so that these "
+            f"tests do not limit by how much the traffic moves the rate of {of}: run the campaign in that environment."
+        )
+        return
     yield (
         f"The traffic, as far as {found.environment} is known, moves the rate of {of} by {times(found.rate)} ({level} "
         f"of {n} replicates{because(found)}); with the sampling error it is {both} per test."
     )
     for name, each in found.ratios.items():
-        ends = f"{ratio(each.both[0])} to {ratio(each.both[1])}"
-        yield f"The ratio to {name} moves by {times(each)}; with the sampling error it is {ends}."
+        yield f"The ratio to {name} moves by {times(each)}; with the sampling error it is {_of_ratio(each)}."
     if found.ratios:
         yield f"Of a ratio {share(ONE_LAW)} either way are for one law being fitted to drivers who differ."
     yield (

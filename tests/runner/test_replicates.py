@@ -71,9 +71,14 @@ def test_what_was_found_once_is_not_looked_for_again(stored_run, tmp_path, monke
 def test_replicates_that_tests_cannot_answer_leave_the_interval_open(stored_run, tmp_path):
     """One in which the AV closes in faster than in any test, one whose laws are none."""
     columns = {"initial_state__r2dot_min_mps": [-10.0, -16.0, -10.0], "cut_in__intercept": [-8.7, -8.7, 900.0]}
-    traffic = estimate_in_other_traffic(stored_run("shells-twin"), fitted(tmp_path, **columns))["traffic"]
+    content = estimate_in_other_traffic(stored_run("shells-twin"), fitted(tmp_path, **columns))
+    traffic, answer = content["traffic"], content["answer"]
     assert (traffic["n_replicates"], traffic["n_refused"]) == (3, 2)
     assert traffic["rate"]["times"] == [0.0, None]
+    (row,) = [row for row in answer["rows"] if row["key"].startswith("traffic")]
+    assert (row["value"], row["remark"]) == ("no limit (fitted)", "2 of 3 replicates unlike what was tested")
+    assert "2 of 3 replicates of mine are unlike what was tested" in content["scope"]
+    assert "∞" not in f"{answer} {content['scope']}"
 
 
 def test_the_folder_keeps_the_answer_of_its_own_traffic_alone(stored_run, tmp_path, capsys):
