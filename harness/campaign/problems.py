@@ -69,7 +69,7 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         expected, mend = f"one of the keys {', '.join(known)}", did_you_mean(last, known)
     elif kind == "model_type":
         expected = f"a section with keys such as {', '.join(list(section.model_fields)[:4])}"
-    elif last == "[key]":
+    elif last == "[key]" and kind != "literal_error":
         found, expected, mend = f"the name {found}", _pattern_in_words(context), "Choose another name."
     elif kind == "literal_error":
         words = re.findall("'(.*?)'", context["expected"])

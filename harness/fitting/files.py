@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 import yaml
 
 from harness.campaign.files import read_model
-from harness.errors import HarnessError
+from harness.campaign.yaml_text import yaml_text
+from harness.errors import HarnessError, TrajectoryError, printable
 from harness.fitting.fit import Fit, fit_traffic
 from harness.fitting.laws import Traffic
 from harness.fitting.observations import Observations, Tally, observations, require_enough
@@ -23,7 +23,7 @@ from harness.fitting.table import load_mapping
 from harness.fitting.tracks import FitRange
 from harness.fitting.uncertainty import REPLICATES, replicates
 from harness.progress import Progress
-from harness.records.folder import require_place, write_atomically, write_text
+from harness.records.folder import parquet, require_place, write_together
 from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
 
 BASE = "ndd-overtaking-2"
@@ -80,8 +80,13 @@ def fit_files(
     progress, out = progress or Progress(), Path(out)
     paths = [Path(file) for file in files]
     read, where = load_mapping(mapping, mirror=mirror), ", ".join(map(str, paths))
-    if mapping is not None and out.exists() and Path(mapping).exists() and out.samefile(mapping):
-        raise HarnessError(f"--out {out}", "the mapping's own file", "another file", "Choose another name.")
+    beside, shown = out.with_name(f"{out.stem}.replicates.parquet"), out.with_suffix(".html")
+    inputs = {path.resolve() for path in paths}
+    if len(inputs) < len(paths):
+        raise TrajectoryError(where, "a file that is named twice", "each once", "Leave one of them out.")
+    for path in (out, beside, shown):
+        if path.resolve() in inputs | {Path(mapping or ".").resolve()}:
+            raise HarnessError(f"--out {out}", f"that {path} is read", "files of its own", "Choose another name.")
     require_place(out.parent)
     base = read_model(SHIPPED_FOLDER / f"{BASE}.yaml", EnvironmentParameters)
     numbers = base.values()
@@ -99,12 +104,10 @@ def fit_files(
     fit = fit_traffic(Traffic.of(gathered), base, BASE, where, progress)
     rows = replicates(fit, n_replicates, seed, progress)
 
-    beside = out.with_name(f"{out.stem}.replicates.parquet")
-    shown = out.with_suffix(".html")
-    write_atomically(beside, lambda temporary: pq.write_table(pa.table(rows), temporary, compression="zstd"))
     noise_mps2 = math.sqrt(math.fsum(each.noise_mps2**2 for each in gathered) / len(gathered))
-    write_text(shown, page(fit, tally, noise_mps2, rows, out.name, paths))
-    write_text(out, _yaml(fit, tally, paths, beside.name, mapping, read.mirror))
+    environment = _yaml(fit, tally, paths, beside.name, mapping, read.mirror)
+    text = page(fit, tally, noise_mps2, rows, out.name, paths)
+    write_together({out: environment.encode(), beside: parquet(pa.table(rows)), shown: text.encode()})
     return FittedFiles(out, beside, shown, fit, tally)
 
 
@@ -121,7 +124,7 @@ def _yaml(fit: Fit, tally: Tally, files: Sequence[Path], beside: str, mapping: s
         f"mapping: {mapping or 'that of the input table'}{', mirrored' if mirrored else ''}",
         *(f"sha256 {_sha256(file)} {file.name}" for file in files),
     ]
-    text = "".join(f"# {line}\n" for line in lines)
+    text = "".join(f"# {printable(' '.join(line.split()))}\n" for line in lines)
     content: dict[str, Any] = fit.environment.model_dump(exclude_none=True)
     for name, section in content.items():
         if not isinstance(section, dict):
@@ -133,7 +136,7 @@ def _yaml(fit: Fit, tally: Tally, files: Sequence[Path], beside: str, mapping: s
                 text += f"  {key}:\n" + "".join(f"    - {_flow(each)}\n" for each in number)
             else:
                 text += f"  {key}: {_flow(number)}\n"
-    return f"{text}\nreplicates: {beside}\n"
+    return f"{text}\n{yaml_text({'replicates': beside})}"
 
 
 def _flow(value: Any) -> str:

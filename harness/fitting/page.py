@@ -161,6 +161,7 @@ def _hazard_plot(fit: Fit) -> Plot:
     panels = []
     for column, label in zip(HAZARD_OF, labels, strict=True):
         edges = np.unique(np.quantile(rows[column], np.linspace(0.0, 1.0, 9)))
+        edges = edges if edges.size > 1 else edges[0] + np.array([-0.5, 0.5])
         at = np.clip(np.searchsorted(edges, rows[column], side="right") - 1, 0, edges.size - 2)
         seen, time_s, wished, middle = (
             np.bincount(at, weights, edges.size - 1).astype(np.float64)
@@ -186,6 +187,7 @@ def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
     panels = []
     for column, of, label in (*columns, ("r1dot_mps", "r1dot_mps", "R1dot, m/s")):
         low, high = np.quantile(rows[column], [0.002, 0.998])
+        low, high = (low, high) if low < high else (low - 0.5, high + 0.5)
         edges = np.linspace(low, high, 31)
         seen, law = _histogram(rows[column], edges), _histogram(drawn[of], edges)
         panel = Panel("", Axis(label, low, high), Axis("density", 0.0, 1.15 * float(max(seen.max(), law.max()))))

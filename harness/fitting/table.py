@@ -26,6 +26,7 @@ from harness.errors import TrajectoryError
 from harness.vocabulary import FloatArray, IntArray
 
 Needed = Literal["vehicle_id", "time_s", "s_m", "speed_mps", "lane", "length_m"]
+Measured = Literal["time_s", "s_m", "speed_mps", "length_m", "lateral_m"]
 Optional = Literal["recording_id", "lateral_m", "class", "direction"]
 NEEDED: tuple[Needed, ...] = get_args(Needed)
 OPTIONAL: tuple[Optional, ...] = get_args(Optional)
@@ -37,6 +38,7 @@ UNITS: dict[Unit, float] = dict(
 )
 NO_LENGTH = "Gaps need lengths: mend them, or give one for all in a mapping (columns: {length_m: 4.6})."
 NO_COLUMN = ("Rename a column, or say in a mapping what it is called (--mapping FILE.yaml).", NO_LENGTH)
+LONGEST_LINE = 1 << 20
 SLOWEST_HZ = 9.5
 FASTEST_MEDIAN_MPS = 70.0
 USUAL_LENGTH_M = (2.5, 10.0)
@@ -54,6 +56,8 @@ SLIPS = {
     -1.0: "positions that fall where vehicles drive forward",
 }
 """What a ratio of speeds to the change of positions comes from."""
+MOST_APART = {"time_s": 1e7, "s_m": 1e5, "lane": 1e3}
+"""Rows further from the others hold a wrong value."""
 LEAST_LAG_S = 0.3
 ANOTHER_VEHICLE_S = 60.0
 """An identifier that comes back after so long belongs to another vehicle (NGSIM's do)."""
@@ -62,10 +66,10 @@ ANOTHER_VEHICLE_S = 60.0
 class Mapping(Section):
     """How the columns of a file are to be read."""
 
-    columns: dict[Needed | Optional, str | float] = Field(
+    columns: dict[Literal[Needed, Optional], str | float] = Field(
         default={}, description="name in the file, or one number for all rows, by name of the input table"
     )
-    units: dict[Needed | Optional, Unit | Annotated[float, Field(gt=0.0)]] = Field(
+    units: dict[Measured, Unit | Annotated[float, Field(gt=0.0)]] = Field(
         default={}, description="unit in the file, or what it is multiplied by"
     )
     lanes: Literal["from_right", "from_left"] | list[int] = Field(
@@ -125,6 +129,15 @@ class Recording:
             f"t = {each.time_s:.10g} s)"
         )
 
+    def require_near(self, column: str) -> None:
+        """Refuse a value so far from the others that neighbours could not be told apart."""
+        values = self.rows[column].to_numpy()
+        off = np.abs(values - np.median(values))
+        if off.max() > MOST_APART[column]:
+            i, mend = int(np.argmax(off)), "Delete the row, or mend the value."
+            expected = f"at most {MOST_APART[column]:g} from the median of the recording"
+            raise TrajectoryError(self.where(i), f"{column} {values[i]:g}", expected, mend)
+
 
 def recordings(files: Sequence[str | Path], mapping: Mapping) -> Iterator[Recording]:
     """Recordings of some files, one after the other, checked.
@@ -160,7 +173,7 @@ def _reading(path: Path) -> Iterator[None]:
         raise TrajectoryError(str(path), "no such file", "a CSV or Parquet file", mend) from None
     except IsADirectoryError:
         raise TrajectoryError(str(path), "a folder", "a CSV or Parquet file", "Name the files in it.") from None
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+    except (pa.ArrowException, OSError, UnicodeError) as error:
         found = f"a file that cannot be read ({str(error).splitlines()[0]})"
         mend = "Is it complete, and of the kind that its name says? Copy or write it again."
         raise TrajectoryError(str(path), found, "a CSV or Parquet file", mend) from None
@@ -205,44 +218,46 @@ def _batches(path: Path, mapping: Mapping) -> Iterator[_Batch]:
                 first += batch.num_rows
         return
     with path.open("rb") as raw:
-        head = raw.readline().decode("utf-8-sig").strip()
-        if not head:
-            raise TrajectoryError(str(path), "an empty file", "a header and rows", "Is it the right file?")
-        line = raw.readline().decode()
-        raw.seek(0)
-        delimiter = max(",;\t", key=head.count)
-        names = [name.strip().strip('"') for name in head.split(delimiter)]
-        columns = _columns(path, names, mapping)
-        types = {name: pa.string() if column in NAMES else pa.float64() for column, name in columns.items()}
-        reader = pa.csv.open_csv(
-            raw,
-            read_options=pa.csv.ReadOptions(column_names=names, skip_rows=1, block_size=1 << 22),
-            parse_options=pa.csv.ParseOptions(delimiter=delimiter),
-            convert_options=pa.csv.ConvertOptions(
-                column_types=types,
-                include_columns=list(columns.values()),
-                decimal_point="," if delimiter == ";" and "," in line else ".",
-            ),
-        )
-        size = path.stat().st_size
-        for batch in reader:
-            yield _Batch(_renamed(batch, columns, first, path, mapping), min(raw.tell() / size, 1.0))
-            first += batch.num_rows
+        head, line = (raw.readline(LONGEST_LINE).decode(each) for each in ("utf-8-sig", "utf-8"))
+    head = head.strip()
+    if not head:
+        raise TrajectoryError(str(path), "an empty file", "a header and rows", "Is it the right file?")
+    delimiter = max(",;\t", key=head.count)
+    names = [name.strip().strip('"') for name in head.split(delimiter)]
+    columns = _columns(path, names, mapping)
+    types = {name: pa.string() if column in NAMES else pa.float64() for column, name in columns.items()}
+    raw = pa.OSFile(str(path))  # after an error pyarrow's threads read on: from a file of Python they abort its exit
+    reader = pa.csv.open_csv(
+        raw,
+        read_options=pa.csv.ReadOptions(column_names=names, skip_rows=1, block_size=1 << 22),
+        parse_options=pa.csv.ParseOptions(delimiter=delimiter),
+        convert_options=pa.csv.ConvertOptions(
+            column_types=types,
+            include_columns=list(columns.values()),
+            decimal_point="," if delimiter == ";" and "," in line else ".",
+        ),
+    )
+    for batch in reader:
+        yield _Batch(_renamed(batch, columns, first, path, mapping), min(raw.tell() / raw.size(), 1.0))
+        first += batch.num_rows
 
 
 def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, str]:
     """Name in the file of each column of the input table that it has; capital letters do not count."""
-    by_lower = {name.lower(): name for name in names}
+    lower = [name.lower() for name in names]
     found: dict[str, str] = {}
     for column in (*NEEDED, *OPTIONAL):
         wanted = mapping.columns.get(column, column)
         if isinstance(wanted, float):
             continue
-        if wanted.lower() in by_lower:
-            found[column] = by_lower[wanted.lower()]
+        if lower.count(wanted.lower()) > 1:
+            mend = "Rename all but one; capital letters do not count."
+            raise TrajectoryError(str(path), f"more than one column {wanted}", "one", mend)
+        if wanted.lower() in lower:
+            found[column] = names[lower.index(wanted.lower())]
         elif column in NEEDED or (column in mapping.columns and column != "recording_id"):
             known = {} if mapping.columns else {"xvelocity": "highd", "local_y": "ngsim"}
-            of = [f"Is it a file for --mapping {known[name]}?" for name in by_lower if name in known]
+            of = [f"Is it a file for --mapping {known[name]}?" for name in lower if name in known]
             mend = of[0] if of else did_you_mean(wanted, names) or NO_COLUMN[column == "length_m"]
             what = f"a column {wanted}" + (f" for {column}" if wanted != column else "")
             raise TrajectoryError(str(path), f"the columns {', '.join(names)}", what, mend)
@@ -259,6 +274,9 @@ def _renamed(batch: Any, columns: dict[str, str], first: int, path: Path, mappin
         values = batch.column(name)
         if column in NAMES:
             text = values.cast(pa.string()).fill_null("")
+            if column in ("recording_id", "vehicle_id") and (i := text.index("").as_py()) >= 0:
+                where, mend = f"{path}, row {first + i}, {name}", "Name whose row it is, or delete it."
+                raise TrajectoryError(where, "nothing", "an identifier in every row", mend)
             data[column] = pd.arrays.ArrowExtensionArray(pa.chunked_array([text]))
             continue
         try:
@@ -314,11 +332,14 @@ def _from_highd(rows: pd.DataFrame, path: Path) -> pd.DataFrame:
     """
     stem = path.stem.removesuffix("_tracks")
     vehicles = _highd_meta(path.with_name(f"{stem}_tracksMeta.csv"), ["id", "drivingDirection", "class"])
-    rate = _highd_meta(path.with_name(f"{stem}_recordingMeta.csv"), ["frameRate"])["frameRate"].astype(float).iloc[0]
+    file = path.with_name(f"{stem}_recordingMeta.csv")
+    rate = pd.to_numeric(_highd_meta(file, ["frameRate"])["frameRate"], errors="coerce").max()
+    if not rate > 0.0:
+        raise TrajectoryError(str(file), "no frameRate", "frames per second", "Take the file as it was published.")
     rows = rows.merge(vehicles.rename(columns={"id": "vehicle_id"}), on="vehicle_id", how="left")
-    if (missing := rows.drivingDirection.isna()).any():
-        found = f"no vehicle {rows.vehicle_id[missing].iloc[0]}"
-        raise TrajectoryError(f"{stem}_tracksMeta.csv", found, "all vehicles", "Take both from one recording.")
+    if (missing := ~rows.drivingDirection.isin(["1", "2"])).any():
+        found = f"no drivingDirection 1 or 2 of vehicle {rows.vehicle_id[missing].iloc[0]}"
+        raise TrajectoryError(f"{stem}_tracksMeta.csv", found, "that of all", "Take both from one recording.")
     leftwards = (rows.drivingDirection == "1").to_numpy()
     forward = np.where(leftwards, -1.0, 1.0)
     return rows.assign(
@@ -362,6 +383,7 @@ def _recording(name: str, path: Path, rows: pd.DataFrame, share_read: float) -> 
         mend = "Delete it; or name recordings (recording_id), should the vehicle be another."
         raise TrajectoryError(where, "a second row of this vehicle and time", "one", mend)
     rate = _rate_hz(recording, dt[same])
+    recording.require_near("time_s")
     since = (time_s - time_s.min()) * rate
     frame = np.rint(since).astype(np.int64)
     if (odd := np.abs(since - frame) > 0.3).any():
@@ -424,6 +446,8 @@ def _check_units(recording: Recording) -> None:
     if abs(lag_s) >= LEAST_LAG_S:
         found = f"speeds that belong to positions of {abs(lag_s):.1f} s {'earlier' if lag_s > 0 else 'later'}"
         raise TrajectoryError(where, found, "both of one time", "Correct the shift between the columns.")
+    recording.require_near("s_m")
+    recording.require_near("lane")
 
 
 def _lag(begin: IntArray, frame: IntArray, vehicle: IntArray, way: FloatArray, v: FloatArray, n: int) -> int:

@@ -123,6 +123,10 @@ REFUSED = {
     "of highD": (lambda: ROWS.rename(columns={"speed_mps": "xVelocity"}), "--mapping highd"),
     "of NGSIM": (lambda: ROWS.rename(columns={"s_m": "Local_Y"}), "--mapping ngsim"),
     "text": (changed(lane="left"), "numbers"),
+    "nobody's row": (with_value(7, "vehicle_id", None), "row 8, vehicle_id: found nothing"),
+    "the end of time": (with_value(7, "time_s", 1e12), r"row 8 .*found time_s 1e\+12"),
+    "far away": (with_value(7, "s_m", 1e12), r"row 8 .*found s_m 1e\+12"),
+    "lanes": (with_value(7, "lane", 1e12), r"row 8 .*found lane 1e\+12"),
     "no rows": (lambda: ROWS[:0], "no rows"),
 }
 
@@ -145,6 +149,7 @@ FILES = {
     "header.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n", "no rows"),
     "ragged.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,0,5\n1,0.1,3\n", "cannot be read"),
     "words.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,fast,0,5\n", "cannot be read .*fast"),
+    "twice.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m,Lane\n1,0,0,30,0,5,1\n", "more than one column lane"),
     "cut.parquet": (b"PAR1 and no more", "cannot be read"),
     "binary.csv": (b"\xff\xfe\x00\x01\x80\n\x80\n", "cannot be read|columns"),
 }
@@ -257,16 +262,26 @@ def test_highd(tmp_path):
         assert risky["r2_m"][0] == pytest.approx(40 - 5 * 0.96 - 4.5)
         assert risky["r2dot_mps"][0] == pytest.approx(-5.0)
     assert set(each.following["vehicle"]) == {1, 4}
-    (tmp_path / "01_tracksMeta.csv").unlink()
-    with pytest.raises(TrajectoryError, match="beside the tracks"):
-        judged(tracks, "highd")
+    wrong = {
+        "01_tracksMeta.csv": ("id,class,drivingDirection\n10,Car,3\n", "no drivingDirection 1 or 2"),
+        "01_recordingMeta.csv": ("id,frameRate\n1,fast\n", "no frameRate"),
+    }
+    for name, (content, words) in wrong.items():
+        right = (tmp_path / name).read_text()
+        (tmp_path / name).write_text(content)
+        with pytest.raises(TrajectoryError, match=words):
+            judged(tracks, "highd")
+        (tmp_path / name).unlink()
+        with pytest.raises(TrajectoryError, match="beside the tracks"):
+            judged(tracks, "highd")
+        (tmp_path / name).write_text(right)
 
 
 def test_a_mapping_is_checked(tmp_path):
-    (tmp_path / "own.yaml").write_text("columns: {speed: v}\nunits: {s_m: yards}\n")
-    with pytest.raises(HarnessError, match="2 problems") as refused:
+    (tmp_path / "own.yaml").write_text("columns: {speed: v}\nunits: {s_m: yards, lane: 2.0}\n")
+    with pytest.raises(HarnessError, match="3 problems") as refused:
         load_mapping(str(tmp_path / "own.yaml"))
-    assert "yards" in str(refused.value)
+    assert all(word in str(refused.value) for word in ("speed_mps", "yards", "lateral_m"))
     with pytest.raises(HarnessError, match="Did you mean 'highd'"):
         load_mapping("higd")
     (tmp_path / "classes.yaml").write_text("classes: [car]\n")

@@ -25,6 +25,7 @@ from harness.records.folder import (
     write_atomically,
     write_json,
     write_shard,
+    write_together,
 )
 from harness.records.reader import read, table_sizes
 from harness.records.schemas import ShardTables
@@ -58,6 +59,27 @@ def test_a_write_that_fails_leaves_nothing_but_the_old_file(tmp_path):
         assert files_below(tmp_path) == old
         write_atomically(path, lambda temporary: temporary.write_text("old"))
     assert path.read_text() == "old"
+
+
+def test_files_that_belong_together_are_all_old_or_all_new(tmp_path, monkeypatch):
+    paths = [tmp_path / name for name in "abc"]
+    write_together(dict.fromkeys(paths, b"old"))
+    write, n_written = Path.write_bytes, []
+
+    def fail_at_last(path: Path, content: bytes) -> int:
+        n_written.append(path)
+        if len(n_written) == len(paths):
+            half_then_fail(path)
+        return write(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", fail_at_last)
+        with pytest.raises(OSError, match="No space left"):
+            write_together(dict.fromkeys(paths, b"new"))
+    assert [path.read_bytes() for path in paths] == [b"old"] * 3
+    write_together(dict.fromkeys(paths, b"new"))
+    assert [path.read_bytes() for path in paths] == [b"new"] * 3
+    assert files_below(tmp_path) == set("abc")
 
 
 def test_what_a_killed_writer_has_left_goes_with_the_next_write(tmp_path):

@@ -1,0 +1,44 @@
+"""`harness fit` from end to end: what it writes, and what it refuses before it reads."""
+
+import json
+
+import pytest
+
+from harness.campaign.sections import EnvironmentSettings
+from harness.cli import main
+from harness.errors import HarnessError
+from harness.fitting.files import fit_files
+from harness.runner.other_traffic import read_replicates
+from harness.traffic.loading import load_parameters
+from tests.fitting.trajectories import overtaking
+
+
+def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_bytes(tmp_path, monkeypatch, capsys):
+    """Also where all vehicles keep one distance from their leaders' speed: plots have a width nevertheless."""
+    monkeypatch.chdir(tmp_path)
+    overtaking(2.0).to_parquet("rows.parquet", index=False)
+    assert main(["fit", "rows.parquet", "--out", "a #1: b.yaml", "--replicates", "5", "--quiet", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["recordings"] == told["lane_changes"] == 24
+    parameters = load_parameters(EnvironmentSettings(parameters="./a #1: b.yaml"))
+    assert len(read_replicates("./a #1: b.yaml", parameters)) == 5
+    assert "R1dot" in (tmp_path / "a #1: b.html").read_text()
+    again = fit_files(["rows.parquet"], tmp_path / "again" / "a #1: b.yaml", n_replicates=5)
+    for file in (again.environment, again.replicates, again.page):
+        assert file.read_bytes() == (tmp_path / file.name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("files", "out", "found"),
+    [
+        (["rows.csv", "./rows.csv"], "mine.yaml", "a file that is named twice"),
+        (["mine.replicates.parquet"], "mine.yaml", "that mine.replicates.parquet is read"),
+        (["rows.csv"], "map.yaml", "that map.yaml is read"),
+    ],
+)
+def test_what_is_read_is_neither_counted_twice_nor_written_over(files, out, found, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "map.yaml").write_text("mirror: true\n")
+    with pytest.raises(HarnessError, match=found):
+        fit_files(files, out, mapping="map.yaml")
+    assert [file.name for file in tmp_path.iterdir()] == ["map.yaml"]
