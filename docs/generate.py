@@ -443,10 +443,7 @@ def pages() -> Iterator[Path]:
     return (page for page in sorted(FOLDER.rglob("*.md")) if "<!-- generated:" in page.read_text(encoding="utf-8"))
 
 
-MADE_BY = (
-    "\n\nMade by `python -m studies case scenarios/case_study/study.yaml --out runs/case_study` "
-    "([how](internals/validation.md#the-papers-case-study)).\n\n"
-)
+MADE_BY = "\n\nMade by [`python -m studies case`](internals/validation.md#the-papers-case-study).\n\n"
 
 
 def take_case_study(study: Path) -> None:
