@@ -4,8 +4,8 @@ Replicates are environments that the same trajectories might as well have given.
 tests and the same paths (`harness.runner.other_traffic`); of the factors by which it moves, ``times`` are the quantiles
 that leave out as much on either side as the interval of the sampling error does. Both errors are independent: on a
 logarithmic scale their distances from the rate add as squares on either side (MOVER: Donner and Zou, Stat. Methods Med.
-Res. 21, 2012, 347). By how much a factor may be wrong (`harness.runner.stored_shells.Nearby`) widens it to both sides,
-and a replicate that could not be answered counts as whatever makes the interval wider.
+Res. 21, 2012, 347). What a reference driver's rate comes out wrong by in a replicate, the vehicle's may, too: it widens
+the factor to both sides. A replicate that could not be answered counts as whatever makes the interval wider.
 
 `Bar` and `Sensitivity` say by how much it moves with one number, or a block of them.
 """
@@ -170,8 +170,8 @@ def sentences(found: TrafficError, of: str = "the vehicle") -> Iterator[str]:
     if found.ratios:
         yield f"Of a ratio {share(ONE_LAW)} either way are for one law being fitted to drivers who differ."
     yield (
-        f"In each replicate the rate may be as wrong as reference drivers and shells show ({share(found.off)} in the "
-        f"mean); {found.n_refused} cannot be answered, and count as whatever makes an interval wider."
+        f"In each replicate the rate may be as wrong as that of a reference driver, which is known ({share(found.off)} "
+        f"in the mean); {found.n_refused} cannot be answered, and count as whatever makes an interval wider."
     )
 
 

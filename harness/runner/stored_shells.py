@@ -47,8 +47,8 @@ SAME_POOL = 0.05
 MOST_OFF = 0.05
 """How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
 LEAST_SHARE = 0.5
-"""Of the cut-ins that crash, in the mean over a rate, from which on shares are taken to stay the same. In traffic that
-takes time rates of drivers with 0.58 or more came out wrong by at most 6 %, with 0.33 by 10 %, with 0.1 by 28 %, and of
+"""Of the cut-ins that crash, in the mean over a rate, from which on shares are taken to stay the same. Where cut-ins
+take time, rates of drivers with 0.58 or more came out wrong by at most 6 %, with 0.33 by 10 %, with 0.1 by 28 %, and of
 one with 0.02 by 71 % (`python -m benchmarks.other_traffic`)."""
 FAR_OFF = 0.5
 """The same in traffic close by, where each rate is taken to be as wrong as that [assumed]."""
@@ -127,10 +127,7 @@ def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progres
     if environment_hash(there.environment) == tested.pool.environment:
         return Moved(tested.design, tested.design)
     _require_same_kind(tested.here, there, name)
-    if (mean := tested.mean_share) < LEAST_SHARE:
-        found = f"a vehicle that crashes on {share(mean)} of the cut-ins of the shells that it crashes in"
-        mend = f"{ELSEWHERE} Or add a surrogate close to it to the library, and run it anew."
-        raise CampaignError(OPTION, found, f"at least {share(LEAST_SHARE)}: else which these are may change", mend)
+    _require_shares(tested)
     progress.stage("pool of the other traffic", None)
     elsewhere = campaign_pool(there, progress, order=tested.pool.names)
     moved = Moved.of(tested.design, design_shells(elsewhere, tested.limit_mps2), name)
@@ -149,8 +146,8 @@ class Nearby:
     """Some traffic beside another: probabilities of the strata ``p`` (S,), and by what rates move from there to here.
 
     ``rate`` is the vehicle's factor, ``references`` (R,) are those of the drivers, which are known, ``off`` by how much
-    it may be wrong, by these and by the vehicle's own shares, and ``beyond`` the share of the crashes in cut-ins unlike
-    any tested.
+    one of these comes out too high or too low at most, and ``beyond`` the share of the crashes in cut-ins unlike any
+    tested.
     """
 
     p: FloatArray
@@ -174,6 +171,7 @@ def nearby(
     tested: StoredShells, there: Resolved, moved: Moved, environments: Sequence[Environment], progress: Progress
 ) -> Iterator[Nearby]:
     """Traffic close to that of ``there``, by few paths."""
+    _require_shares(tested)
     paths = FewPaths(there, tested.pool, tested.design, tested.limit_mps2, progress)
     (base,), p, shares = paths.of([there.environment]), moved.there.p, moved.reference_shares()
     tally, n_surrogates = tested.seen.tally, len(tested.pool.names)
@@ -181,14 +179,13 @@ def nearby(
     for found in paths.of(environments):
         now = p * ratio_of(found.p, base.p)
         known = ratio_of(found.rate[n_surrogates:], base.rate[n_surrogates:])
-        off = np.abs(ratio_of(ratio_of(now @ shares, p @ shares), known) - 1.0)
+        with np.errstate(divide="ignore", over="ignore"):
+            off = np.expm1(np.abs(np.log(ratio_of(ratio_of(now @ shares, p @ shares), known))))
         crashing = now * crash_share
         new = _share(found.beyond, found.p) - _share(base.beyond, base.p)  # ends of a sample are not those of a law
         beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum()) + found.untested / found.p.sum()
         times = tested.rate(now) / tested.rate(p)
-        # What moves shells against each other may move shares within them as much, as far as those are not 1.
-        moves = np.expm1((1.0 - tested.mean_share) * np.abs(np.log(np.maximum(times, 1e-300) / known)))
-        yield Nearby(now, times, known, float(np.max(np.maximum(off, moves), initial=0.0)), beyond)
+        yield Nearby(now, times, known, float(np.max(off, initial=0.0)), beyond)
 
 
 def _share(part: FloatArray, whole: FloatArray) -> FloatArray:
@@ -221,6 +218,14 @@ def _require_shells(campaign: Campaign, option: str) -> None:
         found = "a vehicle that acts before the cut-in: its cut-ins follow from its own runs"
     expected = "tests of shells, of a vehicle that holds its speed until the cut-in"
     raise CampaignError(option, found, expected, ELSEWHERE)
+
+
+def _require_shares(tested: StoredShells) -> None:
+    if (mean := tested.mean_share) < LEAST_SHARE:
+        found = f"a vehicle that crashes on {share(mean)} of the cut-ins of the shells that it crashes in"
+        expected = f"at least {share(LEAST_SHARE)}: else which these are may change with the traffic"
+        mend = "Run it in that environment, or here with a surrogate close to it in the library (pool.library)."
+        raise CampaignError(str(tested.folder), found, expected, mend)
 
 
 def _require_same_kind(here: Resolved, there: Resolved, name: str) -> None:

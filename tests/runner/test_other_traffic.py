@@ -5,12 +5,16 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from harness.cli import main
 from harness.errors import CampaignError
+from harness.pool.moved import Moved as Few
+from harness.progress import Progress
 from harness.runner import stored_shells
 from harness.runner.other_traffic import estimate_in_other_traffic
+from harness.runner.stored_shells import Moved, StoredShells, nearby
 from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.stored_runs import copy_of, estimates
 
@@ -67,9 +71,30 @@ def test_cut_ins_that_no_test_stands_for_are_refused(stored_run, tmp_path):
 
 
 def test_a_vehicle_that_crashes_on_few_cut_ins_of_its_shells_is_refused(stored_run, tmp_path, monkeypatch):
-    monkeypatch.setattr(stored_shells, "LEAST_SHARE", 1.1)
+    """Which these are may change: in other traffic, and in all that is close by."""
+    folder, mine = stored_run("shells-twin"), environment(tmp_path, ignore_share=0.02)
+    tested = StoredShells.of(folder, Progress())
+    same = Moved(tested.design, tested.design)
+    share, p = tested.seen.tally.share, tested.design.p
+    assert tested.mean_share == pytest.approx(np.average(share, weights=p * share))
+    monkeypatch.setattr(stored_shells, "LEAST_SHARE", tested.mean_share + 0.01)
     with pytest.raises(CampaignError, match="of the cut-ins of the shells that it crashes in"):
-        answer(stored_run("shells-twin"), environment(tmp_path, ignore_share=0.02))
+        answer(folder, mine)
+    with pytest.raises(CampaignError, match="with a surrogate close to it"):
+        next(nearby(tested, tested.here, same, [], Progress()))
+
+
+@pytest.mark.parametrize("times", [0.5, 2.0])
+def test_a_reference_driver_told_too_low_is_as_far_off_as_one_told_too_high(stored_run, monkeypatch, times):
+    """Its rate moves, and the shells do not; the vehicle's factor is widened by as much to both sides."""
+    tested = StoredShells.of(stored_run("shells-twin"), Progress())
+    n_drivers, nothing = len(tested.pool.names) + len(tested.design.references), np.zeros_like(tested.design.p)
+    found = [Few(tested.design.p, np.full(n_drivers, rate), nothing, 0.0) for rate in (1.0, times)]
+    monkeypatch.setattr(stored_shells.FewPaths, "of", lambda *_: iter([found.pop(0)]))
+    here = tested.here
+    (near,) = nearby(tested, here, Moved(tested.design, tested.design), [here.environment], Progress())
+    assert (near.rate, near.off) == (1.0, pytest.approx(1.0))
+    assert near.references == pytest.approx(times)
 
 
 @pytest.mark.parametrize(
