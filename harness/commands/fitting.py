@@ -1,4 +1,4 @@
-"""Traffic of one's own: fitted to trajectories."""
+"""Fitting traffic to trajectories."""
 
 from __future__ import annotations
 
@@ -22,12 +22,10 @@ from harness.commands.printing import print_json, say
 )
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", type=FILE, required=True, callback=written_file(".yaml"), help="Environment file to write.")
-@click.option("--mapping", metavar="highd|ngsim|FILE.yaml", help="How columns are to be read, if not as below.")
-@click.option("--mirror", is_flag=True, help="Vehicles that close in from behind are on the left.")
-@click.option(
-    "--replicates", type=click.IntRange(min=2), default=200, show_default=True, help="Of the traffic, for its errors."
-)
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the replicates.")
+@click.option("--mapping", metavar="highd|ngsim|FILE.yaml", help="How to read columns that differ from these.")
+@click.option("--mirror", is_flag=True, help="Fit lane changes to the left: vehicles close in from behind there.")
+@click.option("--replicates", type=click.IntRange(min=2), default=200, show_default=True, help="Environments to draw.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the replicates.")
 @quiet_option
 @json_option
 def fit(
@@ -44,11 +42,11 @@ def fit(
     """Fit the traffic's laws to trajectories in CSV or Parquet FILEs, and write an environment file.
 
     One row per vehicle and time, 10 Hz or more: vehicle_id, time_s, s_m (centre, along the road), speed_mps, lane (0 =
-    right), length_m; if known recording_id, lateral_m, class, direction. Leaders and followers are found by the tool.
+    right), length_m; if known recording_id, lateral_m, class, direction. Leaders and followers need not be given.
 
-    Beside the environment file a page shows what was seen and fitted, and FILE.replicates.parquet holds environments
-    that other trajectories of the same kind would have given: `harness estimate --environment` tells by how much the
-    rate differs between them.
+    Beside the environment file are written a page that shows data and fit, and FILE.replicates.parquet with
+    environments that other trajectories of the same kind would have given: from these `harness estimate --environment`
+    computes how uncertain the rate is.
     """
     from harness.fitting.files import fit_files  # noqa: PLC0415 - keeps --help fast
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
@@ -65,8 +63,8 @@ def fit(
     say(
         f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h; "
         f"{tally.used:,} lane changes used of {tally.changes:,}",
-        f"in front of somebody who closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes, "
-        f"{steps.exposure[:-1].sum():.1f} wished",
+        f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
+        f"{steps.exposure[:-1].sum():.1f} expected with nobody closing in",
         *(f"kept as in {found.fit.base_name}: {what} ({why})" for what, why in found.fit.kept.items()),
         *written,
     )

@@ -27,13 +27,13 @@ from harness.records.folder import parquet, require_place, write_together
 from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
 
 BASE = "ndd-overtaking-2"
-"""What is not fitted stays as it is there."""
+"""Numbers that are not fitted are taken from it."""
 SEED = 1
 
 
 @dataclass(frozen=True)
 class FittedFiles:
-    """What a fit has written, and what it is made of."""
+    """The files that a fit has written, and the fit itself."""
 
     environment: Path
     replicates: Path
@@ -43,7 +43,7 @@ class FittedFiles:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What was seen, and what was kept, for JSON."""
+        """What was observed, and which laws were kept, for JSON."""
         steps, traffic = self.fit.acceptance, self.fit.traffic
         return {
             "recordings": traffic.n_recordings,
@@ -83,10 +83,12 @@ def fit_files(
     beside, shown = out.with_name(f"{out.stem}.replicates.parquet"), out.with_suffix(".html")
     inputs = {path.resolve() for path in paths}
     if len(inputs) < len(paths):
-        raise TrajectoryError(where, "a file that is named twice", "each once", "Leave one of them out.")
+        raise TrajectoryError(where, "a file that is named twice", "each file once", "Leave one of them out.")
     for path in (out, beside, shown):
         if path.resolve() in inputs | {Path(mapping or ".").resolve()}:
-            raise HarnessError(f"--out {out}", f"that {path} is read", "files of its own", "Choose another name.")
+            raise HarnessError(
+                f"--out {out}", f"{path}, which is also an input", "another file", "Choose another name."
+            )
     require_place(out.parent)
     base = read_model(SHIPPED_FOLDER / f"{BASE}.yaml", EnvironmentParameters)
     numbers = base.values()
@@ -112,15 +114,15 @@ def fit_files(
 
 
 def _yaml(fit: Fit, tally: Tally, files: Sequence[Path], beside: str, mapping: str | None, mirrored: bool) -> str:
-    """The environment file: where it comes from, then a number a line."""
+    """The environment file: its provenance, then one number per line."""
     from importlib.metadata import version  # noqa: PLC0415 - takes a while
 
-    clusters = "recordings" if fit.traffic.by_recording else "vehicles within recordings, which are few"
+    clusters = "recording" if fit.traffic.by_recording else "vehicle, as recordings are few"
     lines = [
         f"Traffic fitted by harness {version('harness')} to {fit.traffic.n_recordings} recordings: "
         f"{tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the target lane,",
         f"{tally.used} lane changes to it. Standard errors (se) and replicates are by {clusters}.",
-        f"Numbers that are not fitted are those of {fit.base_name}. lane_change_level is 1 with this traffic.",
+        f"Numbers that are not fitted are those of {fit.base_name}. Use lane_change_level 1 with this traffic.",
         f"mapping: {mapping or 'that of the input table'}{', mirrored' if mirrored else ''}",
         *(f"sha256 {_sha256(file)} {file.name}" for file in files),
     ]

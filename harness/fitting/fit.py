@@ -32,7 +32,7 @@ from harness.traffic.parameters import REPLACED, EnvironmentParameters
 from harness.vocabulary import FloatArray
 
 HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)
-"""Degrees of freedom of R1dot that are tried until LV keeps within what SUMO's lanes allow; fitted at first."""
+"""Degrees of freedom of R1dot: fitted (None), then tried until LV's speed is one that SUMO's lanes allow."""
 DIGITS = 6
 _WHAT = {
     "speed": "speeds of BV",
@@ -42,21 +42,21 @@ _WHAT = {
     "car following": "accelerations behind a leader",
     "lead": "leads of lane changes",
 }
-"""Laws that may keep those of the base."""
+"""Laws that may be kept from the base."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Traffic as it was fitted.
+    """Fitted traffic.
 
     Attributes
     ----------
     base : EnvironmentParameters
-        Environment whose numbers are kept where nothing is fitted; ``base_name`` is its name.
+        Environment from which numbers are kept that are not fitted; ``base_name`` is its name.
     laws : dict of str to FittedLaw
-        Those that were fitted, the hazard among them.
+        Fitted laws, the hazard among them.
     kept : dict of str to str
-        Why a law keeps that of the base, by what it is of.
+        Why a law is kept from the base, by its subject.
     knots : Knots
         Of the hazard.
     acceptance : Acceptance
@@ -75,15 +75,15 @@ class Fit:
     environment: EnvironmentParameters
 
     def hazard_at(self, rows: Any) -> FloatArray:
-        """Rate (1/s) at which lane changes are wished in some states (n,)."""
+        """Rate (1/s) of lane changes with nobody closing in, by state (n,)."""
         return np.exp(hazard_design(self.knots, rows) @ self.laws["hazard"].maximum.theta)
 
 
 def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, where: str, progress: Progress) -> Fit:
     """Fit all laws.
 
-    Raises `TrajectoryError`: no hazard can be fitted, or the laws are none that tests can be drawn from; ``where``
-    names the files.
+    Raises `TrajectoryError`: no hazard can be fitted, or tests cannot be drawn from the laws; ``where`` names the
+    files.
     """
     numbers = base.values()
     settings = EnvironmentSettings()
@@ -104,8 +104,8 @@ def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, w
     }
     hazard = fit_hazard(traffic)
     if hazard is None:
-        found_words = f"no lane change of which nobody closes in within {FREE_TTC_S:g} s"
-        raise TrajectoryError(where, found_words, "20 or more", "Take more recordings.")
+        found_words = f"no lane change without a vehicle that closes in within {FREE_TTC_S:g} s"
+        raise TrajectoryError(where, found_words, "20 or more", "Add recordings.")
     acceptance = Acceptance.of(traffic, *hazard)
     for df in HEAVIEST_TAILS:
         if df is not None:
@@ -117,13 +117,13 @@ def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, w
         except CampaignError as error:
             problem = error
             continue
-        kept = {_WHAT[name]: "too few, or of no such form" for name, law in found.items() if law is None}
+        kept = {_WHAT[name]: "too few data, or the law does not fit them" for name, law in found.items() if law is None}
         if df is not None:
             kept["degrees of freedom of R1dot"] = f"{df:g}: with heavier tails LV would exceed 100 m/s"
         return Fit(traffic, base, base_name, laws, kept, hazard[1], acceptance, environment)
-    mend = f"What was read does not look like motorway traffic; see docs/fit.md. {problem.mend}"
+    mend = f"The data do not look like motorway traffic; see docs/fit.md. {problem.mend}"
     raise TrajectoryError(
-        where, f"laws that no test can be drawn from: {problem.where}, {problem.found}", problem.expected, mend
+        where, f"laws that tests cannot be drawn from: {problem.where}, {problem.found}", problem.expected, mend
     )
 
 
@@ -134,7 +134,7 @@ def _rounded(value: float) -> float:
 def _environment(
     base: EnvironmentParameters, laws: dict[str, FittedLaw], knots: Knots, acceptance: Acceptance
 ) -> EnvironmentParameters:
-    """The base with fitted numbers in place, and tables in place of what they replace."""
+    """The base with fitted numbers, and with tables in place of the formulas that they replace."""
     content: dict[str, Any] = base.model_dump(exclude_none=True)
     for names in REPLACED.values():
         for name in names:
@@ -156,11 +156,11 @@ def _environment(
             elif number["value"] != _rounded(content[section][key]["value"]):
                 content[section][key] = {"value": number["value"], "source": "assumed"}  # R1dot's tails
     if "lead" in laws:
-        content["lateral"]["longest_lead_s"].pop("note", None)  # it says what share is cut off in the base
+        content["lateral"]["longest_lead_s"].pop("note", None)  # it is about the share that the base cuts off
     edges = [{"value": edge, "source": "assumed"} for edge in TTC_EDGES_S.tolist()]
     shares = zip(acceptance.shares.tolist(), acceptance.std_errors.tolist(), strict=True)
     steps = [{"value": _rounded(share), "source": "fitted", "se": _rounded(se)} for share, se in shares]
-    steps[-1] = {"value": 1.0, "source": "assumed", "note": "the hazard is that of who has nobody closing in"}
+    steps[-1] = {"value": 1.0, "source": "assumed", "note": "the hazard is fitted where nobody closes in"}
     exposure = [_rounded(each) for each in acceptance.exposure.tolist()]
     counted = {"events": acceptance.events.tolist(), "exposure": exposure}
     tables["acceptance_steps"] = {"ttc_s": edges, "share": steps, **counted}

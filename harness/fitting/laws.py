@@ -2,11 +2,11 @@
 
 Initial states and accelerations are fitted in the shipped families, the former as densities, the latter by the
 probabilities of the 31 accelerations, so that a law is fitted as it is drawn from. The hazard of a lane change is the
-exponential of a sum of piecewise linear functions of v, R1 and R1dot: Σ log h over lane changes - Σ h Δt over all
-seconds at risk, where nobody closes in within `FREE_TTC_S`. Below that, k lane changes where E = Σ h Δt were wished
-give the share that is accepted.
+exponential of a sum of piecewise linear functions of v, R1 and R1dot. Its log-likelihood, Σ log h over lane changes
+- Σ h Δt over all seconds at risk, is that of moments in which nobody closes in within `FREE_TTC_S`. Below that, the
+accepted share follows from k lane changes where E = Σ h Δt are expected.
 
-Where the data do not tell a number, it keeps the value of the ``base``, a shipped environment.
+Numbers that the data do not determine keep the value of the ``base``, a shipped environment.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ Base = Mapping[str, float]
 FREE_TTC_S = 8.0
 TTC_EDGES_S = np.array([1.0, 2.0, 3.0, 5.0, FREE_TTC_S])
 FEWEST = {"initial": 100, "free": 500, "following": 500, "leads": 20}
-"""Rows from which a law is fitted [assumed]."""
+"""Fewest rows for which a law is fitted [assumed]."""
 FEWEST_RECORDINGS = 10
-"""From so many on recordings are the clusters, not vehicles [assumed]."""
+"""With at least this many, recordings are the clusters, else vehicles [assumed]."""
 OUTLIERS = 1e-4
 """Share of gaps that may lie anywhere in the fit range: the shifted log-normal law rules short ones out [assumed]."""
 KNOTS = np.array([0.02, 0.2, 0.5, 0.8, 0.98])
-"""Quantiles, at lane changes and at risk in the mean, between which the log-hazard is straight."""
+"""Quantiles (means of those at lane changes and at risk) between which the log-hazard is straight."""
 SMOOTH = 1.0, 3.0
-"""Standard deviations of the log-hazard's bends, as change over a quarter of the range, and of its steps [assumed]."""
+"""Prior standard deviations of the log-hazard's bends (change over a quarter of the range) and steps [assumed]."""
 Knots = tuple[FloatArray, FloatArray, FloatArray]
 HAZARD_OF = ("v_mps", "r1_m", "r1dot_mps")
 SMALLEST_SHARE = 1e-12
-"""Of lane changes that are accepted (`harness.traffic.parameters.AcceptanceSteps`)."""
+"""Smallest accepted share of lane changes (`harness.traffic.parameters.AcceptanceSteps`)."""
 _TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Observations of all recordings; ``vehicle`` numbers vehicles throughout, ``recording`` (vehicles,) says where."""
+    """Observations of all recordings; ``vehicle`` numbers all vehicles, ``recording`` (vehicles,) is that of each."""
 
     free: RecordArray
     following: RecordArray
@@ -58,7 +58,7 @@ class Traffic:
 
     @classmethod
     def of(cls, observations: Iterable[Observations]) -> Traffic:
-        """Put recordings together."""
+        """Join recordings."""
         parts: dict[str, list[RecordArray]] = {name: [] for name in _DTYPES}
         vehicles, recording = 0, []
         for i, each in enumerate(observations):
@@ -74,7 +74,7 @@ class Traffic:
 
     @property
     def n_recordings(self) -> int:
-        """With vehicles that were observed."""
+        """Recordings with observed vehicles."""
         return int(np.unique(self.recording).size)
 
     @property
@@ -88,7 +88,7 @@ class Traffic:
         return self.recording if self.by_recording else np.arange(self.recording.size)
 
     def members(self, rows: RecordArray, cell: IntArray | None = None) -> tuple[sparse.csr_array, IntArray]:
-        """How often each row, or each ``cell`` of alike rows, is seen of each vehicle; and the vehicles' clusters."""
+        """Counts by vehicle and row (or ``cell`` of similar rows), and the vehicles' clusters."""
         cell = np.arange(rows.size) if cell is None else cell
         shape = (self.recording.size, int(cell.max()) + 1)
         return sparse.csr_array((np.ones(rows.size), (rows["vehicle"], cell)), shape=shape), self.cluster
@@ -99,7 +99,7 @@ _DTYPES = {"free": FREE, "following": FOLLOWING, "initial": INITIAL, "at_risk": 
 
 @dataclass(frozen=True, eq=False)
 class FittedLaw:
-    """Numbers of a law: ``names`` (m,), and their ``values`` (…, m) from coefficients (…, p)."""
+    """Numbers of a law: ``names`` (m,), and ``values`` (…, m) by coefficients (…, p)."""
 
     names: tuple[str, ...]
     values: Callable[[FloatArray], FloatArray]
@@ -108,12 +108,12 @@ class FittedLaw:
 
     @property
     def estimate(self) -> dict[str, float]:
-        """The numbers."""
+        """Numbers by name."""
         return dict(zip(self.names, self.values(self.maximum.theta).tolist(), strict=True))
 
     @cached_property
     def std_error(self) -> dict[str, float]:
-        """Of each number, by clusters; 0 where it was kept."""
+        """Standard errors of the numbers, by clusters; 0 where kept."""
         theta = self.maximum.theta
         steps = 1e-5 * np.eye(theta.size)
         slopes = (self.values(theta + steps) - self.values(theta - steps)) / 2e-5
@@ -122,12 +122,12 @@ class FittedLaw:
 
 
 def _df(eta: FloatArray) -> FloatArray:
-    """Degrees of freedom from their coefficient: at least 2."""
+    """Degrees of freedom, at least 2, by their coefficient."""
     return 2.0 + np.exp(np.minimum(eta, 6.9))
 
 
 def _scaled(base: Base, v: FloatArray) -> FloatArray:
-    """U of the fits."""
+    """Scaled speed u of the fits."""
     return np.asarray((v - base["fit_range__v_centre_mps"]) / base["fit_range__v_scale_mps"])
 
 
@@ -179,7 +179,7 @@ def fit_gap(traffic: Traffic, base: Base) -> FittedLaw | None:
             return np.asarray(special.ndtr(z))
 
         inside = np.maximum(below(most) - below(least), _TINY)
-        p = (below(rows["r1_m"] + 0.5) - below(rows["r1_m"] - 0.5)) / inside  # a density has a peak without bound
+        p = (below(rows["r1_m"] + 0.5) - below(rows["r1_m"] - 0.5)) / inside  # the density itself is unbounded
         return _log((1.0 - OUTLIERS) * p + OUTLIERS / (most - least))
 
     design = _columns(rows.size, 1.0, _scaled(base, rows["v_mps"]))
@@ -192,9 +192,9 @@ def fit_gap(traffic: Traffic, base: Base) -> FittedLaw | None:
 
 
 def fit_rate(traffic: Traffic, base: Base, df: float | None = None) -> FittedLaw | None:
-    """R1dot given v_BV and R1: Student's t, given that R1 is not closed within the smallest time to collision.
+    """R1dot given v_BV and R1: Student's t, truncated at the smallest time to collision.
 
-    Its degrees of freedom are fitted unless they are given.
+    Degrees of freedom are fitted unless they are given.
     """
     least_s = base["initial_state__r1dot_min_ttc_s"]
     rows = traffic.initial[traffic.initial["r1dot_mps"] > -traffic.initial["r1_m"] / least_s]
@@ -230,7 +230,7 @@ def _law(
     rows: RecordArray,
     transforms: Mapping[int, Callable[[FloatArray], FloatArray]] | None = None,
 ) -> FittedLaw | None:
-    """A law whose numbers are its coefficients, some of them transformed."""
+    """A law whose numbers are its coefficients, some transformed."""
 
     def values(theta: FloatArray) -> FloatArray:
         out = np.array(theta)
@@ -246,20 +246,20 @@ def _law(
 
 
 def bins(acceleration_mps2: FloatArray) -> IntArray:
-    """Which of the 31 accelerations each is counted as; the tails belong to the end points."""
+    """Index of the nearest of the 31 accelerations; the end points take the tails."""
     nearest = np.rint((acceleration_mps2 - ACCELERATIONS_MPS2[0]) / 0.2)
     return np.asarray(np.clip(nearest, 0, N_ACCELERATIONS - 1), np.int64)
 
 
 def _t_between(low: FloatArray, high: FloatArray, df: FloatArray) -> FloatArray:
-    """P(low < T ≤ high), with all its digits in the tails."""
+    """P(low < T ≤ high), precise in the tails."""
     flipped = low > 0.0
     below, upto = np.where(flipped, -high, low), np.where(flipped, -low, high)
     return np.asarray(special.stdtr(df, upto) - special.stdtr(df, below))
 
 
 def _in_bin(rows: RecordArray, mean: FloatArray, log_scale: FloatArray, df: FloatArray) -> FloatArray:
-    """Probability of the ``bin`` of each row, all above its ``cap`` being moved to that."""
+    """Probability of the ``bin`` of each row, with the mass above its ``cap`` moved to that."""
     k, scale = rows["bin"], np.exp(-log_scale)
     edge = ACCELERATIONS_MPS2[k] + 0.1
     low = np.where(k == 0, -np.inf, (edge - 0.2 - mean) * scale)
@@ -277,13 +277,13 @@ def _binned(k: IntArray, cap: IntArray | int) -> RecordArray:
 
 
 def fit_free_driving(traffic: Traffic, base: Base) -> FittedLaw | None:
-    """Accelerations in free driving: Student's t, and a share that brakes."""
+    """Accelerations in free driving: Student's t, mixed with a share that brakes."""
     rows = traffic.free
     t = ("location_mps2", "log_scale", "log_scale_u", "log_scale_uu", "df")
     names = (*t, "brake_logit", "brake_logit_u", "brake_slope_s2pm")
     if rows.size < FEWEST["free"]:
         return None
-    # Rows of about the same speed and the same acceleration are one: there are some thousand kinds.
+    # Rows of about the same speed and acceleration are counted together: some thousand kinds.
     v = np.rint(4.0 * rows["v_mps"]).astype(np.int64)
     kinds, cell = np.unique(v * N_ACCELERATIONS + bins(rows["acceleration_mps2"]), return_inverse=True)
     u, k = _scaled(base, kinds // N_ACCELERATIONS / 4.0), kinds % N_ACCELERATIONS
@@ -314,7 +314,7 @@ def fit_free_driving(traffic: Traffic, base: Base) -> FittedLaw | None:
 
 
 def follows(rows: RecordArray, base: Base) -> tuple[RecordArray, FloatArray, FloatArray, BoolArray]:
-    """What car following needs: bins and caps, designs of mean (n, 6) and log scale (n, 2), and rows that are used.
+    """Inputs of car following: bins and caps, designs of mean (n, 6) and log scale (n, 2), and the rows used.
 
     The mean's coefficients are those of R1dot and R1, three of the gap's polynomial in u, and the closing gain.
     """
@@ -333,7 +333,7 @@ def follows(rows: RecordArray, base: Base) -> tuple[RecordArray, FloatArray, Flo
 
 
 def guard_caps(r1: FloatArray, r1dot: FloatArray, base: Base) -> IntArray:
-    """Largest acceleration that the guard allows, by its number (`harness.traffic.laws.guard_cap`)."""
+    """Index of the largest acceleration that the guard allows (`harness.traffic.laws.guard_cap`)."""
     h, own = base["guard__horizon_s"], base["guard__own_braking_mps2"]
     cap = np.full(r1.size, -1)
     for acceleration in ACCELERATIONS_MPS2:
@@ -344,7 +344,7 @@ def guard_caps(r1: FloatArray, r1dot: FloatArray, base: Base) -> IntArray:
 
 
 def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
-    """Accelerations behind a leader, within the guard, which is kept as the near-standstill is."""
+    """Accelerations behind a leader; guard and behaviour near standstill are kept."""
     binned, mean, scale, used = follows(traffic.following, base)
     rows = traffic.following[used]
     if rows.size < FEWEST["following"]:
@@ -420,7 +420,7 @@ def fit_hazard(traffic: Traffic) -> tuple[FittedLaw, Knots] | None:
 
 
 def hazard_design(knots: Knots, rows: RecordArray) -> FloatArray:
-    """What coefficients of the log-hazard are multiplied by in some states (n,): (n, p)."""
+    """Design matrix (n, p) of the log-hazard in some states (n,)."""
     columns = [np.ones(rows.size)]
     for name, at in zip(HAZARD_OF, knots, strict=True):
         columns += [np.interp(rows[name], at, hat) for j, hat in enumerate(np.eye(at.size)) if j != at.size // 2]
@@ -428,7 +428,7 @@ def hazard_design(knots: Knots, rows: RecordArray) -> FloatArray:
 
 
 def _knots(rows: RecordArray, name: str) -> FloatArray:
-    """Rounded quantiles, at crossings and at risk in the mean; at least a twentieth of their range apart."""
+    """Rounded quantiles (means of those at crossings and at risk), at least a twentieth of their range apart."""
     at = 0.5 * (np.quantile(rows[name], KNOTS) + np.quantile(rows[name][rows["changes"]], KNOTS))
     found = [round(float(at[0]), 1)]
     for each in np.round(at[1:], 1).tolist():
@@ -438,7 +438,7 @@ def _knots(rows: RecordArray, name: str) -> FloatArray:
 
 
 def _penalty(knots: FloatArray) -> FloatArray:
-    """Pseudo-observations of an effect at its knots but the middle one: bends and steps about 0."""
+    """Pseudo-observations, about 0, of bends and steps of an effect; the middle knot is left out."""
     if knots.size == 1:
         return np.empty((0, 0))
     identity = np.eye(knots.size)
@@ -450,9 +450,9 @@ def _penalty(knots: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Acceptance:
-    """Lane changes by time to collision with the vehicle behind, in the bins that `TTC_EDGES_S` are between.
+    """Lane changes by time to collision with the vehicle behind, in bins with the edges `TTC_EDGES_S`.
 
-    ``events`` (6,) are those seen, ``exposure`` (6,) those that were wished: the hazard summed over time. ``design``
+    ``events`` (6,) are those seen, ``exposure`` (6,) those expected with nobody closing in: Σ h Δt. ``design``
     holds rows of the hazard (n, p) in all bins but the last, with ``bin`` and ``duration_s`` (n,).
     """
 
@@ -464,7 +464,7 @@ class Acceptance:
 
     @classmethod
     def of(cls, traffic: Traffic, hazard: FittedLaw, knots: Knots) -> Acceptance:
-        """Count."""
+        """Count lane changes and what is expected."""
         rows = traffic.at_risk
         design = hazard_design(knots, rows)
         at = np.searchsorted(TTC_EDGES_S, rows["ttc_s"], side="right")
@@ -476,13 +476,13 @@ class Acceptance:
         return cls(events, exposure, design[near], at[near].astype(np.int64), rows["duration_s"][near])
 
     def exposures(self, theta: FloatArray) -> FloatArray:
-        """Wished lane changes (b, 5) in all bins but the last, for coefficients (b, p) of the hazard."""
+        """Expected lane changes (b, 5) in all bins but the last, by coefficients (b, p) of the hazard."""
         hazard = np.exp(self.design @ theta.T) * self.duration_s[:, None]
         return np.asarray(np.stack([hazard[self.bin == j].sum(axis=0) for j in range(TTC_EDGES_S.size)], axis=1))
 
     @property
     def shares(self) -> FloatArray:
-        """Estimates (6,), at most 1: half an event stands for none, but no share above those of longer times."""
+        """Estimates (6,), at most 1. Without an event half of one is counted, up to the shares of longer times."""
         events, exposure = self.events[:-1], np.maximum(self.exposure[:-1], 1e-12)
         shares = np.append(np.minimum(np.maximum(events, 0.5) / exposure, 1.0), 1.0)
         for step in np.flatnonzero(events == 0)[::-1]:
@@ -490,23 +490,23 @@ class Acceptance:
         return shares
 
     def drawn(self, theta: FloatArray, random: np.random.Generator) -> FloatArray:
-        """Shares (b, 5) that the counts leave open, of hazards with coefficients (b, p).
+        """Shares (b, 5) drawn by the uncertainty of counts, for hazards with coefficients (b, p).
 
-        Drivers accept a shorter time no more often than a longer one, but draws are not bound to it: where shares are
-        the same, as those of drivers who do not look are, they would come out too small for the shortest times.
+        Drivers accept a shorter time no more often than a longer one, but draws are not ordered like that. Where shares
+        are equal, as for drivers who do not look, ordered draws would be too small at the shortest times.
         """
         counts = random.gamma(self.events[:-1] + 0.5, size=(len(theta), TTC_EDGES_S.size))
         return np.clip(counts / np.maximum(self.exposures(theta), 1e-12), SMALLEST_SHARE, 1.0)
 
     @property
     def std_errors(self) -> FloatArray:
-        """Of the shares (6,), as counts vary; 0 of the last."""
+        """Standard errors of the shares (6,), by counts; 0 of the last."""
         near = np.sqrt(self.events[:-1] + 0.5) / np.maximum(self.exposure[:-1], 1e-12)
         return np.append(np.minimum(near, 1.0), 0.0)
 
 
 def fit_leads(traffic: Traffic, distance_m: float, longest_s: float) -> FittedLaw | None:
-    """Time from onset of lateral motion to overlap: log-normal, cut off at the longest, in steps."""
+    """Time from onset of lateral motion to overlap: log-normal, at most the longest, in steps."""
     rows = traffic.leads
     if rows.size < FEWEST["leads"]:
         return None

@@ -1,11 +1,11 @@
-"""Maximum likelihood for laws whose numbers enter through few predictors, with the influence of each cluster.
+"""Maximum likelihood of laws with few predictors, and the influence of each cluster.
 
-A law's log-likelihood of a row depends on its predictors (location, log scale …); each is a design matrix times
-coefficients of its own. Derivatives by predictors are differences, those by coefficients follow from the designs, so
-that Newton's method needs few evaluations whatever the number of coefficients is.
+A row's log-likelihood depends on predictors (location, log scale …); each is a design matrix times coefficients of its
+own. Derivatives by predictors are differences, those by coefficients follow from the designs. So Newton's method needs
+few evaluations, whatever the number of coefficients.
 
-A weak prior (*pseudo-observations*, ``weights · (θ - centre)`` standard normal) keeps directions that the data say
-nothing about near a known law. It counts as data: its share of the curvature is part of the covariance.
+A weak prior (*pseudo-observations*, ``weights · (θ - centre)`` standard normal) keeps directions that the data do not
+determine near a known law. It counts as data: its share of the curvature is part of the covariance.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from scipy import linalg, sparse
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 LogLikelihood = Callable[..., FloatArray]
-"""Of rows (n,), from their data, a structured array (n,), and one array (n,) per predictor."""
+"""Log-likelihood of rows (n,) by their data, a structured array (n,), and one array (n,) per predictor."""
 MOSTLY_PRIOR = 0.5
-"""Share of a number's information from the prior above which the data do not tell it [assumed]."""
+"""Prior's share of a number's information above which the data do not determine it [assumed]."""
 EXCLUDES = 2.0
-"""Loss of log-likelihood from which on the data exclude what would be kept, though they tell no other value [assumed]:
-of a share that was never seen they say that it is small."""
+"""Loss of log-likelihood above which the data exclude the value that would be kept, even if they determine no other
+[assumed]: a share that was never seen is small."""
 MOST_LEVERAGE = 0.5
-"""Influences of vehicles are divided by what they leave to others, as HC3 does: else few rows look too precise."""
+"""Influences are divided by 1 - leverage, as in HC3, else few rows look too precise; leverage counts at most this."""
 _STEP = 1e-3
 _MOST_ROUNDS = 200
 _ROWS_AT_FIRST = 20_000
@@ -37,7 +37,7 @@ _FIXED = 1e4
 class Prior:
     """Pseudo-observations ``weights @ (θ - centre)``, each standard normal: weights (m, p), centre (p,).
 
-    Where it ``smooths``, it is part of the law, and no number keeps its centre.
+    Where it ``smooths``, it is part of the law, and numbers do not fall back to its centre.
     """
 
     centre: FloatArray
@@ -45,7 +45,7 @@ class Prior:
     smooths: bool = False
 
     def fixed(self, kept: BoolArray) -> Prior:
-        """The same, and no room for coefficients (p,) that are kept."""
+        """The same, with coefficients (p,) that are ``kept`` fixed."""
         return replace(self, weights=self.weights * np.where(kept, _FIXED, 1.0))
 
     @property
@@ -55,17 +55,17 @@ class Prior:
 
     @classmethod
     def of(cls, centre: Sequence[float], spread: Sequence[float]) -> Prior:
-        """Coefficients that are independent, with these standard deviations."""
+        """Independent coefficients with these standard deviations."""
         return cls(np.asarray(centre, np.float64), np.diag(1.0 / np.asarray(spread, np.float64)))
 
 
 @dataclass(frozen=True, eq=False)
 class Maximum:
-    """Where a likelihood is largest.
+    """The maximum of a likelihood.
 
-    ``theta`` (p,); ``influence`` (clusters, p): what seeing a cluster once more moves it by, to first order; ``noise``
-    (p, m): the same for a standard normal change of each pseudo-observation. ``told`` (p,): numbers
-    that the data tell; the others have kept the prior's centre and do not move.
+    ``theta`` (p,); ``influence`` (clusters, p): how far it moves if a cluster is seen once more, to first order;
+    ``noise`` (p, m): the same for a standard normal change of each pseudo-observation. ``told`` (p,): numbers that the
+    data determine; the others keep the prior's centre and do not move.
     """
 
     theta: FloatArray
@@ -74,7 +74,7 @@ class Maximum:
     told: BoolArray
 
     def covariance(self) -> FloatArray:
-        """Sandwich by clusters, (p, p)."""
+        """Sandwich covariance by clusters, (p, p)."""
         n = max(len(self.influence), 2)
         return self.influence.T @ self.influence * (n / (n - 1.0)) + self.noise @ self.noise.T
 
@@ -93,9 +93,8 @@ def maximise(
     """Maximum of Σ counts · log-likelihood + prior; None if it is not found.
 
     ``rows`` (n,) are the data; ``designs`` are (n, p_k), one per predictor, their coefficients one after the other in
-    θ; ``members`` (vehicles, n) says how often each row is seen of each vehicle, and ``clusters`` (vehicles,) to
-    which cluster it belongs. The best of several starts counts.
-    Coefficients that are ``kept`` (p,) stay at the prior's centre.
+    θ; ``members`` (vehicles, n) counts rows by vehicle, and ``clusters`` (vehicles,) is the cluster of each. The best
+    of several starts counts. Coefficients that are ``kept`` (p,) stay at the prior's centre.
     """
     kept = np.zeros(prior.centre.size, np.bool_) if kept is None else kept.copy()
     whole = _Sum(log_likelihood, rows, designs, members, prior.fixed(kept))
@@ -140,7 +139,7 @@ class _Sum:
         self._ends = np.cumsum([design.shape[1] for design in designs])
 
     def thinned(self) -> _Sum:
-        """Of some of the rows, which stand for all."""
+        """The sum over a part of the rows, weighted to stand for all."""
         n = self._rows.size
         few = np.arange(0, n, n // _ROWS_AT_FIRST)
         designs = [design[few] for design in self._designs]
@@ -186,7 +185,7 @@ class _Sum:
         return scores, np.block(blocks) + self.prior.precision
 
     def climb(self, theta: FloatArray) -> tuple[FloatArray, float] | None:
-        """Newton's method, damped where the likelihood is not concave; the maximum and its value, None if not there."""
+        """Newton's method, damped where the likelihood is not concave: the maximum and its value, None if not found."""
         value, damping = self.value(theta), 0.0
         if not np.isfinite(value):
             return None

@@ -1,12 +1,12 @@
 """What the laws of traffic are fitted to, taken from the trajectories of one recording.
 
 States are taken at whole seconds, as they were recorded. The acceleration of a second is the slope of a line through
-all speeds in it: of an acceleration that is held for that second it is the value itself, and noise of
-measurement enters with less than half of the variance that the difference of two speeds has.
+all speeds in it: exact if the acceleration is held for that second, and with less than half of the noise variance of
+the difference of two speeds.
 
-A lane change is a change of ``lane`` to the next one that lasts; lanes that come back within a second are smoothed. The
-likelihood of a hazard is a sum over crossings and an integral over time: the last row before a crossing is its state,
-and each row stands for the time that is nearest to it.
+A lane change is a lasting change of ``lane`` to the next one; returns within a second are smoothed away. The likelihood
+of a hazard is a sum over crossings and an integral over time: the last row before a crossing gives its state, and each
+row stands for the time nearest to it.
 """
 
 from __future__ import annotations
@@ -50,25 +50,25 @@ INITIAL_EVERY_S = 20
 CLOSING_TTC_S = 8.0
 LONGEST_LEAD_S = 10.0
 SEEN_BEFORE_S = 4.5
-"""Crossings that were not seen in their lane so long have no lead: longer leads would be missed more often."""
+"""Crossings seen in their lane for less give no lead: long leads would be missed more often."""
 LEVEL_S = 0.5
-"""A motion that begins so soon after the first row that is looked at may have begun before."""
+"""Motion that begins this soon after the first row may have begun before it."""
 LATERAL_WINDOW_S = 0.5
-"""Half of the time over which the lateral speed at a crossing is a slope."""
+"""Half of the time over which a slope gives the lateral speed at a crossing."""
 STRAIGHT_MPS = 0.1
 SHIFTED_S = 0.8
 OVERLAP_M = -0.5
-"""A gap below that is no error of measurement."""
+"""Gaps below are more than measurement error."""
 MOST_OVERLAPPING = 0.005
 MOST_OUTSIDE = 0.5
 FEWEST_CHANGES = 20
 LEAST_CLOSING_S = 1.0
 OTHER_SIDE = 10.0
-"""Times as much closing in on the other side that it must be the one that is meant."""
+"""If vehicles close in this many times as long on the other side, that side must be meant."""
 
 
 class Tally(NamedTuple):
-    """What was counted on the way, of vehicles beside the target lane: all recordings are judged by it together."""
+    """Counts of vehicles beside the target lane, by which all recordings are judged together."""
 
     vehicles: int = 0
     driven_s: float = 0.0
@@ -90,16 +90,16 @@ class Tally(NamedTuple):
     used: int = 0
     """Of those, behind a leader within the fit range and beside nobody."""
     straight: int = 0
-    """Of those with lateral positions, without lateral motion."""
+    """Lane changes without lateral motion, where lateral positions are known."""
     shifted: int = 0
-    """Of those, more than 0.8 s from the middle between both lanes."""
+    """The same, more than 0.8 s from the middle between both lanes."""
     closing_s: float = 0.0
     """Whole seconds at risk with a time to collision below 8 s."""
     closing_other_s: float = 0.0
     """The same on the other side."""
 
     def plus(self, other: Tally) -> Tally:
-        """Of both."""
+        """Sum of two."""
         pairs: Iterator[tuple[Any, Any]] = zip(self, other, strict=True)
         summed: list[Any] = [mine or theirs if isinstance(mine, str) else mine + theirs for mine, theirs in pairs]
         return Tally(*summed)
@@ -127,9 +127,9 @@ class Observations:
         infinite and 0 where nobody is behind. A row that ``changes`` is the state of a crossing to the target lane.
     leads : RecordArray
         `LEADS`: time from onset of lateral motion to crossing, and lateral speed at it; empty without lateral
-        positions. Of leads above 4 s it may be known only that they are.
+        positions. Leads above 4 s may be lower limits.
     noise_mps2 : float
-        Standard deviation of the error of ``acceleration_mps2`` by noise of measurement that frames do not share.
+        Standard deviation of ``acceleration_mps2`` by white measurement noise.
     tally : Tally
         Counts for `require_enough`.
     """
@@ -147,16 +147,16 @@ class Observations:
 def observations(
     files: Sequence[str | Path], mapping: Mapping, fit_range: FitRange = USUAL_RANGE
 ) -> Iterator[tuple[Observations, float]]:
-    """Observations of each recording of some files, and the share of all that is read by then.
+    """Observations of each recording, and the share of the files that is read by then.
 
-    Raises `TrajectoryError`: a file cannot be read, or its rows are not what they should be.
+    Raises `TrajectoryError`: a file cannot be read, or its rows are wrong.
     """
     for recording in recordings(files, mapping):
         yield observe(recording, fit_range), recording.share_read
 
 
 def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observations:
-    """Observations of one recording, whatever they are worth (`require_enough`)."""
+    """Observations of one recording, not yet judged (`require_enough`)."""
     track, flickers = track_of(recording)
     n = track.second
     changes = np.flatnonzero(track.crosses(-1) & track.fitted)
@@ -232,11 +232,11 @@ def _records(dtype: np.dtype[np.void], columns: dict[str, RecordArray], inside: 
 
 
 def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
-    """Leads of some crossings (rows before them); how many go without lateral motion, and how many at another time.
+    """Leads of some crossings (rows before them); how many have no lateral motion, and how many at another time.
 
-    The onset is where a line, level before and straight from there to the crossing, comes nearest to the lateral
-    positions: as the law has it, which moves BV at a constant lateral speed. Where none is seen, the lead is the time
-    in which it was looked for, at least `SEEN_BEFORE_S`.
+    The onset is the bend of a line, level before and straight from there to the crossing, fitted to the lateral
+    positions: the law's motion at constant lateral speed. Where none is seen, the lead is the time that was searched,
+    at least `SEEN_BEFORE_S`.
     """
     found, straight, shifted = [], 0, 0
     moves = (np.diff(track.lane) != 0) & (np.diff(track.vehicle) == 0)
@@ -267,7 +267,7 @@ def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
 
 
 def _onset(time_s: FloatArray, lateral: FloatArray) -> float:
-    """Where the best line that is level, then straight, has its bend."""
+    """Bend of the best line that is level, then straight."""
     rises = np.maximum(time_s - time_s[:-2, None], 0.0)
     rises -= rises.mean(axis=1, keepdims=True)
     explained = (rises @ lateral) ** 2 / (rises * rises).sum(axis=1)
@@ -292,7 +292,7 @@ def _overlap(recording: Recording, rows: IntArray, state: States, overlaps: Bool
 
 
 def require_enough(total: Tally, where: str) -> None:
-    """Refuse recordings that cannot tell what traffic does, or that were read in a wrong way.
+    """Refuse recordings that are too few, or that were read wrongly.
 
     Parameters
     ----------
@@ -301,49 +301,50 @@ def require_enough(total: Tally, where: str) -> None:
     where : str
         Files, for messages.
 
-    Raises `TrajectoryError`: says which rule is broken.
+    Raises `TrajectoryError`: a rule is broken; it says which.
     """
-    side = "Does who closes in from behind do so on the other side? Set mirror: true in the mapping, or --mirror."
+    side = "If vehicles close in on the other side, set mirror: true in the mapping, or give --mirror."
     if total.driven_s == 0.0:
         found, expected = "no vehicle with another lane beside it, on the side where vehicles close in", "lanes 0, 1, …"
         raise TrajectoryError(
-            f"{where}, lane", found, expected, f"Name a column with lanes, and `classes` as in the file. {side}"
+            f"{where}, lane", found, expected, f"Check the column of lanes, and `classes` of the mapping. {side}"
         )
     if total.overlapping_s > MOST_OVERLAPPING * total.followed_s:
         share = total.overlapping_s / total.followed_s
-        mend = "Are lengths those of the vehicles, and lanes those of the time?"
+        mend = "Check lengths, and that lanes and positions are of the same time."
         if total.overlapping_fronts_s < 0.2 * total.overlapping_s:
-            mend = "Positions fit front bumpers: set origin: front in a mapping (centre, where it says rear)."
+            mend = "Positions seem to be front bumpers': set origin: front in a mapping (or centre, if it says rear)."
         elif total.overlapping_rears_s < 0.2 * total.overlapping_s:
-            mend = "Positions fit rear bumpers: set origin: rear in a mapping (centre, where it says front)."
+            mend = "Positions seem to be rear bumpers': set origin: rear in a mapping (or centre, if it says front)."
         elif total.own_clocks:
-            mend = f"Do times count from one moment for all vehicles of a recording? {mend}"
+            mend = f"If times begin anew with each vehicle, use one clock for all. {mend}"
         found = f"vehicles that overlap in {share:.1%} of the time; first {total.first_overlap}"
         raise TrajectoryError(where, found, f"at most {MOST_OVERLAPPING:.1%}", mend)
     if total.flickers > max(total.changes, FEWEST_CHANGES):
-        found = f"{total.flickers:,} lanes that come back within a second, beside {total.changes:,} lane changes"
+        found = f"lanes that come back within a second {total.flickers:,} times, against {total.changes:,} lane changes"
         mend = "Smooth lanes, or take them from lateral positions."
-        raise TrajectoryError(f"{where}, lane", found, "lanes that last", mend)
+        raise TrajectoryError(f"{where}, lane", found, "fewer", mend)
     how = {"without lateral motion": total.straight, "more than 0.8 s from the lane's marking": total.shifted}
     odd = max(how, key=how.__getitem__)
     if how[odd] > 0.5 * total.changes:
         found = f"{how[odd]:,} of {total.changes:,} lane changes {odd}"
         mend = "Correct the shift between lanes and lateral positions, or leave out lateral_m."
-        raise TrajectoryError(f"{where}, lane", found, "lateral_m of the same time", mend)
+        raise TrajectoryError(f"{where}, lane", found, "lane and lateral_m of the same time", mend)
     if total.outside_s > MOST_OUTSIDE * total.driven_s:
         found = f"{total.outside_s / total.driven_s:.0%} of the time at speeds outside the fit range"
-        mend = "Take recordings of traffic that flows: the laws are those of 20 to 40 m/s."
+        mend = "Use recordings of flowing traffic: laws are fitted at 20 to 40 m/s."
         raise TrajectoryError(f"{where}, speed_mps", found, f"at most {MOST_OUTSIDE:.0%}", mend)
     if total.closing_s < max(LEAST_CLOSING_S, total.closing_other_s / OTHER_SIDE):
         found = (
             f"vehicles that close in from behind in the target lane (TTC < 8 s) for {total.closing_s:.0f} s, "
             f"and for {total.closing_other_s:.0f} s in the lane on the other side"
         )
-        mend = side if total.closing_other_s > total.closing_s else "Take recordings in which vehicles overtake."
+        mend = side if total.closing_other_s > total.closing_s else "Use recordings in which vehicles overtake."
         raise TrajectoryError(f"{where}, lane", found, "most of it in the target lane", mend)
     if total.used < FEWEST_CHANGES:
-        found = f"{total.used} lane changes to the target lane behind a leader within the fit range"
-        expected = (
-            f"at least {FEWEST_CHANGES} (of {total.changes} in all, in {total.driven_s / 3600:.1f} vehicle-hours)"
+        found = (
+            f"{total.used} lane changes to the target lane behind a leader within the fit range (of {total.changes} in "
+            f"all, in {total.driven_s / 3600:.1f} vehicle-hours)"
         )
-        raise TrajectoryError(where, found, expected, "Add recordings: rare lane changes need many hours.")
+        mend = "Add recordings: rare lane changes need many hours."
+        raise TrajectoryError(where, found, f"at least {FEWEST_CHANGES}", mend)

@@ -1,4 +1,4 @@
-"""The page of a fit: what was seen beside what was fitted, and the numbers with their standard errors."""
+"""The page of a fit: data beside the fitted laws, and numbers with standard errors."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, 
 
 CONFIDENCE = 0.9
 SHIPPED = {"ndd-overtaking-1": "muted", "ndd-overtaking-2": "vermillion"}
-"""Environments that are drawn beside it, and their colours."""
+"""Environments drawn for comparison, and their colours."""
 BIN_NAMES = ("0–1", "1–2", "2–3", "3–5", "5–8", "> 8")
 MOST_ROWS = 20_000
 OVER_S = 5
 SAME_MPS = 0.3
-"""Rows of a vehicle follow each other if its speed is that of the row before plus its acceleration."""
+"""A row follows another if its speed is the other's plus acceleration, within this."""
 _SEED = 1
 
 
 class Row(NamedTuple):
-    """A number of the environment, and what the base has."""
+    """A number of the environment beside the base's."""
 
     name: str
     value: str
@@ -54,7 +54,7 @@ def page(
 ) -> str:
     """The page, self-contained; ``rows`` are the replicates, ``name`` is that of the environment's file.
 
-    ``noise_mps2`` is what noise of measurement adds to the spread of accelerations.
+    ``noise_mps2`` is the standard deviation of accelerations by measurement noise.
     """
     environment = templates()
     environment.filters.update(getmembers(numbers, isfunction))
@@ -83,7 +83,7 @@ def _numbers(fit: Fit) -> Iterator[Row]:
 
 
 def _bins(fit: Fit) -> Iterator[tuple[str, int, str, str, str]]:
-    """Time to collision, lane changes seen and wished, the share, and its limits by itself."""
+    """Time to collision, lane changes seen and expected, their ratio and its limits by bin."""
     found = fit.acceptance
     low, high = _limits(found.events, found.exposure)
     for name, events, *row in zip(BIN_NAMES, found.events, found.exposure, found.shares, low, high, strict=True):
@@ -92,7 +92,7 @@ def _bins(fit: Fit) -> Iterator[tuple[str, int, str, str, str]]:
 
 
 def _limits(events: FloatArray | IntArray, exposure: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Of rates (n,), events over exposure, each by itself."""
+    """Limits of rates (n,), events over exposure, each by itself."""
     low, high = garwood(events, 0.5 - 0.5 * CONFIDENCE)
     per = np.maximum(exposure, 1e-12)
     return low / per, high / per
@@ -107,10 +107,10 @@ def _plots(fit: Fit) -> Iterator[Plot]:
     both = [(fit.traffic.free, "Free driving"), (fit.traffic.following, "Behind a leader")]
     panels = [panel for rows, title in both if rows.size for panel in _acceleration_panels(rows, title, traffic)]
     if panels:
-        alt = "Accelerations that were seen and those of the law, their autocorrelation, and changes of speed in 5 s."
+        alt = "Accelerations seen and by the law, their autocorrelation, and changes of speed in 5 s."
         caption = (
-            f"The law draws each second anew, real drivers go on as they did. Where the change of speed in {OVER_S} s "
-            f"that was seen is wider than the law's, its LV and BV are more regular than real ones."
+            f"The law draws every second independently; real drivers persist. Where observed changes of speed in "
+            f"{OVER_S} s spread more than the law's, simulated LV and BV are steadier than real ones."
         )
         yield Plot("accelerations", panels, alt, caption)
     if (lead := fit.laws.get("lead")) is not None:
@@ -126,7 +126,7 @@ def _acceptance_plot(fit: Fit) -> Plot:
     lowest = 1e-3
     y = Axis("share carried out", lowest, 3.0, log=True)
     panel = Panel(
-        "Lane changes before somebody who closes in", Axis("time to collision, s", 0.0, 12.0), y, height=280.0
+        "Lane changes in front of a vehicle that closes in", Axis("time to collision, s", 0.0, 12.0), y, height=280.0
     )
     low, high = _limits(found.events, found.exposure)
     panel.add(
@@ -137,7 +137,7 @@ def _acceptance_plot(fit: Fit) -> Plot:
         np.clip(low, lowest, 3.0),
         np.clip(high, lowest, 3.0),
         opacity=0.18,
-        label=f"{numbers.share(CONFIDENCE)} limits, each bin by itself",
+        label=f"{numbers.share(CONFIDENCE)} limits by bin",
     )
     steps = np.repeat(edges, 2)[1:-1]
     panel.add("line", "blue", steps, np.repeat(found.shares, 2), label="fitted")
@@ -147,10 +147,10 @@ def _acceptance_plot(fit: Fit) -> Plot:
         accept = special.expit((times - n["cut_in__accept_ttc_s"]) / n["cut_in__accept_scale_s"])
         ignored = n["cut_in__ignore_share"]
         panel.add("line", colour, times, ignored + (1.0 - ignored) * accept, dash="4 3", label=name)
-    alt = "Share of wished lane changes carried out, by time to collision with the vehicle behind, with limits."
+    alt = "Share of lane changes carried out, by time to collision with the vehicle behind, with limits."
     caption = (
-        "A lane change is wished as often as with nobody closing in. Nearly all crashes arise below 1.5 s; where no "
-        "lane change was seen there, the data give an upper limit alone."
+        "Of the lane changes expected with nobody closing in. Nearly all crashes follow from times below 1.5 s; "
+        "where no lane change was seen there, the data give only an upper limit."
     )
     return Plot("acceptance", [panel], alt, caption)
 
@@ -175,8 +175,8 @@ def _hazard_plot(fit: Fit) -> Plot:
         panel.add("boxes", "blue", edges[:-1], edges[1:], low, high, opacity=0.18, label="seen, 90 % limits")
         panel.add("line", "blue", middle, wished / per_1000_s, label="fitted")
         panels.append(panel)
-    alt = "Rate of lane changes that was seen and fitted, by speed, gap and speed difference."
-    caption = "Where nobody closes in from behind within 8 s. The fit has all three at once."
+    alt = "Observed and fitted rate of lane changes, by speed, gap and speed difference."
+    caption = "Where nobody closes in from behind within 8 s. One fit with all three variables."
     return Plot("hazard", panels, alt, caption)
 
 
@@ -194,7 +194,7 @@ def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
         panel.add("boxes", "blue", edges[:-1], edges[1:], np.zeros(30), seen, opacity=0.3, label="seen")
         panel.add("line", "vermillion", 0.5 * (edges[1:] + edges[:-1]), law, label="law")
         panels.append(panel)
-    alt = "Histograms of initial states that were seen, and densities of the law."
+    alt = "Histograms of observed initial states, and the law's densities."
     return Plot("initial", panels, alt, "States behind a leader, one per vehicle and 20 s.")
 
 
@@ -236,7 +236,7 @@ def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) ->
         seen = np.array([np.corrcoef(acceleration[first], acceleration[first + lag])[0, 1] for lag in lags])
         panel.add("line", "blue", lags, seen, label="seen")
         panel.add("dots", "blue", lags, seen, 3.0)
-    panel.add("line", "vermillion", [0.0, 1.0, OVER_S], [1.0, 0.0, 0.0], label="law, but for its mean")
+    panel.add("line", "vermillion", [0.0, 1.0, OVER_S], [1.0, 0.0, 0.0], label="law, around its mean")
     yield panel
 
     random = np.random.default_rng(_SEED)
@@ -249,7 +249,7 @@ def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) ->
     seen, law = (_histogram(np.clip(each, -8.0, 8.0), ends) for each in (np.asarray(changes), drawn))
     lowest = 1e-4
     y = Axis("density", lowest, 2.0 * max(float(seen.max()), float(law.max())), log=True)
-    panel = Panel(f"{title}, {OVER_S} s on end", Axis(f"change of speed in {OVER_S} s, m/s", -8.0, 8.0), y)
+    panel = Panel(f"{title}, over {OVER_S} s", Axis(f"change of speed in {OVER_S} s, m/s", -8.0, 8.0), y)
     panel.add(
         "boxes", "blue", ends[:-1], ends[1:], np.full(32, lowest), np.maximum(seen, lowest), opacity=0.3, label="seen"
     )
@@ -260,7 +260,7 @@ def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) ->
 
 
 def _followed(rows: RecordArray, n: int) -> IntArray:
-    """Rows that n - 1 more seconds of the same drive follow."""
+    """Rows that are followed by n - 1 more seconds of the same vehicle."""
     v, a, vehicle = rows["v_mps"], rows["acceleration_mps2"], rows["vehicle"]
     if rows.size < n:
         return np.empty(0, np.int64)
@@ -281,4 +281,6 @@ def _lead_plot(fit: Fit, log_sd: float) -> Plot:
     panel = Panel("", Axis("from onset of lateral motion to overlap, s", 0.0, longest), y)
     panel.add("boxes", "blue", edges[:-1], edges[1:], np.zeros(25), seen, opacity=0.3, label=f"seen ({leads.size})")
     panel.add("line", "vermillion", times, law, label="law")
-    return Plot("leads", [panel], "Histogram of leads, and the law.", "What an attentive vehicle lives on.")
+    return Plot(
+        "leads", [panel], "Histogram of leads, and the law.", "How long an attentive vehicle can see a cut-in coming."
+    )

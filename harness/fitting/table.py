@@ -36,15 +36,15 @@ Unit = Literal["m", "ft", "km", "m/s", "ft/s", "km/h", "mph", "s", "ms", "us", "
 UNITS: dict[Unit, float] = dict(
     zip(get_args(Unit), (1.0, 0.3048, 1e3, 1.0, 0.3048, 1 / 3.6, 0.44704, 1.0, 1e-3, 1e-6, 1e-9), strict=True)
 )
-NO_LENGTH = "Gaps need lengths: mend them, or give one for all in a mapping (columns: {length_m: 4.6})."
-NO_COLUMN = ("Rename a column, or say in a mapping what it is called (--mapping FILE.yaml).", NO_LENGTH)
+NO_LENGTH = "Gaps need lengths: correct them, or give one for all in a mapping (columns: {length_m: 4.6})."
+NO_COLUMN = ("Rename the column, or give its name in a mapping (--mapping FILE.yaml).", NO_LENGTH)
 LONGEST_LINE = 1 << 20
 SLOWEST_HZ = 9.5
 FASTEST_MEDIAN_MPS = 70.0
 USUAL_LENGTH_M = (2.5, 10.0)
-"""Between which the median of vehicles' lengths lies: in feet it is about 15."""
+"""Range of the median length of vehicles, which in feet is about 15."""
 OF_STEP = 0.05
-"""Share by which speeds may differ from the change of positions."""
+"""Largest relative difference between speeds and the change of positions."""
 SLIPS = {
     3.2808: "speeds in ft/s beside positions in m",
     0.3048: "positions in feet beside speeds in m/s",
@@ -55,39 +55,39 @@ SLIPS = {
     1000.0: "positions in km beside speeds in m/s",
     -1.0: "positions that fall where vehicles drive forward",
 }
-"""What a ratio of speeds to the change of positions comes from."""
+"""Cause of a ratio of speeds to the change of positions."""
 MOST_APART = {"time_s": 1e7, "s_m": 1e5, "lane": 1e3}
-"""Rows further from the others hold a wrong value."""
+"""Values further from the median are wrong."""
 LEAST_LAG_S = 0.3
 ANOTHER_VEHICLE_S = 60.0
-"""An identifier that comes back after so long belongs to another vehicle (NGSIM's do)."""
+"""An identifier that reappears after so long is another vehicle's (as in NGSIM)."""
 
 
 class Mapping(Section):
-    """How the columns of a file are to be read."""
+    """How to read the columns of a file."""
 
     columns: dict[Literal[Needed, Optional], str | float] = Field(
         default={}, description="name in the file, or one number for all rows, by name of the input table"
     )
     units: dict[Measured, Unit | Annotated[float, Field(gt=0.0)]] = Field(
-        default={}, description="unit in the file, or what it is multiplied by"
+        default={}, description="unit in the file, or the factor to multiply by"
     )
     lanes: Literal["from_right", "from_left"] | list[int] = Field(
-        default="from_right", description="how lanes are numbered, or their numbers from right to left, others left out"
+        default="from_right", description="how lanes are numbered, or their numbers from right to left, without others"
     )
-    origin: Literal["centre", "front", "rear"] = Field(default="centre", description="what of a vehicle s_m is")
+    origin: Literal["centre", "front", "rear"] = Field(default="centre", description="point of a vehicle that s_m is")
     mirror: bool = Field(default=False, description="whether vehicles that close in from behind are on the left")
     classes: list[str] = Field(default=[], description="classes whose driving is fitted; all, if none is named")
-    layout: Literal["table", "highd"] = Field(default="table", description="whether it is highD's files")
+    layout: Literal["table", "highd"] = Field(default="table", description="whether files are highD's")
 
 
 SHIPPED_FOLDER = Path(__file__).parent
 
 
 def load_mapping(name: str | None = None, *, mirror: bool | None = None) -> Mapping:
-    """A shipped mapping (``highd``, ``ngsim``), one's own YAML file, or that of the input table itself.
+    """A shipped mapping (``highd``, ``ngsim``), that of a YAML file, or by default that of the input table itself.
 
-    Raises `CampaignError`: there is no such mapping, or something in it is wrong.
+    Raises `CampaignError`: there is no such mapping, or it is wrong.
     """
     mapping = Mapping() if name is None else read_model(shipped_or_own(name, SHIPPED_FOLDER, "--mapping"), Mapping)
     return mapping if mirror is None else mapping.replaced(("mirror",), mirror)
@@ -95,7 +95,7 @@ def load_mapping(name: str | None = None, *, mirror: bool | None = None) -> Mapp
 
 @dataclass(frozen=True)
 class Recording:
-    """All vehicles on a stretch of road for a while.
+    """All vehicles on a stretch of road during some time.
 
     Attributes
     ----------
@@ -130,11 +130,11 @@ class Recording:
         )
 
     def require_near(self, column: str) -> None:
-        """Refuse a value so far from the others that neighbours could not be told apart."""
+        """Refuse a value so far from the others that it cannot be right."""
         values = self.rows[column].to_numpy()
         off = np.abs(values - np.median(values))
         if off.max() > MOST_APART[column]:
-            i, mend = int(np.argmax(off)), "Delete the row, or mend the value."
+            i, mend = int(np.argmax(off)), "Delete the row, or correct the value."
             expected = f"at most {MOST_APART[column]:g} from the median of the recording"
             raise TrajectoryError(self.where(i), f"{column} {values[i]:g}", expected, mend)
 
@@ -142,13 +142,13 @@ class Recording:
 def recordings(files: Sequence[str | Path], mapping: Mapping) -> Iterator[Recording]:
     """Recordings of some files, one after the other, checked.
 
-    Raises `TrajectoryError`: a file cannot be read, or what it holds cannot be trajectories in these units.
+    Raises `TrajectoryError`: a file cannot be read, or its rows cannot be trajectories in these units.
     """
     paths = [Path(file) for file in files]
     kept = [path for path in paths if mapping.layout != "highd" or not path.stem.endswith("Meta")]
     if not kept:
         where = ", ".join(map(str, files))
-        raise TrajectoryError(where, "no file with tracks", "NN_tracks.csv", "Name highD's tracks, too.")
+        raise TrajectoryError(where, "no file with tracks", "NN_tracks.csv", "Give highD's tracks as well.")
     for i, path in enumerate(kept):
         for name, rows, share in _pieces(path, mapping):
             yield _recording(name, path, _standard(rows, path, mapping), (i + share) / len(kept))
@@ -169,13 +169,13 @@ def _reading(path: Path) -> Iterator[None]:
         yield
     except FileNotFoundError:
         meant = did_you_mean(path.name, [each.name for each in path.parent.glob("*")])
-        mend = meant or "Check the spelling and the folder that you are in."
+        mend = meant or "Check the spelling and the current folder."
         raise TrajectoryError(str(path), "no such file", "a CSV or Parquet file", mend) from None
     except IsADirectoryError:
         raise TrajectoryError(str(path), "a folder", "a CSV or Parquet file", "Name the files in it.") from None
     except (pa.ArrowException, OSError, UnicodeError) as error:
         found = f"a file that cannot be read ({str(error).splitlines()[0]})"
-        mend = "Is it complete, and of the kind that its name says? Copy or write it again."
+        mend = "Is it complete, and of the type that its name says? Copy or write it again."
         raise TrajectoryError(str(path), found, "a CSV or Parquet file", mend) from None
 
 
@@ -190,9 +190,9 @@ def _pieces(path: Path, mapping: Mapping) -> Iterator[tuple[str, pd.DataFrame, f
             for key, part in batch.rows.groupby("recording_id", sort=False):
                 name = str(key)
                 if name in done:
-                    where, found = f"{path}, row {part.row.iloc[0]}", f"recording {name} again, after others"
+                    where, found = f"{path}, row {part.row.iloc[0]}", f"recording {name} again, after another one"
                     mend = "Sort the file by recording_id, or write a file for each."
-                    raise TrajectoryError(where, found, "its rows together", mend)
+                    raise TrajectoryError(where, found, "all its rows together", mend)
                 if current is not None and name != current:
                     yield current, pd.concat(parts, ignore_index=True), share
                     done.add(current)
@@ -275,7 +275,7 @@ def _renamed(batch: Any, columns: dict[str, str], first: int, path: Path, mappin
         if column in NAMES:
             text = values.cast(pa.string()).fill_null("")
             if column in ("recording_id", "vehicle_id") and (i := text.index("").as_py()) >= 0:
-                where, mend = f"{path}, row {first + i}, {name}", "Name whose row it is, or delete it."
+                where, mend = f"{path}, row {first + i}, {name}", "Fill it in, or delete the row."
                 raise TrajectoryError(where, "nothing", "an identifier in every row", mend)
             data[column] = pd.arrays.ArrowExtensionArray(pa.chunked_array([text]))
             continue
@@ -283,7 +283,7 @@ def _renamed(batch: Any, columns: dict[str, str], first: int, path: Path, mappin
             data[column] = values.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
         except pa.ArrowException:
             found = f"values of type {values.type}"
-            raise TrajectoryError(f"{path}, column {name}", found, "numbers", "Write it as numbers.") from None
+            raise TrajectoryError(f"{path}, column {name}", found, "numbers", "Write the column as numbers.") from None
     rows = pd.DataFrame(data)
     for column, value in mapping.columns.items():
         if isinstance(value, float):
@@ -305,17 +305,17 @@ def _standard(rows: pd.DataFrame, path: Path, mapping: Mapping) -> pd.DataFrame:
     if (odd := ~np.isfinite(rows[list(NEEDED[1:])].to_numpy())).any():
         i, column = np.argwhere(odd)[0]
         where = f"{path}, row {rows.row.iloc[i]}, {NEEDED[1:][column]}"
-        raise TrajectoryError(where, "no finite number", "a number in every row", "Delete the row, or mend the value.")
+        raise TrajectoryError(where, "no finite number", "a number in every row", "Delete or correct the row.")
     if (odd := rows.lane.to_numpy() % 1 != 0).any():
         i = int(np.argmax(odd))
         where = f"{path}, row {rows.row.iloc[i]}, lane"
-        raise TrajectoryError(where, f"{rows.lane.iloc[i]:g}", "a whole number", "Give every lane a number of its own.")
+        raise TrajectoryError(where, f"{rows.lane.iloc[i]:g}", "a whole number", "Number the lanes by whole numbers.")
     if isinstance(mapping.lanes, list):
         order = {float(lane): i for i, lane in enumerate(mapping.lanes)}
         rows = rows[rows.lane.isin(list(order))].copy()
         if rows.empty:
             found = f"no vehicle in the lanes {', '.join(map(str, mapping.lanes))}"
-            raise TrajectoryError(str(path), found, "rows in them", "Correct `lanes` of the mapping.")
+            raise TrajectoryError(str(path), found, "rows in these lanes", "Correct `lanes` of the mapping.")
         rows["lane"] = rows.lane.map(order)
     from_right = mapping.lanes != "from_left"
     rows["lane"] = rows.lane.astype(np.int64) * (1 if from_right != mapping.mirror else -1)
@@ -335,11 +335,11 @@ def _from_highd(rows: pd.DataFrame, path: Path) -> pd.DataFrame:
     file = path.with_name(f"{stem}_recordingMeta.csv")
     rate = pd.to_numeric(_highd_meta(file, ["frameRate"])["frameRate"], errors="coerce").max()
     if not rate > 0.0:
-        raise TrajectoryError(str(file), "no frameRate", "frames per second", "Take the file as it was published.")
+        raise TrajectoryError(str(file), "no frameRate", "frames per second", "Use the file as published.")
     rows = rows.merge(vehicles.rename(columns={"id": "vehicle_id"}), on="vehicle_id", how="left")
     if (missing := ~rows.drivingDirection.isin(["1", "2"])).any():
-        found = f"no drivingDirection 1 or 2 of vehicle {rows.vehicle_id[missing].iloc[0]}"
-        raise TrajectoryError(f"{stem}_tracksMeta.csv", found, "that of all", "Take both from one recording.")
+        found = f"no drivingDirection 1 or 2 for vehicle {rows.vehicle_id[missing].iloc[0]}"
+        raise TrajectoryError(f"{stem}_tracksMeta.csv", found, "that of every vehicle", "Use files of one recording.")
     leftwards = (rows.drivingDirection == "1").to_numpy()
     forward = np.where(leftwards, -1.0, 1.0)
     return rows.assign(
@@ -356,9 +356,9 @@ def _highd_meta(path: Path, columns: list[str]) -> pd.DataFrame:
     try:
         return pd.read_csv(path, usecols=columns, dtype=str)
     except FileNotFoundError:
-        found, mend = "no such file", "highD needs it beside the tracks: put it there."
+        found, mend = "no such file", "highD needs it beside the tracks: copy it there."
     except (ValueError, OSError) as error:
-        found, mend = str(error), "Take the file as it was published."
+        found, mend = str(error), "Use the file as published."
     raise TrajectoryError(str(path), found, f"a CSV file with {', '.join(columns)}", mend)
 
 
@@ -380,14 +380,14 @@ def _recording(name: str, path: Path, rows: pd.DataFrame, share_read: float) -> 
     recording = Recording(name, str(path), rows, 0.0, vehicles, share_read)
     if (twice := same & (dt == 0.0)).any():
         where = recording.where(np.argmax(twice) + 1)
-        mend = "Delete it; or name recordings (recording_id), should the vehicle be another."
+        mend = "Delete it; or, if it is another vehicle, add a recording_id."
         raise TrajectoryError(where, "a second row of this vehicle and time", "one", mend)
     rate = _rate_hz(recording, dt[same])
     recording.require_near("time_s")
     since = (time_s - time_s.min()) * rate
     frame = np.rint(since).astype(np.int64)
     if (odd := np.abs(since - frame) > 0.3).any():
-        found = f"a time between those of others, at {rate:.4g} Hz"
+        found = f"a time off the steps of {rate:.4g} Hz"
         mend = "Interpolate all vehicles to the same times."
         raise TrajectoryError(recording.where(np.argmax(odd)), found, "times in equal steps", mend)
     rows["frame"] = frame + round(time_s.min() * rate)
@@ -398,21 +398,21 @@ def _recording(name: str, path: Path, rows: pd.DataFrame, share_read: float) -> 
 
 def _rate_hz(recording: Recording, steps_s: FloatArray) -> float:
     """Frames per second."""
-    where, mend = f"{recording.file}, recording {recording.name}", "Name recordings at 10 Hz or more."
+    where, mend = f"{recording.file}, recording {recording.name}", "Use recordings at 10 Hz or more."
     if not steps_s.size:
-        raise TrajectoryError(where, "one row per vehicle", "many", "Is vehicle_id the right column?")
+        raise TrajectoryError(where, "one row per vehicle", "many", "Check the column vehicle_id.")
     step_s = float(np.median(steps_s))
     regular = steps_s[np.abs(steps_s - step_s) < 0.5 * step_s]
     rate = 1.0 / float(regular.mean())  # times may be rounded: 0.033, 0.067
     if rate < SLOWEST_HZ:
         if step_s >= 1.0:
-            mend = "Are times milliseconds, or frames? Say so in a mapping: units: {time_s: ms}, or seconds per frame."
+            mend = "If times are milliseconds or frames, use a mapping: units: {time_s: ms}, or seconds per frame."
         raise TrajectoryError(where, f"a row every {step_s:g} s", "10 Hz or more", mend)
     return float(round(rate)) if abs(rate / round(rate) - 1.0) < 1e-4 else rate
 
 
 def _check_units(recording: Recording) -> None:
-    """Refuse what cannot be metres and seconds, or belongs to different times; by name, where the ratio tells it."""
+    """Refuse wrong units, and columns that are shifted in time; name the units where the ratio shows them."""
     rows, where = recording.rows, f"{recording.file}, recording {recording.name}"
     if (odd := rows.length_m.to_numpy() <= 0.0).any():
         raise TrajectoryError(recording.where(np.argmax(odd)), "no length", "a length above 0 m", NO_LENGTH)
@@ -430,22 +430,22 @@ def _check_units(recording: Recording) -> None:
         slip = min(SLIPS, key=lambda each: abs(ratio / each - 1.0))
         words = f": {SLIPS[slip]}" if abs(ratio / slip - 1.0) < OF_STEP else ""
         found = f"speeds {ratio:.3g} times the change of positions{words}"
-        mend = "Say their units in a mapping (units: {s_m: ft}); s_m must rise as one drives."
-        raise TrajectoryError(where, found, "m and m/s of one motion", mend)
+        mend = "Give units in a mapping (units: {s_m: ft}); s_m must rise in driving direction."
+        raise TrajectoryError(where, found, "positions in m and speeds in m/s that agree", mend)
     speed, length = float(np.median(v)), float(np.median(rows.length_m))
     feet = length > USUAL_LENGTH_M[1]
     if not -0.5 < speed < FASTEST_MEDIAN_MPS:
         found = f"a median speed of {speed:.4g} m/s" + (f" and a median length of {length:.3g} m: feet" if feet else "")
-        mend = "Say units in a mapping, such as units: {s_m: ft, speed_mps: ft/s, length_m: ft}; none is negative."
+        mend = "Give units in a mapping (units: {s_m: ft, speed_mps: ft/s, length_m: ft}); forward is positive."
         raise TrajectoryError(where, found, "0 to 70 m/s", mend)
     if feet or length < USUAL_LENGTH_M[0]:
-        mend = "Say so in a mapping: units: {length_m: ft}." if feet else "Is the column that of the width?"
+        mend = "Use a mapping: units: {length_m: ft}." if feet else "Is this the width of vehicles?"
         found = f"a median length of {length:.3g} m{': feet' if feet else ''}"
         raise TrajectoryError(where, found, "2.5 to 10 m", mend)
     lag_s = _lag(begin, frame, vehicle, way_m * recording.rate_hz, v, n) / recording.rate_hz
     if abs(lag_s) >= LEAST_LAG_S:
         found = f"speeds that belong to positions of {abs(lag_s):.1f} s {'earlier' if lag_s > 0 else 'later'}"
-        raise TrajectoryError(where, found, "both of one time", "Correct the shift between the columns.")
+        raise TrajectoryError(where, found, "speeds and positions of the same time", "Shift one of the columns.")
     recording.require_near("s_m")
     recording.require_near("lane")
 

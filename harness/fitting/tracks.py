@@ -1,4 +1,4 @@
-"""Vehicles of a recording: in which lane each drives until when, and who is around it."""
+"""Vehicles of a recording: their lanes over time, and their neighbours."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from harness.fitting.table import Recording
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 IN_VIEW_M = 100.0
-"""Nobody is behind where so much of the road behind is seen."""
+"""Where so much of the road behind is in view and empty, nobody is behind."""
 
 
 class FitRange(NamedTuple):
-    """States that laws are fitted to."""
+    """Range of the states that laws are fitted to."""
 
     v_min_mps: float = 20.0
     v_max_mps: float = 40.0
@@ -24,7 +24,7 @@ class FitRange(NamedTuple):
 
 
 USUAL_RANGE = FitRange()
-"""That of the shipped environments."""
+"""Fit range of the shipped environments."""
 
 
 class Track(NamedTuple):
@@ -44,12 +44,12 @@ class Track(NamedTuple):
     run: IntArray
     road_begin: FloatArray
     road_end: FloatArray
-    """By road: how far it is seen."""
+    """Ends of the view, by road."""
     rate_hz: float
 
     @property
     def second(self) -> int:
-        """Frames of a second."""
+        """Frames per second, rounded."""
         return round(self.rate_hz)
 
     def begins(self) -> IntArray:
@@ -62,28 +62,28 @@ class Track(NamedTuple):
         return np.asarray(same & (np.diff(self.lane, append=0) == side))
 
     def has_lane(self, side: int) -> BoolArray:
-        """Rows (n,) beside a lane in which somebody drives in this recording."""
+        """Rows (n,) beside a lane in which vehicles drive in this recording."""
         lanes = self.lane - self.lane.min() + 1
         at = self.road * (lanes.max() + 2) + lanes
         return np.asarray(np.isin(at + side, np.unique(at)))
 
     def same_run(self, rows: IntArray, frames: int) -> BoolArray:
-        """Whether a vehicle stays in its lane so long after some rows (m,)."""
+        """Whether the vehicle stays in its lane for so many frames after some rows (m,)."""
         last = np.minimum(rows + frames, self.run.size - 1)
         return np.asarray((self.run[last] == self.run[rows]) & (last == rows + frames))
 
     def gap(self, leader: IntArray, follower: IntArray) -> FloatArray:
-        """Bumper to bumper; infinite where one of them is -1."""
+        """Gap (m), bumper to bumper; infinite where a row is -1."""
         gap = self.s[leader] - self.s[follower] - 0.5 * (self.length[leader] + self.length[follower])
         return np.where((leader >= 0) & (follower >= 0), gap, np.inf)
 
     def rate(self, leader: IntArray, follower: IntArray) -> FloatArray:
-        """Speed of the leader minus that of the follower; 0 where one of them is -1."""
+        """Speed of the leader minus that of the follower (m/s); 0 where a row is -1."""
         return np.where((leader >= 0) & (follower >= 0), self.v[leader] - self.v[follower], 0.0)
 
 
 def track_of(recording: Recording) -> tuple[Track, int]:
-    """Columns with lanes smoothed, and how often a lane came back within a second."""
+    """Columns with smoothed lanes, and how often a vehicle came back to a lane within a second."""
     rows = recording.rows
     vehicle, frame, lane = (rows[name].to_numpy() for name in ("vehicle", "frame", "lane"))
     road, s, n = rows.road.to_numpy(), rows.s_m.to_numpy(), round(recording.rate_hz)
@@ -98,12 +98,12 @@ def track_of(recording: Recording) -> tuple[Track, int]:
 
 
 def _numbers(breaks: BoolArray) -> IntArray:
-    """Number of the part that each row (n,) is in, between breaks (n - 1,)."""
+    """Number of each row's part (n,), between breaks (n - 1,)."""
     return np.append(0, np.cumsum(breaks))
 
 
 def _smoothed(lane: IntArray, piece: IntArray, second: int) -> tuple[IntArray, int]:
-    """Lanes (n,) as the median of two seconds where one came back within one, and how often that was."""
+    """Lanes (n,), by the median of two seconds where one came back within a second, and how often it did."""
     run = _numbers((np.diff(piece) != 0) | (np.diff(lane) != 0))
     first = np.flatnonzero(np.diff(run, prepend=-1))
     frames = np.diff(first, append=lane.size)
@@ -118,7 +118,7 @@ def _smoothed(lane: IntArray, piece: IntArray, second: int) -> tuple[IntArray, i
 
 
 class Scene:
-    """Who drives where at the moments of some rows."""
+    """Positions of all vehicles at the moments of some rows."""
 
     def __init__(self, track: Track, chosen: BoolArray) -> None:
         at = np.flatnonzero(np.isin(track.frame, np.unique(track.frame[chosen])))
@@ -133,7 +133,7 @@ class Scene:
         self._place, self._at = place[order], at[order]
 
     def neighbours(self, rows: IntArray, side: int) -> tuple[IntArray, IntArray]:
-        """Rows (m,) of the next vehicles ahead of and behind the centre of some, in a lane beside; -1 for none."""
+        """Rows (m,) of the next vehicles ahead of and behind the centres of some, in the lane ``side``; -1 for none."""
         spot = self._spot[rows] + side
         i = np.searchsorted(self._place, spot * self._span + self._s[rows], side="right")
         ahead = self._at[np.minimum(i, self._at.size - 1)]
@@ -144,7 +144,7 @@ class Scene:
         )
 
     def states(self, rows: IntArray, side: int, fit_range: FitRange) -> States:
-        """States of some rows (m,) towards the lane beside."""
+        """States of some rows (m,) towards the lane ``side``."""
         track, fit = self._track, fit_range
         v = track.v[rows]
         leader, _ = self.neighbours(rows, 0)
@@ -172,18 +172,18 @@ class States(NamedTuple):
     fits: BoolArray
     """Whether the speed is within the fit range."""
     follows: BoolArray
-    """Whether R1 is."""
+    """Whether R1 is within the fit range."""
     behind: BoolArray
-    """Both, without overlap."""
+    """Both, and vehicles do not overlap."""
     r2: FloatArray
     r2dot: FloatArray
     ttc_s: FloatArray
     at_risk: BoolArray
-    """Behind a leader, nobody alongside, and seen who comes from behind."""
+    """Behind a leader, nobody alongside, and the road behind in view."""
 
 
 def durations_s(track: Track, rows: IntArray) -> FloatArray:
-    """Time (s) that each of some rows (m,) stands for: what of its run is nearest to it."""
+    """Time (s) that each of some rows (m,) stands for: the part of its run that is nearest to it."""
     run, frame = track.run[rows], track.frame[rows].astype(np.float64)
     alone = np.flatnonzero(np.diff(track.run, prepend=-1))
     first, last = track.frame[alone].astype(np.float64), track.frame[np.append(alone[1:], track.run.size) - 1]
@@ -207,7 +207,7 @@ def slopes(track: Track, rows: IntArray) -> FloatArray:
 
 
 def noise_of(track: Track) -> float:
-    """Standard deviation (m/s²) of slopes by white noise, which third differences show as no motion does."""
+    """Standard deviation (m/s²) of slopes by white noise, from third differences, to which motion adds little."""
     same = track.piece[3:] == track.piece[:-3]
     third = np.diff(track.v, 3)[same]
     since = np.arange(track.second + 1) - track.second / 2

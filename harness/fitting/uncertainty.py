@@ -1,9 +1,9 @@
 """Replicates of fitted traffic.
 
 A replicate is what other trajectories of the same kind would have given: clusters (recordings, or vehicles where there
-are few) are drawn anew with replacement, and each law moves by the influence of those drawn more or less often than
-once (one-step bootstrap: θ + Σ (w_c - 1) influence_c). Few clusters spread their mean as Student's t does. Lane changes
-in front of somebody who closes in are counts: accepted shares are drawn as gamma(k + 1/2) over exposure.
+are few) are drawn with replacement, and each law moves by the influence of those drawn more or less often than once
+(one-step bootstrap: θ + Σ (w_c - 1) influence_c). With few clusters, moves are widened to those of Student's t. Lane
+changes in front of a vehicle that closes in are counts: accepted shares are drawn as gamma(k + 1/2) over exposure.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from harness.vocabulary import FloatArray
 
 REPLICATES = 200
 MOST_DRAWS = 5
-"""Times as many replicates as are wanted are drawn, should some of them give no laws."""
+"""At most this many times the replicates asked for are drawn, as tests cannot be drawn from some."""
 _SHARES = tuple(f"acceptance_steps__share__{j}" for j in range(TTC_EDGES_S.size))
 
 
 def replicates(fit: Fit, n: int, seed: int, progress: Progress) -> dict[str, FloatArray]:
-    """Numbers that vary, by their flat names, in n replicates (n,) whose laws can be drawn from.
+    """Numbers that vary, by their flat names, in n replicates (n,) from which tests can be drawn.
 
-    Raises `TrajectoryError`: too many have none.
+    Raises `TrajectoryError`: there are too few of these.
     """
     random = np.random.default_rng(seed)
     settings, good = EnvironmentSettings(), []
@@ -44,8 +44,8 @@ def replicates(fit: Fit, n: int, seed: int, progress: Progress) -> dict[str, Flo
             progress.advance(1)
             if len(good) == n:
                 return dict(zip(drawn, np.array(good).T, strict=True))
-    found = f"{len(good)} of {MOST_DRAWS * n} replicates with laws that tests can be drawn from"
-    raise TrajectoryError("replicates", found, f"{n}", "Take more recordings, or fewer replicates: --replicates.")
+    found = f"{len(good)} of {MOST_DRAWS * n} replicates that tests can be drawn from"
+    raise TrajectoryError("replicates", found, f"{n}", "Add recordings, or ask for fewer --replicates.")
 
 
 def _draw(fit: Fit, n: int, random: np.random.Generator) -> dict[str, list[float]]:

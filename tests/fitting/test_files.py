@@ -32,8 +32,8 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
     ("files", "out", "found"),
     [
         (["rows.csv", "./rows.csv"], "mine.yaml", "a file that is named twice"),
-        (["mine.replicates.parquet"], "mine.yaml", "that mine.replicates.parquet is read"),
-        (["rows.csv"], "map.yaml", "that map.yaml is read"),
+        (["mine.replicates.parquet"], "mine.yaml", "mine.replicates.parquet, which is also an input"),
+        (["rows.csv"], "map.yaml", "map.yaml, which is also an input"),
     ],
 )
 def test_what_is_read_is_neither_counted_twice_nor_written_over(files, out, found, tmp_path, monkeypatch):

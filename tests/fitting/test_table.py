@@ -93,11 +93,11 @@ REFUSED = {
     "mirrored": (fast_lanes, "mirror: true"),
     "shifted": (shifted, r"speeds that belong to positions of 1\.0 s earlier"),
     "front bumpers": (long_followers, "origin: front"),
-    "own clocks": (own_clocks, "Do times count from one moment"),
+    "own clocks": (own_clocks, "one clock"),
     "one lane": (changed(lane=0), "no vehicle with another lane beside it"),
     "half a lane": (with_value(7, "lane", 0.5), r"row 8, lane: found 0\.5"),
     "5 Hz": (lambda: ROWS[(ROWS.time_s * 10).round() % 2 == 0], "a row every 0.2 s"),
-    "unequal steps": (with_value(7, "time_s", 0.75), "row 8 .*between those of others"),
+    "unequal steps": (with_value(7, "time_s", 0.75), "row 8 .*a time off the steps of 10 Hz"),
     "twice": (lambda: pd.concat([ROWS[:5], ROWS]), "a second row"),
     "interleaved": (
         lambda: pd.concat([ROWS[ROWS.recording_id < 40]] * 2 + [ROWS]).sort_values("time_s"),
