@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from scipy.special import gammainc, gammaincinv
 
 from harness.campaign.files import shipped_or_own
@@ -274,9 +275,13 @@ def read_replicates(name: str, parameters: EnvironmentParameters) -> list[dict[s
     path = file.parent / str(parameters.replicates)
     again = "Write it anew with `harness fit`, or leave out the key replicates."
     table = read_table(path, mend=again)
-    known = parameters.values()
-    if unknown := sorted(set(table.column_names) - set(known)) or not table.num_rows:
-        found = f"column {unknown[0]}" if isinstance(unknown, list) else "no rows"
-        raise RunFolderError(str(path), found, f"replicates of the numbers of {file.name}, by section__name", again)
+    wrong = [] if table.num_rows else ["no rows"]
+    for column, of in zip(table.column_names, table.columns, strict=True):
+        if column not in parameters.numbers():
+            wrong.append(f"column {column}")
+        elif of.null_count or not (pa.types.is_floating(of.type) or pa.types.is_integer(of.type)):
+            wrong.append(f"column {column} with something else than numbers")
+    if wrong:
+        raise RunFolderError(str(path), wrong[0], f"replicates of the numbers of {file.name}, by section__name", again)
     rows: list[dict[str, float]] = table.to_pylist()
     return rows

@@ -9,6 +9,7 @@ drivers show: by how much their rates, which are known there, would come out wro
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,11 +90,15 @@ def sensitivity(
 
 def moves(name: str, parameters: EnvironmentParameters, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Move]:
     """What is said to be uncertain of an environment, a shipped name or a file, and numbers with stated ``ranges``."""
-    known = parameters.values()
+    known = parameters.numbers()
     stated = {key.replace(".", "__"): ends for key, ends in ranges.items()}
     if unknown := sorted(set(stated) - set(known)):
         mend = f"Its numbers are named section.name, such as {next(reversed(known)).replace('__', '.')}."
         raise CampaignError("--range", unknown[0].replace("__", "."), f"a number of {name}", mend)
+    for key, (low, high) in ranges.items():
+        if not -math.inf < low < high < math.inf:
+            expected = "two finite numbers, the lower first"
+            raise CampaignError(f"--range {key}", f"{low:g}:{high:g}", expected, "Correct them, or change places.")
     blocks = {section: block for block, sections in BLOCKS.items() for section in sections}
     if parameters.replicates is not None:
         rows = read_replicates(name, parameters)[:N_REPLICATES]
@@ -101,7 +106,7 @@ def moves(name: str, parameters: EnvironmentParameters, ranges: Mapping[str, tup
             columns = [key for key in rows[0] if blocks.get(key.split("__")[0]) == block]
             if columns:
                 yield Move(block, "fitted", None, [{key: row[key] for key in columns} for row in rows])
-    for key, number in parameters.numbers().items():
+    for key, number in known.items():
         what, value, se, ends = key.replace("__", "."), number.value, number.se, stated.get(key, number.range)
         if ends is not None:
             yield Move(what, "assumed", (ends[0], ends[1]), [{key: end} for end in ends])

@@ -151,7 +151,13 @@ def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
 
 @pytest.mark.parametrize(
     ("columns", "found"),
-    [({"cut_in__look": [0.1]}, "column cut_in__look"), ({LOOK: []}, "no rows"), (None, "no such file")],
+    [
+        ({"cut_in__look": [0.1]}, "column cut_in__look"),
+        ({"scenario__step_s": [0.1]}, "column scenario__step_s"),
+        ({LOOK: ["few"]}, "else than numbers"),
+        ({LOOK: []}, "no rows"),
+        (None, "no such file"),
+    ],
 )
 def test_replicates_that_are_none_are_refused(stored_run, tmp_path, columns, found):
     mine = fitted(tmp_path, **(columns or {}))

@@ -91,9 +91,13 @@ def test_what_was_fitted_together_moves_together(tmp_path):
     [
         ("cut_in.look=0:1", "cut_in.look"),
         ("cut_in.ignore_share=0.1", "no two numbers"),
+        ("cut_in.ignore_share=nan:0.1", "nan:0.1"),
+        ("cut_in.ignore_share=0.02:0.01", "the lower first"),
+        ("scenario.step_s=0.1:0.2", "a number of ndd-overtaking-1"),
         (None, "no number has a standard error"),
     ],
 )
 def test_what_is_not_said_to_be_uncertain_is_refused(folder, capsys, option, found):
     assert main(["sensitivity", str(folder), *(["--range", option] if option else [])]) == 2
     assert found in capsys.readouterr().err
+    assert not (folder / "sensitivity.json").exists()
