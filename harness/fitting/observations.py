@@ -303,7 +303,7 @@ def require_enough(total: Tally, where: str) -> None:
 
     Raises `TrajectoryError`: a rule is broken; it says which.
     """
-    side = "If vehicles close in on the other side, set mirror: true in a mapping, or --mirror; if it is set, remove it."
+    side = "If vehicles close in on the other side, set mirror: true in a mapping (or --mirror), or remove it."
     if total.driven_s == 0.0:
         found, expected = "no vehicle with another lane beside it, on the side where vehicles close in", "lanes 0, 1, …"
         raise TrajectoryError(
