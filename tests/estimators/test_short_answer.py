@@ -205,6 +205,30 @@ def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, va
     assert statement(best, 1.0, None).count("is below 3.00 × 10⁻⁸") == (seen > 0.0)
 
 
+def severe(stored_run, cut_off=0.0, **of_rate):
+    """The answer of a run, if its tests that were cut off, and ends of its interval, are so many times its rate."""
+    run = read_run_folder(stored_run("shells-twin"))
+    rate = run.headline.crash_rate
+    best = replace(run.headline, **{name: times * rate for name, times in of_rate.items()})
+    severity = replace(run.estimates.severity, cut_off=cut_off * rate)
+    return lambda **other: short_answer(golden("shells-twin"), best, replace(severity, **other), {}, None)
+
+
+@pytest.mark.parametrize(("cut_off", "high", "warned"), [(0.19, 1.1, False), (0.3, 1.2, True), (0.3, 1.4, False)])
+def test_tests_whose_time_was_up_are_warned_of_where_the_interval_leaves_them_out(cut_off, high, warned, stored_run):
+    """They are many, and had they crashed the rate would be above its upper end."""
+    warnings = severe(stored_run, cut_off, ci_high=high)().warnings
+    assert any("time was up" in each for each in warnings) == warned
+
+
+@pytest.mark.parametrize(("driver", "told"), [("brakes-8", True), ("brakes-6", False)])
+def test_only_what_the_hardest_brakes_do_not_avoid_is_called_unavoidable(driver, told, stored_run):
+    answered = severe(stored_run)
+    of = read_run_folder(stored_run("shells-twin")).estimates.severity.unavoidable
+    keys = [row.key for row in answered(unavoidable=replace(of, driver=driver)).rows]
+    assert ("unavoidable" in keys) == told
+
+
 def test_a_comparison_is_as_short():
     """With what makes it long: names, far limits, warnings, a margin."""
     side = {"crash_rate": 1.4e-7, "ci_low": 1e-10, "ci_high": 2e-7, "n_crashes": 93, "upper_bound": 1e-6}

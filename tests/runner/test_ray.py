@@ -17,10 +17,12 @@ from pathlib import Path
 import pytest
 
 from benchmarks.kills import descendants, orphans, started_by
+from harness.campaign.yaml_text import yaml_text
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from tests.runner.conftest import SHELLS, TWIN
 from tests.runner.test_shadow_runs import FORCED, SHADOWS, of
 from tests.stored_runs import manifest, shard_files, unlike_columns
+from tests.traffic.tables import tabled
 
 ray = pytest.importorskip("ray")
 import harness.runner.ray as on_ray  # noqa: E402 - not without the extra
@@ -60,6 +62,16 @@ def test_shadow_runs_come_to_the_machines(run, campaign, tmp_path):
     settings = (*SHELLS, SHADOWS, f"av={of('Speeds')}", TWIN[0])
     a = run(campaign(*settings), tmp_path / "local", workers=2)
     b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
+    assert unlike_columns(a.folder, b.folder) == []
+    assert a.estimates == b.estimates
+
+
+def test_machines_need_no_file_of_the_traffic_though_it_has_tables(run, campaign, tmp_path):
+    (tmp_path / "mine.yaml").write_text(yaml_text(tabled()))
+    settings = (*SHELLS, TWIN[0], "stop.episodes=240", f"environment.parameters={tmp_path / 'mine.yaml'}")
+    a = run(campaign(*settings), tmp_path / "local", workers=2)
+    b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
+    assert a.estimates["estimates"]["shells"]["n_crashes"] > 0
     assert unlike_columns(a.folder, b.folder) == []
     assert a.estimates == b.estimates
 

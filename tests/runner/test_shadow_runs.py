@@ -94,6 +94,20 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
     assert replay(seeded, 123).bit_equal
 
 
+def test_a_vehicle_that_acts_is_tested_in_the_default_traffic(campaign, run_here, tmp_path):
+    """Cut-ins take time there, in baseline runs and in tests that follow from them."""
+    traffic = "environment.parameters=ndd-overtaking-2", "stop.episodes=80", "pool.pilot_tests=0"
+    folder = run_here(campaign(*SHELLS, SHADOWS, TWIN, *traffic, f"av={of('Yields')}"), tmp_path / "run").folder
+    tests = stored_table(folder, "episodes").to_pandas()
+    assert manifest(folder)["cut_ins_take_time"]
+    assert tests.failure.isna().all()
+    assert (tests.lead_steps > 0).all()
+    assert (tests.onset_step == np.maximum(tests.cut_in_step - tests.lead_steps, 0)).all()
+    # It has made room by then: at the cut-in it closes in more slowly than when the test began.
+    assert (tests.cut_in_r2dot_mps > tests.r2dot_mps).mean() > 0.5
+    assert replay(folder, 17).bit_equal
+
+
 def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp_path):
     """Three in 120 fail: refused at one per cent; with five they are a part of the upper limit that no test takes."""
     breaks = (*SHELLS, SHADOWS, TWIN, f"av={of('Breaks')}")
