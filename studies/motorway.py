@@ -25,15 +25,13 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from harness.compiled import unboxed
 from harness.errors import HarnessError
 from harness.fitting.observations import Observations, Tally
-from harness.traffic.laws import Environment, InitialStates
+from harness.traffic.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
 from harness.traffic.loading import evaluate_laws
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import (
     ACCELERATIONS_MPS2,
-    N_ACCELERATIONS,
     BoolArray,
     FloatArray,
     IntArray,
@@ -202,15 +200,13 @@ class Laws(NamedTuple):
         behind = [np.where(nobody, 1.0, risk["r2_m"]), np.where(nobody, 1.0, risk["r2dot_mps"])]
         speeds = seen.free["v_mps"]
         free = np.column_stack([speeds, np.full_like(speeds, 50.0), np.zeros_like(speeds)])
-        pmf_free, *_ = _evaluated(environment, free)
-        pmf, *_ = _evaluated(environment, _states(seen.following))
-        _, chance, accepted = _evaluated(environment, _states(risk), np.column_stack(behind))
+        *_, chance, accepted = evaluate_laws(environment, _states(risk), np.column_stack(behind))
         lateral = environment.lateral
         lead_s = STEP_S * float(np.searchsorted(lateral.cumulative, 0.5))
         return cls(
             InitialStates(environment.numbers).from_uniforms(np.random.default_rng(1).random((20_000, 5))),
-            pmf_free[0],
-            pmf[1],
+            evaluate_laws(environment, free).pmf[FREE_DRIVING],
+            evaluate_laws(environment, _states(seen.following)).pmf[CAR_FOLLOWING],
             -np.log1p(-np.minimum(chance, MOST_LIKELY)) * risk["duration_s"],
             accepted,
             lead_s,
@@ -220,18 +216,6 @@ class Laws(NamedTuple):
 
 def _states(rows: RecordArray) -> FloatArray:
     return np.column_stack([rows[name] for name in ("v_mps", "r1_m", "r1dot_mps")])
-
-
-def _evaluated(
-    environment: Environment, states: FloatArray, approaches: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Probabilities of accelerations (2, n, 31), wishes (n,), shares carried out (m,); see `evaluate_laws`."""
-    if approaches is None:
-        approaches = np.empty((0, 2))
-    pmf, scale = np.empty((2, len(states), N_ACCELERATIONS)), np.empty((2, len(states)))
-    chance, accepted = np.empty(len(states)), np.empty(len(approaches))
-    evaluate_laws(states, approaches, unboxed(environment), pmf, scale, chance, accepted)
-    return pmf, chance, accepted
 
 
 def joined(recordings: Iterable[Observations]) -> Observations:

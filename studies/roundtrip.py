@@ -27,7 +27,6 @@ from scipy import stats
 
 from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
-from harness.compiled import unboxed
 from harness.errors import TrajectoryError
 from harness.estimators.traffic import ONE_LAW
 from harness.fitting.fit import fit_traffic
@@ -42,7 +41,7 @@ from harness.records.folder import write_atomically
 from harness.resolved import resolve
 from harness.traffic.loading import evaluate_laws, load_environment, load_parameters
 from harness.traffic.parameters import FIXED, REPLACED, EnvironmentParameters
-from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray, RecordArray
+from harness.vocabulary import BoolArray, FloatArray, RecordArray
 from studies.trajectories import RECORDING_H, Differences, simulate, write
 
 TRAFFIC = EnvironmentSettings(parameters="ndd-overtaking-2", lane_change_level=1000.0)
@@ -368,10 +367,8 @@ def judge_numbers(
 
 def true_hazard(state: Sequence[float]) -> float:
     """Rate (1/s) at which lane changes are wished in the environment."""
-    environment = load_environment(TRAFFIC, truth())
-    pmf, scale, chance = np.empty((2, 1, N_ACCELERATIONS)), np.empty((2, 1)), np.empty(1)
-    evaluate_laws(np.array([state]), np.empty((0, 2)), unboxed(environment), pmf, scale, chance, np.empty(0))
-    return float(-np.log1p(-chance[0]))
+    values = evaluate_laws(load_environment(TRAFFIC, truth()), np.array([state]))
+    return float(-np.log1p(-values.chance[0]))
 
 
 def true_shares(pool: Traffic) -> dict[str, float]:
@@ -380,9 +377,7 @@ def true_shares(pool: Traffic) -> dict[str, float]:
     nobody = ~np.isfinite(risk["r2_m"])
     states = np.column_stack([risk[name] for name in HAZARD.values()])
     behind = np.column_stack([np.where(nobody, 1.0, risk[name]) for name in ("r2_m", "r2dot_mps")])
-    pmf, scale = np.empty((2, len(risk), N_ACCELERATIONS)), np.empty((2, len(risk)))
-    chance, accepted = np.empty((2, len(risk)))
-    evaluate_laws(states, behind, unboxed(load_environment(TRAFFIC, truth())), pmf, scale, chance, accepted)
+    *_, chance, accepted = evaluate_laws(load_environment(TRAFFIC, truth()), states, behind)
     wished, step = chance * risk["duration_s"], np.searchsorted(TTC_EDGES_S, risk["ttc_s"], side="right")
     all_wished, done = (np.bincount(step, each, N_STEPS) for each in (wished, wished * accepted))
     return {f"acceptance_steps__share__{i}": value for i, value in enumerate((done / all_wished).tolist())}

@@ -18,12 +18,11 @@ from scipy.optimize import brentq
 from harness.campaign.files import read_model
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import EnvironmentSettings, Section
-from harness.compiled import unboxed
 from harness.pool.walk import write_script
 from harness.traffic.laws import Environment, InitialStates
 from harness.traffic.loading import evaluate_laws, load_environment
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import ACCELERATIONS_MPS2, BV, LV, N_ACCELERATIONS, FloatArray
+from harness.vocabulary import ACCELERATIONS_MPS2, BV, LV, FloatArray
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
 N_PATHS, SEED = 4096, 1
@@ -135,12 +134,12 @@ def _cut_ins(environment: Environment, approach: Approach) -> dict[str, float]:
     longest = approach.headway_s * approach.speed_mps
     gaps = longest * (np.arange(240) + 0.5) / 240
     pairs = np.column_stack([np.tile(gaps, closing.size), np.repeat(-closing, gaps.size)])
-    accepted = _laws(environment, np.empty((0, 3)), pairs)[1].reshape(closing.size, gaps.size)
+    accepted = evaluate_laws(environment, np.empty((0, 3)), pairs).accepted.reshape(closing.size, gaps.size)
     share = accepted / accepted.sum(1, keepdims=True)
     headway = np.cumsum(share.mean(0))
     quantile = {f"headway_p{p}_s": float(np.interp(p / 100, headway, gaps)) / approach.speed_mps for p in (5, 50, 95)}
     below = (gaps < approach.ttc_s * closing[:, None])[closing > 0.0]
-    looks = _laws(environment, np.empty((0, 3)), np.array([[1e-3, -1.0]]))[1][0]
+    looks = evaluate_laws(environment, np.empty((0, 3)), np.array([[1e-3, -1.0]])).accepted[0]
     of_lookers = np.maximum(accepted - looks, 0.0)[closing > 0.0] / (1.0 - looks)
 
     def ttc_below(not_looking: float) -> float:
@@ -179,7 +178,7 @@ def _scenario(environment: Environment, approach: Approach) -> dict[str, float]:
     there = real[every]
     states = np.column_stack([each[every][there] for each in (v[BV], r1, v[LV] - v[BV])])
     behind = np.column_stack([each[every][there] for each in (r2, v[BV] - v_av)])
-    wished, accepted = _laws(environment, states, behind)
+    *_, wished, accepted = evaluate_laws(environment, states, behind)
     beside = behind[:, 0] > 0.0
     weight, gap, closing = (wished * accepted)[beside], behind[beside, 0], -behind[beside, 1]
     headway = gap / (states[beside, 0] + closing)
@@ -195,11 +194,3 @@ def _scenario(environment: Environment, approach: Approach) -> dict[str, float]:
 
 def _share(weight: FloatArray, of: FloatArray) -> float:
     return float(weight @ of / weight.sum())
-
-
-def _laws(environment: Environment, states: FloatArray, approaches: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Wishes to change lanes per second in states (n, 3), and shares accepted (m,) in approaches (m, 2)."""
-    pmf, scale = np.empty((2, len(states), N_ACCELERATIONS)), np.empty((2, len(states)))
-    wished, accepted = np.empty(len(states)), np.empty(len(approaches))
-    evaluate_laws(states, approaches, unboxed(environment), pmf, scale, wished, accepted)
-    return wished, accepted

@@ -14,7 +14,6 @@ from scipy import special, stats
 from harness import numbers
 from harness.campaign.files import read_model
 from harness.campaign.sections import EnvironmentSettings
-from harness.compiled import unboxed
 from harness.errors import printable
 from harness.estimators.limits import garwood
 from harness.fitting.fit import Fit
@@ -203,9 +202,7 @@ def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) ->
     some = rows[::step]
     names = rows.dtype.names or ()
     states = np.column_stack([some[name] if name in names else np.zeros(some.size) for name in HAZARD_OF])
-    both, scale, wish = (np.empty((2, some.size, *shape)) for shape in ((N_ACCELERATIONS,), (), ()))
-    evaluate_laws(states, np.empty((0, 2)), unboxed(traffic), both, scale, wish[0], np.empty(0))
-    pmf = both[CAR_FOLLOWING if "r1_m" in names else FREE_DRIVING]
+    pmf = evaluate_laws(traffic, states).pmf[CAR_FOLLOWING if "r1_m" in names else FREE_DRIVING]
     law, seen = pmf.mean(axis=0), np.bincount(bins(rows["acceleration_mps2"]), minlength=N_ACCELERATIONS) / rows.size
     lowest = 10.0 ** math.floor(math.log10(1.0 / rows.size))
     a = Axis(

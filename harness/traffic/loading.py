@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,7 @@ SMALLEST_CHANCE = 1e-200
 """Products of chances over a path must not round to zero: the forced cut-in divides by them."""
 RATES_MPS = np.linspace(-40.0, 40.0, 9)
 AV_GAPS_M = (0.1, 1.0, 10.0, 50.0, 300.0)
+NO_APPROACHES = np.empty((0, 2))
 _IN_STATE = " at v = {:.3g} m/s, R1 = {:.3g} m, R1dot = {:.3g} m/s"
 
 
@@ -70,9 +72,7 @@ def require_sound_laws(environment: Environment, file: str) -> None:
         _require_initial_states(environment, speeds, file)
     states = np.array(list(product(speeds, gaps, RATES_MPS)))
     approaches = np.array(list(product(AV_GAPS_M, RATES_MPS)))
-    pmf, scale = np.empty((2, len(states), N_ACCELERATIONS)), np.empty((2, len(states)))
-    chance, accepted = np.empty(len(states)), np.empty(len(approaches))
-    evaluate_laws(states, approaches, unboxed(environment), pmf, scale, chance, accepted)
+    pmf, scale, chance, accepted = evaluate_laws(environment, states, approaches)
     for law, section in enumerate(("free_driving", "car_following")):
         where, total = f"{section} ({file})", pmf[law].sum(axis=1)
         limits = "a scale from {:g} to {:g} m/s²".format(*SCALES_MPS2)
@@ -133,8 +133,27 @@ def _require(sound: BoolArray, where: str, found: str, values: tuple[FloatArray,
         raise CampaignError(where, found.format(*(value[first] for value in values)), expected, mend)
 
 
+class LawValues(NamedTuple):
+    """Accelerations by `FREE_DRIVING` and `CAR_FOLLOWING`: ``pmf`` (2, n, 31), ``scale`` (2, n); ``chance`` (n,) of a
+    wish to change lanes, and shares ``accepted`` (m,).
+    """  # noqa: D205
+
+    pmf: FloatArray
+    scale: FloatArray
+    chance: FloatArray
+    accepted: FloatArray
+
+
+def evaluate_laws(environment: Environment, states: FloatArray, approaches: FloatArray = NO_APPROACHES) -> LawValues:
+    """In states (n, 3) of v_BV, R1, R1dot and approaches (m, 2) of R2, R2dot, as kernels evaluate them."""
+    n, m = len(states), len(approaches)
+    out = LawValues(np.empty((2, n, N_ACCELERATIONS)), np.empty((2, n)), np.empty(n), np.empty(m))
+    _evaluate(states, approaches, unboxed(environment), *out)
+    return out
+
+
 @compiled_threads
-def evaluate_laws(
+def _evaluate(
     states: FloatArray,
     approaches: FloatArray,
     environment: Environment,
@@ -143,7 +162,6 @@ def evaluate_laws(
     chance: FloatArray,
     accepted: FloatArray,
 ) -> None:
-    """All laws in states (n, 3) of v_BV, R1, R1dot and approaches (m, 2) of R2, R2dot, as kernels evaluate them."""
     for j in range(approaches.shape[0]):
         accepted[j] = laws.acceptance(approaches[j, 0], approaches[j, 1], environment)
     for i in range(states.shape[0]):

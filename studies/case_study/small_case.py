@@ -23,7 +23,6 @@ import numpy as np
 from harness.campaign.drivers import default_surrogates
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.compiled import unboxed
 from harness.estimators.block import MAX_CONTROL_STEPS, Block, Drawn
 from harness.importance.challenge import roll_out
 from harness.importance.grid import GridPoints
@@ -182,9 +181,8 @@ def _laws(
     speed: FloatArray, r1: FloatArray, approaches: FloatArray, environment: Environment
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """BV's distribution over accelerations behind LV (m, 31), its wish to change lanes (m,), and acceptance."""
-    n, accepted, behind_lv = len(speed), np.empty(len(approaches)), np.column_stack([speed, r1, LV_MPS - speed])
-    pmf, scale, chance = np.empty((2, n, N_ACCELERATIONS)), np.empty((2, n)), np.empty(n)
-    evaluate_laws(behind_lv, approaches, unboxed(environment), pmf, scale, chance, accepted)
+    states = np.column_stack([speed, r1, LV_MPS - speed])
+    pmf, _, chance, accepted = evaluate_laws(environment, states, approaches)
     return pmf[1], chance, accepted
 
 

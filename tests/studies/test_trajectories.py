@@ -7,10 +7,9 @@ import pandas as pd
 import pytest
 
 from harness.campaign.sections import EnvironmentSettings
-from harness.compiled import unboxed
 from harness.traffic.laws import Environment
 from harness.traffic.loading import evaluate_laws, load_environment
-from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray
+from harness.vocabulary import ACCELERATIONS_MPS2
 from studies.__main__ import main
 from studies.trajectories import ALIKE, CLOSEST_M, Differences, simulate
 
@@ -49,14 +48,6 @@ def triples(environment: Environment) -> pd.DataFrame:
     ).reset_index()
 
 
-def evaluated(states: FloatArray, approaches: FloatArray, environment: Environment) -> tuple[FloatArray, ...]:
-    n, m = len(states), len(approaches)
-    pmf, scale = np.empty((2, n, N_ACCELERATIONS)), np.empty((2, n))
-    chance, accepted = np.empty(n), np.empty(m)
-    evaluate_laws(states, approaches, unboxed(environment), pmf, scale, chance, accepted)
-    return pmf, chance, accepted
-
-
 @pytest.mark.parametrize(("closest_s", "furthest_s"), [(0.0, 4.0), (4.0, 12.0), (12.0, np.inf), (np.inf, np.inf)])
 def test_lane_changes_are_as_many_as_their_hazards_sum_up_to(
     triples: pd.DataFrame, environment: Environment, closest_s: float, furthest_s: float
@@ -70,7 +61,7 @@ def test_lane_changes_are_as_many_as_their_hazards_sum_up_to(
     here = before & ~triples.beside & (ttc >= closest_s) & ((ttc < furthest_s) | (furthest_s == closest_s))
     rows = triples[here]
     approaches = np.where(closing[here].to_numpy()[:, None], rows[["r2", "r2dot"]], [1.0, 1.0])
-    _, chance, accepted = evaluated(rows[TRUE].to_numpy(), approaches, environment)
+    *_, chance, accepted = evaluate_laws(environment, rows[TRUE].to_numpy(), approaches)
     expected = float((0.1 * -np.log1p(-chance * accepted)).sum())
     assert expected > 10
     assert abs(int(changes[here].sum()) - expected) < 4.0 * np.sqrt(expected)
@@ -85,7 +76,7 @@ def test_accelerations_are_those_of_the_laws(triples: pd.DataFrame, environment:
         change = (of[column].shift(-10) - triples[column])[whole & stays]
         states = triples.loc[change.index, TRUE].to_numpy().copy()
         states[:, 0] = triples.loc[change.index, column]
-        pmf, _, _ = evaluated(states, np.ones((1, 2)), environment)
+        pmf = evaluate_laws(environment, states).pmf
         seen = np.bincount(np.abs(change.to_numpy()[:, None] - ACCELERATIONS_MPS2).argmin(axis=1), minlength=31)
         expected = pmf[law].sum(axis=0)
         assert len(change) > 10_000
