@@ -455,7 +455,7 @@ def misread() -> dict[str, str]:
             write(wrong(table), path)
             try:
                 tally = functools.reduce(Tally.plus, (each.tally for each, _ in observations([path], load_mapping())))
-                require_enough(tally, path.name)
+                require_enough(tally, path.name, load_mapping())
                 found[name] = "not noticed"
             except TrajectoryError as error:
                 found[name] = error.found

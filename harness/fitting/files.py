@@ -102,7 +102,7 @@ def fit_files(
         tally = tally.plus(each.tally)
         progress.advance(round(1000 * share) - done)
         done = round(1000 * share)
-    require_enough(tally, where)
+    require_enough(tally, where, read)
     fit = fit_traffic(Traffic.of(gathered), base, BASE, where, progress)
     rows = replicates(fit, n_replicates, seed, progress)
 

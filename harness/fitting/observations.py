@@ -70,6 +70,9 @@ OTHER_SIDE = 10.0
 class Tally(NamedTuple):
     """Counts of vehicles beside the target lane, by which all recordings are judged together."""
 
+    recordings: int = 0
+    recorded: int = 0
+    """Vehicles in any lane."""
     vehicles: int = 0
     driven_s: float = 0.0
     """At any speed."""
@@ -191,6 +194,8 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
     overlaps = state.follows & (state.r1 < OVERLAP_M)
     longer = 0.5 * (track.length[rows] - track.length[state.leader])
     tally = Tally(
+        recordings=1,
+        recorded=len(recording.vehicles),
         vehicles=np.unique(track.vehicle[rows]).size,
         driven_s=float(duration_s.sum()),
         outside_s=float(duration_s[~state.fits].sum()),
@@ -291,7 +296,17 @@ def _overlap(recording: Recording, rows: IntArray, state: States, overlaps: Bool
     return f"{recording.where(rows[i])}: a gap of {state.r1[i]:.1f} m to vehicle {ahead}"
 
 
-def require_enough(total: Tally, where: str) -> None:
+def _other_side(mapping: Mapping) -> str:
+    """How to mend lanes or a mirror that are the wrong way round."""
+    if mapping.mirror:
+        return "Leave --mirror out (or set mirror: false in the mapping)."
+    if isinstance(mapping.lanes, list):
+        return "Turn `lanes` of the mapping round: they go from right to left. If they do, set mirror: true (--mirror)."
+    other = "from_left" if mapping.lanes == "from_right" else "from_right"
+    return f"Set mirror: true in a mapping (or --mirror); or lanes: {other}, if they are numbered so."
+
+
+def require_enough(total: Tally, where: str, mapping: Mapping) -> None:
     """Refuse recordings that are too few, or that were read wrongly.
 
     Parameters
@@ -300,18 +315,24 @@ def require_enough(total: Tally, where: str) -> None:
         Of all recordings.
     where : str
         Files, for messages.
+    mapping : Mapping
+        How they were read.
 
     Raises `TrajectoryError`: a rule is broken; it says which.
     """
-    side = "If vehicles close in on the other side, set mirror: true in a mapping (or --mirror), or remove it."
+    if total.recorded <= total.recordings:
+        found = "only one vehicle" + (" in each recording" if total.recordings > 1 else "")
+        mend = "Check the columns vehicle_id and recording_id."
+        raise TrajectoryError(where, found, "the vehicles around it as well", mend)
+    side = _other_side(mapping)
     if total.driven_s == 0.0:
         found, expected = "no vehicle with another lane beside it, on the side where vehicles close in", "lanes 0, 1, …"
-        raise TrajectoryError(
-            f"{where}, lane", found, expected, f"Check the column of lanes, and `classes` of the mapping. {side}"
-        )
+        raise TrajectoryError(f"{where}, lane", found, expected, f"Check the column of lanes. {side}")
     if total.overlapping_s > MOST_OVERLAPPING * total.followed_s:
         share = total.overlapping_s / total.followed_s
-        mend = "Check lengths, and that lanes and positions are of the same time."
+        mend = (
+            "Check lengths, and that lanes and positions are of the same time; or do several recordings share a name?"
+        )
         if total.overlapping_fronts_s < 0.2 * total.overlapping_s:
             mend = "Positions seem to be front bumpers': set origin: front in a mapping (or centre, if it says rear)."
         elif total.overlapping_rears_s < 0.2 * total.overlapping_s:
@@ -342,9 +363,12 @@ def require_enough(total: Tally, where: str) -> None:
         mend = side if total.closing_other_s > total.closing_s else "Use recordings in which vehicles overtake."
         raise TrajectoryError(f"{where}, lane", found, "most of it in the target lane", mend)
     if total.used < FEWEST_CHANGES:
+        hours = total.driven_s / 3600.0
         found = (
             f"{total.used} lane changes to the target lane behind a leader within the fit range (of {total.changes} in "
-            f"all, in {total.driven_s / 3600:.1f} vehicle-hours)"
+            f"all), in {hours:.1f} vehicle-hours beside the target lane"
         )
-        mend = "Add recordings: rare lane changes need many hours."
-        raise TrajectoryError(where, found, f"at least {FEWEST_CHANGES}", mend)
+        enough = (
+            f"some {hours * FEWEST_CHANGES / total.used:.2g} such hours are needed" if total.used else "they are rare"
+        )
+        raise TrajectoryError(where, found, f"at least {FEWEST_CHANGES}", f"Add recordings: {enough}.")

@@ -6,6 +6,7 @@ no more than one recording is held in memory (some 400 bytes a row); without ``r
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ UNITS: dict[Unit, float] = dict(
 NO_LENGTH = "Gaps need lengths: correct them, or give one for all in a mapping (columns: {length_m: 4.6})."
 NO_COLUMN = ("Rename the column, or give its name in a mapping (--mapping FILE.yaml).", NO_LENGTH)
 LONGEST_LINE = 1 << 20
+SAMPLE = 1 << 16
+"""Bytes in which decimal signs are counted."""
 SLOWEST_HZ = 9.5
 FASTEST_MEDIAN_MPS = 70.0
 USUAL_LENGTH_M = (2.5, 10.0)
@@ -48,6 +51,7 @@ OF_STEP = 0.05
 SLIPS = {
     3.2808: "speeds in ft/s beside positions in m",
     0.3048: "positions in feet beside speeds in m/s",
+    0.9113: "speeds in ft/s read as km/h",
     3.6: "speeds in km/h beside positions in m",
     2.2369: "speeds in mph beside positions in m",
     0.6818: "positions in feet beside speeds in mph",
@@ -72,13 +76,20 @@ class Mapping(Section):
     units: dict[Measured, Unit | Annotated[float, Field(gt=0.0)]] = Field(
         default={}, description="unit in the file, or the factor to multiply by"
     )
-    lanes: Literal["from_right", "from_left"] | list[int] = Field(
-        default="from_right", description="how lanes are numbered, or their numbers from right to left, without others"
+    lanes: Literal["from_right", "from_left"] | list[int | str] = Field(
+        default="from_right",
+        description="how lanes are numbered, or a list of lanes from right to left, without others",
     )
     origin: Literal["centre", "front", "rear"] = Field(default="centre", description="point of a vehicle that s_m is")
     mirror: bool = Field(default=False, description="whether vehicles that close in from behind are on the left")
     classes: list[str] = Field(default=[], description="classes whose driving is fitted; all, if none is named")
     layout: Literal["table", "highd"] = Field(default="table", description="whether files are highD's")
+
+    @property
+    def lane_names(self) -> list[str]:
+        """Lanes from right to left if some have names; else none."""
+        names = self.lanes if isinstance(self.lanes, list) else []
+        return list(map(str, names)) if any(isinstance(each, str) for each in names) else []
 
 
 SHIPPED_FOLDER = Path(__file__).parent
@@ -149,9 +160,17 @@ def recordings(files: Sequence[str | Path], mapping: Mapping) -> Iterator[Record
     if not kept:
         where = ", ".join(map(str, files))
         raise TrajectoryError(where, "no file with tracks", "NN_tracks.csv", "Give highD's tracks as well.")
+    classes: set[str] = set()
     for i, path in enumerate(kept):
         for name, rows, share in _pieces(path, mapping):
-            yield _recording(name, path, _standard(rows, path, mapping), (i + share) / len(kept))
+            standard = _standard(rows, path, mapping)
+            if mapping.classes:
+                classes.update(standard["class"].unique())
+            yield _recording(name, path, standard, (i + share) / len(kept))
+    if mapping.classes and classes.isdisjoint(mapping.classes):
+        found = f"no row of class {' or '.join(mapping.classes)}; classes are {', '.join(sorted(map(str, classes)))}"
+        where = ", ".join(map(str, kept))
+        raise TrajectoryError(where, found, "one of them", "Correct `classes` of the mapping, or leave it out.")
 
 
 # -- files --
@@ -177,6 +196,32 @@ def _reading(path: Path) -> Iterator[None]:
         found = f"a file that cannot be read ({str(error).splitlines()[0]})"
         mend = "Is it complete, and of the type that its name says? Copy or write it again."
         raise TrajectoryError(str(path), found, "a CSV or Parquet file", mend) from None
+
+
+@contextmanager
+def _numbers_in(path: Path, names: Sequence[str], delimiter: str) -> Iterator[None]:
+    """Say which value of a CSV file is no number, and whether decimal commas are why."""
+    try:
+        yield
+    except pa.ArrowInvalid as error:
+        words = str(error)
+        if value := re.search(r"column #(\d+): .*invalid value '(.*)'", words):
+            name, text = names[int(value[1])], value[2]
+            found, mend = f"'{text}'", "Correct it, or give another column in a mapping (--mapping FILE.yaml)."
+            if re.fullmatch(r"[-+]?\d+[.,]\d+", text):
+                seen = "a decimal comma" if "," in text else "beside decimal commas"
+                found, mend = f"'{text}', {seen}", "Write all numbers with a decimal point."
+            elif name.lower().startswith("lane"):
+                mend = "Lanes with names need a mapping that lists them from right to left (lanes: [R, L])."
+            raise TrajectoryError(f"{path}, column {name}", found, "a number", mend) from None
+        counts = re.search(r"Expected (\d+) columns, got (\d+)", words)
+        if counts and delimiter == "," and int(counts[1]) < int(counts[2]):
+            found, mend = (
+                f"a row of {counts[2]} values",
+                "If numbers have decimal commas, separate columns by semicolons.",
+            )
+            raise TrajectoryError(str(path), found, f"{counts[1]}, as in its header", mend) from None
+        raise
 
 
 def _pieces(path: Path, mapping: Mapping) -> Iterator[tuple[str, pd.DataFrame, float]]:
@@ -218,28 +263,32 @@ def _batches(path: Path, mapping: Mapping) -> Iterator[_Batch]:
                 first += batch.num_rows
         return
     with path.open("rb") as raw:
-        head, line = (raw.readline(LONGEST_LINE).decode(each) for each in ("utf-8-sig", "utf-8"))
+        head = raw.readline(LONGEST_LINE).decode("utf-8-sig")
+        sample = raw.read(SAMPLE).decode(errors="replace")
     head = head.strip()
     if not head:
         raise TrajectoryError(str(path), "an empty file", "a header and rows", "Is it the right file?")
     delimiter = max(",;\t", key=head.count)
     names = [name.strip().strip('"') for name in head.split(delimiter)]
     columns = _columns(path, names, mapping)
-    types = {name: pa.string() if column in NAMES else pa.float64() for column, name in columns.items()}
+    commas, points = (len(re.findall(rf"\d{sign}\d", sample)) for sign in (",", r"\."))
+    text = {columns.get(each) for each in (*NAMES, *(["lane"] if mapping.lane_names else []))}
+    types = {name: pa.string() if name in text else pa.float64() for name in columns.values()}
     raw = pa.OSFile(str(path))  # after an error pyarrow's threads read on: from a file of Python they abort its exit
-    reader = pa.csv.open_csv(
-        raw,
-        read_options=pa.csv.ReadOptions(column_names=names, skip_rows=1, block_size=1 << 22),
-        parse_options=pa.csv.ParseOptions(delimiter=delimiter),
-        convert_options=pa.csv.ConvertOptions(
-            column_types=types,
-            include_columns=list(columns.values()),
-            decimal_point="," if delimiter == ";" and "," in line else ".",
-        ),
-    )
-    for batch in reader:
-        yield _Batch(_renamed(batch, columns, first, path, mapping), min(raw.tell() / raw.size(), 1.0))
-        first += batch.num_rows
+    with _numbers_in(path, names, delimiter):
+        reader = pa.csv.open_csv(
+            raw,
+            read_options=pa.csv.ReadOptions(column_names=names, skip_rows=1, block_size=1 << 22),
+            parse_options=pa.csv.ParseOptions(delimiter=delimiter),
+            convert_options=pa.csv.ConvertOptions(
+                column_types=types,
+                include_columns=list(columns.values()),
+                decimal_point="," if delimiter == ";" and commas > points else ".",
+            ),
+        )
+        for batch in reader:
+            yield _Batch(_renamed(batch, columns, first, path, mapping), min(raw.tell() / raw.size(), 1.0))
+            first += batch.num_rows
 
 
 def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, str]:
@@ -258,13 +307,20 @@ def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, st
         elif column in NEEDED or (column in mapping.columns and column != "recording_id"):
             known = {} if mapping.columns else {"xvelocity": "highd", "local_y": "ngsim"}
             of = [f"Is it a file for --mapping {known[name]}?" for name in lower if name in known]
-            mend = of[0] if of else did_you_mean(wanted, names) or NO_COLUMN[column == "length_m"]
+            unused = [name for name in names if name.lower() not in _asked(mapping)]
+            other = f"Is it one of these: {', '.join(unused[:12])}?" if wanted != column and unused else ""
+            mend = of[0] if of else did_you_mean(wanted, names) or other or NO_COLUMN[column == "length_m"]
             what = f"a column {wanted}" + (f" for {column}" if wanted != column else "")
             raise TrajectoryError(str(path), f"the columns {', '.join(names)}", what, mend)
     if mapping.classes and "class" not in found and mapping.layout != "highd":
         mend = "Add it, or leave out `classes` of the mapping."
         raise TrajectoryError(str(path), "no column class", "one, as the mapping names classes", mend)
     return found
+
+
+def _asked(mapping: Mapping) -> set[str]:
+    """Names in a file that a mapping reads, in small letters."""
+    return {str(mapping.columns.get(column, column)).lower() for column in (*NEEDED, *OPTIONAL)}
 
 
 def _renamed(batch: Any, columns: dict[str, str], first: int, path: Path, mapping: Mapping) -> pd.DataFrame:
@@ -278,6 +334,10 @@ def _renamed(batch: Any, columns: dict[str, str], first: int, path: Path, mappin
                 where, mend = f"{path}, row {first + i}, {name}", "Fill it in, or delete the row."
                 raise TrajectoryError(where, "nothing", "an identifier in every row", mend)
             data[column] = pd.arrays.ArrowExtensionArray(pa.chunked_array([text]))
+            continue
+        if column == "lane" and mapping.lane_names:
+            order = {lane: i for i, lane in enumerate(mapping.lane_names)}
+            data[column] = values.cast(pa.string()).to_pandas().map(order).fillna(-1)  # others are left out
             continue
         try:
             data[column] = values.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
@@ -311,7 +371,8 @@ def _standard(rows: pd.DataFrame, path: Path, mapping: Mapping) -> pd.DataFrame:
         where = f"{path}, row {rows.row.iloc[i]}, lane"
         raise TrajectoryError(where, f"{rows.lane.iloc[i]:g}", "a whole number", "Number the lanes by whole numbers.")
     if isinstance(mapping.lanes, list):
-        order = {float(lane): i for i, lane in enumerate(mapping.lanes)}
+        lanes = range(len(mapping.lanes)) if mapping.lane_names else mapping.lanes
+        order = {float(lane): i for i, lane in enumerate(lanes)}
         rows = rows[rows.lane.isin(list(order))].copy()
         if rows.empty:
             found = f"no vehicle in the lanes {', '.join(map(str, mapping.lanes))}"
@@ -430,7 +491,9 @@ def _check_units(recording: Recording) -> None:
         slip = min(SLIPS, key=lambda each: abs(ratio / each - 1.0))
         words = f": {SLIPS[slip]}" if abs(ratio / slip - 1.0) < OF_STEP else ""
         found = f"speeds {ratio:.3g} times the change of positions{words}"
-        mend = "Give units in a mapping (units: {s_m: ft}); s_m must rise in driving direction."
+        mend = "Correct the units of speed_mps or s_m in a mapping (units: {speed_mps: km/h, s_m: ft})."
+        if ratio < 0.0:
+            mend = "s_m must rise in driving direction, and speeds be positive."
         raise TrajectoryError(where, found, "positions in m and speeds in m/s that agree", mend)
     speed, length = float(np.median(v)), float(np.median(rows.length_m))
     feet = length > USUAL_LENGTH_M[1]

@@ -27,7 +27,7 @@ def joined(found: list[Observations], name: str) -> np.ndarray:
 def test_states_and_accelerations_of_a_known_motion(tmp_path):
     rows = overtaking(3.0)
     found, total = observed(rows, tmp_path)
-    require_enough(total, "rows.parquet")
+    require_enough(total, "rows.parquet", load_mapping())
     following, leads, at_risk = (joined(found, name) for name in ("following", "leads", "at_risk"))
 
     # Held accelerations are found exactly, though states are those of the beginning of their second.
@@ -85,7 +85,7 @@ def test_flicker_of_lanes_makes_no_lane_change(tmp_path):
     assert smoothed.changes == total.changes
     assert smoothed.used == total.used
     with pytest.raises(TrajectoryError, match="come back within a second"):
-        require_enough(smoothed, "rows.parquet")
+        require_enough(smoothed, "rows.parquet", load_mapping())
     assert joined(flickering, "leads")["lead_s"].size
 
 

@@ -18,10 +18,10 @@ ROWS = overtaking(2.5)
 
 def judged(file: Path, mapping: str | None = None) -> Tally:
     """What `harness fit` does with a file before it fits."""
-    total = Tally()
-    for each, _ in observations([file], load_mapping(mapping)):
+    total, read = Tally(), load_mapping(mapping)
+    for each, _ in observations([file], read):
         total = total.plus(each.tally)
-    require_enough(total, file.name)
+    require_enough(total, file.name, read)
     return total
 
 
@@ -88,12 +88,21 @@ REFUSED = {
     "lengths in feet": (changed(length_m=ROWS.length_m * FEET), r"median length of 15\.\d m: feet"),
     "milliseconds": (changed(time_s=ROWS.time_s * 1000), "units: {time_s: ms}"),
     "widths": (changed(length_m=1.9), "the width"),
-    "backwards": (changed(s_m=-ROWS.s_m), "positions that fall where vehicles drive forward"),
+    "backwards": (changed(s_m=-ROWS.s_m), "positions that fall where vehicles drive forward.*must rise"),
     "backwards throughout": (changed(s_m=-ROWS.s_m, speed_mps=-ROWS.speed_mps), "median speed of -"),
     "mirrored": (fast_lanes, "mirror: true"),
     "shifted": (shifted, r"speeds that belong to positions of 1\.0 s earlier"),
     "front bumpers": (long_followers, "origin: front"),
     "own clocks": (own_clocks, "one clock"),
+    "one vehicle": (lambda: ROWS[(ROWS.vehicle_id == 1) & (ROWS.recording_id == 0)], "found only one vehicle;"),
+    "one vehicle each": (lambda: ROWS[ROWS.vehicle_id == 1], "only one vehicle in each recording"),
+    "two recordings of one name": (
+        lambda: pd.concat([ROWS, ROWS.assign(vehicle_id=ROWS.vehicle_id + 5, s_m=ROWS.s_m + 2)]).sort_values(
+            "recording_id"
+        ),
+        "do several recordings share a name",
+    ),
+    "ft/s as km/h": (changed(speed_mps=ROWS.speed_mps * FEET / 3.6), r"speeds in ft/s read as km/h.*speed_mps: km/h"),
     "one lane": (changed(lane=0), "no vehicle with another lane beside it"),
     "half a lane": (with_value(7, "lane", 0.5), r"row 8, lane: found 0\.5"),
     "5 Hz": (lambda: ROWS[(ROWS.time_s * 10).round() % 2 == 0], "a row every 0.2 s"),
@@ -104,7 +113,10 @@ REFUSED = {
         "a second row|its rows together",
     ),
     "flicker": (flickering, "come back within a second"),
-    "few": (lambda: ROWS[ROWS.recording_id < 12], "at least 20"),
+    "few": (
+        lambda: ROWS[ROWS.recording_id < 12],
+        r"\(of 12 in all\), in [\d.]+ vehicle-hours beside.*at least 20.*hours are needed",
+    ),
     "congested": (
         lambda: ROWS.assign(s_m=ROWS.s_m - 15 * ROWS.time_s, speed_mps=ROWS.speed_mps - 15),
         "outside the fit range",
@@ -148,7 +160,16 @@ FILES = {
     "empty.csv": (b"", "an empty file"),
     "header.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n", "no rows"),
     "ragged.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,0,5\n1,0.1,3\n", "cannot be read"),
-    "words.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,fast,0,5\n", "cannot be read .*fast"),
+    "words.csv": (
+        b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,fast,0,5\n",
+        "column speed_mps: found 'fast'; expected a number",
+    ),
+    "names.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,R,5\n", r"found 'R'.*lanes: \[R, L\]"),
+    "comma.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,5,0,5\n", "a row of 7 .*decimal commas"),
+    "both.csv": (
+        b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n",
+        r"column s_m: found '996\.58', beside decimal commas.*with a decimal point",
+    ),
     "twice.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m,Lane\n1,0,0,30,0,5,1\n", "more than one column lane"),
     "cut.parquet": (b"PAR1 and no more", "cannot be read"),
     "binary.csv": (b"\xff\xfe\x00\x01\x80\n\x80\n", "cannot be read|columns"),
@@ -292,6 +313,34 @@ def test_a_mapping_is_checked(tmp_path):
             judged(tmp_path / "rows.csv", str(tmp_path / f"{name}.yaml"))
     assert load_mapping("highd").mirror
     assert not load_mapping("highd", mirror=False).mirror
+
+
+MAPPED = {
+    "classes": ("classes: [car]", "found no row of class car; classes are PKW, van"),
+    "mirror": ("mirror: true", "Leave --mirror out"),
+    "from_left": ("lanes: from_left", "or lanes: from_right"),
+    "list": ("lanes: [1, 0]", "Turn `lanes` of the mapping round"),
+    "column": ("columns: {speed_mps: speed_ft, s_m: s_m}", r"speed_ft for speed_mps\. .*these: speed_mps"),
+}
+
+
+@pytest.mark.parametrize("case", MAPPED)
+def test_a_mapping_that_does_not_suit_the_file(case, tmp_path):
+    content, words = MAPPED[case]
+    (tmp_path / "own.yaml").write_text(content)
+    ROWS.assign(**{"class": np.where(ROWS.vehicle_id > 0, "PKW", "van")}).to_parquet(tmp_path / "rows.parquet")
+    with pytest.raises(TrajectoryError, match=words):
+        judged(tmp_path / "rows.parquet", str(tmp_path / "own.yaml"))
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_lanes_with_names(suffix, tmp_path):
+    file = tmp_path / f"rows.{suffix}"
+    rows = ROWS.assign(lane=np.where(ROWS.vehicle_id == 4, "ramp", np.where(ROWS.lane == 0, "R", "L")))
+    rows.to_csv(file, index=False) if suffix == "csv" else rows.to_parquet(file)
+    (tmp_path / "own.yaml").write_text("lanes: [R, L]\n")
+    ROWS[ROWS.vehicle_id != 4].to_parquet(tmp_path / "numbers.parquet")
+    assert judged(file, str(tmp_path / "own.yaml")) == judged(tmp_path / "numbers.parquet")
 
 
 def test_classes_and_mirror(tmp_path):
