@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -340,11 +341,12 @@ def motorway(folder: Path, *, environments: Sequence[str]) -> None:
     `harness fit --mirror`.
     """
     from harness.campaign.sections import EnvironmentSettings  # noqa: PLC0415 - keeps --help fast
-    from harness.fitting.observations import observations  # noqa: PLC0415
+    from harness.fitting.laws import Traffic  # noqa: PLC0415
+    from harness.fitting.observations import Tally, observations  # noqa: PLC0415
     from harness.fitting.table import load_mapping  # noqa: PLC0415
     from harness.records.folder import write_bytes  # noqa: PLC0415
     from harness.traffic.loading import load_environment  # noqa: PLC0415
-    from studies.motorway import figures, installed_rows, joined, page, trajectories_of  # noqa: PLC0415
+    from studies.motorway import figures, installed_rows, page, trajectories_of  # noqa: PLC0415
     from studies.trajectories import write  # noqa: PLC0415
 
     laws = {Path(each).stem: load_environment(EnvironmentSettings(parameters=each)) for each in environments}
@@ -353,8 +355,9 @@ def motorway(folder: Path, *, environments: Sequence[str]) -> None:
     write(trajectories_of(rows), table := folder / "trajectories.parquet")
     sides = {}
     for side in ("left", "right"):
-        seen = joined(each for each, _ in observations([table], load_mapping(mirror=side == "left")))
-        sides[side] = seen, figures(seen, laws)
+        seen = [each for each, _ in observations([table], load_mapping(mirror=side == "left"))]
+        tally = reduce(Tally.plus, (each.tally for each in seen))
+        sides[side] = tally, figures(Traffic.of(seen), laws)
     written = page(sides)
     write_bytes(folder / "motorway.md", written.encode())
     click.echo(written)

@@ -8,12 +8,11 @@ furthest, less what other vehicles tell of that one's lane changes, and lanes ar
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import math
 import operator
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +25,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from harness.errors import HarnessError
-from harness.fitting.observations import Observations, Tally
+from harness.estimators.limits import clopper_pearson, garwood
+from harness.fitting.laws import Traffic
+from harness.fitting.observations import Tally
 from harness.traffic.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
 from harness.traffic.loading import evaluate_laws
 from harness.vehicles.kinematics import STEP_S
@@ -55,9 +56,6 @@ CHANGES_LANES_M = 1.5
 SHORTEST_S = 2.0
 MORE_LANES = 0.03
 """Share of a section's rows beside the two lanes, from which on it has a ramp."""
-KINDS = ("free", "following", "initial", "at_risk", "leads")
-VEHICLES_OF_RECORDING = 10**6
-"""More than any recording has."""
 FREELY_S = 8.0
 MOST_LIKELY = 0.5
 """Probability of a lane change within a second, at most (``max_probability_1s``)."""
@@ -193,7 +191,7 @@ class Laws(NamedTuple):
     lateral_mps: float
 
     @classmethod
-    def of(cls, environment: Environment, seen: Observations) -> Laws:
+    def of(cls, environment: Environment, seen: Traffic) -> Laws:
         """Of an environment, in the states that were seen."""
         risk = seen.at_risk
         nobody = ~np.isfinite(risk["r2_m"])
@@ -218,22 +216,7 @@ def _states(rows: RecordArray) -> FloatArray:
     return np.column_stack([rows[name] for name in ("v_mps", "r1_m", "r1dot_mps")])
 
 
-def joined(recordings: Iterable[Observations]) -> Observations:
-    """All observations as those of one recording."""
-    parts = list(recordings)
-    tally = functools.reduce(Tally.plus, (each.tally for each in parts))
-
-    def rows(kind: str) -> RecordArray:
-        of_kind: list[RecordArray] = [getattr(each, kind).copy() for each in parts]
-        for i, each in enumerate(of_kind):
-            each["vehicle"] += VEHICLES_OF_RECORDING * i
-        return np.concatenate(of_kind)
-
-    free, following, initial, at_risk, leads = map(rows, KINDS)
-    return Observations("all", free, following, initial, at_risk, leads, tally=tally)
-
-
-def figures(seen: Observations, environments: Mapping[str, Environment]) -> list[Figure]:
+def figures(seen: Traffic, environments: Mapping[str, Environment]) -> list[Figure]:
     """What is seen beside what environments say; vehicles are taken to be independent.
 
     The level of lane changing is not compared: that of an environment is fitted where nobody closes in within 8 s.
@@ -329,14 +312,14 @@ def _mean(values: NDArray[Any], cluster: IntArray, weight: FloatArray | float = 
 
 def _count(k: int) -> Interval:
     """A count and the interval of its mean (Garwood's)."""
-    low = stats.gamma.ppf(TAIL, k) if k else 0.0
-    return float(k), float(low), float(stats.gamma.isf(TAIL, k + 1))
+    low, high = garwood(k, TAIL)
+    return float(k), float(low), float(high)
 
 
 def _share(k: int, n: int) -> Interval:
     """A share of n in per cent and its interval (Clopper's and Pearson's)."""
-    interval = stats.binomtest(k, n).proportion_ci(1.0 - 2.0 * TAIL)
-    return 100.0 * k / n, 100.0 * float(interval.low), 100.0 * float(interval.high)
+    low, high = clopper_pearson(k, n, TAIL)
+    return 100.0 * k / n, 100.0 * float(low), 100.0 * float(high)
 
 
 def _median(values: FloatArray) -> Interval:
@@ -346,7 +329,7 @@ def _median(values: FloatArray) -> Interval:
     return float(np.median(values)), float(ordered[low]), float(ordered[min(high, n - 1)])
 
 
-def page(sides: Mapping[str, tuple[Observations, Sequence[Figure]]]) -> str:
+def page(sides: Mapping[str, tuple[Tally, Sequence[Figure]]]) -> str:
     """The figures of lane changes to each side as Markdown."""
     lines = [
         "# Motorway trajectories beside traffic that is simulated",
@@ -355,8 +338,8 @@ def page(sides: Mapping[str, tuple[Observations, Sequence[Figure]]]) -> str:
         "lie outside. Counts of lane changes are expected at the level of those where nobody closes in within "
         f"{FREELY_S:g} s.",
     ]
-    for side, (seen, found) in sides.items():
-        names, tally = list(found[0].of), seen.tally
+    for side, (tally, found) in sides.items():
+        names = list(found[0].of)
         lines += [
             "",
             f"## To the {side}",

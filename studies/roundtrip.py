@@ -30,7 +30,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.errors import TrajectoryError
 from harness.estimators.traffic import ONE_LAW
 from harness.fitting.fit import fit_traffic
-from harness.fitting.laws import TTC_EDGES_S, Traffic
+from harness.fitting.laws import KINDS, TTC_EDGES_S, Traffic
 from harness.fitting.observations import Tally, observations, require_enough
 from harness.fitting.table import load_mapping
 from harness.fitting.uncertainty import replicates
@@ -65,7 +65,6 @@ STATES = ((30.0, 40.0, 0.0), (25.0, 20.0, -2.0), (35.0, 60.0, 2.0), (30.0, 15.0,
 """States (v, R1, R1dot) whose hazards are judged."""
 SEED, PART_H = 10_000, 10.0
 RECORDINGS_OF_PART = round(PART_H / RECORDING_H)
-KINDS = ("free", "following", "initial", "at_risk", "leads")
 N_PATHS = 4096
 N_STEPS = 6
 
@@ -85,15 +84,10 @@ def simulated(folder: Path, n_parts: int, progress: Progress) -> Traffic:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, functools.partial(_observe, part))
         with np.load(path) as kept:
-            parts.append(Traffic(**{name: kept[name] for name in (*KINDS, "recording")}))
+            recording = kept["recording"] + RECORDINGS_OF_PART * part
+            parts.append(Traffic(**{name: kept[name] for name in KINDS}, recording=recording))
         progress.advance(1)
-    vehicles = np.cumsum([0, *(part.recording.size for part in parts)])
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in KINDS}
-    for name in KINDS:
-        sizes = [getattr(part, name).size for part in parts]
-        joined[name]["vehicle"] += np.repeat(vehicles[:-1], sizes)
-    recording = np.concatenate([part.recording + RECORDINGS_OF_PART * i for i, part in enumerate(parts)])
-    return Traffic(**joined, recording=recording)
+    return Traffic.joined(parts)
 
 
 def _observe(part: int, path: Path) -> None:

@@ -127,8 +127,7 @@ def _yaml(fit: Fit, tally: Tally, files: Sequence[Path], beside: str, mapping: s
         *(f"sha256 {_sha256(file)} {file.name}" for file in files),
     ]
     text = "".join(f"# {printable(' '.join(line.split()))}\n" for line in lines)
-    content: dict[str, Any] = fit.environment.model_dump(exclude_none=True)
-    for name, section in content.items():
+    for name, section in fit.environment.model_dump(exclude_defaults=True).items():
         if not isinstance(section, dict):
             text += f"{name}: {section}\n"
             continue
@@ -142,10 +141,8 @@ def _yaml(fit: Fit, tally: Tally, files: Sequence[Path], beside: str, mapping: s
 
 
 def _flow(value: Any) -> str:
-    if isinstance(value, dict):
-        value = {key: each for key, each in value.items() if each != ""}
-    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6, allow_unicode=True)
-    return text.strip()
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=math.inf, allow_unicode=True)
+    return str(text).strip()
 
 
 def _sha256(file: Path) -> str:

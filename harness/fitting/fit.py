@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from harness.fitting.laws import (
     FREE_TTC_S,
     TTC_EDGES_S,
     Acceptance,
+    Base,
     FittedLaw,
     Knots,
     Traffic,
@@ -34,13 +35,13 @@ from harness.vocabulary import FloatArray
 HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)
 """Degrees of freedom of R1dot: fitted (None), then tried until LV's speed is one that SUMO's lanes allow."""
 DIGITS = 6
-_WHAT = {
-    "speed": "speeds of BV",
-    "gap": "gaps to LV",
-    "rate": "speed differences to LV",
-    "free driving": "accelerations in free driving",
-    "car following": "accelerations behind a leader",
-    "lead": "leads of lane changes",
+_LAWS: dict[str, tuple[Callable[[Traffic, Base], FittedLaw | None], str]] = {
+    "speed": (fit_speed, "speeds of BV"),
+    "gap": (fit_gap, "gaps to LV"),
+    "rate": (fit_rate, "speed differences to LV"),
+    "free driving": (fit_free_driving, "accelerations in free driving"),
+    "car following": (fit_car_following, "accelerations behind a leader"),
+    "lead": (fit_leads, "leads of lane changes"),
 }
 """Laws that may be kept from the base."""
 
@@ -87,25 +88,15 @@ def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, w
     """
     numbers = base.values()
     settings = EnvironmentSettings()
-    progress.stage("fitting laws", len(_WHAT) + 1)
-
-    def done(law: FittedLaw | None) -> FittedLaw | None:
-        progress.advance(1)
-        return law
-
-    lateral = [numbers.get(f"lateral__{name}", math.nan) for name in ("distance_m", "longest_lead_s")]
-    found = {
-        "speed": done(fit_speed(traffic, numbers)),
-        "gap": done(fit_gap(traffic, numbers)),
-        "rate": done(fit_rate(traffic, numbers)),
-        "free driving": done(fit_free_driving(traffic, numbers)),
-        "car following": done(fit_car_following(traffic, numbers)),
-        "lead": done(None if np.isnan(lateral).any() else fit_leads(traffic, lateral[0], lateral[1])),
-    }
-    hazard = fit_hazard(traffic)
-    if hazard is None:
+    progress.stage("fitting laws", len(_LAWS) + 1)
+    if (hazard := fit_hazard(traffic)) is None:
         found_words = f"no lane change without a vehicle that closes in within {FREE_TTC_S:g} s"
         raise TrajectoryError(where, found_words, "20 or more", "Add recordings.")
+    found = {}
+    for name, (law_of, _) in _LAWS.items():
+        progress.advance(1)
+        found[name] = law_of(traffic, numbers)
+    progress.advance(1)
     acceptance = Acceptance.of(traffic, *hazard)
     for df in HEAVIEST_TAILS:
         if df is not None:
@@ -117,7 +108,8 @@ def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, w
         except CampaignError as error:
             problem = error
             continue
-        kept = {_WHAT[name]: "too few data, or the law does not fit them" for name, law in found.items() if law is None}
+        why = "too few data, or the law does not fit them"
+        kept = {_LAWS[name][1]: why for name, law in found.items() if law is None}
         if df is not None:
             kept["degrees of freedom of R1dot"] = f"{df:g}: with heavier tails LV would exceed 100 m/s"
         return Fit(traffic, base, base_name, laws, kept, hazard[1], acceptance, environment)

@@ -59,18 +59,26 @@ class Traffic:
     @classmethod
     def of(cls, observations: Iterable[Observations]) -> Traffic:
         """Join recordings."""
-        parts: dict[str, list[RecordArray]] = {name: [] for name in _DTYPES}
-        vehicles, recording = 0, []
-        for i, each in enumerate(observations):
-            arrays = {name: getattr(each, name).copy() for name in _DTYPES}
-            n = 1 + max((int(rows["vehicle"].max()) for rows in arrays.values() if rows.size), default=-1)
-            for name, rows in arrays.items():
-                rows["vehicle"] += vehicles
-                parts[name].append(rows)
-            vehicles += n
-            recording += [i] * n
-        joined = {name: np.concatenate([np.empty(0, _DTYPES[name]), *rows]) for name, rows in parts.items()}
-        return cls(**joined, recording=np.asarray(recording, np.int64))
+        return cls.joined(cls._alone(i, each) for i, each in enumerate(observations))
+
+    @classmethod
+    def _alone(cls, number: int, seen: Observations) -> Traffic:
+        arrays = {name: getattr(seen, name) for name in KINDS}
+        n = 1 + max((int(rows["vehicle"].max()) for rows in arrays.values() if rows.size), default=-1)
+        return cls(**arrays, recording=np.full(n, number))
+
+    @classmethod
+    def joined(cls, parts: Iterable[Traffic]) -> Traffic:
+        """Join parts, whose recordings have different numbers."""
+        parts = list(parts)
+        before = np.cumsum([0, *(part.recording.size for part in parts)])
+        whole = {}
+        for name, dtype in KINDS.items():
+            of_kind = [getattr(part, name) for part in parts]
+            whole[name] = np.concatenate([np.empty(0, dtype), *of_kind])
+            whole[name]["vehicle"] += np.repeat(before[:-1], [rows.size for rows in of_kind])
+        recording = np.concatenate([np.empty(0, np.int64), *(part.recording for part in parts)])
+        return cls(**whole, recording=recording)
 
     @property
     def n_recordings(self) -> int:
@@ -94,7 +102,7 @@ class Traffic:
         return sparse.csr_array((np.ones(rows.size), (rows["vehicle"], cell)), shape=shape), self.cluster
 
 
-_DTYPES = {"free": FREE, "following": FOLLOWING, "initial": INITIAL, "at_risk": AT_RISK, "leads": LEADS}
+KINDS = {"free": FREE, "following": FOLLOWING, "initial": INITIAL, "at_risk": AT_RISK, "leads": LEADS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -505,10 +513,10 @@ class Acceptance:
         return np.append(np.minimum(near, 1.0), 0.0)
 
 
-def fit_leads(traffic: Traffic, distance_m: float, longest_s: float) -> FittedLaw | None:
+def fit_leads(traffic: Traffic, base: Base) -> FittedLaw | None:
     """Time from onset of lateral motion to overlap: log-normal, at most the longest, in steps."""
-    rows = traffic.leads
-    if rows.size < FEWEST["leads"]:
+    rows, longest_s = traffic.leads, base.get("lateral__longest_lead_s")
+    if rows.size < FEWEST["leads"] or longest_s is None:
         return None
     edge = longest_s - 0.5 * STEP_S
 
@@ -525,6 +533,6 @@ def fit_leads(traffic: Traffic, distance_m: float, longest_s: float) -> FittedLa
     found = maximise(log_likelihood, rows, [np.ones((rows.size, 1))] * 2, *traffic.members(rows), prior)
 
     def speed(mean: FloatArray) -> FloatArray:
-        return distance_m * np.exp(-mean)
+        return base["lateral__distance_m"] * np.exp(-mean)
 
     return _law("lateral", ("speed_median_mps", "speed_log_sd"), found, rows, {0: speed, 1: np.exp})
