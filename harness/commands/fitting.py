@@ -60,11 +60,15 @@ def fit(
         print_json({"files": written, **found.facts})
         return
     tally, traffic, steps = found.tally, found.fit.traffic, found.fit.acceptance
+    counted = found.fit.environment.acceptance_steps
+    unseen = "" if counted is None else counted.where(counted.without_events)
+    limited = f"! no lane change seen at {unseen}: rates of crashes that begin there have only an upper limit"
     say(
         f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h; "
         f"{tally.used:,} lane changes used of {tally.changes:,}",
         f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
         f"{steps.exposure[:-1].sum():.1f} expected with nobody closing in",
         *(f"kept as in {found.fit.base_name}: {what} ({why})" for what, why in found.fit.kept.items()),
+        *([limited] if unseen else []),
         *written,
     )

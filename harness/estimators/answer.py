@@ -13,7 +13,7 @@ from harness.estimators.estimate import WIDE_RHW, Estimate, Number, Point, Unava
 from harness.estimators.one_pass import one_pass
 from harness.estimators.pairs import PairedEstimate
 from harness.estimators.severity import Severity
-from harness.estimators.short_answer import ShortAnswer, assumed_times, short_answer
+from harness.estimators.short_answer import ShortAnswer, assumed_times, no_lower_limit, short_answer
 from harness.estimators.stopping import RoundRule, Rule, limit_words
 from harness.estimators.traffic import TrafficError
 from harness.importance.functions import importance_names
@@ -124,6 +124,10 @@ def _assumed(best: Estimate, manifest: Mapping[str, Any]) -> list[str]:
     if (times := assumed_times(best, manifest)) is None:
         return []
     given, what = manifest["assumed"], "rate" if best.n_crashes else "limit"
+    if "where" in given:
+        told = f"In the data of this traffic no lane change was seen at {given['where']}: the {what} may be"
+        carries = no_lower_limit(best, manifest) is not None
+        return [f"{told} {ratio(times[0])} to {ratio(times[1])} times this one."] if carries else []
     low, high = (plain(end) for end in given["ends"])
     return [
         f"If as few or as many drivers do not look as data allow ({given['name']} {low} or {high}, not "

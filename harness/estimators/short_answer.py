@@ -35,6 +35,8 @@ WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
 CUT_OFF_SHARE = 0.2
 """Weight, relative to the rate, from which tests that were cut off are warned of, if the interval leaves them out."""
+CARRIES = 0.05
+"""Share of a rate from which on there is an upper limit alone, where nothing was seen of it [assumed]."""
 _BRAKES_HARDEST = "brakes-8"
 ENDED = {
     "rhw": "precision reached",
@@ -133,18 +135,23 @@ def _rows(
     if not best.n_crashes or wide:
         less, shown = "< ", best.ci_high if best.n_crashes else best.upper_bound
         ends = f"{number(best.crash_rate)} seen" if best.n_crashes else "no crash seen"
+    unseen = no_lower_limit(best, manifest)
+    if unseen is not None:
+        less, ends = "< ", f"{number(best.crash_rate)} as fitted" if best.n_crashes else ends
+        shown = unseen[1] * (best.ci_high if best.n_crashes else best.upper_bound)
     per_km = "" if not distance_km else f"{less}{number(shown * 1e6 / distance_km)} per million km"
+    remark = per_km if unseen is None else f"none seen at {unseen[0]}"
     untested = any(each["p"] > 0.0 and not each["n_episodes"] for each in best.details.get("shells", ()))
     # A shell without tests adds nothing to the rate, and all of its probability to the upper limit.
     so_far = " so far" if untested and best.n_crashes else ""
-    rows = [Row("rate", f"{counted}{so_far}", f"{less}{number(shown)} per test", ends, per_km)]
+    rows = [Row("rate", f"{counted}{so_far}", f"{less}{number(shown)} per test", ends, remark)]
     beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
     rows += [_beside(each, acts=campaign.av.acts_before_cut_in, wide=wide) for each in beside]
-    # Of an attentive vehicle little more is known than that it crashes less often than that driver: that comes first.
-    yield from reversed(rows) if wide and beside and beside[0]["ratio_high"] < 1.0 else rows
+    # Where little else is known of the rate than a limit, what is known comes first: the ratio.
+    yield from reversed(rows) if unseen or (wide and beside and beside[0]["ratio_high"] < 1.0) else rows
     if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
-    if (moved := assumed_times(best, manifest)) is not None:
+    if "ends" in (manifest.get("assumed") or {}) and (moved := assumed_times(best, manifest)) is not None:
         high = number(moved[1] * (best.ci_high if best.n_crashes else best.upper_bound))
         remark = f"if {share(manifest['assumed']['ends'][1])} do not look"
         yield Row("assumed", "traffic", f"at most × {number(moved[1], 2)} (assumed)", f"up to {high}", remark)
@@ -178,6 +185,14 @@ def assumed_times(best: Estimate, manifest: Mapping[str, Any]) -> tuple[float, f
     of_strata = [p, *(p * np.array(each) for each in given["times"])]
     rates = [float(each @ share) if best.n_crashes else float(np.max(each / n)) for each in of_strata]
     return rates[1] / rates[0], rates[2] / rates[0]
+
+
+def no_lower_limit(best: Estimate, manifest: Mapping[str, Any]) -> tuple[str, float] | None:
+    """Where none of the lane changes was seen that a rate comes from, and by what that may raise it; None elsewhere."""
+    where: str | None = (manifest.get("assumed") or {}).get("where")
+    if where is None or (times := assumed_times(best, manifest)) is None or times[1] - times[0] < CARRIES:
+        return None
+    return where, times[1]
 
 
 def _whence(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | None) -> Iterator[Row]:
@@ -254,6 +269,8 @@ def _warnings(
     decision = manifest.get("decision")
     if decision is not None and decision["contradicted"]:
         yield f"the vehicle does not do what statement {decision['statement']} assumes: ask without it"
+    if decision is not None and not decision.get("driver") and (unseen := no_lower_limit(best, manifest)):
+        yield f"no lane change was seen at {unseen[0]}: a limit on the rate rests on that; ask --accept r157-cc"
     if decision is not None and (before := decision["asked_before"]):
         yield f"these tests were asked about {len(before)} other limits before: {', '.join(map(plain, before))}"
     worst = best.crash_rate + (0.0 if severity is None else severity.cut_off)

@@ -24,9 +24,6 @@ from harness.estimators.short_answer import Row
 from harness.numbers import MISSING, interval, number, ratio, share
 from harness.vocabulary import FloatArray
 
-CARRIES = 0.05
-"""Share of a rate from which on there is an upper limit alone, where nothing was seen of it [assumed]."""
-
 ONE_LAW = 0.07
 """By how much a ratio of two vehicles may be wrong besides, as one law is fitted to drivers who differ [measured where
 they do in a simulation, and nearly alike vehicles came out 4 to 7 % off: `python -m studies roundtrip`]."""

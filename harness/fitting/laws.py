@@ -21,6 +21,7 @@ from scipy import linalg, sparse, special
 
 from harness.fitting.maximum import Maximum, Prior, maximise
 from harness.fitting.observations import AT_RISK, FOLLOWING, FREE, INITIAL, LEADS, Observations
+from harness.traffic.parameters import SMALLEST_SHARE
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, BoolArray, FloatArray, IntArray, RecordArray
 
@@ -40,7 +41,6 @@ SMOOTH = 1.0, 3.0
 """Prior standard deviations of the log-hazard's bends (change over a quarter of the range) and steps [assumed]."""
 Knots = tuple[FloatArray, FloatArray, FloatArray]
 HAZARD_OF = ("v_mps", "r1_m", "r1dot_mps")
-SMALLEST_SHARE = 1e-12
 """Smallest accepted share of lane changes (`harness.traffic.parameters.AcceptanceSteps`)."""
 _TINY = 1e-300
 

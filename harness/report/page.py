@@ -53,6 +53,7 @@ def write_report(folder: str | Path) -> Path:
         scenes=scenes,
         figures={plot.name: plot for plot in plots},
         lateral=lateral_facts(run),
+        tabled=traffic is not None and traffic.accepted.size > 0,
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         outcomes=outcome_rows(summary),
         notes=run_notes(run, summary),

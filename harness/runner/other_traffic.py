@@ -7,7 +7,7 @@ is answered by the same tests, from few paths that are the same in all of them (
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,9 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
-from harness.estimators.traffic import CARRIES, ONE_LAW, TrafficError, Unseen, rows, sentences, uncertain
-from harness.numbers import plain, share
+from harness.estimators.short_answer import CARRIES
+from harness.estimators.traffic import ONE_LAW, TrafficError, Unseen, rows, sentences, uncertain
+from harness.numbers import share
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.moved import FewPaths
 from harness.pool.shells import acceleration_limit
@@ -43,7 +44,7 @@ from harness.runner.stored_shells import (
 from harness.sampling import distance_per_test_m
 from harness.strata import ShellDesign
 from harness.traffic.loading import load_parameters
-from harness.traffic.parameters import SHIPPED_FOLDER, AcceptanceSteps, EnvironmentParameters
+from harness.traffic.parameters import SHIPPED_FOLDER, SMALLEST_SHARE, AcceptanceSteps, EnvironmentParameters
 from harness.vocabulary import EstimatorName, FloatArray
 
 NOT_LOOKING = "cut_in__ignore_share"
@@ -169,23 +170,14 @@ def _unseen(tested: StoredShells, there: Resolved, moved: Moved, progress: Progr
     steps = parameters.acceptance_steps
     if parameters.replicates is None or steps is None or steps.events is None or steps.exposure is None:
         return None
-    empty = [step for step, events in enumerate(steps.events) if not events]
+    empty = steps.without_events
     halves = [{f"{_STEP}{step}": 0.5 * steps.share[step].value} for step in empty]
     halved = [environment_with(there, parameters, each) for each in halves]
     found = nearby(tested, there, moved, [each for each in halved if each is not None], progress)
     known = [step for step, each in zip(empty, halved, strict=True) if each is not None]
     carried = {step: 2.0 * (1.0 - each.rate) for step, each in zip(known, found, strict=True)}
     carried = {step: part for step, part in carried.items() if part > CARRIES}
-    return Unseen(_where(steps, carried), min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
-
-
-def _where(steps: AcceptanceSteps, some: Collection[int]) -> str:
-    """Times to collision of steps, neighbours together: ``TTC < 2 s``, ``TTC 3 to 5 s``."""
-    ends = [0.0, *(each.value for each in steps.ttc_s), math.inf]
-    low = [plain(ends[step]) for step in some if step - 1 not in some]
-    high = [plain(ends[step + 1]) for step in some if step + 1 not in some]
-    between = (f"TTC {a} to {b} s" if float(a) else f"TTC < {b} s" for a, b in zip(low, high, strict=True))
-    return " and ".join(between).replace("to inf s", "s and more")
+    return Unseen(steps.where(carried), min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
 
 
 def _as_if_unseen(row: Mapping[str, float], steps: AcceptanceSteps, unseen: Sequence[int]) -> dict[str, float]:
@@ -235,21 +227,28 @@ def _name(there: Resolved) -> str:
 
 
 def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progress) -> dict[str, Any] | None:
-    """By what the strata's probabilities move over the range that is stated for who does not look; None without one.
+    """By what the strata's probabilities move over what data leave open of who cuts in closely; None without that.
 
-    ``name``, ``value`` and ``ends`` are of that number, ``times`` the factors at both ends, (2, S).
+    ``times`` are the factors at both ends, (2, S): of the ``range`` that is stated for who does not look, with its
+    ``name``, ``value`` and ``ends``; or of shares of lane changes at the times to collision ``where`` none was seen,
+    which are anything up to what that many vehicles without one refuse.
     """
     parameters = load_parameters(traffic.campaign.environment)
-    if (number := parameters.numbers().get(NOT_LOOKING)) is None or number.range is None:
+    number, steps = parameters.numbers().get(NOT_LOOKING), parameters.acceptance_steps
+    if number is not None and number.range is not None:
+        of: dict[str, Any] = {"name": NOT_LOOKING.replace("__", "."), "value": number.value, "ends": list(number.range)}
+        settings = [{NOT_LOOKING: end} for end in number.range]
+    elif steps is not None and steps.exposure is not None and (empty := steps.without_events):
+        of = {"where": steps.where(empty)}
+        settings = [{f"{_STEP}{step}": SMALLEST_SHARE for step in empty}, _as_if_unseen({}, steps, empty)]
+    else:
         return None
-    paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)
-    ends = [environment_with(traffic, parameters, {NOT_LOOKING: end}) for end in number.range]
+    ends = [environment_with(traffic, parameters, each) for each in settings]
     if None in ends:
         return None
+    paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)
     base, *moved = paths.of([traffic.environment, *filter(None, ends)])
-    times = [ratio_of(each.p, base.p).tolist() for each in moved]
-    name = NOT_LOOKING.replace("__", ".")
-    return {"name": name, "value": number.value, "ends": list(number.range), "times": times}
+    return {**of, "times": [ratio_of(each.p, base.p).tolist() for each in moved]}
 
 
 def told_traffic(found: TrafficError, content: Mapping[str, Any]) -> dict[str, Any]:

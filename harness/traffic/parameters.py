@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -16,6 +16,7 @@ from pydantic import AfterValidator, BaseModel, Field, model_validator
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
+from harness.numbers import plain
 from harness.traffic.lateral import LateralMotion, constant_lead, log_normal_speed
 from harness.traffic.laws import Wish
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -265,6 +266,9 @@ class HazardTable(Section):
         return Wish(*(np.column_stack([_values(getattr(self, name)) for name in axis]) for axis in _AXES))
 
 
+SMALLEST_SHARE = 1e-12
+
+
 class AcceptanceSteps(Section):
     """Share of wished lane changes carried out, by time to collision with the AV: below each of ``ttc_s``, and above.
 
@@ -272,7 +276,7 @@ class AcceptanceSteps(Section):
     """
 
     ttc_s: Annotated[list[Annotated[Number, _within(0.01, 100.0)]], _LENGTH, AfterValidator(_rising)]
-    share: list[Annotated[Number, _within(1e-12, 1.0)]]
+    share: list[Annotated[Number, _within(SMALLEST_SHARE, 1.0)]]
     events: list[Annotated[int, Field(ge=0)]] | None = None
     exposure: list[Annotated[float, Field(ge=0.0)]] | None = None
 
@@ -286,6 +290,19 @@ class AcceptanceSteps(Section):
     def steps(self) -> FloatArray:
         """Upper ends (s) and shares (n, 2), as kernels read them."""
         return np.column_stack([[*_values(self.ttc_s), math.inf], _values(self.share)])
+
+    @property
+    def without_events(self) -> list[int]:
+        """Steps in which no lane change was seen."""
+        return [step for step, events in enumerate(self.events or ()) if not events]
+
+    def where(self, some: Collection[int]) -> str:
+        """Times to collision of steps, neighbours together: ``TTC < 2 s``, ``TTC 3 to 5 s``."""
+        ends = [0.0, *_values(self.ttc_s), math.inf]
+        low = [plain(ends[step]) for step in some if step - 1 not in some]
+        high = [plain(ends[step + 1]) for step in some if step + 1 not in some]
+        between = (f"TTC {a} to {b} s" if float(a) else f"TTC < {b} s" for a, b in zip(low, high, strict=True))
+        return " and ".join(between).replace("to inf s", "s and more")
 
 
 def _values(numbers: Sequence[Number]) -> list[float]:

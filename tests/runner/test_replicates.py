@@ -125,13 +125,22 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
     content = estimate_in_other_traffic(stored_run("shells-twin"), str(tmp_path / "mine.yaml"))
     traffic = content["traffic"]
     assert traffic["unseen"]["where"] == "TTC < 2 s"
-    assert (part := traffic["unseen"]["share"]) > 0.9
+    part = traffic["unseen"]["share"]
+    assert part > 0.9
     far = -math.log1p(-math.erf(math.sqrt(a * 50.0))) / 50.0  # the same quantile, of what zero events refuse
     assert traffic["rate"]["times"] == [0.0, pytest.approx(1.0 + part * (far / 0.01 - 1.0), rel=0.03)]
     (row,) = [row for row in content["answer"]["rows"] if row["key"] == "traffic"]
     assert row["value"].startswith("at most × ")
     assert row["remark"] == "none seen at TTC < 2 s"
     assert "since no lane change was seen at TTC < 2 s, where " in content["scope"]
+
+    # So does a run in that traffic, which asks no replicates: what is known comes first, the ratio.
+    first, rate, *_ = content["answer"]["rows"]
+    stored, none = content["estimates"]["shells"], -math.log(0.05) / 50.0
+    high = stored["ci_high"] * (1.0 + part * (none / 0.01 - 1.0))
+    assert (first["key"], rate["value"][:2], rate["remark"]) == ("ratio", "< ", "none seen at TTC < 2 s")
+    assert float(rate["value"].split()[1]) == pytest.approx(high * 10 ** -math.floor(math.log10(high)), rel=0.03)
+    assert "In the data of this traffic no lane change was seen at TTC < 2 s: the rate may be " in content["scope"]
 
 
 def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
