@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from inspect import getmembers, isfunction
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy import special, stats
@@ -38,16 +37,6 @@ SAME_MPS = 0.3
 _SEED = 1
 
 
-class Row(NamedTuple):
-    """A number of the environment beside the base's."""
-
-    name: str
-    value: str
-    se: str
-    base: str
-    away: str
-
-
 def page(
     fit: Fit, tally: Tally, noise_mps2: float, rows: Mapping[str, FloatArray], name: str, files: Sequence[Path]
 ) -> str:
@@ -71,14 +60,15 @@ def page(
     return printable(shown)
 
 
-def _numbers(fit: Fit) -> Iterator[Row]:
+def _numbers(fit: Fit) -> Iterator[tuple[str, ...]]:
+    """Name, value, standard error, the base's value, and the distance from it in standard errors."""
     base, found = fit.base.values(), fit.environment.numbers()
     for path, each in found.items():
         if each.se is None or path.startswith(("hazard_table", "acceptance_steps")):
             continue
         was = base[path]
         away = (each.value - was) / each.se if each.se > 0.0 else math.nan
-        yield Row(path.replace("__", "."), number(each.value), number(each.se, 2), number(was), f"{away:+.1f}")
+        yield (path.replace("__", "."), number(each.value), number(each.se, 2), number(was), f"{away:+.1f}")
 
 
 def _bins(fit: Fit) -> Iterator[tuple[str, int, str, str, str]]:
@@ -118,6 +108,27 @@ def _plots(fit: Fit) -> Iterator[Plot]:
 
 def _histogram(values: FloatArray, edges: FloatArray) -> FloatArray:
     return np.asarray(np.histogram(values, edges)[0] / max(values.size, 1) / np.diff(edges))
+
+
+def _beside(
+    title: str,
+    label: str,
+    y: Axis,
+    edges: FloatArray,
+    seen: FloatArray,
+    law: tuple[FloatArray, FloatArray],
+    words: tuple[str, str] = ("seen", "law"),
+) -> Panel:
+    """A histogram (n,) between edges (n + 1,), and points of the law's line."""
+    panel, (at, line) = Panel(title, Axis(label, float(edges[0]), float(edges[-1])), y), law
+    low = np.full(seen.size, y.low)
+    panel.add("boxes", "blue", edges[:-1], edges[1:], low, np.maximum(seen, low), opacity=0.3, label=words[0])
+    panel.add("line", "vermillion", at, np.maximum(line, y.low), label=words[1])
+    return panel
+
+
+def _density(*curves: FloatArray) -> Axis:
+    return Axis("density", 0.0, 1.15 * max(float(each.max()) for each in curves))
 
 
 def _acceptance_plot(fit: Fit) -> Plot:
@@ -189,10 +200,8 @@ def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
         low, high = (low, high) if low < high else (low - 0.5, high + 0.5)
         edges = np.linspace(low, high, 31)
         seen, law = _histogram(rows[column], edges), _histogram(drawn[of], edges)
-        panel = Panel("", Axis(label, low, high), Axis("density", 0.0, 1.15 * float(max(seen.max(), law.max()))))
-        panel.add("boxes", "blue", edges[:-1], edges[1:], np.zeros(30), seen, opacity=0.3, label="seen")
-        panel.add("line", "vermillion", 0.5 * (edges[1:] + edges[:-1]), law, label="law")
-        panels.append(panel)
+        line = 0.5 * (edges[1:] + edges[:-1]), law
+        panels.append(_beside("", label, _density(seen, law), edges, seen, line))
     alt = "Histograms of observed initial states, and the law's densities."
     return Plot("initial", panels, alt, "States behind a leader, one per vehicle and 20 s.")
 
@@ -204,24 +213,10 @@ def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) ->
     states = np.column_stack([some[name] if name in names else np.zeros(some.size) for name in HAZARD_OF])
     pmf = evaluate_laws(traffic, states).pmf[CAR_FOLLOWING if "r1_m" in names else FREE_DRIVING]
     law, seen = pmf.mean(axis=0), np.bincount(bins(rows["acceleration_mps2"]), minlength=N_ACCELERATIONS) / rows.size
-    lowest = 10.0 ** math.floor(math.log10(1.0 / rows.size))
-    a = Axis(
-        "acceleration of one second, m/s²", float(ACCELERATIONS_MPS2[0]) - 0.1, float(ACCELERATIONS_MPS2[-1]) + 0.1
-    )
-    panel = Panel(title, a, Axis("share", lowest, 1.0, log=True))
-    left = ACCELERATIONS_MPS2 - 0.1
-    panel.add(
-        "boxes",
-        "blue",
-        left,
-        left + 0.2,
-        np.full(law.size, lowest),
-        np.maximum(seen, lowest),
-        opacity=0.3,
-        label="seen",
-    )
-    panel.add("line", "vermillion", ACCELERATIONS_MPS2, np.maximum(law, lowest), label="law")
-    yield panel
+    y = Axis("share", 10.0 ** math.floor(math.log10(min(1.0 / rows.size, 0.1))), 1.0, log=True)
+    edges = np.append(ACCELERATIONS_MPS2 - 0.1, ACCELERATIONS_MPS2[-1] + 0.1)
+    line = ACCELERATIONS_MPS2, law
+    yield _beside(title, "acceleration of one second, m/s²", y, edges, seen, line)
 
     first = _followed(rows, OVER_S)
     panel = Panel(
@@ -238,22 +233,15 @@ def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) ->
 
     random = np.random.default_rng(_SEED)
     drawn = np.zeros(some.size)
+    below = np.cumsum(pmf, axis=1)[:, :-1]
     for _ in range(OVER_S):
-        below = np.cumsum(pmf, axis=1)[:, :-1]
         drawn += ACCELERATIONS_MPS2[(random.random((some.size, 1)) > below).sum(axis=1)]
     changes = sum(acceleration[first + lag] for lag in lags) if first.size else np.empty(0)
     ends = np.linspace(-8.0, 8.0, 33)
     seen, law = (_histogram(np.clip(each, -8.0, 8.0), ends) for each in (np.asarray(changes), drawn))
-    lowest = 1e-4
-    y = Axis("density", lowest, 2.0 * max(float(seen.max()), float(law.max())), log=True)
-    panel = Panel(f"{title}, over {OVER_S} s", Axis(f"change of speed in {OVER_S} s, m/s", -8.0, 8.0), y)
-    panel.add(
-        "boxes", "blue", ends[:-1], ends[1:], np.full(32, lowest), np.maximum(seen, lowest), opacity=0.3, label="seen"
-    )
-    panel.add(
-        "line", "vermillion", 0.5 * (ends[1:] + ends[:-1]), np.maximum(law, lowest), label="law, second by second"
-    )
-    yield panel
+    y = Axis("density", 1e-4, 2.0 * max(float(seen.max()), float(law.max())), log=True)
+    line, label = (0.5 * (ends[1:] + ends[:-1]), law), f"change of speed in {OVER_S} s, m/s"
+    yield _beside(f"{title}, over {OVER_S} s", label, y, ends, seen, line, ("seen", "law, second by second"))
 
 
 def _followed(rows: RecordArray, n: int) -> IntArray:
@@ -274,10 +262,8 @@ def _lead_plot(fit: Fit, log_sd: float) -> Plot:
     seen = _histogram(np.minimum(leads, longest - 1e-9), edges)
     times = np.linspace(0.02, longest, 250)
     law = stats.lognorm.pdf(times, log_sd, scale=median)
-    y = Axis("density", 0.0, 1.15 * float(max(seen.max(), law.max())))
-    panel = Panel("", Axis("from onset of lateral motion to overlap, s", 0.0, longest), y)
-    panel.add("boxes", "blue", edges[:-1], edges[1:], np.zeros(25), seen, opacity=0.3, label=f"seen ({leads.size})")
-    panel.add("line", "vermillion", times, law, label="law")
+    label, words = "from onset of lateral motion to overlap, s", (f"seen ({leads.size})", "law")
+    panel = _beside("", label, _density(seen, law), edges, seen, (times, law), words)
     return Plot(
         "leads", [panel], "Histogram of leads, and the law.", "How long an attentive vehicle can see a cut-in coming."
     )
