@@ -282,6 +282,7 @@ def pairs_plot(who: IntArray, weight: FloatArray, gap_m: FloatArray, closing_mps
         return None
     cells = np.stack((who, gap_m // CELL_M, closing_mps // CELL_MPS))
     (kind, *_), place = np.unique(cells, axis=1, return_inverse=True)
+    place = place.ravel()  # numpy 2.0 gives it another axis
     adds = np.bincount(place, weight)
     gap, closing = (np.bincount(place, weight * x) / adds for x in (gap_m, closing_mps))
     axes = Axis("gap at the cut-in, m", 0.0, 1.1 * gap.max()), Axis("closing speed, m/s", 0.0, 1.1 * closing.max())

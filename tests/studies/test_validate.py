@@ -108,7 +108,8 @@ def test_enumerated_vehicles_alone_and_compared(tmp_path, monkeypatch):
     assert {(one["result"], one["covered"]) for one in found.values() if not one["assumption_met"]} == {
         (w, 0) for w in wrong
     }
-    assert found["idm", "shells"]["truth"] == found["idm", "shells, upper bound"]["truth"]  # that of the pools' paths
+    truth, same = (found["idm", result]["truth"] for result in ("shells", "shells, upper bound"))
+    assert truth == pytest.approx(same, rel=1e-12)  # both that of the pools' paths
     verdicts = {key: one for key, one in found.items() if key[1].startswith("limit ")}
     assert {name for name, _ in verdicts} == {"idm", "hole"}
     for (name, result), one in verdicts.items():
