@@ -31,13 +31,7 @@ from harness.fitting.observations import Tally
 from harness.traffic.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
 from harness.traffic.loading import evaluate_laws
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import (
-    ACCELERATIONS_MPS2,
-    BoolArray,
-    FloatArray,
-    IntArray,
-    RecordArray,
-)
+from harness.vocabulary import ACCELERATIONS_MPS2, BoolArray, FloatArray, IntArray, RecordArray
 
 ARCHIVE = "dataset/data/DLR-Highway-Traffic-dataset_*.zip"
 COLUMNS = {
@@ -246,20 +240,13 @@ def figures(seen: Traffic, environments: Mapping[str, Environment]) -> list[Figu
         if not (changes & freely).any():
             return
         share = _share(int((changes & here & freely).sum()), int((changes & freely).sum()))
-        add(
-            f"lane changes {words} (%)",
-            share,
-            lambda of: 100.0 * float(of.wished[here & freely].sum() / of.wished[freely].sum()),
-        )
+        chosen, words = here & freely, f"lane changes {words} (%)"
+        add(words, share, lambda of: 100.0 * float(of.wished[chosen].sum() / of.wished[freely].sum()))
 
     def carried_out(low: float, high: float) -> None:
         here = (ttc >= low) & (ttc < high)
-        seen_here = _count(int((changes & here).sum()))
-        add(
-            f"lane changes at a TTC of {low:g} to {high:g} s",
-            seen_here,
-            lambda of: _expected(of, here, changes, freely),
-        )
+        words, interval = f"lane changes at a TTC of {low:g} to {high:g} s", _count(int((changes & here).sum()))
+        add(words, interval, lambda of: _expected(of, here, changes, freely))
 
     state("R1, mean (m)", "r1_m", "r1_m", lambda r1: r1)
     state("R1 below 30 m (%)", "r1_m", "r1_m", lambda r1: 100.0 * (r1 < 30.0))

@@ -73,6 +73,8 @@ def estimate(
         if estimators:
             raise click.UsageError("--environment does not go with -e: tests of shells alone can be moved.")
         if (folder / COMPARISON).is_file():
+            if write:
+                raise click.UsageError("--write does not go with the folder of a comparison.")
             _compared_elsewhere(folder, environment, confidence, as_json=as_json)
             return
         from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast

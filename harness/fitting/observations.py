@@ -20,17 +20,7 @@ import numpy as np
 
 from harness.errors import TrajectoryError
 from harness.fitting.table import Mapping, Recording, recordings
-from harness.fitting.tracks import (
-    USUAL_RANGE,
-    FitRange,
-    Scene,
-    States,
-    Track,
-    durations_s,
-    noise_of,
-    slopes,
-    track_of,
-)
+from harness.fitting.tracks import USUAL_RANGE, FitRange, Scene, States, Track, durations_s, noise_of, slopes, track_of
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 

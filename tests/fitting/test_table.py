@@ -1,5 +1,6 @@
 """Files and mappings: what is read, and what is refused, by name."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,12 +17,15 @@ FEET = 1 / 0.3048
 ROWS = overtaking(2.5)
 
 
+def tallied(file: Path, mapping: str | None = None) -> Tally:
+    found = observations([file], load_mapping(mapping))
+    return functools.reduce(Tally.plus, (each.tally for each, _ in found), Tally())
+
+
 def judged(file: Path, mapping: str | None = None) -> Tally:
     """What `harness fit` does with a file before it fits."""
-    total, read = Tally(), load_mapping(mapping)
-    for each, _ in observations([file], read):
-        total = total.plus(each.tally)
-    require_enough(total, file.name, read)
+    total = tallied(file, mapping)
+    require_enough(total, file.name, load_mapping(mapping))
     return total
 
 
@@ -348,17 +352,9 @@ def test_classes_and_mirror(tmp_path):
     rows = ROWS.assign(**{"class": np.where(ROWS.recording_id % 2 == 0, "car", "truck")})
     rows.to_csv(tmp_path / "rows.csv", index=False)
     (tmp_path / "cars.yaml").write_text("classes: [car]\n")
-    cars, whole = judged_loosely(tmp_path / "rows.csv", "cars"), judged(tmp_path / "rows.csv")
+    cars, whole = tallied(tmp_path / "rows.csv", str(tmp_path / "cars.yaml")), judged(tmp_path / "rows.csv")
     assert 0.4 * whole.driven_s < cars.driven_s < 0.6 * whole.driven_s
     fast_lanes().to_csv(tmp_path / "mirrored.csv", index=False)
     (tmp_path / "mirror.yaml").write_text("mirror: true\n")
     mirrored = judged(tmp_path / "mirrored.csv", str(tmp_path / "mirror.yaml"))
     assert mirrored == whole
-
-
-def judged_loosely(file: Path, mapping: str) -> Tally:
-    found = observations([file], load_mapping(str(file.with_name(f"{mapping}.yaml"))))
-    total = Tally()
-    for each, _ in found:
-        total = total.plus(each.tally)
-    return total

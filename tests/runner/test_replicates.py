@@ -110,6 +110,8 @@ def test_the_ratio_of_two_vehicles_hardly_moves(tmp_path, capsys):
     assert of_both["times"] == pytest.approx([1.0 / (1.0 + ONE_LAW), 1.0 + ONE_LAW], rel=0.01)
     assert of_both["value"] == pytest.approx(compared["ratio"])
     assert of_both["sampling"] == pytest.approx([compared["ratio_low"], compared["ratio_high"]])
+    assert main(["estimate", str(tmp_path / "pair"), "--environment", mine, "--write"]) == 2
+    assert "--write does not go with" in capsys.readouterr().err
 
 
 def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run, tmp_path):
