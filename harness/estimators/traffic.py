@@ -87,16 +87,17 @@ def uncertain(
     confidence: float,
     *,
     from_below: bool = True,
+    held: bool = True,
 ) -> Uncertain:
     """By the factors (B,) of replicates, each over that of the environment itself, that may be ``off`` (B,) by so much.
 
-    Not ``from_below`` there is an upper limit alone.
+    Not ``from_below`` there is an upper limit alone; not ``held`` factors are of the upper limit, not of the value.
     """
     tail = round((1.0 - confidence) / 2.0, 12)  # so that it falls on one of them where it should
     lower, upper = np.append(factors / (1.0 + off), np.zeros(n_refused)), factors * (1.0 + off)
     low = float(np.quantile(lower, tail, method="lower")) if from_below else 0.0
     high = float(np.quantile(np.append(upper, np.full(n_refused, np.inf)), 1.0 - tail, method="higher"))
-    if value <= 0.0:
+    if value <= 0.0 or not held:
         return Uncertain(value, (low, high), sampling, (0.0, 0.0), (0.0, sampling[1] * high))
     environment = value * low, value * high
     below, above = (
@@ -131,13 +132,13 @@ def is_open(found: TrafficError) -> bool:
 def _ends(found: TrafficError) -> str:
     if is_open(found):
         return MISSING
-    return interval(*found.rate.both) if found.unseen is None else f"< {number(found.rate.both[1])}"
+    return interval(*found.rate.both) if found.rate.times[0] > 0.0 else f"< {number(found.rate.both[1])}"
 
 
 def _of_ratio(of: Uncertain) -> str:
     low, high = of.both
     if math.isfinite(high):
-        return f"{ratio(low)} to {ratio(high)}"
+        return f"{ratio(low)} to {ratio(high)}" if low > 0.0 else f"< {ratio(high)}"
     return f"at least {ratio(low)}" if low > 0.0 else "no limit"
 
 
@@ -175,7 +176,7 @@ def sentences(found: TrafficError, of: str = "the vehicle") -> Iterator[str]:
 def because(found: TrafficError) -> str:
     """Why there is an upper limit alone."""
     if (unseen := found.unseen) is None:
-        return ""
+        return "" if found.rate.times[0] > 0.0 else ", since other cut-ins of its shells may be those that crash"
     return f", since no lane change was seen at {unseen.where}, where {share(unseen.share)} of the rate arises"
 
 

@@ -40,6 +40,7 @@ from harness.runner.stored_shells import (
     moved_to,
     nearby,
     ratio_of,
+    require_shares,
 )
 from harness.sampling import distance_per_test_m
 from harness.strata import ShellDesign
@@ -111,16 +112,18 @@ def traffic_error(
     estimate, confidence = content["estimates"]["shells"], content["confidence"]
     times, off, n_refused = np.array([each.rate for each in near]), _off(near), n - len(near)
     sampling = estimate["ci_low"], estimate["ci_high"]
-    if not estimate["n_crashes"]:
+    if not estimate["n_crashes"] or not tested.holds:
         sampling = 0.0, estimate["upper_bound"]
-    about = off, n_refused, confidence
-    of_rate = uncertain(estimate["crash_rate"], sampling, times, *about, from_below=unseen is None)
+    about, held = (off, n_refused, confidence), tested.holds
+    from_below = unseen is None and held
+    of_rate = uncertain(estimate["crash_rate"], sampling, times, *about, from_below=from_below, held=held)
     ratios = {}
     for r, driver in enumerate(tested.design.references):
         for each in estimate["details"]["references"]:
             if each["reference"] == driver.name:
                 ends, moves = _ends(each), times / np.array([one.references[r] for one in near])
-                ratios[driver.name] = uncertain(each["ratio"], ends, moves, off + ONE_LAW, *about[1:])
+                further = off + ONE_LAW, *about[1:]
+                ratios[driver.name] = uncertain(each["ratio"], ends, moves, *further, from_below=held, held=held)
     return TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), of_rate, ratios, unseen)
 
 
@@ -134,6 +137,8 @@ def compare_in_other_traffic(
     """
     progress = progress or Progress()
     sides = [StoredShells.of(Path(folder) / side, progress) for side in ("a", "b")]
+    for tested in sides:
+        require_shares(tested)
     there = resolve(sides[0].here.campaign.replaced(("environment", "parameters"), environment))
     moved = [moved_to(side, there, environment, progress) for side in sides]
     pairs = PairedShells(moved[0].there)

@@ -23,7 +23,7 @@ from harness.estimators.traffic import Bar, Sensitivity
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
 from harness.runner.other_traffic import read_replicates
-from harness.runner.stored_shells import Moved, Nearby, StoredShells, environment_with, nearby
+from harness.runner.stored_shells import Moved, Nearby, StoredShells, environment_with, nearby, require_shares
 from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import EnvironmentParameters
 
@@ -62,6 +62,7 @@ def sensitivity(
     """
     folder, progress = Path(folder), progress or Progress()
     tested = StoredShells.of(folder, progress, _OPTION)
+    require_shares(tested)
     settings = tested.here.campaign.environment
     parameters = load_parameters(settings)
     asked = list(moves(settings.parameters, parameters, ranges or {}))

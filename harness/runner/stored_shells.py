@@ -3,8 +3,8 @@
 Traffic decides how probable a cut-in is; what a vehicle makes of one, only through what LV and BV do afterwards, and
 through which cut-ins of a shell there are. Crash shares within shells are taken to be the same. The reference drivers,
 of which no shell is made, tell how far that holds: their rates follow by the same rule, and are known besides. Of a
-vehicle that crashes on few of the cut-ins of its shells they do not: which these are may change. Of such a vehicle, and
-of traffic with cut-ins that no test stands for, nothing is said.
+vehicle that crashes on few of the cut-ins of its shells they do not: which these are may change. Of such a vehicle
+there are upper limits alone, in traffic close by; of traffic with cut-ins that no test stands for nothing is said.
 """
 
 from __future__ import annotations
@@ -113,13 +113,22 @@ class StoredShells:
         share, p = self.seen.tally.share, self.design.p
         return float(p @ share**2 / (p @ share)) if share.any() else 1.0
 
+    @property
+    def holds(self) -> bool:
+        """Whether shares may be taken to stay the same."""
+        return self.mean_share >= LEAST_SHARE
+
     def rate(self, p: FloatArray) -> float:
         """Crash rate where strata have probabilities (S,); its upper limit where no test crashed."""
         tally = self.seen.tally
-        if tally.crashes.any():
-            return float(p @ tally.share)
-        worst = tally.failed_as_crashes()
-        return likelihood_limit(p, worst.crashes, worst.tests, Level.two_sided(0.9), 1.0)
+        return float(p @ tally.share) if tally.crashes.any() else self.limit(p)
+
+    def limit(self, p: FloatArray, *, at_worst: bool = False) -> float:
+        """Upper limit of it; ``at_worst`` every cut-in may crash of strata of which a few did."""
+        worst = self.seen.tally.failed_as_crashes()
+        few = at_worst & (worst.crashes > 0) & (worst.crashes < LEAST_SHARE * worst.tests)
+        crashes = np.where(few, worst.tests, worst.crashes)
+        return likelihood_limit(p, crashes, worst.tests, Level.two_sided(0.9), 1.0)
 
 
 def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progress) -> Moved:
@@ -127,7 +136,7 @@ def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progres
     if environment_hash(there.environment) == tested.pool.environment:
         return Moved(tested.design, tested.design)
     _require_same_kind(tested.here, there, name)
-    _require_shares(tested)
+    require_shares(tested)
     progress.stage("pool of the other traffic", None)
     elsewhere = campaign_pool(there, progress, order=tested.pool.names)
     moved = Moved.of(tested.design, design_shells(elsewhere, tested.limit_mps2), name)
@@ -170,12 +179,15 @@ class Nearby:
 def nearby(
     tested: StoredShells, there: Resolved, moved: Moved, environments: Sequence[Environment], progress: Progress
 ) -> Iterator[Nearby]:
-    """Traffic close to that of ``there``, by few paths."""
-    _require_shares(tested)
+    """Traffic close to that of ``there``, by few paths.
+
+    Of a vehicle whose shares may change with it, the factor is that of its upper limit.
+    """
     paths = FewPaths(there, tested.pool, tested.design, tested.limit_mps2, progress)
     (base,), p, shares = paths.of([there.environment]), moved.there.p, moved.reference_shares()
     tally, n_surrogates = tested.seen.tally, len(tested.pool.names)
     crash_share = tally.share if tally.crashes.any() else np.ones_like(p)
+    limit = tested.limit(p)
     for found in paths.of(environments):
         now = p * ratio_of(found.p, base.p)
         known = ratio_of(found.rate[n_surrogates:], base.rate[n_surrogates:])
@@ -184,7 +196,7 @@ def nearby(
         crashing = now * crash_share
         new = _share(found.beyond, found.p) - _share(base.beyond, base.p)  # ends of a sample are not those of a law
         beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum()) + found.untested / found.p.sum()
-        times = tested.rate(now) / tested.rate(p)
+        times = tested.rate(now) / tested.rate(p) if tested.holds else tested.limit(now, at_worst=True) / limit
         yield Nearby(now, times, known, float(np.max(off, initial=0.0)), beyond)
 
 
@@ -220,12 +232,14 @@ def _require_shells(campaign: Campaign, option: str) -> None:
     raise CampaignError(option, found, expected, ELSEWHERE)
 
 
-def _require_shares(tested: StoredShells) -> None:
-    if (mean := tested.mean_share) < LEAST_SHARE:
-        found = f"a vehicle that crashes on {share(mean)} of the cut-ins of the shells that it crashes in"
-        expected = f"at least {share(LEAST_SHARE)}: else which these are may change with the traffic"
-        mend = "Run it in that environment, or here with a surrogate close to it in the library (pool.library)."
-        raise CampaignError(str(tested.folder), found, expected, mend)
+def require_shares(tested: StoredShells) -> None:
+    """Raise a `CampaignError` where shares may not be taken to stay the same."""
+    if tested.holds:
+        return
+    found = f"a vehicle that crashes on {share(tested.mean_share)} of the cut-ins of the shells that it crashes in"
+    expected = f"at least {share(LEAST_SHARE)}: else which these are may change with the traffic"
+    mend = "Run it in that environment, or here with a surrogate close to it in the library (pool.library)."
+    raise CampaignError(str(tested.folder), found, expected, mend)
 
 
 def _require_same_kind(here: Resolved, there: Resolved, name: str) -> None:

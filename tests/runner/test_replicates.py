@@ -19,9 +19,11 @@ from harness.estimators.traffic import ONE_LAW, uncertain
 from harness.pool import moved
 from harness.progress import Progress
 from harness.resolved import resolve
+from harness.runner import stored_shells
 from harness.runner.compare import compare_campaigns
 from harness.runner.other_traffic import assumed, estimate_in_other_traffic
-from harness.runner.stored_shells import StoredShells
+from harness.runner.stored_shells import Moved, StoredShells, environment_with, nearby
+from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.golden.campaigns import COMPARED
 from tests.in_process import one_process, without_page
@@ -59,6 +61,24 @@ def test_the_rate_moves_with_the_share_that_does_not_look_and_the_ratio_does_not
     keys = [row["key"] for row in content["answer"]["rows"]]
     assert keys[keys.index("ratio") + 1 :][:2] == ["traffic", "traffic_ratio"]
     assert "5 replicates" in content["scope"]
+
+
+def test_of_a_vehicle_whose_shares_may_change_there_is_an_upper_limit_alone(stored_run, tmp_path, monkeypatch):
+    """All cut-ins of the shells that it crashes in may crash."""
+    folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.01, 0.02]})
+    tested = StoredShells.of(folder, Progress())
+    here, same = tested.here, Moved(tested.design, tested.design)
+    twice = environment_with(here, load_parameters(here.campaign.environment), {LOOK: 0.02})
+    (near,) = nearby(tested, here, same, [twice], Progress())
+    monkeypatch.setattr(stored_shells, "LEAST_SHARE", 1.1)
+    content = estimate_in_other_traffic(folder, mine)
+    estimate, traffic = content["estimates"]["shells"], content["traffic"]
+    worst = tested.limit(near.p, at_worst=True) / tested.limit(tested.design.p)
+    assert traffic["rate"]["times"] == [0.0, pytest.approx(worst, rel=0.01)]
+    assert traffic["rate"]["both"] == [0.0, pytest.approx(estimate["upper_bound"] * traffic["rate"]["times"][1])]
+    (row,) = [row for row in content["answer"]["rows"] if row["key"] == "traffic"]
+    assert (row["value"][:9], row["interval"][:2]) == ("at most ×", "< ")
+    assert "since other cut-ins of its shells may be those that crash" in content["scope"]
 
 
 def test_what_was_found_once_is_not_looked_for_again(stored_run, tmp_path, monkeypatch):
