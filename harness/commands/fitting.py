@@ -67,7 +67,7 @@ def fit(
         f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h; "
         f"{tally.used:,} lane changes used of {tally.changes:,}",
         f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
-        f"{steps.exposure[:-1].sum():.1f} expected with nobody closing in",
+        f"{steps.exposure[:-1].sum():.1f} expected if nobody minded it",
         *(f"kept as in {found.fit.base_name}: {what} ({why})" for what, why in found.fit.kept.items()),
         *([limited] if unseen else []),
         *written,

@@ -60,15 +60,16 @@ def page(
     return printable(shown)
 
 
-def _numbers(fit: Fit) -> Iterator[tuple[str, ...]]:
-    """Name, value, standard error, the base's value, and the distance from it in standard errors."""
+def _numbers(fit: Fit) -> Iterator[tuple[str | bool, ...]]:
+    """Name, value, standard error, the base's value, the distance from it in standard errors; whether data are silent."""
     base, found = fit.base.values(), fit.environment.numbers()
     for path, each in found.items():
         if each.se is None or path.startswith(("hazard_table", "acceptance_steps")):
             continue
         was = base[path]
         away = (each.value - was) / each.se if each.se > 0.0 else math.nan
-        yield (path.replace("__", "."), number(each.value), number(each.se, 2), number(was), f"{away:+.1f}")
+        values = number(each.value), number(each.se, 2), number(was), f"{away:+.1f}"
+        yield (path.replace("__", "."), *values, each.se > max(abs(each.value), abs(was)))
 
 
 def _bins(fit: Fit) -> Iterator[tuple[str, int, str, str, str]]:
@@ -135,9 +136,7 @@ def _acceptance_plot(fit: Fit) -> Plot:
     found, edges = fit.acceptance, [0.0, *TTC_EDGES_S.tolist(), 12.0]
     lowest = 1e-3
     y = Axis("share carried out", lowest, 3.0, log=True)
-    panel = Panel(
-        "Lane changes in front of a vehicle that closes in", Axis("time to collision, s", 0.0, 12.0), y, height=280.0
-    )
+    panel = Panel("", Axis("time to collision, s", 0.0, 12.0), y, height=280.0)
     low, high = _limits(found.events, found.exposure)
     panel.add(
         "boxes",
@@ -159,8 +158,8 @@ def _acceptance_plot(fit: Fit) -> Plot:
         panel.add("line", colour, times, ignored + (1.0 - ignored) * accept, dash="4 3", label=name)
     alt = "Share of lane changes carried out, by time to collision with the vehicle behind, with limits."
     caption = (
-        "Of the lane changes expected with nobody closing in. Nearly all crashes follow from times below 1.5 s; "
-        "where no lane change was seen there, the data give only an upper limit."
+        "Of the lane changes expected with nobody closing in; as that number is itself estimated, and changes are few, "
+        "a share may exceed 1. Nearly all crashes follow from times below 1.5 s."
     )
     return Plot("acceptance", [panel], alt, caption)
 

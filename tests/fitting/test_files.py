@@ -1,6 +1,7 @@
 """`harness fit` from end to end: what it writes, and what it refuses before it reads."""
 
 import json
+import re
 
 import pytest
 
@@ -22,7 +23,16 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
     assert told["recordings"] == told["lane_changes"] == 24
     parameters = load_parameters(EnvironmentSettings(parameters="./a #1: b.yaml"))
     assert len(read_replicates("./a #1: b.yaml", parameters)) == 5
-    assert "R1dot" in (tmp_path / "a #1: b.html").read_text()
+    page = (tmp_path / "a #1: b.html").read_text()
+    assert "R1dot" in page
+    assert (
+        0 < page.index("No lane change was seen at TTC &lt; 1 s") < page.index("How to use it")
+    )  # the chief finding first
+    grey = re.findall(r'<tr class="open"><th scope="row"><code>(.*?)<', page)
+    numbers = parameters.numbers()
+    assert grey
+    assert all(each.se > abs(each.value) for each in (numbers[name.replace(".", "__")] for name in grey))
+    assert len(grey) < len(re.findall(r'<tr><th scope="row"><code>', page))
     again = fit_files(["rows.parquet"], tmp_path / "again" / "a #1: b.yaml", n_replicates=5)
     for file in (again.environment, again.replicates, again.page):
         assert file.read_bytes() == (tmp_path / file.name).read_bytes()
