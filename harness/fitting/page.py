@@ -61,7 +61,7 @@ def page(
 
 
 def _numbers(fit: Fit) -> Iterator[tuple[str | bool, ...]]:
-    """Name, value, standard error, the base's value, the distance from it in standard errors; whether data are silent."""
+    """Name, value, standard error, the base's value, distance from it in standard errors, whether data are silent."""
     base, found = fit.base.values(), fit.environment.numbers()
     for path, each in found.items():
         if each.se is None or path.startswith(("hazard_table", "acceptance_steps")):
@@ -263,6 +263,5 @@ def _lead_plot(fit: Fit, log_sd: float) -> Plot:
     law = stats.lognorm.pdf(times, log_sd, scale=median)
     label, words = "from onset of lateral motion to overlap, s", (f"seen ({leads.size})", "law")
     panel = _beside("", label, _density(seen, law), edges, seen, (times, law), words)
-    return Plot(
-        "leads", [panel], "Histogram of leads, and the law.", "How long an attentive vehicle can see a cut-in coming."
-    )
+    caption = "How long an attentive vehicle can see a lane change coming."
+    return Plot("leads", [panel], "Histogram of leads, and the law.", caption)
