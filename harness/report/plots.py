@@ -129,7 +129,7 @@ def shells_plot(found: ShownShells) -> Plot:
     widest = 1.3 * max(*(shell.half_width for shell in tested), pool)
     rows, y = np.arange(len(names)), Axis("", len(names) - 0.4, -0.6, names=names)
     left, right = (
-        Panel(title, Axis(f"{label}, per test", 0.0, end), y, height=62.0 + 22.0 * len(names))
+        Panel(title, Axis(f"{label}, per test", 0.0, end), y, height=62.0 + 26.0 * len(names))
         for title, label, end in (
             ("Where the rate comes from", "contribution to the crash rate", limit),
             ("Where the uncertainty lies", "half-width", widest),

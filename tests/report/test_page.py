@@ -70,6 +70,15 @@ def test_notes_say_what_is_stale(run_folder):
     assert "cover 2,000 tests but the records hold 3,000" in "\n".join(run_notes(run, summarise(run)))
 
 
+def test_a_ratio_that_leads_says_of_what_it_is(reports, tmp_path):
+    folder = shutil.copytree(reports["shells"], tmp_path / "run")
+    answer = edit(folder / "estimates.json")["answer"]
+    row = {"key": "ratio", "what": "× competent driver", "value": "< 0.25 (crashes less)", "interval": "", "remark": ""}
+    edit(folder / "estimates.json", answer=answer | {"rows": [row, *answer["rows"]]})
+    write_report(folder)
+    assert "Crash rate < 0.25 × competent driver (crashes less)" in Page(folder).words
+
+
 def test_a_statement_that_a_vehicle_does_not_keep_to_is_said_so_and_sooner_that_it_is_refuted(runs):
     ahead = replace(runs["shells"].shells.widest, n_checked=9, n_ahead=1)
     assert verdict(ahead) == "no longer justified: this vehicle does not keep to it"
