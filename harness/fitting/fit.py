@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.campaign.files import Places, validated
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
 from harness.fitting.laws import (
@@ -90,7 +91,9 @@ def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, w
     settings = EnvironmentSettings()
     progress.stage("fitting laws", len(_LAWS) + 1)
     if (hazard := fit_hazard(traffic)) is None:
-        found_words = f"no lane change without a vehicle that closes in within {FREE_TTC_S:g} s"
+        found_words = (
+            f"too few lane changes without a vehicle that closes in within {FREE_TTC_S:g} s to fit their hazard"
+        )
         raise TrajectoryError(where, found_words, "20 or more", "Add recordings.")
     found = {}
     for name, (law_of, _) in _LAWS.items():
@@ -103,7 +106,7 @@ def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, w
             found["rate"] = fit_rate(traffic, numbers, df)
         laws = {name: law for name, law in found.items() if law is not None} | {"hazard": hazard[0]}
         try:
-            environment = _environment(base, laws, hazard[1], acceptance)
+            environment = _environment(base, laws, hazard[1], acceptance, where)
             require_sound_laws(load_environment(settings, environment), where)
         except CampaignError as error:
             problem = error
@@ -124,7 +127,7 @@ def _rounded(value: float) -> float:
 
 
 def _environment(
-    base: EnvironmentParameters, laws: dict[str, FittedLaw], knots: Knots, acceptance: Acceptance
+    base: EnvironmentParameters, laws: dict[str, FittedLaw], knots: Knots, acceptance: Acceptance, where: str
 ) -> EnvironmentParameters:
     """The base with fitted numbers, and with tables in place of the formulas that they replace."""
     content: dict[str, Any] = base.model_dump(exclude_none=True)
@@ -156,4 +159,4 @@ def _environment(
     exposure = [_rounded(each) for each in acceptance.exposure.tolist()]
     counted = {"events": acceptance.events.tolist(), "exposure": exposure}
     tables["acceptance_steps"] = {"ttc_s": edges, "share": steps, **counted}
-    return EnvironmentParameters.model_validate({**content, **tables})
+    return validated({**content, **tables}, EnvironmentParameters, where, Places(where, {}))

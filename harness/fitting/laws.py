@@ -404,7 +404,8 @@ def fit_hazard(traffic: Traffic) -> tuple[FittedLaw, Knots] | None:
     knots = first, second, third
 
     def log_likelihood(rows: RecordArray, eta: FloatArray) -> FloatArray:
-        rate = -np.log1p(-np.minimum(np.exp(eta), 0.5))  # decided once a second (`harness.traffic.laws`)
+        # Decided once a second (`harness.traffic.laws`); beyond a chance of 1/2 straight on, as a bend has no maximum.
+        rate = -np.log1p(-np.minimum(np.exp(eta), 0.5)) + np.maximum(eta + math.log(2.0), 0.0)
         return np.asarray(np.where(rows["changes"], np.log(rate), 0.0) - rate * rows["duration_s"])
 
     def values(theta: FloatArray) -> FloatArray:

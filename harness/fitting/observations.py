@@ -46,6 +46,8 @@ LEVEL_S = 0.5
 LATERAL_WINDOW_S = 0.5
 """Half of the time over which a slope gives the lateral speed at a crossing."""
 STRAIGHT_MPS = 0.1
+JUMP_M = 1.5
+"""Between two frames nobody drives so far across."""
 SHIFTED_S = 0.8
 OVERLAP_M = -0.5
 """Gaps below are more than measurement error."""
@@ -86,6 +88,8 @@ class Tally(NamedTuple):
     """Lane changes without lateral motion, where lateral positions are known."""
     shifted: int = 0
     """The same, more than 0.8 s from the middle between both lanes."""
+    jumping: int = 0
+    """The same, within one frame."""
     closing_s: float = 0.0
     """Whole seconds at risk with a time to collision below 8 s."""
     closing_other_s: float = 0.0
@@ -180,7 +184,7 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         "acceleration_mps2": acceleration,
         "changes": crosses,
     }
-    leads, straight, shifted = _leads(track, rows[crosses & state.fits])
+    leads, straight, shifted, jumping = _leads(track, rows[crosses & state.fits])
     overlaps = state.follows & (state.r1 < OVERLAP_M)
     longer = 0.5 * (track.length[rows] - track.length[state.leader])
     tally = Tally(
@@ -200,6 +204,7 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         used=int((state.at_risk & crosses).sum()),
         straight=straight,
         shifted=shifted,
+        jumping=jumping,
         closing_s=float((whole & state.at_risk & (state.ttc_s < CLOSING_TTC_S)).sum()),
         closing_other_s=float((other.at_risk & (other.ttc_s < CLOSING_TTC_S)).sum()),
     )
@@ -226,14 +231,14 @@ def _records(dtype: np.dtype[np.void], columns: dict[str, RecordArray], inside: 
 # -- lateral motion --
 
 
-def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
-    """Leads of some crossings (rows before them); how many have no lateral motion, and how many at another time.
+def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int, int]:
+    """Leads of some crossings (rows before them); how many have no lateral motion, at another time, or in one frame.
 
     The onset is the bend of a line, level before and straight from there to the crossing, fitted to the lateral
     positions: the law's motion at constant lateral speed. Where none is seen, the lead is the time that was searched,
     at least `SEEN_BEFORE_S`.
     """
-    found, straight, shifted = [], 0, 0
+    found, straight, shifted, jumping = [], 0, 0, 0
     moves = (np.diff(track.lane) != 0) & (np.diff(track.vehicle) == 0)
     steady = ~np.isin(track.vehicle, track.vehicle[1:][moves]) & np.isfinite(track.lateral)
     middle: dict[tuple[int, int], float] = {}
@@ -254,11 +259,12 @@ def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int]:
         off_m = abs(track.lateral[reach[-1]] - middle[where])
         straight += int(abs(speed) < STRAIGHT_MPS)
         shifted += int(STRAIGHT_MPS <= abs(speed) < off_m / SHIFTED_S)
+        jumping += int(np.abs(np.diff(track.lateral[near])).max() > JUMP_M)
         if before_s[0] <= -SEEN_BEFORE_S:
             onset = _onset(before_s, track.lateral[reach])
             lead_s = -onset if onset - before_s[0] >= LEVEL_S else -before_s[0]
             found.append((track.vehicle[row], lead_s, abs(speed)))
-    return np.array(found, LEADS), straight, shifted
+    return np.array(found, LEADS), straight, shifted, jumping
 
 
 def _onset(time_s: FloatArray, lateral: FloatArray) -> float:
@@ -335,7 +341,11 @@ def require_enough(total: Tally, where: str, mapping: Mapping) -> None:
         found = f"lanes that come back within a second {total.flickers:,} times, against {total.changes:,} lane changes"
         mend = "Smooth lanes, or take them from lateral positions."
         raise TrajectoryError(f"{where}, lane", found, "fewer", mend)
-    how = {"without lateral motion": total.straight, "more than 0.8 s from the lane's marking": total.shifted}
+    how = {
+        "without lateral motion": total.straight,
+        "more than 0.8 s from the lane's marking": total.shifted,
+        "in one jump of lateral_m, as of a lane's middle": total.jumping,
+    }
     odd = max(how, key=how.__getitem__)
     if how[odd] > 0.5 * total.changes:
         found = f"{how[odd]:,} of {total.changes:,} lane changes {odd}"

@@ -130,6 +130,7 @@ REFUSED = {
         changed(lateral_m=ROWS.groupby(["recording_id", "vehicle_id"]).lateral_m.transform("first")),
         "without lateral motion",
     ),
+    "lanes' middles": (changed(lateral_m=3.5 * ROWS.lane), "in one jump"),
     "late lanes": (late_lanes, r"more than 0\.8 s from the lane's marking"),
     "no length": (with_value(3, "length_m", 0.0), r"row 4 \(vehicle 0 of recording 0, t = 0\.3 s\): found no length"),
     "NaN": (with_value(9, "speed_mps", np.nan), "row 10, speed_mps: found no finite number"),
