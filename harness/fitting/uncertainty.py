@@ -51,8 +51,7 @@ def replicates(fit: Fit, n: int, seed: int, progress: Progress) -> dict[str, Flo
 def _draw(fit: Fit, n: int, random: np.random.Generator) -> dict[str, list[float]]:
     n_clusters = int(fit.traffic.cluster.max()) + 1
     times = random.multinomial(n_clusters, np.full(n_clusters, 1.0 / n_clusters), n) - 1.0
-    few = max(n_clusters - 1, 1)
-    times *= np.sqrt(n_clusters / few * few / random.chisquare(few, n))[:, None]
+    times *= np.sqrt(n_clusters / random.chisquare(max(n_clusters - 1, 1), n))[:, None]
     drawn: dict[str, list[float]] = {}
     for name, law in fit.laws.items():
         theta, noise = law.maximum.theta, law.maximum.noise

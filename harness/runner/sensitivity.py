@@ -117,18 +117,13 @@ def moves(name: str, parameters: EnvironmentParameters, ranges: Mapping[str, tup
 
 
 def _bar(move: Move, results: Sequence[Nearby | None]) -> Bar:
-    found = [each for each in results if each is not None and not each.refused]
+    nowhere = np.full((2, 2), np.nan)
+    ends = np.array([nowhere[0] if each is None or each.refused else (each.rate, each.ratio) for each in results])
     off = max((each.off for each in results if each is not None), default=np.nan)
     note = " and ".join(sorted({_WHY[each is None] for each in results if each is None or each.refused}))
     if move.values is None:
-        tail = (1.0 - CONFIDENCE) / 2.0
-        columns = np.array([(each.rate, each.ratio) for each in found]).T
-        known = len(found) >= (1.0 - tail) * len(results)
-        ends = np.quantile(columns, [tail, 1.0 - tail], axis=1) if known else np.full((2, 2), np.nan)
-    else:
-        ends = np.full((2, 2), np.nan)
-        for place, each in enumerate(results):
-            if each is not None and not each.refused:
-                ends[place] = each.rate, each.ratio
+        tail, known = (1.0 - CONFIDENCE) / 2.0, ends[~np.isnan(ends[:, 0])]
+        enough = len(known) >= (1.0 - tail) * len(results)
+        ends = np.quantile(known, [tail, 1.0 - tail], axis=0) if enough else nowhere
     (rate_low, ratio_low), (rate_high, ratio_high) = ends.tolist()
     return Bar(move.what, move.known, move.values, (rate_low, rate_high), (ratio_low, ratio_high), float(off), note)
