@@ -48,8 +48,8 @@ MOST_OFF = 0.05
 """How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
 LEAST_SHARE = 0.5
 """Of the cut-ins that crash, in the mean over a rate, from which on shares are taken to stay the same. Where cut-ins
-take time, rates of drivers with 0.58 or more came out wrong by at most 6 %, with 0.33 by 10 %, with 0.1 by 28 %, and of
-one with 0.02 by 71 % (`python -m benchmarks.other_traffic`)."""
+take time, rates of drivers with 0.58 or more came out wrong by at most 6 %, with 0.33 by 16 %, with 0.1 by 28 %,
+with 0.02 by more than a factor of 3 (`python -m benchmarks.other_traffic`)."""
 FAR_OFF = 0.5
 """The same in traffic close by, where each rate is taken to be as wrong as that [assumed]."""
 OPTION = "--environment"
