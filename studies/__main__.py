@@ -241,7 +241,7 @@ def trajectories(environment: str, file: Path, *, hours: float, seed: int, level
     """Simulate vehicles that drive and change lanes by the laws of ENVIRONMENT, a shipped name or a file of your own.
 
     Vehicles differ from each other, and positions and speeds are measured with errors that change slowly (0.1 m,
-    0.1 m/s). The table has the columns that `harness fit` reads, lateral_m where cut-ins take time. A level of 1,000
+    0.1 m/s). The table has the columns that `harness fit` reads, lateral_m where cut-ins take time. A level of 270
     makes lane changes of the shipped environments about as frequent as on motorways.
     """
     from harness.campaign.sections import EnvironmentSettings  # noqa: PLC0415 - keeps --help fast

@@ -48,7 +48,9 @@ def fit(
     environments that other trajectories of the same kind would have given: from these `harness estimate --environment`
     computes how uncertain the rate is.
     """
+    from harness.estimators.traffic import too_few  # noqa: PLC0415 - keeps --help fast
     from harness.fitting.files import fit_files  # noqa: PLC0415 - keeps --help fast
+    from harness.fitting.page import CONFIDENCE  # noqa: PLC0415 - keeps --help fast
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
     with shown_progress(quiet=quiet) as bar:
@@ -70,5 +72,6 @@ def fit(
         f"{steps.exposure[:-1].sum():.1f} expected if nobody minded it",
         *(f"kept as in {found.fit.base_name}: {what} ({why})" for what, why in found.fit.kept.items()),
         *([limited] if unseen else []),
+        *(f"! {words}" for words in too_few(replicates, CONFIDENCE)),
         *written,
     )

@@ -64,10 +64,11 @@ def estimate(
     Nothing is simulated in SUMO. Estimators that are asked for, and with -v all, are shown in a table; one that the
     records do not allow with the reason. The exit code is 2 if they allow none of those asked for.
 
-    With --environment the shells' probabilities in other traffic are found in the twin (25 s), and crash shares within
-    shells are taken to be the same there. Traffic in which they cannot be is refused. Replicates of fitted traffic take
-    a second each, once: the answer tells what they leave open, and with --write, in the run's own traffic, so do
-    estimates.json and the page. DIR may be that of a comparison, too.
+    With --environment the shells' probabilities in other traffic are found in the twin (half a minute), and crash
+    shares within shells are taken to be the same there. Traffic in which they cannot be is refused. Replicates of
+    fitted traffic take a second each, or minutes for 200; what they give is kept, for this run and for others with the
+    same shells. The answer tells what they leave open, and with --write, in the run's own traffic, so do estimates.json
+    and the page. DIR may be that of a comparison, too.
     """
     if environment is not None:
         if estimators:

@@ -28,6 +28,9 @@ ONE_LAW = 0.07
 """By how much a ratio of two vehicles may be wrong besides, as one law is fitted to drivers who differ [measured where
 they do in a simulation, and nearly alike vehicles came out 4 to 7 % off: `python -m studies roundtrip`]."""
 
+LEAST_REPLICATES = 100
+"""With fewer, quantiles far out in the tails change with their number [assumed]."""
+
 CLOSE = 0.1
 """Factors closer to 1 than so much on a logarithmic scale are told with three digits."""
 
@@ -110,6 +113,16 @@ def uncertain(
 
 def _log(value: float) -> float:
     return math.log(value) if 0.0 < value < math.inf else math.copysign(math.inf, value - 1.0)
+
+
+def too_few(n_replicates: int, confidence: float) -> tuple[str, ...]:
+    """A warning of limits from few replicates; nothing where there are enough."""
+    if n_replicates >= LEAST_REPLICATES:
+        return ()
+    least = math.ceil(2.0 / (1.0 - confidence) - 1e-9)
+    none = f" (a {share(confidence)} interval needs {least} at least)" if n_replicates < least else ""
+    limits = f"limits of what is not known of the traffic change with their number below {LEAST_REPLICATES}"
+    return (f"{n_replicates} replicates{none}: {limits}",)
 
 
 def rows(found: TrafficError) -> Iterator[Row]:

@@ -22,7 +22,7 @@ from harness.estimators.answer import estimate_blocks
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
 from harness.estimators.short_answer import CARRIES
-from harness.estimators.traffic import ONE_LAW, TrafficError, Unseen, rows, sentences, uncertain
+from harness.estimators.traffic import ONE_LAW, TrafficError, Unseen, rows, sentences, too_few, uncertain
 from harness.numbers import share
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.moved import FewPaths
@@ -263,9 +263,10 @@ def told_traffic(found: TrafficError, content: Mapping[str, Any]) -> dict[str, A
     place = 1 + max((i for i, row in enumerate(old) if row["key"] in ("verdict", "rate", "ratio")), default=-1)
     new = [asdict(row) for row in rows(found)]
     said = " ".join(sentences(found))
+    warnings = [*answer["warnings"], *too_few(found.n_replicates, found.confidence)]
     return {
         "traffic": finite_json(found),
-        "answer": {**answer, "rows": [*old[:place], *new, *old[place:]]},
+        "answer": {**answer, "rows": [*old[:place], *new, *old[place:]], "warnings": warnings},
         "scope": f"{said} {content['scope']}",
     }
 

@@ -15,7 +15,7 @@ import pytest
 from harness.cli import main
 from harness.errors import HarnessError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.traffic import ONE_LAW, uncertain
+from harness.estimators.traffic import ONE_LAW, too_few, uncertain
 from harness.pool import moved
 from harness.progress import Progress
 from harness.resolved import resolve
@@ -61,6 +61,8 @@ def test_the_rate_moves_with_the_share_that_does_not_look_and_the_ratio_does_not
     keys = [row["key"] for row in content["answer"]["rows"]]
     assert keys[keys.index("ratio") + 1 :][:2] == ["traffic", "traffic_ratio"]
     assert "5 replicates" in content["scope"]
+    (warning,) = [text for text in content["answer"]["warnings"] if "replicates" in text]
+    assert warning.startswith("5 replicates (a 90 % interval needs 20 at least): limits ")
 
 
 def test_of_a_vehicle_whose_shares_may_change_there_is_an_upper_limit_alone(stored_run, tmp_path, monkeypatch):
@@ -196,6 +198,13 @@ def test_replicates_that_are_none_are_refused(stored_run, tmp_path, columns, fou
         (tmp_path / "replicates.parquet").unlink()
     with pytest.raises(HarnessError, match=found):
         estimate_in_other_traffic(stored_run("shells-twin"), mine)
+
+
+@pytest.mark.parametrize(("n", "said"), [(19, "needs 20 at least"), (20, "20 replicates: "), (100, "")])
+def test_few_replicates_are_warned_of(n, said):
+    words = "".join(too_few(n, 0.9))
+    assert said in words
+    assert bool(words) == bool(said)
 
 
 def test_both_errors_add_as_squares_of_distances_on_a_logarithmic_scale():
