@@ -185,13 +185,14 @@ def _unseen(tested: StoredShells, there: Resolved, moved: Moved, progress: Progr
     return Unseen(steps.where(carried), min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
 
 
-def _as_if_unseen(row: Mapping[str, float], steps: AcceptanceSteps, unseen: Sequence[int]) -> dict[str, float]:
+def _as_if_unseen(row: Mapping[str, float], steps: AcceptanceSteps) -> dict[str, float]:
     """A replicate with what zero events leave open upwards, in place of the draw that is right in the mean.
 
-    Draws are of (½)-gamma quantiles over the exposure; the same quantile of 1-gamma is what no event at all refuses.
+    In all steps without events, whichever carry a vehicle's rate: so what is found serves every vehicle. Draws are of
+    (½)-gamma quantiles over the exposure; the same quantile of 1-gamma is what no event at all refuses.
     """
     moved = dict(row)
-    for step in unseen:
+    for step in steps.without_events:
         name, exposure = f"{_STEP}{step}", (steps.exposure or ())[step]
         below = float(gammainc(0.5, row[name] * exposure)) if name in row else ONE_SIDED
         moved[name] = min(float(gammaincinv(1.0, below)) / exposure, 1.0) if exposure > 0.0 else 1.0
@@ -208,7 +209,7 @@ def _answered(
         return None
     values = read_replicates(settings.parameters, parameters)
     if unseen is not None and parameters.acceptance_steps is not None:
-        values = [_as_if_unseen(row, parameters.acceptance_steps, unseen.steps) for row in values]
+        values = [_as_if_unseen(row, parameters.acceptance_steps) for row in values]
     environments = [each for row in values if (each := environment_with(there, parameters, row)) is not None]
     progress.stage("replicates of the traffic", len(sides) * len(environments))
     found = [list(nearby(tested, there, moved, environments, progress)) for tested in sides]
@@ -245,7 +246,7 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
         settings = [{NOT_LOOKING: end} for end in number.range]
     elif steps is not None and steps.exposure is not None and (empty := steps.without_events):
         of = {"where": steps.where(empty)}
-        settings = [{f"{_STEP}{step}": SMALLEST_SHARE for step in empty}, _as_if_unseen({}, steps, empty)]
+        settings = [{f"{_STEP}{step}": SMALLEST_SHARE for step in empty}, _as_if_unseen({}, steps)]
     else:
         return None
     ends = [environment_with(traffic, parameters, each) for each in settings]

@@ -19,7 +19,7 @@ from harness.estimators.traffic import ONE_LAW, too_few, uncertain
 from harness.pool import moved
 from harness.progress import Progress
 from harness.resolved import resolve
-from harness.runner import stored_shells
+from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
 from harness.runner.other_traffic import assumed, estimate_in_other_traffic
 from harness.runner.stored_shells import Moved, StoredShells, environment_with, nearby
@@ -136,7 +136,7 @@ def test_the_ratio_of_two_vehicles_hardly_moves(tmp_path, capsys):
     assert "--write does not go with" in capsys.readouterr().err
 
 
-def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run, tmp_path):
+def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run, tmp_path, monkeypatch):
     """Shares of the wishes that are much as those of the tests' traffic, none of them seen below 2 s."""
     ends, shares, n = (1, 2, 3, 5, 8), (0.01, 0.01, 0.01, 0.01, 0.02, 1.0), [0, 0, 2, 3, 9, 1000]
     listed = [", ".join(f"{{value: {each}, source: fitted}}" for each in of) for of in (ends, shares)]
@@ -157,6 +157,13 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
     assert row["value"].startswith("at most × ")
     assert row["remark"] == "none seen at TTC < 2 s"
     assert "since no lane change was seen at TTC < 2 s, where " in content["scope"]
+
+    # What was found serves vehicles, too, of whose rate other steps carry much.
+    with monkeypatch.context() as patch:
+        patch.setattr(moved.FewPaths, "_walk", None)
+        patch.setattr(other_traffic, "CARRIES", 0.5)
+        fewer = estimate_in_other_traffic(stored_run("shells-twin"), str(tmp_path / "mine.yaml"))["traffic"]["unseen"]
+    assert 0.5 < fewer["share"] < part
 
     # So does a run in that traffic, which asks no replicates: what is known comes first, the ratio.
     first, rate, *_ = content["answer"]["rows"]
