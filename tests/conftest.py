@@ -1,6 +1,6 @@
 """What all tests share: settings, kernels that are compiled once, and runs that are made once.
 
-Property tests neither hang on the clock nor on chance, nor leave a database behind. With ``HARNESS_TEST_SEED`` set,
+Property tests depend neither on the clock nor on chance, nor leave a database behind. With ``HARNESS_TEST_SEED`` set,
 Hypothesis looks elsewhere on every run, as the statistical tests do with that seed.
 """
 

@@ -131,7 +131,7 @@ def _ranges(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, 
 
 
 @click.command(
-    short_help="Say which numbers of the traffic an answer hangs on.",
+    short_help="Say which numbers of the traffic an answer depends on.",
     epilog=examples(
         "harness sensitivity runs/smoke", "harness sensitivity runs/smoke --range cut_in.ignore_share=0.001:0.08"
     ),

@@ -1,4 +1,4 @@
-"""What the answer of a stored run hangs on: by how much it moves where a number of its traffic is not known.
+"""What the answer of a stored run depends on: by how much it moves where a number of its traffic is not known.
 
 Fitted numbers move by their standard errors or, where the environment names replicates, in blocks, as those of a block
 were fitted together. Assumed numbers move over the range that is stated for them. Each move is answered by the run's

@@ -1,4 +1,4 @@
-"""The seed of statistical tests; set HARNESS_TEST_SEED to see that they do not hang on it."""
+"""The seed of statistical tests; set HARNESS_TEST_SEED to see that they do not depend on it."""
 
 import os
 

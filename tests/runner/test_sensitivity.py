@@ -1,4 +1,4 @@
-"""What an answer hangs on: a rate that is in proportion to one number, and hardly moves with others."""
+"""What an answer depends on: a rate that is in proportion to one number, and hardly moves with others."""
 
 from __future__ import annotations
 
