@@ -284,7 +284,7 @@ def damaged(path: Path, error: Exception, mend: str = MEND_SHARD) -> RunFolderEr
     """What to say of a Parquet file of a run that cannot be read."""
     missing = isinstance(error, FileNotFoundError)
     found = "no such file" if missing else f"a file that cannot be read ({str(error).splitlines()[0]})"
-    return RunFolderError(str(path), found, "a complete Parquet file of this run", mend)
+    return RunFolderError(str(path), found, "a complete Parquet file", mend)
 
 
 def no_episodes(folder: Path) -> RunFolderError:
