@@ -206,14 +206,18 @@ def _numbers_in(path: Path, names: Sequence[str], delimiter: str) -> Iterator[No
     except pa.ArrowInvalid as error:
         words = str(error)
         if value := re.search(r"column #(\d+): .*invalid value '(.*)'", words):
-            name, text = names[int(value[1])], value[2]
+            column, text = int(value[1]), value[2]
+            name = names[column]
             found, mend = f"'{text}'", "Correct it, or give another column in a mapping (--mapping FILE.yaml)."
             if re.fullmatch(r"[-+]?\d+[.,]\d+", text):
                 seen = "a decimal comma" if "," in text else "beside decimal commas"
                 found, mend = f"'{text}', {seen}", "Write all numbers with a decimal point."
             elif name.lower().startswith("lane"):
                 mend = "Lanes with names need a mapping that lists them from right to left (lanes: [R, L])."
-            raise TrajectoryError(f"{path}, column {name}", found, "a number", mend) from None
+            with path.open(encoding="utf-8", errors="replace") as lines:
+                cells = (line.rstrip().split(delimiter)[column : column + 1] for line in lines)
+                row = next((f", row {i}" for i, each in enumerate(cells, 1) if each == [text]), "")
+            raise TrajectoryError(f"{path}{row}, column {name}", found, "a number", mend) from None
         counts = re.search(r"Expected (\d+) columns, got (\d+)", words)
         if counts and delimiter == "," and int(counts[1]) < int(counts[2]):
             found, mend = (

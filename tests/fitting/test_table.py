@@ -167,13 +167,13 @@ FILES = {
     "ragged.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,0,5\n1,0.1,3\n", "cannot be read"),
     "words.csv": (
         b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,fast,0,5\n",
-        "column speed_mps: found 'fast'; expected a number",
+        "row 2, column speed_mps: found 'fast'; expected a number",
     ),
     "names.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,R,5\n", r"found 'R'.*lanes: \[R, L\]"),
     "comma.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,5,0,5\n", "a row of 7 .*decimal commas"),
     "both.csv": (
         b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n",
-        r"column s_m: found '996\.58', beside decimal commas.*with a decimal point",
+        r"row 2, column s_m: found '996\.58', beside decimal commas.*with a decimal point",
     ),
     "twice.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m,Lane\n1,0,0,30,0,5,1\n", "more than one column lane"),
     "cut.parquet": (b"PAR1 and no more", "cannot be read"),

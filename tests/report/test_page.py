@@ -73,10 +73,11 @@ def test_notes_say_what_is_stale(run_folder):
 def test_a_ratio_that_leads_says_of_what_it_is(reports, tmp_path):
     folder = shutil.copytree(reports["shells"], tmp_path / "run")
     answer = edit(folder / "estimates.json")["answer"]
-    row = {"key": "ratio", "what": "× competent driver", "value": "< 0.25 (crashes less)", "interval": "", "remark": ""}
+    row = {"key": "ratio", "what": "× competent driver", "value": "< 0.25 (crashes less)", "interval": "no crash seen"}
+    row["remark"] = ""
     edit(folder / "estimates.json", answer=answer | {"rows": [row, *answer["rows"]]})
     write_report(folder)
-    assert "Crash rate < 0.25 × competent driver (crashes less)" in Page(folder).words
+    assert "Crash rate < 0.25 × a competent driver's crashes less, no crash seen" in Page(folder).words
 
 
 def test_a_statement_that_a_vehicle_does_not_keep_to_is_said_so_and_sooner_that_it_is_refuted(runs):
