@@ -66,9 +66,9 @@ def estimate(
 
     With --environment the shells' probabilities in other traffic are found in the twin (half a minute), and crash
     shares within shells are taken to be the same there. Traffic in which they cannot be is refused. Replicates of
-    fitted traffic take a second each, or minutes for 200; what they give is kept, for this run and for others with the
-    same shells. The answer tells what they leave open, and with --write, in the run's own traffic, so do estimates.json
-    and the page. DIR may be that of a comparison, too.
+    fitted traffic take a second each, so minutes for 200. What they give is kept: asked again, this run is answered in
+    seconds, and so are most other vehicles tested in the same pool. The answer tells what they leave open, and with
+    --write, in the run's own traffic, so do estimates.json and the page. DIR may be that of a comparison, too.
     """
     if environment is not None:
         if estimators:

@@ -188,7 +188,7 @@ def _unseen(tested: StoredShells, there: Resolved, moved: Moved, progress: Progr
 def _as_if_unseen(row: Mapping[str, float], steps: AcceptanceSteps) -> dict[str, float]:
     """A replicate with what zero events leave open upwards, in place of the draw that is right in the mean.
 
-    In all steps without events, whichever carry a vehicle's rate: so what is found serves every vehicle. Draws are of
+    In all steps without events, whichever carry a vehicle's rate: so what is found serves others, too. Draws are of
     (½)-gamma quantiles over the exposure; the same quantile of 1-gamma is what no event at all refuses.
     """
     moved = dict(row)
