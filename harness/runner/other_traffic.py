@@ -22,8 +22,8 @@ from harness.estimators.answer import estimate_blocks
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
 from harness.estimators.short_answer import CARRIES
-from harness.estimators.traffic import ONE_LAW, TrafficError, Unseen, rows, sentences, too_few, uncertain
-from harness.numbers import share
+from harness.estimators.traffic import ONE_LAW, TrafficError, Unseen, is_open, rows, sentences, too_few, uncertain
+from harness.numbers import number, share
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.moved import FewPaths
 from harness.pool.shells import acceleration_limit
@@ -81,8 +81,11 @@ def estimate_in_other_traffic(
     told: dict[str, Any] = {key: tested.manifest[key] for key in keys if key in tested.manifest}
     told |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_per_test_m(there.environment)}
     blocks = map(moved.block, tested.blocks)
+    limited = load_parameters(there.campaign.environment).replicates is not None
     if not moved.is_same:
         told["assumed"] = assumed(there, tested.pool, tested.design, progress)
+    if limited and "where" in (told.get("assumed") or {}):
+        del told["assumed"]  # replicates say it better
     asked: list[EstimatorName] | None = None if moved.is_same else ["shells"]
     content = estimate_blocks(blocks, there.campaign, told, estimators=asked, confidence=confidence)
     answer, scope = content["answer"], content["scope"]
@@ -185,7 +188,7 @@ def _unseen(tested: StoredShells, there: Resolved, moved: Moved, progress: Progr
     return Unseen(steps.where(carried), min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
 
 
-def _as_if_unseen(row: Mapping[str, float], steps: AcceptanceSteps) -> dict[str, float]:
+def as_if_unseen(row: Mapping[str, float], steps: AcceptanceSteps) -> dict[str, float]:
     """A replicate with what zero events leave open upwards, in place of the draw that is right in the mean.
 
     In all steps without events, whichever carry a vehicle's rate: so what is found serves others, too. Draws are of
@@ -209,7 +212,7 @@ def _answered(
         return None
     values = read_replicates(settings.parameters, parameters)
     if unseen is not None and parameters.acceptance_steps is not None:
-        values = [_as_if_unseen(row, parameters.acceptance_steps) for row in values]
+        values = [as_if_unseen(row, parameters.acceptance_steps) for row in values]
     environments = [each for row in values if (each := environment_with(there, parameters, row)) is not None]
     progress.stage("replicates of the traffic", len(sides) * len(environments))
     found = [list(nearby(tested, there, moved, environments, progress)) for tested in sides]
@@ -246,7 +249,7 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
         settings = [{NOT_LOOKING: end} for end in number.range]
     elif steps is not None and steps.exposure is not None and (empty := steps.without_events):
         of = {"where": steps.where(empty)}
-        settings = [{f"{_STEP}{step}": SMALLEST_SHARE for step in empty}, _as_if_unseen({}, steps)]
+        settings = [{f"{_STEP}{step}": SMALLEST_SHARE for step in empty}, as_if_unseen({}, steps)]
     else:
         return None
     ends = [environment_with(traffic, parameters, each) for each in settings]
@@ -260,7 +263,7 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
 def told_traffic(found: TrafficError, content: Mapping[str, Any]) -> dict[str, Any]:
     """What of ``estimates.json`` tells of it: ``traffic`` itself, lines of the answer below rate and ratio, words."""
     answer = content["answer"]
-    old = answer["rows"]
+    old = _limited(answer["rows"], found)
     place = 1 + max((i for i, row in enumerate(old) if row["key"] in ("verdict", "rate", "ratio")), default=-1)
     new = [asdict(row) for row in rows(found)]
     said = " ".join(sentences(found))
@@ -270,6 +273,16 @@ def told_traffic(found: TrafficError, content: Mapping[str, Any]) -> dict[str, A
         "answer": {**answer, "rows": [*old[:place], *new, *old[place:]], "warnings": warnings},
         "scope": f"{said} {content['scope']}",
     }
+
+
+def _limited(told: Sequence[Mapping[str, Any]], found: TrafficError) -> list[Mapping[str, Any]]:
+    """Rows of an answer, whose rate has but an upper limit where no lane change was seen: behind the ratio."""
+    if found.unseen is None or is_open(found):
+        return list(told)
+    seen = {"interval": f"{number(found.rate.value)} as fitted"} if found.rate.value else {}
+    limit = {"value": f"< {number(found.rate.both[1])} per test", "remark": f"none seen at {found.unseen.where}"}
+    limited = [{**row, **limit, **seen} if row["key"] == "rate" else row for row in told]
+    return sorted(limited, key=lambda row: {"verdict": 0, "ratio": 1}.get(row["key"], 2))
 
 
 def read_replicates(name: str, parameters: EnvironmentParameters) -> list[dict[str, float]]:

@@ -22,7 +22,7 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
-from harness.runner.other_traffic import read_replicates
+from harness.runner.other_traffic import as_if_unseen, read_replicates
 from harness.runner.stored_shells import Moved, Nearby, StoredShells, environment_with, nearby, require_shares
 from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import EnvironmentParameters
@@ -75,7 +75,7 @@ def sensitivity(
     progress.stage("other traffic", len(environments))
     answered = nearby(tested, tested.here, Moved(tested.design, tested.design), environments, progress)
     results = iter([None if each is None else next(answered) for each in traffic])
-    bars = [_bar(move, [next(results) for _ in move.settings]) for move in asked]
+    bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
     drivers = [each.name for each in tested.design.references]
     content = finite_json(
         Sensitivity(
@@ -103,6 +103,8 @@ def moves(name: str, parameters: EnvironmentParameters, ranges: Mapping[str, tup
     blocks = {section: block for block, sections in BLOCKS.items() for section in sections}
     if parameters.replicates is not None:
         rows = read_replicates(name, parameters)[:N_REPLICATES]
+        if (steps := parameters.acceptance_steps) is not None and steps.exposure is not None:
+            rows = [as_if_unseen(row, steps) for row in rows]
         for block in BLOCKS:
             columns = [key for key in rows[0] if blocks.get(key.split("__")[0]) == block]
             if columns:
@@ -116,14 +118,15 @@ def moves(name: str, parameters: EnvironmentParameters, ranges: Mapping[str, tup
             yield Move(what, "fitted", ends, [{key: end} for end in ends])
 
 
-def _bar(move: Move, results: Sequence[Nearby | None]) -> Bar:
+def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:
+    """What traffic moved to some ``results`` says; a block's ends are those of what can be answered, half at least."""
     nowhere = np.full((2, 2), np.nan)
     ends = np.array([nowhere[0] if each is None or each.refused else (each.rate, each.ratio) for each in results])
     off = max((each.off for each in results if each is not None), default=np.nan)
     note = " and ".join(sorted({_WHY[each is None] for each in results if each is None or each.refused}))
     if move.values is None:
         tail, known = (1.0 - CONFIDENCE) / 2.0, ends[~np.isnan(ends[:, 0])]
-        enough = len(known) >= (1.0 - tail) * len(results)
-        ends = np.quantile(known, [tail, 1.0 - tail], axis=0) if enough else nowhere
+        ends = np.quantile(known, [tail, 1.0 - tail], axis=0) if 2 * len(known) >= len(results) else nowhere
+        note = note and f"{len(results) - len(known)} of {len(results)}: {note}"
     (rate_low, ratio_low), (rate_high, ratio_high) = ends.tolist()
     return Bar(move.what, move.known, move.values, (rate_low, rate_high), (ratio_low, ratio_high), float(off), note)

@@ -165,7 +165,14 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
         fewer = estimate_in_other_traffic(stored_run("shells-twin"), str(tmp_path / "mine.yaml"))["traffic"]["unseen"]
     assert 0.5 < fewer["share"] < part
 
-    # So does a run in that traffic, which asks no replicates: what is known comes first, the ratio.
+    # What is known comes first: the ratio.
+    first, rate, *_ = content["answer"]["rows"]
+    assert (first["key"], rate["value"]) == ("ratio", f"{row['interval']} per test")
+    assert "In the data" not in content["scope"]
+
+    # So it does where no replicates are asked, as in a run in that traffic.
+    (tmp_path / "mine.yaml").write_text(text)
+    content = estimate_in_other_traffic(stored_run("shells-twin"), str(tmp_path / "mine.yaml"))
     first, rate, *_ = content["answer"]["rows"]
     stored, none = content["estimates"]["shells"], -math.log(0.05) / 50.0
     high = stored["ci_high"] * (1.0 + part * (none / 0.01 - 1.0))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -11,7 +13,8 @@ import pytest
 from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.pool import moved
-from harness.runner.sensitivity import moves, sensitivity
+from harness.runner.sensitivity import Move, bar_of, moves, sensitivity
+from harness.runner.stored_shells import Nearby
 from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.stored_runs import copy_of, manifest
@@ -101,3 +104,13 @@ def test_what_is_not_said_to_be_uncertain_is_refused(folder, capsys, option, fou
     assert main(["sensitivity", str(folder), *(["--range", option] if option else [])]) == 2
     assert found in capsys.readouterr().err
     assert not (folder / "sensitivity.json").exists()
+
+
+@pytest.mark.parametrize(("n", "ends"), [(1, [0.55, 1.45]), (3, [None, None])])
+def test_a_block_shows_what_is_answered_and_how_much_is_not(n, ends):
+    """Of five replicates, n in which the reference driver comes out wrong by a factor of 3."""
+    near = [Nearby(np.ones(1), rate, np.ones(1), 0.0, 0.0) for rate in np.linspace(0.5, 1.5, 5 - n)]
+    wrong = [Nearby(np.ones(1), 9.0, np.ones(1), 2.0, 0.0)] * n
+    bar = bar_of(Move("cut-in", "fitted", None, []), [*near, *wrong])
+    assert [None if math.isnan(end) else pytest.approx(end) for end in bar.rate] == ends
+    assert bar.note == f"{n} of 5: unlike what was tested"
