@@ -41,7 +41,6 @@ SMOOTH = 1.0, 3.0
 """Prior standard deviations of the log-hazard's bends (change over a quarter of the range) and steps [assumed]."""
 Knots = tuple[FloatArray, FloatArray, FloatArray]
 HAZARD_OF = ("v_mps", "r1_m", "r1dot_mps")
-"""Smallest accepted share of lane changes (`harness.traffic.parameters.AcceptanceSteps`)."""
 _TINY = 1e-300
 
 

@@ -267,6 +267,7 @@ class HazardTable(Section):
 
 
 SMALLEST_SHARE = 1e-12
+"""Of lane changes that are accepted."""
 
 
 class AcceptanceSteps(Section):
