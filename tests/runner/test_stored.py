@@ -86,7 +86,7 @@ def test_the_weights_give_the_rate_of_every_method_as_docs_have_it(name, stored_
     assert (tests.weight * crash).mean() == pytest.approx(rate, rel=1e-9)
     plain = (np.exp(tests.log_weight) * crash).mean()
     assert (plain == pytest.approx(rate, rel=1e-9)) == (name != "shells-twin")
-    exec(LINES.replace("runs/hard-braking", str(folder)), {})
+    exec(LINES.replace("runs/late", str(folder)), {})
     assert float(capsys.readouterr().out.split()[-1]) == pytest.approx(rate, rel=1e-9)
 
 
