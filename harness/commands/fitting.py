@@ -62,8 +62,7 @@ def fit(
         print_json({"files": written, **found.facts})
         return
     tally, traffic, steps = found.tally, found.fit.traffic, found.fit.acceptance
-    counted = found.fit.environment.acceptance_steps
-    unseen = "" if counted is None else counted.where(counted.without_events)
+    unseen = found.fit.environment.unseen
     limited = f"! no lane change seen at {unseen}: rates of crashes that begin there have only an upper limit"
     say(
         f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h; "

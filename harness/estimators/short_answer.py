@@ -179,7 +179,8 @@ def assumed_times(best: Estimate, manifest: Mapping[str, Any]) -> tuple[float, f
 
     Without a crash it is the upper limit that moves, which lies in one stratum.
     """
-    if not (given := manifest.get("assumed")) or not (shells := best.details.get("shells")):
+    given = manifest.get("assumed") or {}
+    if "times" not in given or not (shells := best.details.get("shells")):
         return None
     p, n, share = np.array([(each["p"], max(each["n_episodes"], 1), each["crash_share"]) for each in shells]).T
     of_strata = [p, *(p * np.array(each) for each in given["times"])]
@@ -193,6 +194,11 @@ def no_lower_limit(best: Estimate, manifest: Mapping[str, Any]) -> tuple[str, fl
     if where is None or (times := assumed_times(best, manifest)) is None or times[1] - times[0] < CARRIES:
         return None
     return where, times[1]
+
+
+def unseen_words(where: str) -> str:
+    """The same where it is not known by what the rate may rise."""
+    return f"no lane change was seen at {where} in the data of this traffic: rates have only an upper limit"
 
 
 def _whence(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | None) -> Iterator[Row]:
@@ -266,6 +272,9 @@ def _warnings(
         yield f"{count(n)} of {count(best.n_episodes)} tests FAILED; had they all crashed, the rate would be {had}"
     if severity is not None and severity.share_below_1_mps > 0.5:
         yield f"{share(severity.share_below_1_mps)} of this rate are touches below {plain(TOUCH_MPS)} m/s"
+    given = manifest.get("assumed") or {}
+    if "where" in given and "times" not in given:
+        yield unseen_words(given["where"])
     decision = manifest.get("decision")
     if decision is not None and decision["contradicted"]:
         yield f"the vehicle does not do what statement {decision['statement']} assumes: ask without it"

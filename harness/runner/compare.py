@@ -21,6 +21,7 @@ from harness.campaign.drivers import BuiltInParameters
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
 from harness.estimators.answer import conditional_paired_statement, paired_statement
 from harness.estimators.pairs import MarginVerdict, PairedEstimate, PairedShells, paired_estimate
+from harness.estimators.short_answer import unseen_words
 from harness.estimators.stopping import PairRule
 from harness.numbers import leaves
 from harness.pool.shells import Draw, acceleration_limit
@@ -33,6 +34,7 @@ from harness.runner.run import Run
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import PairRounds, Shells, round_requests
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
+from harness.traffic.loading import load_parameters
 from harness.vocabulary import COMPARISON
 
 SIDES = ("a", "b")
@@ -115,6 +117,8 @@ def compare_campaigns(
     code = (EXIT_BUDGET_SPENT if missed else EXIT_DONE) if rule.margin is None else EXIT_OF[rule.margin.verdict]
     if code == EXIT_BUDGET_SPENT:
         content["ended"] = "episodes" if rule.margin is None else "open"
+    if where := load_parameters(a.environment).unseen:
+        content["warnings"].append(unseen_words(where))
     write_json(out / COMPARISON, content)
     from harness.report.compare_page import write_comparison  # noqa: PLC0415
 

@@ -81,11 +81,11 @@ def estimate_in_other_traffic(
     told: dict[str, Any] = {key: tested.manifest[key] for key in keys if key in tested.manifest}
     told |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_per_test_m(there.environment)}
     blocks = map(moved.block, tested.blocks)
-    limited = load_parameters(there.campaign.environment).replicates is not None
-    if not moved.is_same:
+    parameters = load_parameters(there.campaign.environment)
+    if parameters.replicates is not None and parameters.unseen:
+        told.pop("assumed", None)  # replicates say it better
+    elif not moved.is_same:
         told["assumed"] = assumed(there, tested.pool, tested.design, progress)
-    if limited and "where" in (told.get("assumed") or {}):
-        del told["assumed"]  # replicates say it better
     asked: list[EstimatorName] | None = None if moved.is_same else ["shells"]
     content = estimate_blocks(blocks, there.campaign, told, estimators=asked, confidence=confidence)
     answer, scope = content["answer"], content["scope"]
@@ -247,9 +247,9 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
     if number is not None and number.range is not None:
         of: dict[str, Any] = {"name": NOT_LOOKING.replace("__", "."), "value": number.value, "ends": list(number.range)}
         settings = [{NOT_LOOKING: end} for end in number.range]
-    elif steps is not None and steps.exposure is not None and (empty := steps.without_events):
-        of = {"where": steps.where(empty)}
-        settings = [{f"{_STEP}{step}": SMALLEST_SHARE for step in empty}, as_if_unseen({}, steps)]
+    elif steps is not None and parameters.unseen:
+        of = {"where": parameters.unseen}
+        settings = [{f"{_STEP}{step}": SMALLEST_SHARE for step in steps.without_events}, as_if_unseen({}, steps)]
     else:
         return None
     ends = [environment_with(traffic, parameters, each) for each in settings]

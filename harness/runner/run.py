@@ -53,6 +53,7 @@ from harness.sampling import distance_per_test_m, prepare
 from harness.sampling.baseline import IN_MANIFEST, baseline_file, begin, stored_baseline
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
+from harness.traffic.loading import load_parameters
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
 ESTIMATES = "estimates.json"
@@ -238,6 +239,8 @@ class Run:
         if (design := self.source.design) is not None and not self.campaign.has_baseline_runs:
             pool = campaign_pool(self.resolved, self._progress)
             self.manifest.note(assumed=assumed(self.resolved, pool, design, self._progress))
+        elif where := load_parameters(self.campaign.environment).unseen:
+            self.manifest.note(assumed={"where": where})
 
     def finish(self, rule: Rule) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no shard beyond the stop is left."""

@@ -377,6 +377,12 @@ class EnvironmentParameters(Section):
             raise broken_rule("initial_state", found, f"speeds from 0 to {MAX_CONFIGURED_SPEED_MPS:g} m/s", mend)
         return self
 
+    @property
+    def unseen(self) -> str:
+        """Times to collision at which the data that it was fitted to have no lane change; empty without such."""
+        steps = self.acceptance_steps
+        return "" if steps is None or steps.exposure is None else steps.where(steps.without_events)
+
     def _entries(self, section: str) -> list[tuple[str, Any]]:
         of = getattr(self, section)
         return list(of) if isinstance(of, Section) else []

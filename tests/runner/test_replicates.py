@@ -22,6 +22,7 @@ from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
 from harness.runner.other_traffic import assumed, estimate_in_other_traffic
+from harness.runner.run import run_campaign
 from harness.runner.stored_shells import Moved, StoredShells, environment_with, nearby
 from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER
@@ -136,13 +137,18 @@ def test_the_ratio_of_two_vehicles_hardly_moves(tmp_path, capsys):
     assert "--write does not go with" in capsys.readouterr().err
 
 
-def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run, tmp_path, monkeypatch):
-    """Shares of the wishes that are much as those of the tests' traffic, none of them seen below 2 s."""
+def without_changes() -> str:
+    """The shipped environment with steps of acceptance much as there, in which below 2 s nothing was seen."""
     ends, shares, n = (1, 2, 3, 5, 8), (0.01, 0.01, 0.01, 0.01, 0.02, 1.0), [0, 0, 2, 3, 9, 1000]
     listed = [", ".join(f"{{value: {each}, source: fitted}}" for each in of) for of in (ends, shares)]
     steps = "acceptance_steps: {{ttc_s: [{}], share: [{}], events: {}, exposure: {}}}".format(*listed, n, [50.0] * 6)
     replaced = re.compile(r"  (ignore_share|accept_ttc_s|accept_scale_s):")
-    text = "\n".join([*(line for line in SHIPPED.splitlines() if not replaced.match(line)), steps])
+    return "\n".join([*(line for line in SHIPPED.splitlines() if not replaced.match(line)), steps])
+
+
+def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run, tmp_path, monkeypatch):
+    """Shares of the wishes that are much as those of the tests' traffic, none of them seen below 2 s."""
+    text = without_changes()
     a, names = 0.02, [f"acceptance_steps__share__{step}" for step in (0, 1)]
     pq.write_table(pa.table({name: [a] for name in names}), tmp_path / "rows.parquet")
     (tmp_path / "mine.yaml").write_text(text.replace("version: 1", "version: 1\nreplicates: rows.parquet", 1))
@@ -179,6 +185,19 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
     assert (first["key"], rate["value"][:2], rate["remark"]) == ("ratio", "< ", "none seen at TTC < 2 s")
     assert float(rate["value"].split()[1]) == pytest.approx(high * 10 ** -math.floor(math.log10(high)), rel=0.03)
     assert "In the data of this traffic no lane change was seen at TTC < 2 s: the rate may be " in content["scope"]
+
+
+def test_runs_that_cannot_tell_by_how_much_and_comparisons_warn(tmp_path):
+    """Without shells of the traffic, and of two vehicles, there is a warning."""
+    (tmp_path / "mine.yaml").write_text(without_changes())
+    shared, other = COMPARED
+    mine, seen = f"environment.parameters={tmp_path / 'mine.yaml'}", "no lane change was seen at TTC < 2 s"
+    pair = golden("shells-twin", *shared, mine), golden("shells-twin", *shared, mine, other)
+    with one_process(), without_page():
+        run_campaign(golden("forced-twin", mine), tmp_path / "forced")
+        compared = compare_campaigns(*pair, tmp_path / "pair", workers=1)
+    for warnings in (estimates(tmp_path / "forced")["answer"]["warnings"], compared.content["warnings"]):
+        assert [text[: len(seen)] for text in warnings if "lane change" in text and "level" not in text] == [seen]
 
 
 def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
