@@ -47,7 +47,7 @@ LATERAL_WINDOW_S = 0.5
 """Half of the time over which a slope gives the lateral speed at a crossing."""
 STRAIGHT_MPS = 0.1
 JUMP_M = 1.5
-"""Between two frames nobody drives so far across."""
+"""Between two frames nobody drives so far across [assumed]."""
 SHIFTED_S = 0.8
 OVERLAP_M = -0.5
 """Gaps below are more than measurement error."""

@@ -61,7 +61,7 @@ SLIPS = {
 }
 """Cause of a ratio of speeds to the change of positions."""
 MOST_APART = {"time_s": 1e7, "s_m": 1e5, "lane": 1e3}
-"""Values further from the median are wrong."""
+"""Values further from the median are wrong [assumed]."""
 LEAST_LAG_S = 0.3
 ANOTHER_VEHICLE_S = 60.0
 """An identifier that reappears after so long is another vehicle's (as in NGSIM)."""
