@@ -40,7 +40,8 @@ def fmu_form(folder: Path) -> tuple[str, float]:
     from pythonfmu.builder import FmuBuilder  # noqa: PLC0415 - of the test extra
 
     file = FmuBuilder.build_FMU(ROOT / "examples/idm_fmu.py", dest=folder, project_files=[ROOT / "examples/idm.py"])
-    return f"{{fmu: {{file: '{file}', inputs: {{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap}}, output: a}}}}", 6.0
+    inputs = "{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap, set_speed_mps: v_set}"
+    return f"{{fmu: {{file: '{file}', inputs: {inputs}, output: a}}}}", 6.0
 
 
 def external_process(n_episodes: int) -> float:

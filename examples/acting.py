@@ -38,22 +38,14 @@ class DrivesFreely(Holds):
 
 
 class Speeds(Holds):
-    """Drives freely to so many times its first speed."""
+    """Drives freely to so many times its set speed."""
 
     def __init__(self, times: float = 1.2, acceleration_mps2: float = 0.8) -> None:
         self._times, self._acceleration = times, acceleration_mps2
-        self._wanted = np.zeros(0)
-
-    def start_batch(self, cells: Any, episodes: Any, random: Any) -> None:
-        """Nobody knows yet how fast each begins."""
-        self._wanted = _with_room(self._wanted, cells)
-        self._wanted[cells] = np.nan
 
     def before(self, seen: Any) -> Any:
         """What it does until the cut-in (m/s²)."""
-        wanted = self._wanted[seen.cell]
-        self._wanted[seen.cell] = wanted = np.where(np.isnan(wanted), self._times * seen.speed_mps, wanted)
-        return np.where(seen.speed_mps < wanted, self._acceleration, 0.0)
+        return np.where(seen.speed_mps < self._times * seen.set_speed_mps, self._acceleration, 0.0)
 
 
 class Beside(Holds):

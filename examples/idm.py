@@ -13,6 +13,11 @@ def idm_acceleration(speed: float, lead_speed: float, gap: float, min_accelerati
     return min(max(2.0 * (1.0 - squared * squared - close * close), min_acceleration_mps2), 2.0)
 
 
+def cruise(speed: float, set_speed: float) -> float:
+    """Acceleration (m/s²) towards the set speed, where nobody is ahead."""
+    return min(max(0.5 * (set_speed - speed), -2.0), 2.0)
+
+
 class IDM:
     """One AV."""
 
@@ -23,7 +28,9 @@ class IDM:
         """Nothing to forget."""
 
     def step(self, seen: Observation) -> float:
-        """Acceleration (m/s²) behind the vehicle ahead."""
+        """Acceleration (m/s²) behind the vehicle ahead; without one it keeps its set speed."""
+        if math.isinf(seen.gap_m):
+            return cruise(seen.speed_mps, seen.set_speed_mps)
         return idm_acceleration(seen.speed_mps, seen.lead_speed_mps, seen.gap_m, self.min_acceleration_mps2)
 
     def close(self) -> None:

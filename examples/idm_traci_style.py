@@ -16,6 +16,8 @@ class IDM(TraciStyleController):
             name, gap = leader
             acceleration = idm_acceleration(traci.vehicle.getSpeed(veh_id), traci.vehicle.getSpeed(name), gap)
             traci.vehicle.setAcceleration(veh_id, acceleration, traci.simulation.getDeltaT())
+        else:
+            traci.vehicle.setSpeed(veh_id, traci.vehicle.getAllowedSpeed(veh_id))
 
 
 class Listener:

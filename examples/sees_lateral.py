@@ -6,7 +6,7 @@ then. Both drive alike once BV is on their lane.
 
 from __future__ import annotations
 
-from examples.idm import idm_acceleration
+from examples.idm import cruise, idm_acceleration
 from harness.controllers import EpisodeStart, Observation
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M
 
@@ -25,7 +25,7 @@ class Yields:
         """Follow BV from where it is seen to come over."""
         comes = seen.bv_lateral_speed_mps > 0.0 and seen.bv_lateral_m >= self._perceives_m - 1e-9
         if not (comes or seen.bv_overlaps):
-            return 0.0
+            return cruise(seen.speed_mps, seen.set_speed_mps)
         gap_m = seen.bv.position_m - VEHICLE_LENGTH_M - seen.position_m
         return idm_acceleration(seen.speed_mps, seen.bv.speed_mps, gap_m, self._min)
 

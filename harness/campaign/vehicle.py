@@ -43,6 +43,7 @@ def with_another_driver(data: dict[str, Any], source: str, value: Any) -> dict[s
     av = {key: each for key, each in av.items() if key == source or key not in AV_SOURCES}
     if source != last:
         lost = {"parameters", "reaction"} | ({"before_cut_in"} if source == "model" else set())
+        lost |= {"takes_over"} if source in ("sumo", "traci") else set()
         av = {key: each for key, each in av.items() if key not in lost}
     elif source == "model" and isinstance(parameters := av.get("parameters"), dict) and value in PARAMETERS:
         before, after = (set(PARAMETERS.get(name, BaseModel).model_fields) for name in (av.get("model", "idm"), value))
@@ -151,6 +152,10 @@ class AutomatedVehicle(Section):
         "hold_speed",
         description="hold_speed until the cut-in [itsc], or controller: it acts from the start",
     )
+    takes_over: Literal["first_braking", "onset"] = Field(
+        "first_braking",
+        description="it keeps its speed until it first asks to brake, or BV is on its lane; or until the onset alone",
+    )
     warm_up_s: StepTime = Field(
         2.0,
         ge=0.0,
@@ -188,6 +193,8 @@ class AutomatedVehicle(Section):
             if content[section].get(key) == usual:
                 del content[section][key]
         del content["limits"]["construction_time_s"]  # changes no test
+        if self.acts_before_cut_in:
+            del content["takes_over"]
         if not self.warm_up_steps:  # as before there was one
             del content["warm_up_s"]
         if self.controller is not None:  # as a module that is found from where it lies
@@ -222,6 +229,10 @@ class AutomatedVehicle(Section):
         if self.source in READS_NO_PARAMETERS and self.parameters:
             found = f"{listed(dict(self.parameters))}, which nothing reads"
             raise broken_rule("parameters", found, f"no parameters {beside}", READS_NO_PARAMETERS[self.source])
+        if self.takes_over == "onset" and (self.source in ("sumo", "traci") or self.acts_before_cut_in):
+            beside = f"beside before_cut_in: {self.before_cut_in}" if self.acts_before_cut_in else beside
+            mend = "Leave it out. SUMO hands over at the overlap; who acts before the cut-in drives from the start."
+            raise broken_rule("takes_over", f"onset {beside}", "a vehicle that is asked from the onset on", mend)
         if self.model is None and self.reaction != Reaction():
             mend = "Your own driver has its own delays: leave av.reaction out."
             raise broken_rule("reaction", f"a reaction {beside}", "a reaction only of a built-in model", mend)

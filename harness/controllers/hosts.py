@@ -228,6 +228,7 @@ class _Host:
 
     def __init__(self, av: AutomatedVehicle, seed: int, guard: Guard) -> None:
         self.acts_before_cut_in, self.warm_up_steps = av.acts_before_cut_in, av.warm_up_steps
+        self.cruises = av.takes_over == "first_braking"
         self._seed, self._guard = seed, guard
 
 
@@ -252,18 +253,19 @@ class VehicleHost(_Host):
         self._episodes = [-1] * n_cells
         self._fatal_episodes = {} if fatal_episodes is None else fatal_episodes
 
-    def start(self, cells: IntArray, episodes: IntArray, announced: IntArray) -> Failures:
+    def start(self, cells: IntArray, episodes: IntArray, announced: IntArray, set_speed_mps: FloatArray) -> Failures:
         """Begin episodes, ``announced`` to their controllers under these indices; returns those that failed at once."""
         failures = {}
         with self._guard:
-            for k, episode, index in np.stack((cells, episodes, announced), axis=1).tolist():
+            begun = cells.tolist(), episodes.tolist(), announced.tolist(), set_speed_mps.tolist()
+            for k, episode, index, set_speed in zip(*begun, strict=True):
                 self._episodes[k] = episode
                 wrong = self._known_death(episode, START)
                 if wrong is None and self._controllers[k] is None:
                     made = OF_EPISODE, self._make
                     self._controllers[k], wrong = self._guard.call(*made, episode=episode, step=MAKING, makes=True)
                 if wrong is None:
-                    start = EpisodeStart(index, STEP_S, controller_random(self._seed, index))
+                    start = EpisodeStart(index, STEP_S, controller_random(self._seed, index), set_speed)
                     begin = OF_EPISODE, optional("start", start), self._controllers[k]
                     _, wrong = self._guard.call(*begin, episode=episode)
                 if wrong is not None:
@@ -313,9 +315,10 @@ class VehicleHost(_Host):
 
 def _step(controller: VehicleController, seen: list[Any]) -> Any:
     """Answer to a row of a `BatchObservation`, without cell and episode."""
-    *row, bv_position_m, bv_speed_mps, bv_lane, lv_position_m, lv_speed_mps, lateral_m, lateral_mps, overlaps = seen
+    *row, bv_position_m, bv_speed_mps, bv_lane, lv_position_m, lv_speed_mps = seen[:-4]
+    lateral_m, lateral_mps, overlaps, set_speed_mps = seen[-4:]
     row += [Neighbour(bv_position_m, bv_speed_mps, bv_lane), Neighbour(lv_position_m, lv_speed_mps, 1)]
-    row += [lateral_m, lateral_mps, bool(overlaps)]
+    row += [lateral_m, lateral_mps, bool(overlaps), set_speed_mps]
     return controller.step(Observation(*row))
 
 
@@ -326,7 +329,7 @@ class BatchHost(_Host):
         super().__init__(av, seed, guard)
         self._controller = controller
 
-    def start(self, cells: IntArray, _episodes: IntArray, announced: IntArray) -> Failures:
+    def start(self, cells: IntArray, _episodes: IntArray, announced: IntArray, _set_speed_mps: FloatArray) -> Failures:
         """As `VehicleHost.start`."""
         random = [controller_random(self._seed, index) for index in announced.tolist()]
         handed = read_only(cells.copy()), read_only(announced.copy())

@@ -6,6 +6,7 @@ anything but the AV: the motion of LV and BV is what the likelihood ratios are a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -26,13 +27,14 @@ class Neighbour(NamedTuple):
 class EpisodeStart:
     """What a per-vehicle controller is told when an episode begins: its index, and the time (s) between two steps.
 
-    ``random`` is the only randomness that a controller may use: seeded by campaign and episode, so that a replay sees
-    the same.
+    ``set_speed_mps`` is the speed at which its vehicle cruises. ``random`` is the only randomness that a controller may
+    use: seeded by campaign and episode, so that a replay sees the same.
     """
 
     episode: int
     step_s: float
     random: np.random.Generator
+    set_speed_mps: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,8 @@ class Observation:
         How fast it comes over; 0 before the onset, and from the overlap on.
     bv_overlaps : bool
         Whether it is on the AV's lane. Until then the gap is infinite: one that sees only its own lane sees nobody.
+    set_speed_mps : float
+        The speed at which the AV cruises where nobody is ahead: that at which the episode began.
     """
 
     time_s: float
@@ -69,6 +73,7 @@ class Observation:
     bv_lateral_m: float = 0.0
     bv_lateral_speed_mps: float = 0.0
     bv_overlaps: bool = False
+    set_speed_mps: float = math.nan
 
 
 class BatchObservation(NamedTuple):
@@ -94,6 +99,7 @@ class BatchObservation(NamedTuple):
     bv_lateral_m: FloatArray
     bv_lateral_speed_mps: FloatArray
     bv_overlaps: IntArray
+    set_speed_mps: FloatArray
 
 
 class VehicleController(Protocol):

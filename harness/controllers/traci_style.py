@@ -81,8 +81,9 @@ class VehicleDomain(Domain):
 
     _path = "traci.vehicle"
 
-    def __init__(self) -> None:
+    def __init__(self, set_speed_mps: float = math.nan) -> None:
         self.legacy_leader = True
+        self._set_speed = {"LV": MAX_SPEED_MPS, "BV": MAX_SPEED_MPS, VEH_ID: set_speed_mps}
         self._plan: Iterator[float] = iter(())
         """Accelerations (m/s²) of the coming steps; empty without a command."""
         self._accel = self._decel = math.inf
@@ -142,7 +143,9 @@ class VehicleDomain(Domain):
     getAngle = _question("Heading (degrees, 90 is along x).", lambda _: HEADING_DEGREES)
     getLength = _question("Length (m).", lambda _: VEHICLE_LENGTH_M)
     getMinGap = _question("MinGap (m): zero, so that gaps are bumper to bumper.", lambda _: 0.0)
-    getMaxSpeed = _question("Speed (m/s) that the vehicle type allows.", lambda _: MAX_SPEED_MPS)
+    getMaxSpeed = _question("Speed (m/s) that the vehicle allows; of the AV that at which it cruises.",
+                            lambda self: self._set_speed)  # fmt: skip
+    getAllowedSpeed = getMaxSpeed
     getTypeID = _question("Vehicle type.", lambda _: "exact")
 
     def getPosition(self, vehID: str) -> tuple[float, float]:
@@ -270,8 +273,8 @@ class Traci(Domain):
     TraCIException = TraCIException
     _path = "traci"
 
-    def __init__(self) -> None:
-        self.vehicle, self.simulation = VehicleDomain(), SimulationDomain()
+    def __init__(self, set_speed_mps: float = math.nan) -> None:
+        self.vehicle, self.simulation = VehicleDomain(set_speed_mps), SimulationDomain()
         self.exceptions = self  # so that ``traci.exceptions.TraCIException`` is found
 
     def see(self, now: Observation) -> None:
@@ -313,7 +316,7 @@ class TraciStyleController:
 
     def start(self, episode: EpisodeStart) -> None:
         """See `harness.controllers.VehicleController`."""
-        self._traci = Traci()
+        self._traci = Traci(episode.set_speed_mps)
         self.on_start(episode.random)
 
     def step(self, observation: Observation) -> float:

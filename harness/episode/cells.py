@@ -53,6 +53,10 @@ CELL_DTYPE = np.dtype(
         ("log_sampled", _f8),  # log q_sampled/p so far, of all but the episode mixture: see likelihood_ratio
         ("min_ttc", _f8),
         *((name, _f8) for name in ("cut_r2", "cut_r2dot", "onset_r2", "onset_r2dot", "av_start")),
+        ("cruises", _i8),  # whether the AV still keeps its speed, whatever it asks for but to brake
+        ("set_speed", _f8),  # at which the AV cruises
+        ("took_over_step", _i8),  # first step in which it did what it asked for; -1: none yet
+        ("asked_to_speed_up", _i8),  # whether it asked for that while it was held
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration
         ("boundary_x", _f8),  # of the boundary beside the AV: position, speed, and what it remembers
         ("boundary_v", _f8),
@@ -62,11 +66,14 @@ CELL_DTYPE = np.dtype(
     ]
 )
 
-_STEPS = ("n_steps", "cut_in_step", "lead_steps", "onset_step", "n_control_steps", "n_lv", "n_bv", "ahead_step")
+_STEPS = (
+    *("n_steps", "cut_in_step", "lead_steps", "onset_step", "took_over_step", "n_control_steps"),
+    *("n_lv", "n_bv", "ahead_step"),
+)
 _AT_CUT_IN = ("cut_in_r2_m", "cut_in_r2dot_mps", "onset_r2_m", "onset_r2dot_mps")
 _AT_END = ("crash_time_s", "impact_speed_mps", "min_ttc_s", "av_distance_m", "log_weight", "log_p_cut_in")
 EPISODE_DTYPE = np.dtype(
-    [(name, np.int8) for name in ("outcome", "component")]
+    [(name, np.int8) for name in ("outcome", "component", "asked_to_speed_up")]
     + [(name, np.int16) for name in _STEPS]
     + [(name, _f8) for name in (*_AT_CUT_IN, *_AT_END)]
 )
@@ -234,7 +241,8 @@ class KernelState(NamedTuple):
     world's positions (m) and speeds (m/s) of LV, BV, AV. ``driver`` is (1,) for a built-in AV, else (0,). ``passed_m``
     is the R2 at which the AV has passed. ``asks_controller`` says whether one outside of the kernels decides for the
     AV: ``observation`` is what it sees, ``acts_before_cut_in`` whether from the start; else from the step after the
-    onset. ``boundary`` is (1,) where the AV is compared with a driver beside it, else (0,). What may be so or not is 0
+    onset. ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or BV is on its lane.
+    ``boundary`` is (1,) where the AV is compared with a driver beside it, else (0,). What may be so or not is 0
     or 1.
     """
 
@@ -255,4 +263,5 @@ class KernelState(NamedTuple):
     asks_controller: int
     observation: BatchObservation
     acts_before_cut_in: int
+    av_cruises: int
     boundary: RecordArray

@@ -174,6 +174,8 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     cell = cells.cell[k]
     cell.row, cell.episode, cell.step, cell.cut_step, cell.component = row, episode, 0, -1, -1
     cell.planned, cell.lead, cell.onset_step = -1, 0, -1
+    cell.cruises, cell.took_over_step, cell.asked_to_speed_up = kernel.av_cruises, -1, 0
+    cell.set_speed = kernel.v[k, AV]
     cell.announced_index = kernel.traffic.announced_index[row] if kernel.traffic.announced_index.size > 0 else episode
     cell.motion_hash = 0
     cell.lv_maneuver = cell.bv_maneuver = cell.n_lv = cell.n_bv = cell.n_bv_free = cell.n_path = cell.n_control = 0

@@ -18,7 +18,7 @@ from harness.controllers.protocol import BatchObservation
 from harness.episode.cells import KernelState
 from harness.traffic.lateral import lateral_position, perceived_in
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, next_position, next_speed
-from harness.vehicles.references import Memory, react, reaction_steps
+from harness.vehicles.references import Memory, react, reaction_steps, still_cruises
 from harness.vocabulary import AV, BV, LV, FloatArray, IntArray, read_only
 
 
@@ -36,7 +36,27 @@ def drive_av(kernel: KernelState) -> None:
         if step >= 0:
             memory = Memory(cells.acceleration[k, AV], cell.danger, driver[0].used_up_steps + earlier)
             memory = react(driver[0], memory, step, v[k, AV], v[k, BV], gap(x[k, BV], x[k, AV]))
-            cells.acceleration[k, AV], cell.danger = memory.acceleration, memory.danger
+            cells.acceleration[k, AV], cell.danger = held_if_cruising(k, memory.acceleration, kernel), memory.danger
+
+
+@compiled_inline
+def held_if_cruising(k: int, asked: float, kernel: KernelState) -> float:
+    """Acceleration (m/s²) of an AV that asks for one: none while it cruises."""
+    cell = kernel.cells.cell[k]
+    if still_cruises(cell.cruises, 0 <= cell.cut_step < cell.step, asked):
+        cell.asked_to_speed_up |= asked > 0.0
+        return 0.0
+    if cell.took_over_step < 0:
+        cell.cruises, cell.took_over_step = 0, cell.step
+    return asked
+
+
+@compiled
+def hold_cruising(kernel: KernelState, n: int) -> None:
+    """The first ``n`` AVs that were asked do what they ask for, unless they are still to keep their speed."""
+    for i in range(n):
+        k = kernel.observation.cell[i]
+        kernel.cells.acceleration[k, AV] = held_if_cruising(k, kernel.cells.acceleration[k, AV], kernel)
 
 
 @compiled
@@ -60,14 +80,14 @@ def observe(kernel: KernelState) -> int:
         out.lv_position_m[n], out.lv_speed_mps[n] = x[k, LV], v[k, LV]
         out.bv_lateral_m[n] = lateral_position(cell.step, cell.planned, cell.lead, distance_m) if comes else 0.0
         out.bv_lateral_speed_mps[n] = distance_m / (cell.lead * STEP_S) if comes and not followed else 0.0
-        out.bv_overlaps[n] = 1 if followed else 0
+        out.bv_overlaps[n], out.set_speed_mps[n] = 1 if followed else 0, cell.set_speed
         n += 1
     return n
 
 
 def empty_observation(n_cells: int) -> BatchObservation:
     """Room for the observations of K cells: rows of one array of whole numbers and of one of floats."""
-    return _rows(np.zeros((4, n_cells), np.int64), np.zeros((12, n_cells)))
+    return _rows(np.zeros((4, n_cells), np.int64), np.zeros((13, n_cells)))
 
 
 def first(observation: BatchObservation, n: int) -> BatchObservation:
@@ -102,14 +122,15 @@ class Past:
         x = x - v * ((ago - known) * STEP_S)
         nobody = np.full(known.shape, math.inf), np.full(known.shape, math.nan)
         zero = np.zeros(known.shape)
-        real = (step - ago) * STEP_S, x[AV], v[AV], zero, *nobody, x[BV], v[BV], x[LV], v[LV], zero, zero
+        set_speed = np.broadcast_to(seen.set_speed_mps, known.shape)
+        real = (step - ago) * STEP_S, x[AV], v[AV], zero, *nobody, x[BV], v[BV], x[LV], v[LV], zero, zero, set_speed
         whole = read_only(np.stack((seen.cell, seen.episode, np.ones_like(seen.cell), np.zeros_like(seen.cell))))
         return [_rows(whole, rows) for rows in read_only(np.stack(real, axis=1))]
 
 
 def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
     cell, episode, bv_lane, bv_overlaps = whole
-    return BatchObservation._make([cell, episode, *real[:8], bv_lane, *real[8:], bv_overlaps])
+    return BatchObservation._make([cell, episode, *real[:8], bv_lane, *real[8:12], bv_overlaps, real[12]])
 
 
 @compiled

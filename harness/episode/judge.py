@@ -118,6 +118,7 @@ def end_episode(k: int, outcome: int, n: int, kernel: KernelState) -> None:
     row.log_p_cut_in = cell.log_p_cut_in
     row.n_lv, row.n_bv = cell.n_lv, cell.n_path
     row.ahead_step = cell.ahead_step
+    row.took_over_step, row.asked_to_speed_up = cell.took_over_step, cell.asked_to_speed_up
     copy_row(cells.log_ratio[k], results.log_q[cell.row])
     copy_row(cells.martingale[k], results.martingale[cell.row])
     copy_row(cells.lv_path[k], results.lv_path[cell.row])

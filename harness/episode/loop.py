@@ -23,7 +23,7 @@ from harness.episode.cells import (
     with_more_room,
 )
 from harness.episode.decide import decide
-from harness.episode.drive import Past, command, empty_observation, first, observe
+from harness.episode.drive import Past, command, empty_observation, first, hold_cruising, observe
 from harness.episode.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
 from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
@@ -169,6 +169,7 @@ class EpisodeLoop:
     def _kernel_state(self, shard: Shard) -> KernelState:
         """All that kernels need for a shard, in the form that they need it in."""
         policy, early = self._policy, (self._av or self._world).acts_before_cut_in
+        cruises = policy.driver["cruises"].all() if self._av is None else self._av.cruises
         return unboxed(
             KernelState(
                 seed=policy.seed,
@@ -188,6 +189,7 @@ class EpisodeLoop:
                 asks_controller=int(self._av is not None),
                 observation=self._observation,
                 acts_before_cut_in=int(early),
+                av_cruises=int(cruises and not early),
                 boundary=policy.boundary,
             )
         )
@@ -198,12 +200,13 @@ class EpisodeLoop:
         if placed:
             refilled = cells.placed[:placed]
             begun = cells.cell[refilled]
-            failures.update(av.start(refilled, begun["episode"], begun["announced_index"]))
+            failures.update(av.start(refilled, begun["episode"], begun["announced_index"], begun["set_speed"]))
         if n := observe(kernel):
             seen = first(self._observation, n)
             if av.warm_up_steps:
                 failures = {**self._warm_up(av, seen), **failures}
             cells.acceleration[seen.cell, AV], failed = av.act(seen)
+            hold_cruising(kernel, n)
             failures = {**failed, **failures}
         self._past.note(self._world.x, self._world.v)
         return self._fail(failures, kernel, shard)

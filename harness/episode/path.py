@@ -19,7 +19,7 @@ from harness.traffic.lateral import onset_of, perceived_in
 from harness.traffic.laws import Environment, acceleration
 from harness.vehicles.drivers import MOST_FOLLOWERS, NEED_BASED_KIND, Followers
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
-from harness.vehicles.references import Memory, react
+from harness.vehicles.references import Memory, react, still_cruises
 from harness.vocabulary import (
     AV,
     BV,
@@ -39,7 +39,7 @@ NO_CRASH, WAS_AHEAD, FOLLOWS = -1, -2, -3
 SAFE_M = 0.01
 """A gap that no rounding of positions makes a contact."""
 FOLLOWER_DTYPE = np.dtype(
-    [(name, np.int64) for name in ("driver", "encloses", "first", "end")]
+    [(name, np.int64) for name in ("driver", "encloses", "first", "end", "cruises")]
     + [(name, np.float64) for name in ("x", "v", "acceleration", "danger", "used_up")]
 )
 
@@ -218,6 +218,7 @@ def take_over(
     one.driver, one.encloses, one.first, one.end = d, encloses, perceived + late, FOLLOWS
     one.x, one.v = path.x[onset + 1, AV], path.v[onset + 1, AV]
     one.acceleration, one.danger, one.used_up = 0.0, math.inf, driver.used_up_steps + earlier
+    one.cruises = driver.cruises and not encloses
     if onset == cut and gap(path.x_after[cut + 1], one.x) < CONTACT_M:
         one.end = cut + 1
 
@@ -251,7 +252,8 @@ def follow(n: int, drivers: RecordArray, cut: int, lead: int, until: int, path: 
             if step >= one.first:
                 memory = Memory(one.acceleration, one.danger, one.used_up)
                 memory = react(driver, memory, step - one.first, one.v, v_bv, ahead)
-                one.acceleration, one.danger = memory.acceleration, memory.danger
+                one.cruises = still_cruises(one.cruises, step > cut, memory.acceleration)
+                one.acceleration, one.danger = 0.0 if one.cruises else memory.acceleration, memory.danger
             v_after = next_speed(one.v, one.acceleration)
             one.x, one.v = next_position(one.x, one.v, v_after), v_after
             if step >= cut and gap(x_next, one.x) < CONTACT_M:

@@ -112,7 +112,7 @@ def estimate_blocks(
             reference_statements=tuple(reference_statements(best)),
             boundary_statements=boundary_statements(best),
             scope=" ".join([*_assumed(best, manifest), SCOPE]),
-            answer=short_answer(campaign, best, done.severity, manifest, distance_km),
+            answer=short_answer(campaign, best, done.severity, manifest, distance_km, done.diagnostics.counts),
             severity=done.severity,
             ending=manifest.get("ending"),
             decision=manifest.get("decision"),

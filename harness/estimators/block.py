@@ -38,7 +38,7 @@ MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
 EPISODE_COLUMNS = (
     "episode", "outcome", "cut_in_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_cut_in", "log_q",
-    "n_steps", "min_ttc_s",
+    "n_steps", "min_ttc_s", "took_over_step", "asked_to_speed_up",
 )  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step")
 BASELINE_COLUMNS = ("shadow", "cut_in_mass")
@@ -99,9 +99,10 @@ class Block:
     ``outcome`` (n,) are places in `OUTCOMES`: a failed episode is a row like any other and never a crash.
     ``log_weight`` (n,) is log p(x_c) - log q_sampled(x_c), exactly 0 without control. ``columns`` are what else the
     method records, a row for each episode, also as attributes; those that it does not record are left out. ``cut_in``
-    (n,) bool. ``impact_mps`` (n,): closing speed at contact, NaN without a crash. ``cut_off`` (n,) bool: see
-    `CUT_OFF_STEPS`. ``log_q`` (n, M): per importance function, the sum over control steps of log(q_j/p), -inf where q_j
-    cannot draw the episode. ``n_control_steps`` (n,): stratum l of each episode. ``first_ratios`` (n, 9, J):
+    (n,) bool. ``took_over_early`` (n,) bool: the AV did something before BV was on its lane, ``asked_to_speed_up``
+    (n,) bool: or asked for that in vain. ``impact_mps`` (n,): closing speed at contact, NaN without a crash.
+    ``cut_off`` (n,) bool: see `CUT_OFF_STEPS`. ``log_q`` (n, M): per importance function, the sum over control steps
+    of log(q_j/p), -inf where q_j cannot draw the episode. ``n_control_steps`` (n,): stratum l of each episode. ``first_ratios`` (n, 9, J):
     q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one. ``log_p_cut_in`` (n,): log
     P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode alone. Of shells ``stratum``
     and ``cell`` (n,), ``cell_mass`` (n, C): its path's probability of a cut-in of each cell; ``ahead`` (n,) bool:
@@ -238,6 +239,10 @@ def block_from_tables(
         left = pc.subtract(episodes.column("n_steps"), episodes.column("cut_in_step"))
         close = pc.and_(pc.less(left, CUT_OFF_STEPS), pc.less(episodes.column("min_ttc_s"), DANGER_TTC_S))
         columns["cut_off"] = (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy()
+    if "took_over_step" in episodes.column_names:
+        early = pc.less_equal(episodes.column("took_over_step"), episodes.column("cut_in_step"))
+        columns["took_over_early"] = pc.fill_null(early, fill_value=False).to_numpy()
+        columns["asked_to_speed_up"] = episodes.column("asked_to_speed_up").to_numpy()
     if moments is not None and SAMPLING[method].mixes_steps:
         columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     if np.all(_known(episodes, "log_p_cut_in") | failed):

@@ -36,6 +36,8 @@ NOTE = (
 )
 NOTE_SHELLS = "Every test within a shell stands for the same probability: there are no weights to be diagnosed."
 LOW_MEAN_WEIGHT = 0.5
+BEFORE_OVERLAP = ("took_over_early", "asked_to_speed_up")
+"""What AVs do, or ask for in vain, while BV comes over; columns of blocks."""
 
 
 class Diagnostics:
@@ -44,7 +46,7 @@ class Diagnostics:
     _sampling: Sampling  # of the first block
 
     def __init__(self) -> None:
-        self.n, self._counts = 0, Counter[str]()
+        self.n, self.counts = 0, Counter[str]()
         self._weight, self._cut_in, self._contact = Moments(), Moments(), Moments()
         self._ratios: list[Moments] = []
 
@@ -54,7 +56,8 @@ class Diagnostics:
         self._sampling = block.drawn.sampling
         self.n += len(block)
         counted = {"n_cut_ins": block.cut_in, "n_bv_lv_contacts": contact, "n_failed": block.failed}
-        self._counts.update({name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
+        counted |= {f"n_{name}": block.columns[name] for name in BEFORE_OVERLAP if name in block.columns}
+        self.counts.update({name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
         self._weight += Moments.of(weights)
         self._cut_in += Moments.of(weights[block.cut_in])
         self._contact += Moments.of(weights[contact])
@@ -72,7 +75,7 @@ class Diagnostics:
             "mean_weight_cut_in": self._mean(self._cut_in),
             "mean_ratio": {name: self._mean(sums) for name, sums in zip(names, self._ratios, strict=False)},
             "bv_lv_contact_share": self._mean(self._contact),
-            **self._counts,
+            **self.counts,
             "note": NOTE_SHELLS if self._sampling.strata else NOTE,
         }
         if not self._sampling.bounded and (mean := self._weight.mean(self.n)) < LOW_MEAN_WEIGHT:

@@ -83,8 +83,12 @@ def short_answer(
     severity: Severity | None,
     manifest: Mapping[str, Any],
     distance_km: float | None,
+    counts: Mapping[str, int],
 ) -> ShortAnswer:
-    """The answer by a campaign's own estimate ``best``; ``distance_km`` is the mean of a test, if it is known."""
+    """The answer by a campaign's own estimate ``best``; ``distance_km`` is the mean of a test, if it is known.
+
+    ``counts`` says in how many tests the vehicle did something before BV was on its lane, or asked for it in vain.
+    """
     vehicle, parameters = vehicle_words(campaign.av)
     engine = "SUMO" if campaign.world.engine == "sumo" else "SUMO’s twin"
     return ShortAnswer(
@@ -92,7 +96,7 @@ def short_answer(
         parameters=tuple(parameters),
         tests=f"{count(best.n_episodes)} tests in {engine}",
         rows=tuple(_rows(campaign, best, severity, manifest, distance_km)),
-        warnings=tuple(_warnings(campaign, best, severity, manifest)),
+        warnings=(*_warnings(campaign, best, severity, manifest), *_before_overlap(campaign, manifest, counts)),
         scope=_scope(campaign, best, manifest.get("stopped_by")),
     )
 
@@ -285,10 +289,20 @@ def _warnings(
     worst = best.crash_rate + (0.0 if severity is None else severity.cut_off)
     if worst > max((1.0 + CUT_OFF_SHARE) * best.crash_rate, best.ci_high):
         yield f"time was up while it closed in: had all these tests crashed, {number(worst)} per test"
-    if manifest.get("cut_ins_take_time") and campaign.av.source in ("sumo", "traci"):
-        yield "SUMO switches lanes in one step: this vehicle cannot see BV come over, as other drivers do"
     if (level := campaign.environment.lane_change_level) != 1.0:
         yield f"lane-change level {plain(level)}: never compare with rates of other levels"
+
+
+def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> Iterator[str]:
+    """What the vehicle did while BV came over, a line each."""
+    if not manifest.get("cut_ins_take_time") or campaign.av.acts_before_cut_in:
+        return
+    if campaign.av.source in ("sumo", "traci"):
+        yield "SUMO switches lanes in one step: this vehicle cannot see BV come over, as other drivers do"
+    elif counts.get("n_cut_ins") and not counts.get("n_took_over_early"):
+        yield "it did nothing until BV was on its lane, though it can see it come over some 2 s before: bv_lateral_m"
+    if n := counts.get("n_asked_to_speed_up"):
+        yield f"in {count(n)} tests it asked to speed up before BV was on its lane, and was held (av.takes_over)"
 
 
 def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None) -> str:

@@ -50,7 +50,7 @@ def driver_dtype() -> np.dtype[np.void]:
     """All parameters of all models, and how a driver lags behind; 0 where one has no such."""
     derived = "reaction_steps", "used_up_steps", "max_jerk_mps3", "inattention_probability", "perceives_lateral_m"
     numbers = dict.fromkeys(chain(*(model.model_fields for model in get_args(BuiltInParameters)), derived))
-    whole = "kind", "delay_steps", "inattention_steps"
+    whole = "kind", "delay_steps", "inattention_steps", "cruises"
     return np.dtype([(name, np.int64) for name in whole] + [(name, np.float64) for name in numbers])
 
 
@@ -66,7 +66,7 @@ def driver_records(
     kinds = dict(zip(get_args(BuiltInParameters), (IDM_KIND, FVDM_KIND, CONSTANT_KIND, *remembering), strict=True))
     records: RecordArray = np.zeros(len(drivers), driver_dtype())
     for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
-        record["kind"] = kinds[type(driver)]
+        record["kind"], record["cruises"] = kinds[type(driver)], 1
         for name in records.dtype.names or ():
             record[name] = getattr(driver, name, record[name])
         record["reaction_steps"] = 10.0 * record["reaction_time_s"]
@@ -85,7 +85,9 @@ def driver_records(
 def av_records(av: AutomatedVehicle, *, see_onset: bool = False) -> RecordArray:
     """Parameters of a built-in AV, shape (1,); of an AV that something else drives, shape (0,)."""
     if isinstance(av.parameters, BuiltInParameters):
-        return driver_records([av.parameters], [av.reaction], see_onset=see_onset)
+        records = driver_records([av.parameters], [av.reaction], see_onset=see_onset)
+        records["cruises"] = av.takes_over == "first_braking"
+        return records
     return driver_records([])
 
 

@@ -246,7 +246,7 @@ def test_controllers_do_not_share_the_lists_among_their_parameters():
     av = forced(f"av={_of('ChangesItsParameters', braking=[1.0])}").av
     hosts = [build_host(av, n_cells=3, seed=1) for _ in range(2)]
     for host in hosts:
-        assert host.start(*3 * (np.arange(3),)) == {}
+        assert host.start(*3 * (np.arange(3),), np.zeros(3)) == {}
         host.close()
     assert ChangesItsParameters.made[-6:] == [[1.0, 0.01]] * 6
     assert av.parameters == {"braking": [1.0]}

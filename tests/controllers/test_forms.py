@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from examples.idm import IDM
+from examples import idm_batch
+from examples.idm import IDM, idm_acceleration
 from harness.controllers.hosts import BatchHost, Guard
+from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
-from harness.vocabulary import PASSED
+from harness.vocabulary import CRASH, PASSED
 from tests.worlds.running import LATERAL, drive, fmu_av, forced, motion
 
 FORMS = {
@@ -49,6 +53,63 @@ def test_one_that_sees_bv_come_over_is_the_built_in_model_and_one_that_waits_for
     assert built_in == sees
     assert built_in != waits
     assert waits == blind
+
+
+class ACC(IDM):
+    """As everybody writes it: without a leader it makes for a speed of its own."""
+
+    def step(self, seen):
+        return 2.0 if math.isinf(seen.gap_m) else super().step(seen)
+
+
+class ACCBatch(idm_batch.IDM):
+    def step_batch(self, seen):
+        return super().step_batch(seen._replace(set_speed_mps=np.full(seen.cell.size, 60.0)))
+
+
+class ACCScript(TraciStyleController):
+    def on_step(self, traci, veh_id, time):
+        speed, leader = traci.vehicle.getSpeed(veh_id), traci.vehicle.getLeader(veh_id)
+        ahead = 2.0 if leader is None else idm_acceleration(speed, traci.vehicle.getSpeed(leader[0]), leader[1])
+        traci.vehicle.setAcceleration(veh_id, ahead, 0.1)
+
+
+@pytest.mark.parametrize("form", ["ACC", "ACCBatch", "ACCScript"])
+def test_one_that_sees_nobody_keeps_its_speed_until_bv_is_on_its_lane_however_it_is_written(form):
+    """It crashed three times as often as one that waits: it had sped up for 2 s. With ``onset`` it still does."""
+    av = f"controller: 'tests.controllers.test_forms:{form}'"
+    held, waits = (drive(LATERAL, f"av={{{one}}}", n=400) for one in (av, "reaction: {perceives_lateral_m: 2.0}"))
+    assert [held.traces[row].tobytes() for row in range(400)] == [waits.traces[row].tobytes() for row in range(400)]
+    episode, early = held.results.episode, waits.results.episode["asked_to_speed_up"]
+    assert episode["asked_to_speed_up"].mean() > 0.9
+    assert not early.any()
+    assert np.all(episode["took_over_step"] == episode["cut_in_step"] + 1)
+    at_once = drive(LATERAL, f"av={{{av}, takes_over: onset}}", n=400).results.episode
+    assert (at_once["outcome"] == CRASH).sum() > 1.2 * (episode["outcome"] == CRASH).sum()
+
+
+EAGER = "parameters: {desired_speed_mps: 60.0, time_headway_s: 0.2}"
+
+
+class Eager(IDM):
+    """Sees BV from the onset on, and follows it with little headway."""
+
+    def step(self, seen):
+        gap, v, v_lead = seen.bv.position_m - 5.0 - seen.position_m, seen.speed_mps, seen.bv.speed_mps
+        desired = 2.0 + max(0.0, v * 0.2 + (v * (v - v_lead)) / (2.0 * math.sqrt(2.0 * 3.0)))
+        ratio, close = v / 60.0, desired / max(gap, 0.1)
+        return min(max(2.0 * (1.0 - (ratio * ratio) * (ratio * ratio) - close * close), -4.0), 2.0)
+
+
+@pytest.mark.parametrize("takes_over", ["first_braking", "onset"])
+def test_a_built_in_model_is_held_by_the_same_rule(takes_over):
+    own = f"controller: 'tests.controllers.test_forms:Eager', takes_over: {takes_over}"
+    built_in = f"reaction: {{perceives_lateral_m: 0.0}}, {EAGER}, takes_over: {takes_over}"
+    ours, theirs = (drive(LATERAL, f"av={{{av}}}", n=400) for av in (own, built_in))
+    assert ours.results.episode.tobytes() == theirs.results.episode.tobytes()
+    asked = ours.results.episode["asked_to_speed_up"]
+    assert (asked.sum() > 20) == (takes_over == "first_braking")
+    assert any((ours.traces[row][:-1, 2, 2] > 0.0).any() for row in range(400))
 
 
 # -- one that acts from the start meets the methods that do not need to know the AV's speed --
@@ -106,7 +167,7 @@ def test_tests_of_one_baseline_run_that_begin_together_have_streams_of_their_own
 
     av = forced(EARLY).av
     host = BatchHost(Draws(), av, 7, Guard(av.limits, None))
-    assert host.start(np.arange(3), np.arange(3), np.array([3, 5, 3])) == {}
+    assert host.start(np.arange(3), np.arange(3), np.array([3, 5, 3]), np.zeros(3)) == {}
     host.close()
     np.testing.assert_array_equal(seen[0], seen[2])
     assert not np.any(seen[0] == seen[1])

@@ -119,6 +119,7 @@ def test_what_is_shown_is_what_was_and_before_the_test_nobody_changed_speed(epis
     assert shard.failures == {}
     onset = int(shard.results.episode["onset_step"][0])
     assert [round(10.0 * each.time_s) for each in seen[:SHOWN]] == list(range(onset - SHOWN + 1, onset + 1))
+    assert {each.set_speed_mps for each in seen} == {trace[0, 2, 1]}
     for each in seen[: SHOWN + 2]:
         step = round(10.0 * each.time_s)
         there, ago_s = trace[max(step, 0)], max(-step, 0) * 0.1

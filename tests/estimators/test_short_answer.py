@@ -163,12 +163,12 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
     folder = stored_run("shells-acting-twin")
     best = read_run_folder(folder).headline
     best = replace(best, n_crashes=0, rhw=math.inf, cautions=(), details={**best.details, "references": []})
-    answer = short_answer(golden("shells-acting-twin", "stop.rhw=0.3"), best, None, {"stopped_by": "pool"}, None)
+    answer = short_answer(golden("shells-acting-twin", "stop.rhw=0.3"), best, None, {"stopped_by": "pool"}, None, {})
     [row] = [row for row in answer.rows if row.key == "ratio"]
     assert (row.value, row.remark) == ("no ratio", "such drivers never crash here")
     assert answer.scope.endswith("was tested, no crash seen, asked: ± 30 %; raise pool.cut_ins_per_shell")
     forced = replace(read_run_folder(stored_run("forced-acting-twin")).headline, cautions=())  # asks no other driver
-    answer = short_answer(golden("forced-acting-twin"), forced, None, {}, None)
+    answer = short_answer(golden("forced-acting-twin"), forced, None, {}, None, {})
     assert "ratio" not in {row.key for row in answer.rows}
 
 
@@ -177,7 +177,7 @@ def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time
     for name, takes_time, warned in (
         ("forced-krauss", True, True), ("forced-krauss", False, False), ("forced-twin", True, False)
     ):  # fmt: skip
-        answer = short_answer(golden(name), best, None, {"cut_ins_take_time": takes_time}, None)
+        answer = short_answer(golden(name), best, None, {"cut_ins_take_time": takes_time}, None, {})
         assert any("cannot see BV come over" in each for each in answer.warnings) == warned
 
 
@@ -198,7 +198,7 @@ def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, va
     beside = {**beside, "reference": "r157-cc", "crash_rate": 3e-8, "ratio": seen, "ratio_low": low, "ratio_high": high}
     rate = {"crash_rate": 1e-9 * (seen > 0.0), "ci_low": 5e-10 * (seen > 0.0), "ci_high": 3e-8, "rhw": 15.0}
     best = replace(best, **rate, n_crashes=2 * (seen > 0.0), details={**best.details, "references": [beside]})
-    rows = short_answer(golden("shells-lateral-twin", "stop.rhw=0.3"), best, None, {}, None).rows
+    rows = short_answer(golden("shells-lateral-twin", "stop.rhw=0.3"), best, None, {}, None, {}).rows
     assert (rows[0].key, rows[0].value, rows[0].interval) == (first, value, ends)
     [told, *_] = reference_statements(best)
     assert ("this vehicle crashes less than 0.20 times as often as" in told) == (high < 1.0)
@@ -211,7 +211,7 @@ def severe(stored_run, cut_off=0.0, **of_rate):
     rate = run.headline.crash_rate
     best = replace(run.headline, **{name: times * rate for name, times in of_rate.items()})
     severity = replace(run.estimates.severity, cut_off=cut_off * rate)
-    return lambda **other: short_answer(golden("shells-twin"), best, replace(severity, **other), {}, None)
+    return lambda **other: short_answer(golden("shells-twin"), best, replace(severity, **other), {}, None, {})
 
 
 @pytest.mark.parametrize(("cut_off", "high", "warned"), [(0.19, 1.1, False), (0.3, 1.2, True), (0.3, 1.4, False)])

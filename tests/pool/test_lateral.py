@@ -68,7 +68,7 @@ def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name)
         LIBRARY.followers(environment.lateral.present).drivers[[*NAMES, *LIBRARY.references].index(name)][None].copy()
     )
     if name == LIBRARY.envelope:  # it acts from the onset
-        driver["perceives_lateral_m"] = 0.0
+        driver["perceives_lateral_m"] = driver["cruises"] = 0
     policy = Drawing(1, environment, build_importance(lateral, None), driver)
     episode = EpisodeLoop(TwinWorld(16), policy, RecordPolicy(0, "none", 0.0)).run(0, states, traffic).results.episode
     reached = episode["outcome"] == CRASH

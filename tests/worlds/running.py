@@ -90,5 +90,5 @@ def motion(*overrides: str, **options) -> tuple[bytes, list[bytes]]:
 
 def fmu_av(file: str | Path, more: str = "") -> str:
     """YAML of the FMU of the examples, with further keys."""
-    inputs = "{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap}"
+    inputs = "{speed_mps: v, lead_speed_mps: v_lead, gap_m: gap, set_speed_mps: v_set}"
     return f"{{fmu: {{file: '{file}', inputs: {inputs}, output: a}}{more}}}"
