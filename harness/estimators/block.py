@@ -101,13 +101,13 @@ class Block:
     method records, a row for each episode, also as attributes; those that it does not record are left out. ``cut_in``
     (n,) bool. ``took_over_early`` (n,) bool: the AV did something before BV was on its lane, ``asked_to_speed_up``
     (n,) bool: or asked for that in vain. ``impact_mps`` (n,): closing speed at contact, NaN without a crash.
-    ``cut_off`` (n,) bool: see `CUT_OFF_STEPS`. ``log_q`` (n, M): per importance function, the sum over control steps
-    of log(q_j/p), -inf where q_j cannot draw the episode. ``n_control_steps`` (n,): stratum l of each episode. ``first_ratios`` (n, 9, J):
-    q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one. ``log_p_cut_in`` (n,): log
-    P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode alone. Of shells ``stratum``
-    and ``cell`` (n,), ``cell_mass`` (n, C): its path's probability of a cut-in of each cell; ``ahead`` (n,) bool:
-    whether the vehicle was ever ahead of the boundary that a statement checks; and `BASELINE_COLUMNS`, with ``step``
-    (n,) of the cut-in, below 0 where a failed test has come to none.
+    ``cut_off`` (n,) bool: see `CUT_OFF_STEPS`. ``log_q`` (n, M): per importance function, the sum over control steps of
+    log(q_j/p), -inf where q_j cannot draw the episode. ``n_control_steps`` (n,): stratum l of each episode.
+    ``first_ratios`` (n, 9, J): q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one.
+    ``log_p_cut_in`` (n,): log P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode
+    alone. Of shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C): its path's probability of a cut-in of each
+    cell; ``ahead`` (n,) bool: whether the vehicle was ever ahead of the boundary that a statement checks; and
+    `BASELINE_COLUMNS`, with ``step`` (n,) of the cut-in, below 0 where a failed test has come to none.
     """
 
     first_episode: int
