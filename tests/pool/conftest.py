@@ -37,6 +37,9 @@ def enumerated(library, environment: Environment, n: int, *, enclosed=True, stri
     """Probability of each cut-in of n paths, and who crashes on it; with or without an envelope that is asked first."""
     states, offsets = InitialStates(environment.numbers).draw(SEED, 0, n), np.full(n, offset)
     followers = library.followers(environment.lateral.present)
-    asked = environment, followers if enclosed else Followers(followers.drivers)
-    found = enumerate_cut_ins(SEED, np.arange(n), states, *asked, stride=stride, offset=offsets)
+    if not enclosed:  # the envelope is one among many then, which takes over at the onset as before
+        followers.drivers["cruises"][followers.envelope] = 0
+        followers = Followers(followers.drivers)
+    paths = SEED, np.arange(n), states
+    found = enumerate_cut_ins(*paths, environment, followers, stride=stride, offset=offsets)
     return found.probability, found.crashes
