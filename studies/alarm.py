@@ -27,15 +27,15 @@ import pyarrow as pa
 from scipy.special import logsumexp
 
 from harness.campaign.files import load_campaign
-from harness.compiled import compiled_threads, unboxed
-from harness.episode.path import Trajectory, empty_trajectory, who_crashes
+from harness.compiled import compiled_inline, compiled_threads, unboxed
+from harness.episode.path import Trajectory, empty_trajectory, end_in, walk, who_crashes
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, Drawn, block_from_tables
 from harness.estimators.estimate import finite_json
 from harness.importance.functions import mixture_weights
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
-from harness.pool.replay import LEAD, PATH_COLUMNS, StoredPaths, approach_cut_in, leave_stored, stored_paths
+from harness.pool.replay import LEAD, PATH_COLUMNS, StoredPaths, leave_stored, recall, stored_paths
 from harness.processes import made_ahead
 from harness.progress import Progress
 from harness.records.folder import MEND_SHARD, read_manifest
@@ -43,7 +43,30 @@ from harness.records.reader import read_shard
 from harness.resolved import Resolved, resolve
 from harness.traffic.laws import Environment
 from harness.vehicles.drivers import Followers
-from harness.vocabulary import BV_LV_CONTACT, RUNNING, BoolArray, FloatArray, IntArray
+from harness.vocabulary import BV_LV_CONTACT, FAILED, PASSED, RUNNING, BoolArray, FloatArray, IntArray
+
+
+@compiled_inline
+def approach(i: int, until: int, stored: StoredPaths, environment: Environment, path: Trajectory) -> tuple[int, int]:
+    """LV's and BV's stored motion to a step or a decision without cut-in; how it is decided, and the step.
+
+    `FAILED` where fewer maneuvers are stored than that takes.
+    """
+    known = recall(i, stored, path)
+    reach = min(until, known * environment.numbers.hold_steps, environment.numbers.max_steps)
+    step = walk(stored.state[i], stored.seed, stored.episode[i], known, reach, True, environment, path)
+    decided = end_in(step, path)
+    return FAILED if decided == RUNNING and step < until else decided, step
+
+
+@compiled_inline
+def approach_cut_in(i: int, stored: StoredPaths, environment: Environment, path: Trajectory) -> tuple[int, int]:
+    """`approach` through the step of the stored cut-in: BV may touch LV before it has left the lane."""
+    cut = stored.cut_step[i]
+    decided, step = approach(i, cut + 1, stored, environment, path)
+    if decided == PASSED and step == cut + 1:  # beside the AV on its own lane: that is for the AV to answer
+        return RUNNING, step
+    return decided, step
 
 
 @compiled_threads
@@ -206,7 +229,7 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
     if (shells := campaign.testing.method == "shells") or campaign.av.acts_before_cut_in:
         found = "tests drawn from shells" if shells else "an AV that acted before the cut-in"
         expected = "weighted tests of an AV that keeps its speed until the cut-in: pools know rates of surrogates then"
-        mend = "Choose another run; that SUMO and the twin agree is checked in each by retracing."
+        mend = "Choose another run; SUMO's positions are held against the twin's in each step."
         raise HarnessError(str(folder), found, expected, mend)
     pool = campaign_pool(resolved, progress)
     alarm, alpha = Alarm(KnownRates.of(pool)), mixture_weights(campaign)

@@ -87,7 +87,6 @@ def estimate_blocks(
     estimates = {done.headline: best, **done.estimates}
     level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
     distance_km = None if distance_m is None else distance_m / 1000.0
-    retraced = manifest.get("retraced") or {"reason": "the run did not retrace its episodes"}
     repeated = manifest.get("repeated")
     about = level, distance_km, campaign.crash.counts_above_mps
     statements: dict[str, str] = {name: _answer(of, repeated, *about) for name, of in estimates.items()}
@@ -105,7 +104,7 @@ def estimate_blocks(
             distance_per_test_km=distance_km,
             crash_rate_per_1e6_km=None if distance_km is None else per_distance(best, distance_km),
             estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in estimates.items()},
-            diagnostics={**done.diagnostics.result(importance_names(campaign)), "alarm": {"retraced": retraced}},
+            diagnostics=done.diagnostics.result(importance_names(campaign)),
             convergence=tuple(done.convergence),
             statement=statements[done.headline],
             statements=statements,

@@ -325,14 +325,6 @@ class StoredShard(Stored):
     crc32: dict[str, Count] = {}
 
 
-class Retraced(Stored):
-    """How many episodes the twin has retraced in which columns, or why none."""
-
-    n_episodes: Count | None = None
-    compared: list[str] | None = None
-    reason: str | None = None
-
-
 @dataclass(frozen=True)
 class Repeated:
     """How many tests were run once more, and which of them (campaign indices) came out otherwise."""
@@ -356,7 +348,6 @@ class StoredManifest(Stored):
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
     limits: list[float | str] = []
-    retraced: Retraced | None = None
     repeated: Repeated | None = None
     baseline_crc32: list[Count] = []
     pilot_tests: dict[str, Count] | None = None

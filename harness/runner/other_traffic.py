@@ -77,7 +77,7 @@ def estimate_in_other_traffic(
         expected = "the environment that the folder's tests were run in: estimates.json is of that"
         raise CampaignError(f"{OPTION} with --write", f"{environment}, with other numbers", expected, ELSEWHERE)
     moved = moved_to(tested, there, environment, progress)
-    keys = tested.manifest if moved.is_same else ("retraced", "repeated")
+    keys = tested.manifest if moved.is_same else ("repeated",)
     told: dict[str, Any] = {key: tested.manifest[key] for key in keys if key in tested.manifest}
     told |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_per_test_m(there.environment)}
     blocks = map(moved.block, tested.blocks)

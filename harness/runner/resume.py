@@ -21,7 +21,6 @@ from harness.campaign.files import dump_campaign
 from harness.campaign.sections import Accept
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.estimators.stopping import limit_words
-from harness.pool.replay import Retracing
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
@@ -96,7 +95,7 @@ class Manifest:
         self._folder, self._earlier, self._campaign = folder, earlier, resolved.campaign
         campaign, self._yaml = self._campaign, dump_campaign(self._campaign).encode()
         self.shards: list[dict[str, Any]] = []
-        self.n_episodes = self.n_crashes = self.n_retraced = self._n_failed = 0
+        self.n_episodes = self.n_crashes = self._n_failed = 0
         self._repeated: Repeated | None = None
         self._causes: Counter[str] = Counter()
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
@@ -126,7 +125,6 @@ class Manifest:
         place = {name: getattr(request, name) for name in ("index", "first_episode", "n_episodes")}
         self.shards.append({**place, "files": done.files, "crc32": done.crc32})
         self.n_episodes += request.n_episodes
-        self.n_retraced += done.n_retraced
         self.n_crashes += int(done.block.crash.sum())
         self._n_failed += int(done.block.failed.sum())
         self._causes += done.failures
@@ -187,7 +185,7 @@ class Manifest:
         content = {
             **self._content,
             "status": status,
-            **dict.fromkeys(("stopped_by", "ending", "retraced")),
+            **dict.fromkeys(("stopped_by", "ending")),
             **of_the_end,
             "reproducible": self._campaign.av.reproducible and not (repeated and repeated.differing),
             "repeated": None if repeated is None else asdict(repeated),
@@ -263,16 +261,13 @@ def require_same_pool(folder: Path, source: Source) -> None:
         raise RunFolderError(str(path), f"cut-ins of pool {found}", expected, mend)
 
 
-def stored_shard(
-    folder: Path, source: Source, retracing: Retracing, listed: Mapping[str, Any], request: ShardRequest
-) -> ShardResult | None:
+def stored_shard(folder: Path, source: Source, listed: Mapping[str, Any], request: ShardRequest) -> ShardResult | None:
     """A shard that needs not be run again, or None; ``listed`` is what the manifest tells of it (`Manifest.listed`).
 
     It is taken over if its episodes are on disk, and its moments where the campaign keeps some, with as many rows as
-    are wanted and, of shells, the cut-ins that are to be drawn now. The twin retraces it.
+    are wanted and, of shells, the cut-ins that are to be drawn now.
 
-    Raises `RunFolderError`: one of its files is damaged. Raises `WorldDisagreementError`: the twin retraces an episode
-    differently.
+    Raises `RunFolderError`: one of its files is damaged.
     """
     files = shard_files(folder, request.index)
     needed = {"episodes"} | ({"moments"} if source.campaign.records.moments != "none" else set())
@@ -283,4 +278,4 @@ def stored_shard(
     if not source.is_shard(request, kept.episodes):
         return None
     crc32 = {name: checksum(folder / path) for name, path in files.items()}
-    return replace(finished(source, retracing, request, kept), files=files, crc32=crc32)
+    return replace(finished(source, request, kept), files=files, crc32=crc32)

@@ -19,7 +19,6 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import conclusion, expected_for
 from harness.estimators.stopping import Rule, Verdict
 from harness.pool.build import campaign_pool
-from harness.pool.replay import Retracing
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
 from harness.records.folder import (
@@ -135,7 +134,6 @@ class Run:
         remove_unfinished(out.rglob(".*.part"))
         self.source = prepare(resolved, progress)
         self.held = int(earlier["n_episodes"])
-        self._retracing = Retracing(resolved)
         self._workers = workers_of(resolved, n_workers, n_runs=n_runs)
         with ExitStack() as refused:
             refused.callback(self._workers.close)
@@ -189,7 +187,7 @@ class Run:
 
     def _known(self, request: ShardRequest) -> ShardResult | None:
         """See `stored_shard`."""
-        return stored_shard(self.out, self.source, self._retracing, self.manifest.listed(request), request)
+        return stored_shard(self.out, self.source, self.manifest.listed(request), request)
 
     def _add(self, shard: ShardResult) -> None:
         """Write a shard that is not there yet, and count it."""
@@ -257,8 +255,7 @@ class Run:
             decided["decision"] = replace(decision, asked_before=manifest.limits_before).to_json()
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
-        retraced = self._retracing.summary(manifest.n_retraced)
-        manifest.write("done", stopped_by=stopped_by, ending=said, retraced=retraced, expected=expected, **decided)
+        manifest.write("done", stopped_by=stopped_by, ending=said, expected=expected, **decided)
         self._progress.stage("writing estimates and report", None)
         estimates = estimate_run(self.out)
         write_sealed(self.out / ESTIMATES, estimates)

@@ -29,7 +29,6 @@ from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
 from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
-from harness.pool.replay import Retracing
 from harness.processes import (
     CLOSED_PIPE_EXIT_CODE,
     OF_EPISODE,
@@ -75,7 +74,7 @@ Bits = tuple[bytes, bytes, str | None]
 
 @dataclass(frozen=True)
 class ShardResult:
-    """A finished shard: what the stop rule needs of it, how many episodes the twin has retraced, causes of failures.
+    """A finished shard: what the stop rule needs of it, and causes of failures.
 
     ``repeated`` is None where no test was run twice; ``parquet`` are its tables as files. Once they are on disk,
     ``files`` are their paths and ``crc32`` their checksums, by table.
@@ -83,7 +82,6 @@ class ShardResult:
 
     request: ShardRequest
     block: Block
-    n_retraced: int
     failures: Counter[str]
     repeated: Repeated | None
     parquet: dict[str, bytes] = field(default_factory=dict)
@@ -126,7 +124,6 @@ class ShardRunner:
         self._fatal_episodes: dict[int, Death] = {}
         self._baseline = baseline
         self._source = prepare(resolved)
-        self._retracing = Retracing(resolved)
         self._begun = False
         world = build_world(resolved.campaign)
         self._loop: EpisodeLoop = self._source.loop(world, black_box=black_box, fatal_episodes=self._fatal_episodes)
@@ -136,10 +133,7 @@ class ShardRunner:
         self._loop.close()
 
     def run(self, request: ShardRequest, fatal_episodes: Mapping[int, Death] | None = None) -> Result:
-        """Run a shard; episodes in ``fatal_episodes`` fail before the call that ended a process.
-
-        Raises `WorldDisagreementError`: the twin retraces an episode differently.
-        """
+        """Run a shard; episodes in ``fatal_episodes`` fail before the call that ended a process."""
         self._fatal_episodes.clear()  # a baseline run may have the number of a test
         self._fatal_episodes.update(fatal_episodes or {})
         source, paths = self._source, self._source.baseline_paths
@@ -159,15 +153,14 @@ class ShardRunner:
         # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
         if request.index == 0 and campaign.av.model is None and campaign.av.traci is None:
             tables = tables._replace(episodes=with_repeated(tables.episodes, repeat(self._loop, campaign, shard)))
-        return replace(finished(self._source, self._retracing, request, tables), parquet=encoded(tables))
+        return replace(finished(self._source, request, tables), parquet=encoded(tables))
 
 
-def finished(source: Source, retracing: Retracing, request: ShardRequest, tables: ShardTables) -> ShardResult:
-    """What is to be known of a shard's tables, after the twin has retraced them."""
-    n_retraced = retracing.check(tables.episodes)
+def finished(source: Source, request: ShardRequest, tables: ShardTables) -> ShardResult:
+    """What is to be known of a shard's tables."""
     block = source.block(tables.episodes)
     failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
-    return ShardResult(request, block, n_retraced, failures, repeated_of(tables.episodes))
+    return ShardResult(request, block, failures, repeated_of(tables.episodes))
 
 
 def repeat(loop: EpisodeLoop, campaign: Campaign, shard: Shard) -> Repeated:

@@ -23,9 +23,7 @@ from harness.episode.judge import judge
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.episode.path import empty_trajectory, mean_test_distance
 from harness.importance.functions import build_importance
-from harness.pool.replay import Retracing
 from harness.progress import Progress
-from harness.records.schemas import shard_tables
 from harness.resolved import Resolved
 from harness.sampling.forced import Forced
 from harness.sampling.protocol import Source
@@ -75,8 +73,8 @@ def prepare(resolved: Resolved, progress: Progress | None = None) -> Source:
 def compile_kernels(resolved: Resolved) -> None:
     """Compile what episodes will need, while threads build tables: neither waits for the other.
 
-    Kernels are the same for all methods and worlds, so one naturalistic episode in the twin, retraced as if SUMO had
-    driven it, compiles them into the cache, where worker processes find them.
+    Kernels are the same for all methods and worlds, so one naturalistic episode in the twin compiles them into the
+    cache, where worker processes find them.
     """
     from harness.worlds.twin import TwinWorld  # noqa: PLC0415 - only a cold start needs it
 
@@ -85,8 +83,7 @@ def compile_kernels(resolved: Resolved) -> None:
     importance = build_importance(naturalistic, None)
     policy = Drawing(campaign.seed, environment, importance, resolved.av, boundary=resolved.surrogates[:1])
     states = InitialStates(environment.numbers).draw(0, 0, 1)
-    shard = EpisodeLoop(TwinWorld(1), policy, RecordPolicy(0, "none", 0.0)).run(0, states)
-    Retracing(resolved).check(shard_tables(shard, campaign.seed, keep_traces=False).episodes)
+    EpisodeLoop(TwinWorld(1), policy, RecordPolicy(0, "none", 0.0)).run(0, states)
     distance_per_test_m(environment)
 
 

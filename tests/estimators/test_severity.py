@@ -16,7 +16,7 @@ from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import SPEEDS_MPS, Impacts
 from harness.estimators.shells import Shells as SeenShells
 from harness.pool.build import campaign_pool
-from harness.pool.replay import RETRACED_DTYPE, StoredPaths, retrace
+from harness.pool.replay import StoredPaths
 from harness.pool.walk import Script
 from harness.resolved import resolve
 from harness.runner.stored import stored_blocks
@@ -24,6 +24,7 @@ from harness.sampling import prepare
 from harness.sampling.shells import ShellRounds, Shells
 from harness.vocabulary import CRASH, FAILED, SAMPLING, TIMEOUT
 from tests.in_process import run_here
+from tests.retracing import RETRACED_DTYPE, retrace
 from tests.stored_runs import estimates, golden, stored_table
 
 

@@ -10,7 +10,7 @@ from harness.episode.cells import PrescribedTraffic, drawn_traffic
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.episode.path import empty_trajectory
 from harness.importance.functions import build_importance
-from harness.pool.replay import Retracing, stored_paths
+from harness.pool.replay import stored_paths
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.traffic.loading import load_environment
@@ -20,6 +20,7 @@ from harness.vocabulary import BV_LV_CONTACT, CRASH, CUT_IN, STATE_DTYPE, TIMEOU
 from harness.worlds.twin import TwinWorld
 from studies.alarm import replay_surrogates
 from tests.episode.test_lateral import BESIDE, beside
+from tests.retracing import retraced
 from tests.worlds.running import smoke
 
 KEEP_SPEED, BRAKE = 20, 0
@@ -61,7 +62,7 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
     assert shard.results.episode["outcome"].tolist() == OUTCOMES
     assert shard.results.episode["n_steps"].tolist() == [1, 200, 1, 1]
     episodes = episodes_table(shard, campaign.seed)
-    assert Retracing(resolve(campaign)).check(episodes) == len(STATES)
+    assert retraced(episodes, resolve(campaign)) == []
     crashes = np.full(len(STATES), -1, np.int64)
     stored, room = stored_paths(episodes, campaign.seed), empty_trajectory(environment)
     followers = Followers(library.followers(environment.lateral.present).drivers)
