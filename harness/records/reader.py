@@ -67,7 +67,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
         raise RunFolderError(str(path), found, expected, mend) from error
     crc32 = manifest.get("campaign_crc32")
     require_unchanged(path, crc32, mend)
-    if crc32 is None:  # a folder of before, or one whose run was killed as it began
+    if crc32 is None:  # its run was killed as it began
         with suppress(CampaignError):  # its environment file is gone: nobody can tell
             parameters = load_parameters(campaign.environment)
             require_campaign(path, campaign.content_hash(parameters.content_hash()), manifest)

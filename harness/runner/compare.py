@@ -26,7 +26,7 @@ from harness.estimators.stopping import PairRule
 from harness.numbers import leaves
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import read_manifest, sole_use, write_json
+from harness.records.folder import read_manifest, sole_use, write_sealed
 from harness.records.reader import read_shards
 from harness.resolved import Resolved, require_ready
 from harness.runner.resume import require_own_folder
@@ -119,7 +119,7 @@ def compare_campaigns(
         content["ended"] = "episodes" if rule.margin is None else "open"
     if where := load_parameters(a.environment).unseen:
         content["warnings"].append(unseen_words(where))
-    write_json(out / COMPARISON, content)
+    write_sealed(out / COMPARISON, content)
     from harness.report.compare_page import write_comparison  # noqa: PLC0415
 
     return Comparison(out, found, content, code, write_comparison(out))

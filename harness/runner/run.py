@@ -254,7 +254,7 @@ class Run:
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
         if decision is not None:
             code = EXIT_OF[decision.verdict]
-            decided["decision"] = replace(decision, asked_before=manifest.limits_before).to_json()
+            decided["decision"] = decision.to_json()
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         retraced = self._retracing.summary(manifest.n_retraced)

@@ -33,7 +33,7 @@ from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
 from tests.golden.record import column_hash
 from tests.in_process import controllers_here, run_here
-from tests.stored_runs import copy_of, edit, golden, of_before, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, edit, golden, shard_files, stored_table, unlike_columns, unnoted
 
 
 @pytest.fixture
@@ -194,7 +194,7 @@ def test_a_flipped_bit_changes_no_number_silently(stored):
 
 def test_without_checksums_it_would(stored):
     """The same flips in a folder of before: this is what they are for."""
-    assert told(of_before(stored))
+    assert told(unnoted(stored))
     assert next(flips_unnoticed(stored, FLIPS, seed=2))
 
 
