@@ -15,7 +15,7 @@ from harness.commands.campaigns import av_check, check, compare, pool, run, sche
 from harness.commands.fitting import fit
 from harness.commands.options import examples
 from harness.commands.printing import go_on_unread, show_error, show_interrupted, system_error, usage_error
-from harness.commands.stored import estimate, export, replay, report, sensitivity
+from harness.commands.stored import estimate, replay, report, sensitivity
 from harness.errors import EXIT_DONE, HarnessError, shortened
 from harness.processes import Interruption, interruptible, open_streams
 
@@ -41,7 +41,7 @@ def cli() -> None:
     """
 
 
-_TESTING = check, av_check, run, compare, pool, estimate, sensitivity, report, replay, export
+_TESTING = check, av_check, run, compare, pool, estimate, sensitivity, report, replay
 for command in (*_TESTING, fit, schema, setup):
     cli.add_command(command)
 

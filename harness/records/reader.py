@@ -35,7 +35,8 @@ from harness.records.folder import (
     read_manifest,
     require_unchanged,
 )
-from harness.traffic.loading import load_parameters
+from harness.traffic.laws import Environment
+from harness.traffic.loading import load_environment, load_parameters
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
@@ -80,6 +81,16 @@ def require_campaign(path: Path, content_hash: str, manifest: Mapping[str, Any])
         expected = f"campaign {manifest['campaign_hash']}, which made the records (manifest.json)"
         mend = "Restore campaign.yaml and the environment parameter file that it names."
         raise RunFolderError(str(path), f"campaign {content_hash}", expected, mend)
+
+
+def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment | None:
+    """The run's traffic, where its parameters are still what they were; else others cannot be driven."""
+    try:
+        parameters = load_parameters(campaign.environment)
+    except CampaignError:
+        return None
+    known = campaign.content_hash(parameters.content_hash()) == manifest["campaign_hash"]
+    return load_environment(campaign.environment, parameters) if known else None
 
 
 def read_shards(folder: Path, columns: list[str] | None = None) -> Iterator[pa.Table]:

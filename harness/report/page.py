@@ -14,8 +14,8 @@ from harness.estimators.shells import Within
 from harness.estimators.traffic import Sensitivity
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
-from harness.records.reader import table_sizes
-from harness.report.crashes import crash_gallery, environment_of
+from harness.records.reader import table_sizes, traffic_of
+from harness.report.crashes import crash_gallery
 from harness.report.drawing import Plot
 from harness.report.player import templates
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
@@ -40,7 +40,7 @@ def write_report(folder: str | Path) -> Path:
     """
     folder = Path(folder)
     run = read_run_folder(folder)
-    sizes, summary, traffic = table_sizes(folder), summarise(run), environment_of(run)
+    sizes, summary, traffic = table_sizes(folder), summarise(run), traffic_of(run.campaign, run.manifest)
     plots = _plots(run, summary, traffic)
     gallery, scenes = crash_gallery(run, summary, traffic)
     environment = templates()

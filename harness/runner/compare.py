@@ -26,7 +26,8 @@ from harness.estimators.stopping import PairRule
 from harness.numbers import leaves
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import read_manifest, sole_use, write_sealed
+from harness.records.folder import CAMPAIGN, read_manifest, sole_use, write_sealed
+from harness.records.origin import require_trust
 from harness.records.reader import read_shards
 from harness.resolved import Resolved, require_ready
 from harness.runner.resume import require_own_folder
@@ -81,6 +82,9 @@ def compare_campaigns(
     Raises `CampaignError`: the campaigns differ in something else, or do not draw from the same shells. Raises
     `RunFolderError`: ``out`` holds other runs.
     """
+    if stored is not None:
+        mend = f"Read that code; then name {Path(stored) / CAMPAIGN} for A, which drives it anew."
+        require_trust(Path(stored), read_manifest(Path(stored)), a.av, mend)
     sides = require_ready(a, "compare"), require_ready(b, "compare")
     require_comparable(*(side.campaign for side in sides))
     require_same_shells(sides, stored)

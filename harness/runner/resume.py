@@ -35,6 +35,7 @@ from harness.records.folder import (
     write_bytes,
     write_sealed,
 )
+from harness.records.origin import signature
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult, finished
@@ -97,6 +98,7 @@ class Manifest:
             "name": campaign.name,
             "campaign_hash": resolved.content_hash,
             "campaign_crc32": zlib.crc32(self._yaml),
+            "signature": signature(self._yaml),
             "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
             "seed": campaign.seed,
             "engine": campaign.world.engine,
