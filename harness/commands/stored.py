@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, verbose_option
+from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar, verbose_option
 from harness.commands.printing import in_folder, print_answer, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share
@@ -79,9 +79,7 @@ def estimate(
                 raise click.UsageError("--write does not go with the folder of a comparison.")
             _compared_elsewhere(folder, environment, confidence, as_json=as_json)
             return
-        from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-
-        with shown_progress() as bar:
+        with progress_bar() as bar:
             from harness.runner.other_traffic import estimate_in_other_traffic  # noqa: PLC0415 - keeps --help fast
 
             content = estimate_in_other_traffic(folder, environment, confidence=confidence, own=write, progress=bar)
@@ -106,9 +104,7 @@ def estimate(
 
 def _compared_elsewhere(folder: Path, environment: str, confidence: float | None, *, as_json: bool) -> None:
     """What two vehicles' stored tests say of other traffic."""
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-
-    with shown_progress() as bar:
+    with progress_bar() as bar:
         from harness.runner.other_traffic import compare_in_other_traffic  # noqa: PLC0415 - keeps --help fast
 
         content = compare_in_other_traffic(folder, environment, confidence=confidence, progress=bar)
@@ -149,9 +145,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     Fitted numbers move by their standard errors, or in blocks by replicates, assumed ones over their ranges. Nothing is
     simulated in SUMO: each move takes a second, once. DIR keeps it as sensitivity.json, and its page shows it.
     """
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-
-    with shown_progress() as bar:
+    with progress_bar() as bar:
         from harness.runner.sensitivity import sensitivity as found_by  # noqa: PLC0415 - keeps --help fast
 
         content = found_by(folder, ranges=ranges, progress=bar)

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
@@ -173,6 +174,7 @@ class StoredRun:
         again = f"Make it again with `harness estimate {self.folder} --write`."
         return read_as(dict[str, Any], self.folder / "estimates.json", mend=again)
 
+    @checked("episodes")
     def episodes(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """One row per test, failed ones included, with its ``weight`` and all ``columns``, or those that are named.
 
@@ -181,14 +183,17 @@ class StoredRun:
         """
         return _described(self.table("episodes", columns))
 
+    @checked("moments")
     def moments(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """One row per control step; a `RunFolderError` where the campaign kept none (``records.moments``)."""
         return _described(self.table("moments", columns))
 
+    @checked("traces")
     def traces(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """One row per step and vehicle; a `RunFolderError` where nothing was traced (``records.traces``)."""
         return _described(self.table("traces", columns))
 
+    @checked("table")
     def table(self, name: TableName, columns: Sequence[str] | None = None) -> pa.Table:
         """What the method of that ``name`` gives, as an Arrow table: several times faster, and smaller, for long runs.
 
@@ -196,6 +201,7 @@ class StoredRun:
         """
         return concatenated(list(self.batches(name, columns)), self.folder)
 
+    @checked("batches")
     def batches(self, name: TableName, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
         """`table` in consecutive pieces, one per shard: for what does not fit into memory."""
         shards = [shard for shard in read_manifest(self.folder)["shards"] if shard["files"].get(name)]
@@ -242,6 +248,11 @@ def _described(table: pa.Table) -> pd.DataFrame:
     return frame
 
 
+@checked("harness.read")
 def read(folder: str | Path) -> StoredRun:
-    """Tables of a stored run, as pandas frames or Arrow tables, with units and weights."""
+    """Tables of a stored run, as pandas frames or Arrow tables, with units and weights.
+
+    Raises `RunFolderError`: the folder is no run.
+    """
+    read_manifest(Path(folder))
     return StoredRun(Path(folder))

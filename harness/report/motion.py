@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pyarrow import csv
 
+from harness.arguments import checked
 from harness.errors import HarnessError
 from harness.records.folder import write_atomically
 from harness.report.player import write_player
@@ -18,6 +19,7 @@ from harness.vehicles.kinematics import STEP_S
 SUFFIXES = ".html", ".csv", ".xosc"
 
 
+@checked("harness.write_motion")
 def write_motion(result: ReplayResult, file: str | Path) -> Sequence[Path]:
     """Write what `harness.replay` has given into a file, and return the files that were written.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import numbers
+from harness.arguments import checked
 from harness.campaign.files import dump_campaign
 from harness.errors import printable
 from harness.estimators.shells import Within
@@ -28,6 +29,7 @@ PLOT_NAMES = re.compile(
 )
 
 
+@checked("harness.write_report")
 def write_report(folder: str | Path) -> Path:
     """Write ``report.html`` and ``plots/`` (SVG) into a run folder, and return the page.
 

@@ -6,11 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+from pydantic import Field
 
+from harness.arguments import Confidence, Episode, checked
 from harness.campaign.campaign import Campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
 from harness.errors import CampaignError, HarnessError, RunFolderError
@@ -39,11 +41,12 @@ _FINISH = "Run `harness run` with --resume, which makes missing shards."
 _Shards = Sequence[Mapping[str, Any]]
 
 
+@checked("harness.estimate")
 def estimate_run(
     folder: str | Path,
     *,
-    estimators: Sequence[EstimatorName] | None = None,
-    confidence: float | None = None,
+    estimators: Annotated[Sequence[EstimatorName], Field(min_length=1)] | None = None,
+    confidence: Confidence | None = None,
 ) -> dict[str, Any]:
     """Estimate a stored run from its records; returns the content of ``estimates.json``.
 
@@ -139,9 +142,10 @@ class ReplayResult:
     suspects: str | None = None
 
 
+@checked("harness.replay")
 def replay_episode(
     folder: str | Path,
-    episode: int,
+    episode: Episode,
     *,
     gui: bool = False,
     fcd: str | Path | None = None,

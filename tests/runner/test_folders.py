@@ -176,7 +176,7 @@ def test_values_that_no_run_has_written_are_refused(stored):
     for key, wrong in (
         *(("n_episodes", wrong) for wrong in (-1, 0.5, 10**400, True, "240", [240])),
         *(("shards", wrong) for wrong in (None, {}, *([{**shard, **changed}] for changed in of_no_shard))),
-        *(("campaign_hash", 5), ("stopped_by", "the moon"), ("distance_per_test_m", float("nan")), ("versions", ["x"])),
+        *(("campaign_hash", 5), ("stopped_by", "the moon"), ("distance_per_test_m", "far"), ("versions", ["x"])),
     ):
         content = (stored / "manifest.json").read_text()
         edit(stored, **{key: wrong})
