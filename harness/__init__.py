@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from harness.campaign.files import load_campaign
     from harness.errors import HarnessError
     from harness.records.reader import read
+    from harness.report.motion import write_motion
     from harness.report.page import write_report
-    from harness.report.player import write_player
     from harness.runner.compare import compare_campaigns as compare
     from harness.runner.look import check_av as av_check
     from harness.runner.run import run_campaign as run
@@ -35,7 +35,7 @@ __all__ = [
     "read",
     "replay",
     "run",
-    "write_player",
+    "write_motion",
     "write_report",
 ]
 
@@ -48,7 +48,7 @@ _PLACES = {
     "read": ("harness.records.reader", "read"),
     "replay": ("harness.runner.stored", "replay_episode"),
     "run": ("harness.runner.run", "run_campaign"),
-    "write_player": ("harness.report.player", "write_player"),
+    "write_motion": ("harness.report.motion", "write_motion"),
     "write_report": ("harness.report.page", "write_report"),  # not "report": the package of that name takes that place
 }
 """Where each name is; imported when it is asked for, so that ``import harness`` and ``harness --help`` are quick."""

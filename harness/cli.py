@@ -13,10 +13,10 @@ import click
 
 from harness.commands.campaigns import av_check, check, compare, pool, run, schema, setup
 from harness.commands.fitting import fit
-from harness.commands.options import examples
+from harness.commands.options import examples, quiet_option
 from harness.commands.printing import go_on_unread, show_error, show_interrupted, system_error, usage_error
-from harness.commands.stored import estimate, export, replay, report, sensitivity
-from harness.errors import EXIT_DONE, HarnessError, shortened
+from harness.commands.stored import estimate, replay, report, sensitivity
+from harness.errors import EXIT_DONE, HarnessError
 from harness.processes import Interruption, interruptible, open_streams
 
 
@@ -41,9 +41,9 @@ def cli() -> None:
     """
 
 
-_TESTING = check, av_check, run, compare, pool, estimate, sensitivity, report, replay, export
+_TESTING = check, av_check, run, compare, pool, estimate, sensitivity, report, replay
 for command in (*_TESTING, fit, schema, setup):
-    cli.add_command(command)
+    cli.add_command(quiet_option(command))
 
 
 def main(arguments: Sequence[str] | None = None, group: click.Group = cli, name: str = "harness") -> int:
@@ -64,13 +64,11 @@ def _main(group: click.Group, name: str, arguments: list[str], interruption: Int
     except HarnessError as error:
         show_error(error)
         return error.exit_code
-    except click.ClickException as error:
-        if isinstance(error, click.UsageError) and error.ctx is not None and error.ctx.parent is not None:
-            show_error(usage_error(error, error.ctx))
-        elif isinstance(error, click.exceptions.NoArgsIsHelpError):
+    except click.UsageError as error:
+        if isinstance(error, click.exceptions.NoArgsIsHelpError):
             error.show()
         else:
-            click.UsageError(shortened(error.message), getattr(error, "ctx", None)).show()
+            show_error(usage_error(error, error.ctx or click.Context(group, info_name=name)))
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         return _end_early(arguments, interruption)

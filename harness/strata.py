@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, AliasChoices, Field, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import AfterValidator, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 
 from harness.vocabulary import BoolArray, FloatArray
 
@@ -83,7 +83,7 @@ class ShellDesign:
         From the narrowest boundary to the widest; strata up to the widest are shells.
     p_cut_in, p_unreachable : float
         Probability of a cut-in, and the part of it on which no vehicle within the envelope's acceleration can crash,
-        and which is not tested; runs of earlier days have it as ``p_impossible``.
+        and which is not tested.
     available : tuple of int, length S
         Cut-ins that the pool has kept of each; empty if that is no limit.
     shadow_runs : bool
@@ -91,7 +91,7 @@ class ShellDesign:
     learned : str
         How that surrogate was learned, in words; empty if there is none.
     candidates : int
-        Of how many paths these were chosen; 0 in runs of earlier days, whose tests do not say which runs they repeat.
+        Of how many paths these were chosen; 0 where the AV holds its speed.
     """
 
     pool: str
@@ -101,7 +101,7 @@ class ShellDesign:
     n_paths: int
     statements: tuple[Statement, ...]
     p_cut_in: float
-    p_unreachable: Annotated[float, Field(validation_alias=AliasChoices("p_unreachable", "p_impossible"))]
+    p_unreachable: float
     cell_references: tuple[int, ...] = ()
     references: tuple[Reference, ...] = ()
     reference_rate: Numbers = field(default_factory=lambda: np.zeros(0))

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
-from harness.records.folder import SEAL
+from harness.records.folder import SEAL, write_sealed
 from tests.golden.campaigns import BASE, RUNS
 from tests.golden.record import TABLES, tables_of
 
@@ -42,17 +42,14 @@ def manifest(folder: Path) -> dict[str, Any]:
 
 
 def edit(folder: Path, file: str = "manifest.json", **changes: Any) -> None:
-    """Change keys of a JSON file of a run, which then has no checksum."""
-    content = {**json.loads((folder / file).read_text()), **changes}
-    content.pop(SEAL, None)
-    (folder / file).write_text(json.dumps(content))
+    """Change keys of a JSON file of a run, and its checksum with them."""
+    write_sealed(folder / file, {**json.loads((folder / file).read_text()), **changes})
 
 
-def of_before(folder: Path) -> Path:
-    """Let a folder be as earlier versions left it: without a checksum."""
-    shards = [{key: value for key, value in shard.items() if key != SEAL} for shard in manifest(folder)["shards"]]
-    edit(folder, shards=shards, campaign_crc32=None, baseline_crc32=[])
-    edit(folder, "estimates.json")
+def unnoted(folder: Path) -> Path:
+    """Let the manifest tell of no other file's checksum, as while a run is at it: a test may change them."""
+    edit(folder, shards=[shard | {"crc32": {}} for shard in manifest(folder)["shards"]], campaign_crc32=None)
+    edit(folder, baseline_crc32=[])
     return folder
 
 

@@ -11,12 +11,13 @@ from importlib.machinery import PathFinder
 from importlib.metadata import distributions
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 import harness
 from harness.resolved import resolve
-from tests.stored_runs import MIXTURE_FILE, ROOT, estimates
+from tests.stored_runs import MIXTURE_FILE, ROOT, estimates, unlike_columns
 
 BUDGET = ("stop.episodes=3000", "stop.rhw=0.5", "stop.min_crashes=20", "run.shard_size=60")
 SMALL = ["world.engine=twin", "testing.method=forced", "av={model: fvdm}", *BUDGET]
@@ -69,6 +70,66 @@ def test_load_run_estimate_and_replay_in_a_few_lines(tmp_path):
         harness.replay(folder, 10_000)
     with pytest.raises(harness.HarnessError, match="--resume"):
         harness.run(harness.load_campaign(MIXTURE_FILE, SMALL), folder)
+
+
+RUN = "shells-twin"
+
+
+@pytest.mark.parametrize(
+    ("call", "where", "said"),
+    [
+        (lambda _: harness.run(3, "out"), "harness.run(campaign=", "found 3; expected a campaign (harness.load"),
+        (lambda _: harness.run({}, "out"), "harness.run(campaign=", "or a path"),
+        (lambda _: harness.run("no.yaml", "out"), "no.yaml", "no such file"),
+        (lambda _: harness.run("idm", ""), "harness.run(out=", "no text"),
+        (lambda _: harness.run("idm", "a\0b"), "harness.run(out=", "zero byte"),
+        (lambda _: harness.run("idm", "a\ud800"), "harness.run(out=", "no UTF-8"),
+        (lambda _: harness.run("idm", "out", workers=0), "harness.run(workers=", "found 0; expected greater than"),
+        (lambda _: harness.run("idm", "out", workers=True), "harness.run(workers=", "a whole number"),
+        (lambda _: harness.run("idm", "out", workers="2"), "harness.run(workers=", "the text '2'"),
+        (lambda _: harness.run("idm", "out", resume="no"), "harness.run(resume=", "true or false"),
+        (lambda _: harness.run("idm", "out", progress=print), "harness.run(progress=", "an instance of Progress"),
+        (lambda _: harness.run("idm", "out", worker=2), "harness.run:", "Did you mean 'workers'?"),
+        (lambda _: harness.run("idm"), "harness.run:", "'out'"),
+        (lambda _: harness.load_campaign("smoke.yaml", "stop.rhw=.1"), "(overrides=", "Write ['stop.rhw=.1']."),
+        (lambda _: harness.load_campaign("smoke.yaml", [0.1]), "(overrides=", "expected text"),
+        (lambda _: harness.load_campaign(None), "harness.load_campaign(path=", "nothing (null)"),
+        (lambda _: harness.load_campaign("idm", av=3), "harness.load_campaign(av=", "expected text"),
+        (lambda run: harness.estimate(run, estimators=["snis"]), "(estimators=", "'nde', 'nade', 'mixture_cv'"),
+        (lambda run: harness.estimate(run, estimators=["nad"]), "(estimators=", "Did you mean 'nade'?"),
+        (lambda run: harness.estimate(run, estimators="nade"), "(estimators=", "Write ['nade']."),
+        (lambda run: harness.estimate(run, estimators=[]), "(estimators=", "one at least"),
+        (lambda run: harness.estimate(run, confidence=math.nan), "(confidence=", "found nan"),
+        (lambda run: harness.estimate(run, confidence=np.float32(2)), "(confidence=", "found 2.0"),
+        (lambda run: harness.replay(run, "1"), "harness.replay(episode=", "a whole number"),
+        (lambda run: harness.replay(run, np.int64(-1)), "harness.replay(episode=", "found -1"),
+        (lambda run: harness.replay(run, 1, stored=1), "harness.replay(stored=", "true or false"),
+        (lambda run: harness.replay(run, 0, stored=True, gui=True), "--stored", "which SUMO does not simulate"),
+        (lambda run: harness.read(run / "no"), "no/manifest.json", "no run folder"),
+        (lambda run: harness.read(run).episodes("outcome"), "episodes(columns=", "Write ['outcome']."),
+        (lambda run: harness.read(run).episodes(["outcom"]), RUN, "no column 'outcom'"),
+        (lambda run: harness.read(run).table("episode"), "table(name=", "Did you mean 'episodes'?"),
+        (lambda run: harness.write_report(None), "harness.write_report(folder=", "a path"),
+        (lambda run: harness.write_motion(harness.replay(run, 0), "a.mp4"), "a.mp4", ".html, .csv, .xosc"),
+        (lambda run: harness.write_motion({}, "a.html"), "harness.write_motion(result=", "ReplayResult"),
+        (lambda _: harness.compare("idm", "fvdm", "out", margin=math.inf), "harness.compare(margin=", "found inf"),
+        (lambda _: harness.compare("idm", "fvdm", "out", labels="ab"), "harness.compare(labels=", "a tuple"),
+        (lambda _: harness.av_check("idm", 1), "harness.av_check(n_episodes=", "found 1"),
+    ],
+)
+def test_arguments_that_are_wrong_are_named(call, where, said, stored_run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(harness.HarnessError) as caught:
+        call(stored_run(RUN))
+    assert where in str(caught.value)
+    assert said in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_path_is_taken_where_a_campaign_is_and_a_number_of_numpy_s_where_a_number_is(stored_run, tmp_path):
+    harness.run(stored_run(RUN) / "campaign.yaml", tmp_path / "run", workers=np.int64(1))
+    assert unlike_columns(stored_run(RUN), tmp_path / "run") == []
+    assert harness.replay(tmp_path / "run", np.int16(3)).bit_equal
 
 
 # -- the recommended method against a committed reference --

@@ -86,11 +86,15 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     [
         ["run"],
         ["nothing"],
+        ["estimat"],
+        ["--nothing"],
+        ["pool", SMOKE, "--quite"],
         ["check", SMOKE, "--nothing"],
         ["estimate", "no-such-folder"],
         ["estimate", ".", "--confidence", "1"],
         ["replay", ".", "-1"],
-        ["export", ".", "1", "--to", "csv", "--out", "trace.txt"],
+        ["replay", ".", "1", "--out", "trace.txt"],
+        ["replay", ".", "1", "--out", "a.xml", "--out", "b.xml"],
         [],
     ],
 )
@@ -98,9 +102,10 @@ def test_wrong_calls_end_with_2(capsys, arguments):
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    if arguments and arguments != ["nothing"]:
+    if arguments:
         assert err.startswith("error: ")
         assert [line.split()[0] for line in err.splitlines()[1:]] == ["found:", "expected:", "mend:"]
+        assert ("Did you mean" in err) == (arguments[-1] in ("estimat", "--quite"))
     else:
         assert "Usage: harness" in err
 
@@ -206,12 +211,24 @@ def test_estimate_writes_only_when_asked(folder, capsys):
     assert estimates(folder)["confidence"] == 0.5
 
 
-@pytest.mark.parametrize("option", ["--html", "--fcd"])
-def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_path, option):
+@pytest.mark.parametrize("name", ["x.html", "x.xml"])
+def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_path, name):
     (tmp_path / "file").write_text("not a folder")
     never = ZeroDivisionError(), "harness.runner.stored.replay_episode", "replay"
-    assert raising(*never, more=["17", option, str(tmp_path / "file" / "x.html")]) == 2
+    assert raising(*never, more=["17", "--out", str(tmp_path / "file" / name)]) == 2
     assert "nothing can be written" in capsys.readouterr().err
+
+
+def test_every_command_can_be_quiet(monkeypatch):
+    """And those that show progress ask for it."""
+    for command in cli.commands.values():
+        assert "--quiet" in {name for each in command.params for name in each.opts}
+    shown = Mock(side_effect=ZeroDivisionError)
+    monkeypatch.setattr("harness.progress.shown_progress", shown)
+    for quiet in (True, False):
+        with pytest.raises(ZeroDivisionError):
+            main(["pool", *CAMPAIGN, *["--quiet"] * quiet])
+        assert shown.call_args.kwargs == {"quiet": quiet}
 
 
 def test_pool_prints_what_it_has(capsys):

@@ -26,7 +26,6 @@ from harness.campaign.sections import (
     Records,
     Run,
     Section,
-    ShellSettings,
     Stop,
     SurrogateName,
     Testing,
@@ -99,26 +98,16 @@ class Campaign(Section):
         Cells, workers, stop rule, trace policy and names are left out, so that a campaign can be continued to a
         smaller RHW or with other resources.
         """
-        shells = self.sampling.strata
-        environment, testing = self.environment.model_dump(exclude={"parameters"}), self.testing.model_dump()
-        # What came later changes no hash of before where it is left as it is.
-        if environment["cut_in_lead_s"] is None:
-            del environment["cut_in_lead_s"]
-        if testing["shells"]["smallest_round"] == 1:
-            del testing["shells"]["smallest_round"]
-        testing["shells"] |= {key: usual for key, (usual, *_) in ShellSettings.gone.items()}  # nor does what went
-        acts, usual = self.av.acts_before_cut_in, PoolSettings().pilot_tests
-        unused = {"shadow_paths"} if not acts else set()
-        unused |= {"pilot_tests"} if not acts or self.pool.pilot_tests == usual else set()
+        unused = set() if self.av.acts_before_cut_in else {"shadow_paths", "pilot_tests"}
         content = {
-            **({"crash": self.crash.model_dump()} if self.crash != CrashSettings() else {}),
+            "crash": self.crash.model_dump(),
             "seed": self.seed,
-            "environment": environment,
+            "environment": self.environment.model_dump(exclude={"parameters"}),
             "environment_parameters": environment_parameters,
             "av": self.av.identity(),
             "surrogates": [(name, model.model_dump()) for name, model in self.surrogates.items()],
-            "testing": testing,
-            "pool": self.pool.model_dump(exclude=unused) if shells else None,
+            "testing": self.testing.model_dump(),
+            "pool": self.pool.model_dump(exclude=unused) if self.sampling.strata else None,
             "engine": self.world.engine,
             "moments": self.records.moments,
             "shard_size": self.run.smallest_shard,

@@ -18,6 +18,7 @@ from pydantic import BaseModel, Field, ValidationError
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
+from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import ModelName, default_surrogates
 from harness.campaign.problems import MOST_SHOWN, NAME_PATTERN, describe_found, did_you_mean, in_words
@@ -41,6 +42,7 @@ _FILES = {
 """Places of a campaign that may name a file, and what that has to be."""
 
 
+@checked("harness.load_campaign")
 def load_campaign(
     path: str | Path, overrides: Sequence[str] = (), *, av: str | None = None, check_files: bool = True
 ) -> Campaign:
@@ -87,6 +89,11 @@ def load_campaign(
         for key, value in campaign.run.ray.runtime_env.items()
     }
     return campaign.replaced(("run", "ray", "runtime_env"), runtime_env)
+
+
+def campaign_of(campaign: Campaign | str | Path) -> Campaign:
+    """The campaign itself, or that of a path or a vehicle (`load_campaign`)."""
+    return campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
 
 
 def _absolute(value: Any, folder: Path) -> Any:

@@ -22,12 +22,15 @@ _PATTERNS = {
     for pattern, signs in ((NAME_PATTERN, "_ . and -"), (SURROGATE_PATTERN, "_ and -"))
 }
 _NUMBERS = ("float_type", "finite_number", "int_type", "int_from_float")
-_KINDS = {
+KINDS = {
     **dict(zip(_NUMBERS, ("a number", "a number", "a whole number", "a whole number"), strict=True)),
     "string_type": "text",
     "bool_type": "true or false",
     "dict_type": "names, each with its value",
     "list_type": "a list",
+    "tuple_type": "a tuple",
+    "sequence_str": "a list of texts",
+    "too_short": "one at least",
 }
 """Kinds of values in words, by pydantic's name for the error."""
 _UNITS = {"_mps2": "m/s²", "_mps": "m/s", "_per_s": "1/s", "_per_m": "1/m", "_s": "s", "_m": "m"}
@@ -79,7 +82,7 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         expected = f"text such as {examples}" if examples else _pattern_in_words(context)
     else:
         unit = next((f" ({unit})" for suffix, unit in _UNITS.items() if last.endswith(suffix)), "")
-        expected = _KINDS.get(kind, details["msg"].removeprefix("Input should be ")) + unit
+        expected = KINDS.get(kind, details["msg"].removeprefix("Input should be ")) + unit
         expected += ", or null" if field and len(loc) == 1 and type(None) in get_args(field.annotation) else ""
     return {"key": key, "found": found, "expected": expected, "mend": mend}
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -42,14 +42,10 @@ class Section(BaseModel):
     """A section of the campaign: unknown keys are errors, values never change after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-    gone: ClassVar[Mapping[str, Sequence[Any]]] = {}
-    """Keys of earlier versions, which stored campaigns name, and which values change nothing, the usual one first."""
 
     @model_validator(mode="wrap")
     @classmethod
     def _errors_in_words(cls, data: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        if isinstance(data, dict) and not cls.gone.keys().isdisjoint(data):
-            data = {key: value for key, value in data.items() if value not in cls.gone.get(key, ())}
         try:
             return validate(data)
         except ValidationError as error:
@@ -114,8 +110,6 @@ class CrashSettings(Section):
 
 class ShellSettings(Section):
     """How tests are spread over the shells of the pool, and what is said about vehicles that keep to some of them."""
-
-    gone = {"stopping": ("sequential",), "boundary": (None,), "statements": (None,)}
 
     statement: str = Field(
         ASSUMPTION_FREE,
@@ -215,8 +209,6 @@ class Records(Section):
 class Stop(Section):
     """When the campaign is long enough."""
 
-    gone = {"estimator": (None, "nde", "nade", "mixture_cv", "shells")}
-
     episodes: Whole = Field(100_000, ge=1, le=10**10, description="most episodes to run")
     rhw: float | None = Field(
         None, gt=0.0, lt=10.0, description="stop at this half-width of the interval over the rate; not for step_mixture"
@@ -243,8 +235,6 @@ class TimesReference(Section):
 
 class Accept(Section):
     """A limit: a run of shells ends when it is known on which side of it the rate of testing.shells.statement lies."""
-
-    gone = {"statement": (None,)}
 
     crash_rate_below: float | None = Field(
         None, gt=0.0, lt=1.0, description="crashes per test: accepted below it, rejected above"

@@ -13,8 +13,6 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from harness.campaign.drivers import (
     PARAMETERS,
-    PERCEIVES_LATERAL_M,
-    RISK_EVALUATION_S,
     BuiltInParameters,
     ModelName,
     Parameters,
@@ -106,12 +104,6 @@ class FmuController(Section):
     start_values: dict[str, float] = Field(default_factory=dict, description="values set before initialisation")
 
 
-_LATER = (
-    ("reaction", "perceives_lateral_m", PERCEIVES_LATERAL_M),
-    ("parameters", "risk_evaluation_s", RISK_EVALUATION_S),
-)
-
-
 def _schema_of_sources(schema: dict[str, Any]) -> None:
     """Say in a JSON schema that parameters follow the source of the AV, which is the IDM where none is named."""
     properties, by_model = schema["properties"], schema_by_model(schema)
@@ -188,14 +180,10 @@ class AutomatedVehicle(Section):
     def identity(self) -> dict[str, Any]:
         """What the AV is, for the campaign's hash: an FMU counts by its content, wherever it lies."""
         content = self.model_dump()
-        # What has come with cut-ins that take time changes no test of before; a controller's parameters are its own.
-        for section, key, usual in _LATER if self.model is not None else _LATER[:1]:
-            if content[section].get(key) == usual:
-                del content[section][key]
         del content["limits"]["construction_time_s"]  # changes no test
         if self.acts_before_cut_in:
             del content["takes_over"]
-        if not self.warm_up_steps:  # as before there was one
+        if not self.warm_up_steps:  # nobody is shown it
             del content["warm_up_s"]
         if self.controller is not None:  # as a module that is found from where it lies
             content["controller"] = re.sub(r"^(?:.*/)?([^/]+)\.py:", r"\1:", self.controller)

@@ -21,7 +21,7 @@ from harness.commands.options import (
     executor_option,
     json_option,
     junit_option,
-    quiet_option,
+    progress_bar,
     set_option,
     verbose_option,
     workers_option,
@@ -102,7 +102,6 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     "such as r157-cc, instead of to stop.rhw.",
 )
 @junit_option
-@quiet_option
 @verbose_option
 @av_option
 @set_option
@@ -118,7 +117,6 @@ def run(
     resume: bool,
     accept: str | None,
     junit: Path | None,
-    quiet: bool,
     verbose: bool,
     av: str | None,
     overrides: Sequence[str],
@@ -141,14 +139,13 @@ def run(
     campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
     chosen, folder = folder is None, folder or _run_folder(campaign.name, resume=resume)
     from harness.processes import imports_ahead, worker_modules  # noqa: PLC0415 - keeps --help fast
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
     is_local = campaign.run.executor == "local"
     ahead = imports_ahead(*worker_modules(campaign.world.engine)) if is_local else nullcontext()
     with (
         named_if_written(folder, chosen=chosen),
         ahead,
-        shown_progress(campaign.stop.rhw, campaign.min_crashes, quiet=quiet) as bar,
+        progress_bar(campaign.stop.rhw, campaign.min_crashes) as bar,
     ):
         from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: the bar is there meanwhile
 
@@ -259,7 +256,6 @@ def av_check(
 )
 @workers_option
 @junit_option
-@quiet_option
 @verbose_option
 @av_option
 @set_option
@@ -276,7 +272,6 @@ def compare(
     margin: float | None,
     workers: int | None,
     junit: Path | None,
-    quiet: bool,
     verbose: bool,
     av: str | None,
     overrides: Sequence[str],
@@ -300,13 +295,11 @@ def compare(
     a, b = loaded(file_a, overrides, av), loaded(file_b or file_a, [*overrides, *against], against_av or av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     labels = (a.name, label_b) if a.name != label_b else (str(source_a), str(file_b))
     if chosen := folder is None:
         folder = RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b.removeprefix(f'{a.name}, '))}"
-    with named_if_written(folder, chosen=chosen), shown_progress(a.stop.rhw, a.min_crashes, quiet=quiet) as bar:
+    with named_if_written(folder, chosen=chosen), progress_bar(a.stop.rhw, a.min_crashes) as bar:
         from harness.runner.compare import compare_campaigns  # noqa: PLC0415 - slow to import: the bar is there meanwhile
 
         found = compare_campaigns(
@@ -331,21 +324,21 @@ def compare(
 
 @click.command(
     short_help="Build the pool of cut-ins, and show its shells.",
-    epilog=examples("harness pool scenarios/smoke.yaml"),
+    epilog=examples("harness pool scenarios/smoke.yaml", "harness pool idm --set environment.cut_in_lead_s=0.5"),
 )
-@click.argument("campaign_file", metavar="CAMPAIGN", type=CAMPAIGN)
+@click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
 @set_option
 @json_option
 def pool(campaign_file: Path, *, overrides: Sequence[str], as_json: bool) -> None:
-    """Build the pool that belongs to CAMPAIGN's environment and surrogate library, and show what is in it.
+    """Build the pool that belongs to the environment and surrogate library of CAMPAIGN, and show what is in it.
+
+    Of a VEHICLE it is the one that `harness run VEHICLE` draws from; the vehicle itself does not matter.
 
     Shown are the surrogates from careful to careless with their crash rates, and how probable it is that a cut-in is
     the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
     """
     campaign = loaded(campaign_file, overrides)
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-
-    with shown_progress() as bar:
+    with progress_bar() as bar:
         from harness.pool.build import campaign_pool  # noqa: PLC0415 - slow to import: the bar is there meanwhile
         from harness.resolved import resolve  # noqa: PLC0415 - slow to import
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from harness.commands.options import FILE, examples, json_option, quiet_option, written_file
+from harness.commands.options import FILE, examples, json_option, progress_bar, written_file
 from harness.commands.printing import print_json, say
 
 
@@ -26,7 +26,6 @@ from harness.commands.printing import print_json, say
 @click.option("--mirror", is_flag=True, help="Fit lane changes to the left: vehicles close in from behind there.")
 @click.option("--replicates", type=click.IntRange(min=2), default=200, show_default=True, help="Environments to draw.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the replicates.")
-@quiet_option
 @json_option
 def fit(
     files: Sequence[Path],
@@ -36,7 +35,6 @@ def fit(
     mirror: bool,
     replicates: int,
     seed: int,
-    quiet: bool,
     as_json: bool,
 ) -> None:
     """Fit the traffic's laws to trajectories in CSV or Parquet FILEs, and write an environment file.
@@ -51,9 +49,8 @@ def fit(
     from harness.estimators.traffic import too_few  # noqa: PLC0415 - keeps --help fast
     from harness.fitting.files import fit_files  # noqa: PLC0415 - keeps --help fast
     from harness.fitting.page import CONFIDENCE  # noqa: PLC0415 - keeps --help fast
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
-    with shown_progress(quiet=quiet) as bar:
+    with progress_bar() as bar:
         found = fit_files(
             files, out, mapping=mapping, mirror=mirror or None, n_replicates=replicates, seed=seed, progress=bar
         )

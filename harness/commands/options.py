@@ -4,28 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from harness.errors import HarnessError
 
-
-class FolderPath(click.Path):
-    """A folder of Parquet files, whose library takes names in UTF-8 alone."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Refuse what is no UTF-8 (`HarnessError`) before anything is written."""
-        try:
-            str(value).encode()
-        except UnicodeEncodeError as error:
-            mend = "Rename the folder, or change into the one above it and name it from there."
-            raise HarnessError(str(value), "a name with bytes that are no UTF-8", "a name in UTF-8", mend) from error
-        return super().convert(value, param, ctx)
+if TYPE_CHECKING:
+    from harness.progress import Progress
 
 
-FOLDER = FolderPath(path_type=Path, file_okay=False)
-RUN_FOLDER = FolderPath(path_type=Path, file_okay=False, exists=True)
+FOLDER = click.Path(path_type=Path, file_okay=False)
+RUN_FOLDER = click.Path(path_type=Path, file_okay=False, exists=True)
 FILE = click.Path(path_type=Path, dir_okay=False)
 CAMPAIGN = click.Path(path_type=Path)
 RUNS = Path("runs")
@@ -76,8 +66,19 @@ executor_option = click.option(
     help="Where they run: on this machine, or a Ray cluster ($RAY_ADDRESS, or run.ray.address of the campaign).",
 )
 quiet_option = click.option(
-    "--quiet", is_flag=True, help="No progress: no bar on a terminal, no line every 30 s elsewhere."
-)
+    "--quiet", is_flag=True, expose_value=False, callback=lambda ctx, _, value: ctx.meta.update(quiet=value),
+    help="No progress: no bar on a terminal, no line every 30 s elsewhere.",
+)  # fmt: skip
+"""Common to all commands: `progress_bar` asks for it."""
+
+
+def progress_bar(target_rhw: float | None = None, min_crashes: int = 0) -> Progress:
+    """What a command shows of its work, unless it is to be quiet."""
+    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+
+    return shown_progress(target_rhw, min_crashes, quiet=click.get_current_context().meta["quiet"])
+
+
 junit_option = click.option(
     "--junit",
     type=FILE,

@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, verbose_option, written_file
+from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar, verbose_option
 from harness.commands.printing import in_folder, print_answer, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share
 from harness.vocabulary import COMPARISON, ESTIMATORS
 
 if TYPE_CHECKING:
-    from harness.runner.stored import ReplayResult
     from harness.vocabulary import EstimatorName
 
 
+FCD = ".xml"
+"""Suffix of SUMO's floating car data."""
 LATERAL = ("lead_steps", "onset_step", "onset_r2_m", "onset_ttc_s", "overlap_ttc_s", "contact")
 """What a replay tells of a cut-in that takes time."""
 
@@ -78,9 +79,7 @@ def estimate(
                 raise click.UsageError("--write does not go with the folder of a comparison.")
             _compared_elsewhere(folder, environment, confidence, as_json=as_json)
             return
-        from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-
-        with shown_progress() as bar:
+        with progress_bar() as bar:
             from harness.runner.other_traffic import estimate_in_other_traffic  # noqa: PLC0415 - keeps --help fast
 
             content = estimate_in_other_traffic(folder, environment, confidence=confidence, own=write, progress=bar)
@@ -105,9 +104,7 @@ def estimate(
 
 def _compared_elsewhere(folder: Path, environment: str, confidence: float | None, *, as_json: bool) -> None:
     """What two vehicles' stored tests say of other traffic."""
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-
-    with shown_progress() as bar:
+    with progress_bar() as bar:
         from harness.runner.other_traffic import compare_in_other_traffic  # noqa: PLC0415 - keeps --help fast
 
         content = compare_in_other_traffic(folder, environment, confidence=confidence, progress=bar)
@@ -148,9 +145,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     Fitted numbers move by their standard errors, or in blocks by replicates, assumed ones over their ranges. Nothing is
     simulated in SUMO: each move takes a second, once. DIR keeps it as sensitivity.json, and its page shows it.
     """
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
-
-    with shown_progress() as bar:
+    with progress_bar() as bar:
         from harness.runner.sensitivity import sensitivity as found_by  # noqa: PLC0415 - keeps --help fast
 
         content = found_by(folder, ranges=ranges, progress=bar)
@@ -190,85 +185,78 @@ def report(folder: Path) -> None:
     say(write(folder))
 
 
+def _motion_files(_ctx: click.Context, _parameter: click.Parameter, files: tuple[Path, ...]) -> tuple[Path, ...]:
+    """Files that can be written, before anything is simulated for them."""
+    if files:
+        from harness.records.folder import require_place  # noqa: PLC0415 - keeps --help fast
+        from harness.report.motion import writer_of  # noqa: PLC0415
+
+        if len(twice := [str(file) for file in files if file.suffix == FCD]) > 1:
+            raise HarnessError("--out", " and ".join(twice), "one file of SUMO's", "Copy it.")
+        for file in files:
+            if file.suffix != FCD:
+                writer_of(file)
+            require_place(file.parent)
+    return files
+
+
 @click.command(
-    short_help="Simulate one episode of a run again, bit for bit.",
+    short_help="Simulate one episode of a run again, bit for bit; watch or write it.",
     epilog=examples(
         "harness replay runs/smoke 17",
-        "harness replay runs/smoke 17 --html episode_17.html",
+        "harness replay runs/smoke 17 --out episode_17.html   # or .csv, .xosc, .xml",
+        "harness replay runs/smoke 17 --stored --out episode_17.csv",
         "harness replay runs/smoke 17 --gui",
     ),
 )
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 @click.argument("episode", type=click.IntRange(min=0))
-@click.option("--html", type=FILE, callback=written_file(".html"), help="Write a page that plays the episode.")
-@click.option("--fcd", type=FILE, callback=written_file(), help="Write SUMO's floating car data (XML) of the episode.")
-@click.option("--gui", is_flag=True, help="Show the episode in sumo-gui (extra 'sumo').")
+@click.option(
+    "--out", "files", metavar="FILE", type=FILE, multiple=True, callback=_motion_files,
+    help="Write the motion. The suffix says how: .html, a page that plays it; .csv, a row for each vehicle and step; "
+    ".xosc, OpenSCENARIO XML 1.2 and its road (.xodr; extra 'export'); .xml, SUMO's floating car data. May be given "
+    "several times.",
+)  # fmt: skip
+@click.option("--gui", is_flag=True, help="Show it in sumo-gui (extra 'sumo').")
+@click.option("--stored", is_flag=True, help="As the run has traced it: nothing is simulated, nobody's code runs.")
+@click.option("--trust", is_flag=True, help="Run the vehicle's code, though DIR was not made here by you.")
 @json_option
-def replay(folder: Path, episode: int, *, html: Path | None, fcd: Path | None, gui: bool, as_json: bool) -> None:
+def replay(
+    folder: Path, episode: int, *, files: Sequence[Path], gui: bool, stored: bool, trust: bool, as_json: bool
+) -> None:
     """Simulate episode number EPISODE of the run in DIR again, bit for bit, and say what happens when.
 
     And what would have happened with others in the vehicle's place: the careful and competent driver of UN Regulation
     No. 157 (r157-cc), and one that brakes at once, at up to 8 m/s2 (brakes-8).
 
     Where the run has stored the episode's trace, the replay is compared with it; a difference ends with exit code 3.
+
+    A vehicle of one's own is code that DIR names, and that this runs: it says which. If DIR was not made on this
+    machine by you, --trust is needed for that.
     """
-    from harness.runner.stored import replay_episode  # noqa: PLC0415 - keeps --help fast
+    from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
+    from harness.records.origin import code_of  # noqa: PLC0415
+    from harness.records.reader import read_campaign  # noqa: PLC0415
+    from harness.runner.stored import replay_episode  # noqa: PLC0415
 
-    result = replay_episode(folder, episode, gui=gui, fcd=fcd)
-    files = [str(file) for file in (html, fcd) if file is not None]
-    if html is not None:
-        from harness.report.player import write_player  # noqa: PLC0415 - keeps --help fast
+    if not stored and (code := code_of(read_campaign(folder, read_manifest(folder)).av)) is not None:
+        say(f"The vehicle is {code}.", err=True)
+    fcd = next((file for file in files if file.suffix == FCD), None)
+    result = replay_episode(folder, episode, gui=gui, fcd=fcd, stored=stored, trust=trust)
+    written = [] if fcd is None else [fcd]
+    if others := [file for file in files if file.suffix != FCD]:
+        from harness.report.motion import write_motion  # noqa: PLC0415 - keeps --help fast
 
-        write_player(result.scene, html)
+        written += [each for file in others for each in write_motion(result, file)]
     if as_json:
-        content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal, "files": files}
+        content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
+        content |= {"files": [str(file) for file in written]}
         print_json({**content, **{name: result.row[name] for name in LATERAL if name in result.row}})
     else:
         compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
+        words = "as the run has traced it" if stored else compared[result.bit_equal]
         facts = [f"  {name:<13} {fact}" for name, fact in result.scene["facts"]]
-        say(f"episode {episode}: {result.outcome}; {compared[result.bit_equal]}", *facts, *files)
-    _require_bits(result, folder, episode)
-
-
-@click.command(
-    short_help="Write one episode of a run for other tools.",
-    epilog=examples(
-        "harness export runs/smoke 17 --to xosc", "harness export runs/smoke 17 --to csv --out episode_17.csv"
-    ),
-)
-@click.argument("folder", metavar="DIR", type=RUN_FOLDER)
-@click.argument("episode", type=click.IntRange(min=0))
-@click.option("--to", "form", type=click.Choice(["xosc", "csv"]), required=True, help="Kind of file.")
-@click.option("--out", type=FILE, callback=written_file(), help="File to write. Default: episode_N.xosc or .csv, here.")
-def export(folder: Path, episode: int, *, form: str, out: Path | None) -> None:
-    """Simulate episode number EPISODE of the run in DIR again, bit for bit, and write its motion for other tools.
-
-    xosc: OpenSCENARIO XML 1.2, and its OpenDRIVE road beside it (.xodr), with the motion of all three vehicles in steps
-    of 0.1 s. Needs the extra 'export'.
-
-    csv: a row for each vehicle and step; the columns' names say the units.
-    """
-    file = out or Path(f"episode_{episode}.{form}")
-    if file.suffix != f".{form}":
-        mend = f"Write --out {file.with_suffix(f'.{form}')}, or another --to."
-        raise HarnessError(f"--out {file}", f"a name that ends in '{file.suffix}'", f"one that ends in .{form}", mend)
-    if form == "xosc":
-        try:
-            from harness.report.openscenario import write_openscenario as write  # noqa: PLC0415 - an extra
-        except ModuleNotFoundError as error:
-            mend = "Install it, in the harness's folder: pip install -c requirements.lock -e '.[export]'."
-            raise HarnessError("--to xosc", f"no package {error.name}", "the extra 'export'", mend) from error
-    else:
-        from harness.report.player import write_csv as write  # noqa: PLC0415 - keeps --help fast
-    from harness.runner.stored import replay_episode  # noqa: PLC0415 - keeps --help fast
-
-    result = replay_episode(folder, episode)
-    _require_bits(result, folder, episode)
-    write(result.trace, file)
-    say(str(file), *([str(file.with_suffix(".xodr"))] if form == "xosc" else []))
-
-
-def _require_bits(result: ReplayResult, folder: Path, episode: int) -> None:
+        say(f"episode {episode}: {result.outcome}; {words}", *facts, *written)
     if result.bit_equal is False:
         found = "a replay that differs from the stored trace"
         raise WorldDisagreementError(f"episode {episode} of {folder}", found, "the same bits", str(result.suspects))

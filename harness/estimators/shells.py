@@ -136,7 +136,7 @@ class ShellDetails:
     rhw_from_pool: Number
     rhw_from_pool_at_least: Number
     p_cut_in: float
-    p_impossible: float
+    p_unreachable: float
     learned: str
     references: tuple[BesideReference, ...]
     statements: tuple[Within, ...]

@@ -284,8 +284,6 @@ def _warnings(
         yield f"the vehicle does not do what statement {decision['statement']} assumes: ask without it"
     if decision is not None and not decision.get("driver") and (unseen := no_lower_limit(best, manifest)):
         yield f"no lane change was seen at {unseen[0]}: a limit on the rate rests on that; ask --accept r157-cc"
-    if decision is not None and (before := decision["asked_before"]):
-        yield f"these tests were asked about {len(before)} other limits before: {', '.join(map(plain, before))}"
     worst = best.crash_rate + (0.0 if severity is None else severity.cut_off)
     if worst > max((1.0 + CUT_OFF_SHARE) * best.crash_rate, best.ci_high):
         yield f"time was up while it closed in: had all these tests crashed, {number(worst)} per test"

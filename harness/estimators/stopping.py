@@ -82,8 +82,7 @@ class Decision:
     crash rate lies on the side which is said, whatever the budget: a campaign is wrong in at most 1 - ``confidence`` of
     cases even where the limit is the rate itself.
     ``contradicted`` says whether a test has shown that the vehicle does not do what the statement assumes: its upper
-    limit then says nothing, while what crashed, crashed. ``asked_before`` are other limits that were asked of the same
-    tests: who asks until an answer pleases errs more often.
+    limit then says nothing, while what crashed, crashed.
     """
 
     limit: float
@@ -93,7 +92,6 @@ class Decision:
     high: float
     contradicted: bool = False
     n_episodes: int = 0
-    asked_before: Sequence[float | str] = ()
     driver: str | None = None
 
     @property
@@ -110,10 +108,9 @@ class Decision:
 
     @property
     def sentence(self) -> str:
-        """The verdict in words, and which limits were asked before."""
+        """The verdict in words."""
         given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
-        limit, before = limit_words(self.limit, self.driver), self.asked_before
-        shown = ratio if self.driver else number
+        limit, shown = limit_words(self.limit, self.driver), ratio if self.driver else number
         side = f"below {limit} (upper limit {shown(self.high)})"
         if self.verdict == "rejected":
             side = f"above {limit} (lower limit {shown(self.low)})"
@@ -127,10 +124,7 @@ class Decision:
         elif self.verdict == "undecided":
             between = f"it may be {shown(self.low)} as well as {shown(self.high)}"
             text = f"UNDECIDED: whether the crash rate{given} is below {limit} is not known; {between}."
-        if not before:
-            return text
-        place = ("second", "third")[len(before) - 1] if len(before) < 3 else f"{len(before) + 1}th"
-        return f"{text} This is the {place} limit asked of these tests (before: {', '.join(map(plain, before))})."
+        return text
 
     def to_json(self) -> dict[str, Any]:
         """All of it; a limit per test also by its key in the campaign."""

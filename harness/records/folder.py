@@ -266,7 +266,7 @@ def read_kept(
 
 
 def listed_crc32(shard: Mapping[str, Any], table: str) -> int | None:
-    """Checksum of a shard's table; None in folders of before."""
+    """Checksum of a shard's table; None of one that is being made anew."""
     crc32: int | None = shard.get("crc32", {}).get(table)
     return crc32
 
@@ -344,10 +344,9 @@ class StoredManifest(Stored):
     shards: list[StoredShard]
     campaign_crc32: Count | None = None
     versions: dict[str, str] = {}
-    stopped_by: StoppedBy | Literal["two_phase"] | None = None
+    stopped_by: StoppedBy | None = None
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
-    limits: list[float | str] = []
     repeated: Repeated | None = None
     baseline_crc32: list[Count] = []
     pilot_tests: dict[str, Count] | None = None
@@ -355,21 +354,12 @@ class StoredManifest(Stored):
 
 
 def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
-    """Read ``manifest.json`` of a run, as `StoredManifest` says; ``mend`` is the advice where it cannot be.
-
-    Earlier versions could divide a run into parts, or into two phases: such a folder is refused.
-    """
+    """Read ``manifest.json`` of a run, as `StoredManifest` says; ``mend`` is the advice where it cannot be."""
     path = folder / MANIFEST
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
-    content = read_as(StoredManifest, path, mend=mend).model_dump(exclude_unset=True)
-    divided = {"part": "a part of a run", "plan": "a plan of a run", "reported_from": "a run in two phases"}
-    if kind := next((kind for kind in divided if content.get(kind)), None):
-        version = (content.get("versions") or {}).get("harness", "that made it")
-        again = f"Read it with version {version}, or run the campaign.yaml again into a new folder."
-        raise RunFolderError(str(folder), divided[kind], "a whole run, as this version makes it", again)
-    return content
+    return read_as(StoredManifest, path, mend=mend).model_dump(exclude_unset=True)
 
 
 def read_as(kind: type[T], path: Path, *, mend: str) -> T:
@@ -389,7 +379,6 @@ def read_as(kind: type[T], path: Path, *, mend: str) -> T:
         found = f"no key {where}" if first["type"] == "missing" else f"{where} {shortened(repr(first['input']), 60)}"
         wrong = f"what a run has written: {first['msg'][:1].lower()}{first['msg'][1:]}"
         raise RunFolderError(str(path), found + more, wrong, mend) from None
-    seal = values.pop(SEAL, None)
-    if seal is not None and seal != _seal(values):
+    if (seal := values.pop(SEAL, "none")) != _seal(values):
         raise RunFolderError(str(path), f"values that do not fit their checksum ({SEAL}: {seal})", expected, mend)
     return value

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
@@ -35,7 +36,8 @@ from harness.records.folder import (
     read_manifest,
     require_unchanged,
 )
-from harness.traffic.loading import load_parameters
+from harness.traffic.laws import Environment
+from harness.traffic.loading import load_environment, load_parameters
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
@@ -67,7 +69,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
         raise RunFolderError(str(path), found, expected, mend) from error
     crc32 = manifest.get("campaign_crc32")
     require_unchanged(path, crc32, mend)
-    if crc32 is None:  # a folder of before, or one whose run was killed as it began
+    if crc32 is None:  # its run was killed as it began
         with suppress(CampaignError):  # its environment file is gone: nobody can tell
             parameters = load_parameters(campaign.environment)
             require_campaign(path, campaign.content_hash(parameters.content_hash()), manifest)
@@ -80,6 +82,16 @@ def require_campaign(path: Path, content_hash: str, manifest: Mapping[str, Any])
         expected = f"campaign {manifest['campaign_hash']}, which made the records (manifest.json)"
         mend = "Restore campaign.yaml and the environment parameter file that it names."
         raise RunFolderError(str(path), f"campaign {content_hash}", expected, mend)
+
+
+def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment | None:
+    """The run's traffic, where its parameters are still what they were; else others cannot be driven."""
+    try:
+        parameters = load_parameters(campaign.environment)
+    except CampaignError:
+        return None
+    known = campaign.content_hash(parameters.content_hash()) == manifest["campaign_hash"]
+    return load_environment(campaign.environment, parameters) if known else None
 
 
 def read_shards(folder: Path, columns: list[str] | None = None) -> Iterator[pa.Table]:
@@ -162,6 +174,7 @@ class StoredRun:
         again = f"Make it again with `harness estimate {self.folder} --write`."
         return read_as(dict[str, Any], self.folder / "estimates.json", mend=again)
 
+    @checked("episodes")
     def episodes(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """One row per test, failed ones included, with its ``weight`` and all ``columns``, or those that are named.
 
@@ -170,14 +183,17 @@ class StoredRun:
         """
         return _described(self.table("episodes", columns))
 
+    @checked("moments")
     def moments(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """One row per control step; a `RunFolderError` where the campaign kept none (``records.moments``)."""
         return _described(self.table("moments", columns))
 
+    @checked("traces")
     def traces(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
         """One row per step and vehicle; a `RunFolderError` where nothing was traced (``records.traces``)."""
         return _described(self.table("traces", columns))
 
+    @checked("table")
     def table(self, name: TableName, columns: Sequence[str] | None = None) -> pa.Table:
         """What the method of that ``name`` gives, as an Arrow table: several times faster, and smaller, for long runs.
 
@@ -185,6 +201,7 @@ class StoredRun:
         """
         return concatenated(list(self.batches(name, columns)), self.folder)
 
+    @checked("batches")
     def batches(self, name: TableName, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
         """`table` in consecutive pieces, one per shard: for what does not fit into memory."""
         shards = [shard for shard in read_manifest(self.folder)["shards"] if shard["files"].get(name)]
@@ -231,6 +248,11 @@ def _described(table: pa.Table) -> pd.DataFrame:
     return frame
 
 
+@checked("harness.read")
 def read(folder: str | Path) -> StoredRun:
-    """Tables of a stored run, as pandas frames or Arrow tables, with units and weights."""
+    """Tables of a stored run, as pandas frames or Arrow tables, with units and weights.
+
+    Raises `RunFolderError`: the folder is no run.
+    """
+    read_manifest(Path(folder))
     return StoredRun(Path(folder))

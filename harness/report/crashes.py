@@ -9,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from harness.errors import CampaignError
 from harness.estimators.severity import weighted_quantiles
 from harness.numbers import tenths
 from harness.pool.replay import LEAD, PATH_COLUMNS
@@ -17,7 +16,6 @@ from harness.records.reader import read_traces, stored_columns
 from harness.report.player import OTHERS, TRACE_COLUMNS, UNKNOWN, Scene, Scenes
 from harness.report.summary import RunFolder, RunSummary
 from harness.traffic.laws import Environment
-from harness.traffic.loading import load_environment, load_parameters
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 CANDIDATES, SHOWN = 50, 3
@@ -98,17 +96,6 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
         keys["weight"] = weight
     first = {"crash {} that r157-cc would have avoided": worst_crashes(impact, episode, avoided[:, 0])}
     return first | {name: worst_crashes(key, episode, among) for name, key in keys.items()}
-
-
-def environment_of(run: RunFolder) -> Environment | None:
-    """The run's traffic, where its parameters are still what they were; else others cannot be driven."""
-    settings = run.campaign.environment
-    try:
-        parameters = load_parameters(settings)
-    except CampaignError:
-        return None
-    known = run.campaign.content_hash(parameters.content_hash()) == run.manifest["campaign_hash"]
-    return load_environment(settings, parameters) if known else None
 
 
 def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArray) -> IntArray:

@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from harness import numbers
+from harness.arguments import checked
 from harness.campaign.files import dump_campaign
 from harness.errors import printable
 from harness.estimators.shells import Within
 from harness.estimators.traffic import Sensitivity
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
-from harness.records.reader import table_sizes
-from harness.report.crashes import crash_gallery, environment_of
+from harness.records.reader import table_sizes, traffic_of
+from harness.report.crashes import crash_gallery
 from harness.report.drawing import Plot
 from harness.report.player import templates
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
@@ -28,6 +29,7 @@ PLOT_NAMES = re.compile(
 )
 
 
+@checked("harness.write_report")
 def write_report(folder: str | Path) -> Path:
     """Write ``report.html`` and ``plots/`` (SVG) into a run folder, and return the page.
 
@@ -40,7 +42,7 @@ def write_report(folder: str | Path) -> Path:
     """
     folder = Path(folder)
     run = read_run_folder(folder)
-    sizes, summary, traffic = table_sizes(folder), summarise(run), environment_of(run)
+    sizes, summary, traffic = table_sizes(folder), summarise(run), traffic_of(run.campaign, run.manifest)
     plots = _plots(run, summary, traffic)
     gallery, scenes = crash_gallery(run, summary, traffic)
     environment = templates()

@@ -19,7 +19,6 @@ import pyarrow.compute as pc
 from jinja2 import Environment as Templates
 from jinja2 import FileSystemBytecodeCache, PackageLoader, StrictUndefined
 from markupsafe import Markup
-from pyarrow import csv
 
 from harness.campaign.campaign import Campaign
 from harness.compiled import cache_root, unboxed
@@ -28,7 +27,7 @@ from harness.errors import printable
 from harness.numbers import tenths
 from harness.pool.cut_ins import onset_steps
 from harness.pool.replay import drive_others, stored_paths
-from harness.records.folder import write_atomically, write_bytes
+from harness.records.folder import write_bytes
 from harness.report.summary import floats
 from harness.traffic.laws import Environment
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -165,13 +164,6 @@ def _states(rows: pa.Table) -> dict[str, Any]:
     return {"x": floats(rows.column("x_m")), "v": floats(rows.column("v_mps"))}
 
 
-def write_csv(trace: pa.Table, file: Path) -> None:
-    """The rows of a trace with the time in place of episode and step; the columns' names say the units."""
-    time_s = pa.array(trace.column("step").to_numpy() * STEP_S).cast(pa.float64())
-    rows = trace.drop_columns(["episode", "step"]).add_column(0, "time_s", pc.round(time_s, 1))
-    write_atomically(file, lambda unfinished: csv.write_csv(rows, unfinished))
-
-
 def share_over(track: pa.Table) -> FloatArray:
     """How far a vehicle has come over from the left lane in each row of its trace: 0 to 1."""
     over: FloatArray = 1.0 - floats(track.column("lane"))
@@ -275,6 +267,6 @@ def templates() -> Templates:
 
 
 def write_player(scene: Scene, file: str | Path) -> None:
-    """Write a page with nothing but the player of a scene, such as `harness.runner.stored.ReplayResult` has."""
+    """Write a page with nothing but the player of a scene."""
     page = templates().get_template("replay.html.j2").render(scene=scene, scenes=[scene])
     write_bytes(Path(file), printable(page).encode("utf-8"))

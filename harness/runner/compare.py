@@ -12,12 +12,15 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
+from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
+from harness.campaign.files import campaign_of
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
 from harness.estimators.answer import conditional_paired_statement, paired_statement
 from harness.estimators.pairs import MarginVerdict, PairedEstimate, PairedShells, paired_estimate
@@ -26,7 +29,8 @@ from harness.estimators.stopping import PairRule
 from harness.numbers import leaves
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import read_manifest, sole_use, write_json
+from harness.records.folder import CAMPAIGN, read_manifest, sole_use, write_sealed
+from harness.records.origin import require_trust
 from harness.records.reader import read_shards
 from harness.resolved import Resolved, require_ready
 from harness.runner.resume import require_own_folder
@@ -60,27 +64,33 @@ class Comparison:
     report: Path
 
 
+@checked("harness.compare")
 def compare_campaigns(
-    a: Campaign,
-    b: Campaign,
+    a: Campaign | str | Path,
+    b: Campaign | str | Path,
     out: str | Path,
     *,
-    workers: int | None = None,
+    workers: AtLeastOne | None = None,
     progress: Progress | None = None,
     labels: tuple[str, str] | None = None,
     stored: str | Path | None = None,
-    margin: float | None = None,
+    margin: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None,
 ) -> Comparison:
     """Drive two vehicles on the same cut-ins until the difference, or the margin, is known well enough.
 
-    The campaigns are equal but for ``av``, ``name`` and ``description``; ``labels`` name them in the answer, by default
-    as they do themselves. ``out/a`` and ``out/b`` become run folders; what an earlier call has finished there is used
-    again. ``stored`` is a run folder of A, whose tests are not driven again: it is copied to ``out/a``. A ``margin``
-    asks whether B's rate is at most 1 + margin times A's. ``workers`` and ``progress`` are those of `run_campaign`.
+    The campaigns, or those that paths or vehicles' names stand for, are equal but for ``av``, ``name`` and
+    ``description``; ``labels`` name them in the answer, by default as they do themselves. ``out/a`` and ``out/b``
+    become run folders; what an earlier call has finished there is used again. ``stored`` is a run folder of A, whose
+    tests are not driven again: it is copied to ``out/a``. A ``margin`` asks whether B's rate is at most 1 + margin
+    times A's. ``workers`` and ``progress`` are those of `run_campaign`.
 
     Raises `CampaignError`: the campaigns differ in something else, or do not draw from the same shells. Raises
     `RunFolderError`: ``out`` holds other runs.
     """
+    a, b = campaign_of(a), campaign_of(b)
+    if stored is not None:
+        mend = f"Read that code; then name {Path(stored) / CAMPAIGN} for A, which drives it anew."
+        require_trust(Path(stored), read_manifest(Path(stored)), a.av, mend)
     sides = require_ready(a, "compare"), require_ready(b, "compare")
     require_comparable(*(side.campaign for side in sides))
     require_same_shells(sides, stored)
@@ -119,7 +129,7 @@ def compare_campaigns(
         content["ended"] = "episodes" if rule.margin is None else "open"
     if where := load_parameters(a.environment).unseen:
         content["warnings"].append(unseen_words(where))
-    write_json(out / COMPARISON, content)
+    write_sealed(out / COMPARISON, content)
     from harness.report.compare_page import write_comparison  # noqa: PLC0415
 
     return Comparison(out, found, content, code, write_comparison(out))

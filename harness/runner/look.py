@@ -10,11 +10,14 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
+from harness.arguments import checked
 from harness.campaign.campaign import Campaign
+from harness.campaign.files import campaign_of
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.find import has_foreign_code, run_apart
 from harness.episode.loop import EpisodeLoop, Shard
@@ -150,7 +153,13 @@ class AvCheck:
         return finite_json({**asdict(self), "deterministic": not self.differing, "exit_code": self.exit_code})
 
 
-def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path | None = None) -> AvCheck:
+@checked("harness.av_check")
+def check_av(
+    campaign: Campaign | str | Path,
+    n_episodes: Annotated[int, Field(ge=2)] = EPISODES,
+    *,
+    black_box: Path | None = None,
+) -> AvCheck:
     """Run a few dozen episodes with a campaign's AV, twice, and say what is to be seen.
 
     The second run has other cells, begins in the middle, and follows episodes of its own: a controller that remembers
@@ -161,7 +170,7 @@ def check_av(campaign: Campaign, n_episodes: int = EPISODES, *, black_box: Path 
 
     Raises `HarnessError`: the campaign is wrong, or the AV cannot be found, made or started.
     """
-    tested = _as_checked(campaign)
+    tested = _as_checked(campaign_of(campaign))
     require_world(tested)
     source = prepare(resolve(tested, "av-check"))
     first, own_speed = _timed_run(source, n_episodes, black_box)
@@ -310,6 +319,7 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
 # -- what a campaign costs --
 
 
+@checked("plan_campaign")
 def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     """Most that a campaign may cost: ``most_tests`` and ``most_seconds``, the budget, and what is left to build.
 

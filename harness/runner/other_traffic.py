@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 from scipy.special import gammainc, gammaincinv
 
+from harness.arguments import Confidence, checked
 from harness.campaign.files import shipped_or_own
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
@@ -54,11 +55,12 @@ ONE_SIDED = 0.95
 """Quantile of a step's share that no replicate has drawn."""
 
 
+@checked("estimate_in_other_traffic")
 def estimate_in_other_traffic(
     folder: str | Path,
     environment: str,
     *,
-    confidence: float | None = None,
+    confidence: Confidence | None = None,
     own: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -130,8 +132,9 @@ def traffic_error(
     return TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), of_rate, ratios, unseen)
 
 
+@checked("compare_in_other_traffic")
 def compare_in_other_traffic(
-    folder: str | Path, environment: str, *, confidence: float | None = None, progress: Progress | None = None
+    folder: str | Path, environment: str, *, confidence: Confidence | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
     """What the stored tests of a comparison say of both vehicles in other traffic, and its replicates of their ratio.
 

@@ -18,9 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.campaign.files import dump_campaign
-from harness.campaign.sections import Accept
 from harness.errors import RunFolderError, TooManyFailedError
-from harness.estimators.stopping import limit_words
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
@@ -36,6 +34,7 @@ from harness.records.folder import (
     write_bytes,
     write_sealed,
 )
+from harness.records.origin import signature
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult, finished
@@ -76,17 +75,11 @@ def require_few_failed(
         )
 
 
-def _asked(accept: Accept) -> float | str:
-    """A limit as the manifest lists it: per test a number, else in words."""
-    _, limit, driver = accept.asked
-    return limit if driver is None else limit_words(limit, driver)
-
-
 class Manifest:
     """Finished shards in order, from the first on, and counts over them: keeps ``manifest.json`` and its campaign true.
 
     ``earlier`` is what `require_own_folder` found, ``began`` `time.monotonic` at the run's beginning; ``facts`` are
-    more keys. ``limits_before`` are other limits that have been asked of the folder's tests.
+    more keys.
     """
 
     def __init__(
@@ -99,21 +92,18 @@ class Manifest:
         self._repeated: Repeated | None = None
         self._causes: Counter[str] = Counter()
         self._began = began - float(earlier.get("wall_time_s") or 0.0)
-        asked = [] if campaign.accept is None else [_asked(campaign.accept)]
-        earlier_limits = earlier.get("limits", []) if earlier["n_episodes"] else []
-        self.limits_before = [limit for limit in earlier_limits if limit not in asked]
         self._content: dict[str, Any] = {
             "format": 1,
             "name": campaign.name,
             "campaign_hash": resolved.content_hash,
             "campaign_crc32": zlib.crc32(self._yaml),
+            "signature": signature(self._yaml),
             "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
             "seed": campaign.seed,
             "engine": campaign.world.engine,
             "versions": versions(),
             "cpu": cpu_name(),
             "controller_sha256": resolved.controller_sha256,
-            "limits": [*self.limits_before, *asked],
             **facts,
         }
         self._written = began

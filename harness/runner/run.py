@@ -14,7 +14,9 @@ from typing import Any
 
 import pyarrow as pa
 
+from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
+from harness.campaign.files import campaign_of
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import conclusion, expected_for
 from harness.estimators.stopping import Rule, Verdict
@@ -75,22 +77,24 @@ class RunResult:
     exit_code: int
 
 
+@checked("harness.run")
 def run_campaign(
-    campaign: Campaign | Resolved,
+    campaign: Campaign | Resolved | str | Path,
     out: str | Path,
     *,
-    workers: int | None = None,
+    workers: AtLeastOne | None = None,
     resume: bool = False,
     progress: Progress | None = None,
 ) -> RunResult:
-    """Run a campaign (if it has been through `require_ready`, as that returned it) into a folder.
+    """Run a campaign, or the one that a path or a vehicle's name stands for, into a folder.
 
     That is new or empty or, with ``resume``, holds a run of this campaign that was interrupted, or is to go on to a
     smaller RHW. The number of ``workers``, by default as many as there are cores, never changes a result.
 
     Raises `HarnessError`: the campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
-    resolved, out = campaign if isinstance(campaign, Resolved) else require_ready(campaign), Path(out)
+    resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign_of(campaign))
+    out = Path(out)
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)
         require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
@@ -252,7 +256,7 @@ class Run:
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
         if decision is not None:
             code = EXIT_OF[decision.verdict]
-            decided["decision"] = replace(decision, asked_before=manifest.limits_before).to_json()
+            decided["decision"] = decision.to_json()
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         manifest.write("done", stopped_by=stopped_by, ending=said, expected=expected, **decided)

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from harness.arguments import checked
 from harness.errors import CampaignError
 from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
@@ -51,6 +52,7 @@ class Move:
     settings: Sequence[Mapping[str, float]]
 
 
+@checked("sensitivity")
 def sensitivity(
     folder: str | Path, *, ranges: Mapping[str, tuple[float, float]] | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:

@@ -6,26 +6,30 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+from pydantic import Field
 
+from harness.arguments import Confidence, Episode, checked
 from harness.campaign.campaign import Campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block
 from harness.estimators.one_pass import SPACING
 from harness.processes import made_ahead
 from harness.records.folder import CAMPAIGN, concatenated, no_episodes, read_kept, read_manifest
-from harness.records.reader import read_campaign, read_shard, require_campaign
+from harness.records.origin import require_trust
+from harness.records.reader import read_campaign, read_shard, require_campaign, traffic_of
 from harness.records.schemas import shard_tables
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.resume import cpu_name, require_same_pool, versions
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
 from harness.sampling.protocol import block_of
+from harness.traffic.laws import Environment
 from harness.vocabulary import ESTIMATORS, EstimatorName
 from harness.worlds import build_world
 from harness.worlds.system_libraries import require_libraries
@@ -37,11 +41,12 @@ _FINISH = "Run `harness run` with --resume, which makes missing shards."
 _Shards = Sequence[Mapping[str, Any]]
 
 
+@checked("harness.estimate")
 def estimate_run(
     folder: str | Path,
     *,
-    estimators: Sequence[EstimatorName] | None = None,
-    confidence: float | None = None,
+    estimators: Annotated[Sequence[EstimatorName], Field(min_length=1)] | None = None,
+    confidence: Confidence | None = None,
 ) -> dict[str, Any]:
     """Estimate a stored run from its records; returns the content of ``estimates.json``.
 
@@ -115,6 +120,7 @@ def _incomplete(folder: Path, found: str, expected: str) -> RunFolderError:
     return RunFolderError(str(folder), found, expected, _FINISH)
 
 
+_TRUST = "Look at stored motion alone (--stored), which runs no code; or read that code, and then add --trust."
 _UNLIKE_BITS = ("episode", "seed", "failure")
 
 
@@ -123,8 +129,8 @@ class ReplayResult:
     """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
 
     ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where
-    nothing is; ``suspects`` is what may be why if it was not. ``scene`` is for `harness.write_player`; its ``facts``
-    are what happens, as pairs of a name and a phrase.
+    nothing is; ``suspects`` is what may be why if it was not. ``scene`` is what a page plays; its ``facts`` are what
+    happens, as pairs of a name and a phrase.
     """
 
     outcome: str
@@ -136,25 +142,69 @@ class ReplayResult:
     suspects: str | None = None
 
 
+@checked("harness.replay")
 def replay_episode(
-    folder: str | Path, episode: int, *, gui: bool = False, fcd: str | Path | None = None
+    folder: str | Path,
+    episode: Episode,
+    *,
+    gui: bool = False,
+    fcd: str | Path | None = None,
+    stored: bool = False,
+    trust: bool = False,
 ) -> ReplayResult:
     """Replay an episode of a run; a user's own code in a process of its own.
 
     ``episode`` is its index in the campaign. With ``gui`` it is shown in sumo-gui (extra ``harness[sumo]``); ``fcd`` is
-    a file for SUMO's floating-car data.
+    a file for SUMO's floating-car data. With ``stored`` it is as the run has traced it: nothing is simulated. Code that
+    a folder names which was not made on this machine by this user is run only if you ``trust`` it.
 
-    Raises `RunFolderError`: the folder is no run, has no such episode, or the campaign or the environment's parameter
-    file has changed since. Raises `CampaignError`: the AV is not reproducible. Raises `HarnessError`: SUMO's system
-    libraries are missing.
+    Raises `RunFolderError`: the folder is no run, has no such episode, or none that is traced, the campaign or the
+    environment's parameter file has changed since, or it names code that is not trusted. Raises `CampaignError`: the AV
+    is not reproducible. Raises `HarnessError`: SUMO's system libraries are missing.
     """
-    from harness.report.player import Scenes  # noqa: PLC0415 - `run` and `estimate` draw nothing
-
     folder, fcd = Path(folder), None if fcd is None else Path(fcd)
     manifest = read_manifest(folder)
-    _require_reproducible(manifest)
-    stored = _stored(folder, manifest, episode)
-    campaign = read_campaign(folder, manifest, check_files=True)
+    tables = _stored(folder, manifest, episode)
+    campaign = read_campaign(folder, manifest, check_files=not stored)
+    if not stored:
+        _require_reproducible(manifest, campaign)
+        if not trust:
+            require_trust(folder, manifest, campaign.av, _TRUST)
+        return _simulated(folder, manifest, campaign, tables, episode, gui, fcd)
+    if gui or fcd is not None:
+        found, expected = "stored motion, which SUMO does not simulate", "a simulation, for sumo-gui and its data"
+        raise HarnessError("--stored", found, expected, "Leave one of the two out.")
+    if "traces" not in tables or not tables["traces"].num_rows:
+        mend = "Simulate it again (without --stored), or run with --set records.traces=all, say."
+        raise RunFolderError(str(folder), f"no stored motion of episode {episode}", "an episode that is traced", mend)
+    return _result(campaign, traffic_of(campaign, manifest), tables, None, ())
+
+
+def _result(
+    campaign: Campaign,
+    traffic: Environment | None,
+    tables: Mapping[str, pa.Table],
+    bit_equal: bool | None,
+    compared: tuple[str, ...],
+    suspected: str | None = None,
+) -> ReplayResult:
+    from harness.report.player import Scenes  # noqa: PLC0415 - `run` and `estimate` draw nothing
+
+    (row,), traces = tables["episodes"].to_pylist(), tables["traces"]
+    scene = Scenes(campaign, traffic).scene(tables["episodes"], traces)
+    return ReplayResult(str(row["outcome"]), row, traces, bit_equal, compared, scene, suspected)
+
+
+def _simulated(
+    folder: Path,
+    manifest: dict[str, Any],
+    campaign: Campaign,
+    stored: Mapping[str, pa.Table],
+    episode: int,
+    gui: bool,
+    fcd: Path | None,
+) -> ReplayResult:
+    """The episode run again, and compared with what is stored."""
     resolved = resolve(campaign)
     require_campaign(folder / CAMPAIGN, resolved.content_hash, manifest)
     if gui or fcd is not None:
@@ -165,10 +215,8 @@ def replay_episode(
     again = replay(resolved, folder, episode, stored["episodes"], gui, fcd)
     compared = tuple(name for name in again if name in stored and stored[name].num_rows)
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
-    row: dict[str, Any] = again["episodes"].to_pylist()[0]
     why = None if bit_equal is not False else suspects(manifest, campaign)
-    scene = Scenes(campaign, resolved.environment).scene(again["episodes"], again["traces"])
-    return ReplayResult(str(row["outcome"]), row, again["traces"], bit_equal, compared, scene, why)
+    return _result(campaign, resolved.environment, again, bit_equal, compared, why)
 
 
 def _replay(
@@ -212,8 +260,8 @@ def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
     return " ".join(found) or "Versions and CPU are the run's: the records have been changed, or it is a defect."
 
 
-def _require_reproducible(manifest: dict[str, Any]) -> None:
-    if manifest.get("reproducible", True):
+def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:
+    if campaign.av.reproducible and manifest.get("reproducible", True):
         return
     repeated = manifest.get("repeated")
     if repeated:
@@ -223,10 +271,10 @@ def _require_reproducible(manifest: dict[str, Any]) -> None:
             "that it repeated itself came out otherwise",
             "an AV that does the same again, given the same observations and the same random stream",
             "Draw only from the generator handed over in start, and keep nothing across episodes (`harness "
-            "av-check` tells whether that is so). The traces that the run has kept are what happened.",
+            "av-check` tells whether that is so). The traces that the run has kept (--stored) are what happened.",
         )
     found = "a run that is not reproducible: a program outside of the harness drove the AV"
-    mend = "Look at the traces that the run has kept (records.traces: crash), or let the program write a log."
+    mend = "Look at the traces that the run has kept (--stored; records.traces: crash), or let the program write a log."
     raise CampaignError("av.traci", found, "an AV that does the same again: model, controller, sumo or fmu", mend)
 
 

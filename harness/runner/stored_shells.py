@@ -168,12 +168,12 @@ class Nearby:
     @property
     def ratio(self) -> float:
         """The factor of the ratio to the first reference driver."""
-        return self.rate / float(self.references[0]) if self.references.size else math.nan
+        return self.rate / float(self.references[0]) if self.references[:1].any() else math.nan
 
     @property
     def refused(self) -> bool:
-        """Whether the tests do not say it."""
-        return self.off > FAR_OFF or self.beyond > MOST_BEYOND
+        """Whether the tests do not say it: nothing is said, either, of traffic in which a driver never crashes."""
+        return not (self.off <= FAR_OFF and self.beyond <= MOST_BEYOND)
 
 
 def nearby(
@@ -191,11 +191,11 @@ def nearby(
     for found in paths.of(environments):
         now = p * ratio_of(found.p, base.p)
         known = ratio_of(found.rate[n_surrogates:], base.rate[n_surrogates:])
-        with np.errstate(divide="ignore", over="ignore"):
-            off = np.expm1(np.abs(np.log(ratio_of(ratio_of(now @ shares, p @ shares), known))))
         crashing = now * crash_share
         new = _share(found.beyond, found.p) - _share(base.beyond, base.p)  # ends of a sample are not those of a law
-        beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum()) + found.untested / found.p.sum()
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            off = np.expm1(np.abs(np.log(ratio_of(now @ shares, p @ shares) / known)))
+            beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum() + found.untested / found.p.sum())
         times = tested.rate(now) / tested.rate(p) if tested.holds else tested.limit(now, at_worst=True) / limit
         yield Nearby(now, times, known, float(np.max(off, initial=0.0)), beyond)
 

@@ -44,7 +44,7 @@ from harness.vocabulary import IntArray, RecordArray
 
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
-_FINISH = "Run `harness run` with --resume, which makes what is missing; one of an earlier version into a new folder."
+_FINISH = "Run `harness run` with --resume, which makes what is missing."
 POOL_S = "about 15 s"
 
 

@@ -18,7 +18,7 @@ from harness.campaign.files import load_campaign
 from harness.compiled import WORLD_SOURCES, source_hash
 from harness.estimators.estimate import finite_json
 from harness.progress import Progress
-from harness.records.folder import read_as, sole_use, write_json
+from harness.records.folder import read_as, sole_use, write_sealed
 from harness.resolved import resolve
 from studies.case_study.counted import compare_control_variates, count_required_tests, draw_convergence
 from studies.case_study.page import write_page
@@ -69,7 +69,7 @@ def run_study(
             if not (place / RESULT).is_file():
                 began = time.monotonic()
                 context = Context(place, study.rhw, study.confidence, made, workers, progress or Progress())
-                write_json(place / RESULT, finite_json({"kind": step.kind, **_MAKERS[step.kind](step, context)}))
+                write_sealed(place / RESULT, finite_json({"kind": step.kind, **_MAKERS[step.kind](step, context)}))
                 seconds[name] = time.monotonic() - began
             result = read_as(dict[str, Any], place / RESULT, mend="Delete the folder of this step; it is made again.")
             made[name] = Made(place, result)

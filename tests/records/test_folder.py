@@ -24,6 +24,7 @@ from harness.records.folder import (
     shard_file,
     write_atomically,
     write_json,
+    write_sealed,
     write_shard,
     write_together,
 )
@@ -33,7 +34,7 @@ from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
 from tests.golden.record import column_hash
 from tests.in_process import controllers_here, run_here
-from tests.stored_runs import copy_of, edit, golden, of_before, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, edit, golden, shard_files, stored_table, unlike_columns
 
 
 @pytest.fixture
@@ -135,8 +136,8 @@ def test_json_is_strict(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "file.json", {"rhw": float("inf")})
     assert files_below(tmp_path) == set()
-    write_json(tmp_path / "file.json", {"rate": 0.1, "σ": [1, None]})
-    assert read_as(dict, tmp_path / "file.json", mend="") == {"rate": 0.1, "σ": [1, None]}
+    write_sealed(tmp_path / "file.json", {"rate": 0.1, "σ": [1, None]})
+    assert read_as(dict, tmp_path / "file.json", mend="").items() >= {"rate": 0.1, "σ": [1, None]}.items()
 
 
 # -- a bit that flips, or a file of another run, changes no number without a word --
@@ -190,12 +191,6 @@ def flips_unnoticed(folder: Path, n: int, seed: int) -> Iterator[str]:
 
 def test_a_flipped_bit_changes_no_number_silently(stored):
     assert list(flips_unnoticed(stored, FLIPS, seed=1)) == []
-
-
-def test_without_checksums_it_would(stored):
-    """The same flips in a folder of before: this is what they are for."""
-    assert told(of_before(stored))
-    assert next(flips_unnoticed(stored, FLIPS, seed=2))
 
 
 def test_a_flipped_bit_of_a_baseline_run_changes_no_test(stored_run, tmp_path):

@@ -12,7 +12,7 @@ from harness.campaign.files import load_campaign
 from harness.report.page import write_report
 from tests.golden.campaigns import BASE, FAILING, FORCED, MIXTURE, RUNS, SHELLS
 from tests.in_process import run_here
-from tests.stored_runs import edit, of_before
+from tests.stored_runs import edit, unnoted
 
 GOLDEN = Path(__file__).parent / "golden"
 KINDS = ("shells", "weighted", "nde", "no_crash")
@@ -51,7 +51,7 @@ def write_run(folder: Path, name: str) -> Path:
     """Run it into the folder, and return that: without checksums, so that a test may change files."""
     run_here(load_campaign(BASE, PAGES[name]), folder)
     edit(folder, **FIXED)
-    return of_before(folder)
+    return unnoted(folder)
 
 
 class Page(HTMLParser):

@@ -39,7 +39,7 @@ def report(stored_run, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def replayed(stored_run, tmp_path_factory) -> Path:
     folder, file = stored_run("shells-lateral-sumo"), tmp_path_factory.mktemp("replay") / "crash.html"
-    harness.write_player(harness.replay(folder, crashed(folder)[0]).scene, file)
+    harness.write_motion(harness.replay(folder, crashed(folder)[0]), file)
     return file
 
 

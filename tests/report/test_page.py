@@ -12,6 +12,7 @@ import pytest
 from junitparser import JUnitXml
 
 from harness.errors import RunFolderError
+from harness.records.folder import write_sealed
 from harness.report.junit import statement_cases, write_junit
 from harness.report.page import run_notes, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
@@ -31,9 +32,9 @@ SEEN = {
 
 
 def edit(path: Path, **changes) -> dict:
-    """Change top-level keys of a JSON file; returns what it held before."""
+    """Change top-level keys of a JSON file, and its checksum; returns what it held before."""
     content = json.loads(path.read_text())
-    path.write_text(json.dumps(content | changes))
+    write_sealed(path, content | changes)
     return content
 
 

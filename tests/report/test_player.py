@@ -11,6 +11,7 @@ import pytest
 import harness
 from harness.campaign.files import load_campaign
 from harness.cli import main
+from harness.records.reader import traffic_of
 from harness.report import crashes, player
 from harness.report.page import write_report
 from harness.report.player import OTHERS, UNKNOWN, Scenes
@@ -42,7 +43,7 @@ def test_a_page_holds_the_motion_to_the_last_bit(name, stored_run, tmp_path):
     folder, file = stored_run(name), tmp_path / "crash.html"
     for episode in sorted({*crashed(folder, 2), 0, 1}):
         result = harness.replay(folder, episode)
-        harness.write_player(result.scene, file)
+        harness.write_motion(result, file)
         [scene] = scenes_in(file.read_text(encoding="utf-8"))
         first, n = scene["first"], result.row["n_steps"] + 1
         for track in scene["tracks"]:
@@ -132,7 +133,7 @@ def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_n
     for rank, end in who.items():
         ends[by_rank[rank]] = end
     monkeypatch.setattr(crashes, "_ends", lambda *_: ends)
-    rows, scenes = crashes.crash_gallery(run, summary, crashes.environment_of(run))
+    rows, scenes = crashes.crash_gallery(run, summary, traffic_of(run.campaign, run.manifest))
     assert [row.reason.split(", ")[0] for row in rows][: len(leads)] == [lead.split(", ")[0] for lead in leads]
     shown = [row.episode for row in rows]
     allowed = [int(summary.crashes["episode"][by_rank[rank]]) for rank in who or range(impact.size)]
@@ -148,7 +149,9 @@ def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_n
 def test_a_report_shows_crashes_with_those_who_avoid_them(stored_run, tmp_path):
     folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
     scenes = scenes_in(write_report(folder).read_text(encoding="utf-8"))
-    rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run), crashes.environment_of(run))
+    rows, _ = crashes.crash_gallery(
+        run := read_run_folder(folder), summarise(run), traffic_of(run.campaign, run.manifest)
+    )
     assert [row.episode for row in rows if row.scene is not None] == [scene["episode"] for scene in scenes]
     for row, scene in zip(rows, scenes, strict=True):
         avoids = [ghost["name"] for ghost in scene["ghosts"] if ghost["crash"] is None]
@@ -164,7 +167,9 @@ def test_without_the_runs_traffic_its_vehicles_are_played_alone(stored_run, tmp_
     scenes = scenes_in(write_report(folder).read_text(encoding="utf-8"))
     assert scenes
     assert not any(scene["ghosts"] for scene in scenes)
-    rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run), crashes.environment_of(run))
+    rows, _ = crashes.crash_gallery(
+        run := read_run_folder(folder), summarise(run), traffic_of(run.campaign, run.manifest)
+    )
     assert {row.avoided_by for row in rows} == {"–"}
 
 
@@ -172,7 +177,7 @@ def test_hostile_names_stay_text(stored_run, tmp_path):
     hostile = "</script><script>alert('x')</script><!--"
     scene = harness.replay(stored_run("shells-twin"), 0).scene | {"campaign": hostile, "title": hostile}
     file = tmp_path / "page.html"
-    harness.write_player(scene, file)
+    player.write_player(scene, file)
     page = file.read_text(encoding="utf-8")
     assert page.count("<script") == 2
     assert hostile not in page
@@ -182,7 +187,7 @@ def test_hostile_names_stay_text(stored_run, tmp_path):
 def test_replay_says_what_happens_and_writes_the_page(stored_run, tmp_path, capsys):
     folder, file = stored_run("forced-lateral-sumo"), tmp_path / "crash.html"
     episode = crashed(folder)[0]
-    assert main(["replay", str(folder), str(episode), "--html", str(file)]) == 0
+    assert main(["replay", str(folder), str(episode), "--out", str(file)]) == 0
     first, *lines, last = capsys.readouterr().out.splitlines()
     assert first == f"episode {episode}: crash; bit for bit as stored"
     assert last == str(file)

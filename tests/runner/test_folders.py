@@ -14,7 +14,7 @@ from harness.resolved import resolve
 from harness.runner.resume import require_own_folder
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import run_here
-from tests.stored_runs import copy_of, edit, golden, manifest, of_before, sets, shard_files, truncate, unlike_columns
+from tests.stored_runs import copy_of, edit, golden, manifest, sets, shard_files, truncate, unlike_columns, unnoted
 
 NAME = "mixture-twin"
 RUN = ("run", BASE, *sets(*RUNS[NAME]), "--out")
@@ -132,7 +132,7 @@ def written(file: str, text: str | None):
         (lambda run: None, [("replay", 400)], "from 0 to 239"),
         (lambda run: truncate(shard_files(run)[1]), READERS, "episodes/shard-000001.parquet"),
         (
-            lambda run: truncate(shard_files(of_before(run))[1]),
+            lambda run: truncate(shard_files(unnoted(run))[1]),
             READERS,
             "shard-000001.parquet found: a file that cannot",
         ),
@@ -140,8 +140,6 @@ def written(file: str, text: str | None):
         (lambda run: shard_files(run, "traces")[1].unlink(), READERS[1:], "traces/shard-000001.parquet found: no such"),
         (lambda run: (run / "estimates.json").unlink(), READERS[1:2], "harness estimate"),
         (lambda run: edit(run, n_episodes=0, shards=[]), READERS[::2], "has not finished an episode yet"),
-        (lambda run: edit(run, part={"number": 1}), READERS[:1], "a part of a run"),
-        (lambda run: edit(run, reported_from=90, stopped_by="two_phase"), READERS[:1], "a run in two phases"),
         (lambda run: edit(run, n_episodes=500), READERS[:1], "240 episodes"),
         (lambda run: edit(run, shards=manifest(run)["shards"][::2]), READERS[:1], "begins at episode 160"),
         (lambda run: edit(run, campaign_hash="0" * 16), READERS[2:], "campaign.yaml"),
@@ -178,7 +176,7 @@ def test_values_that_no_run_has_written_are_refused(stored):
     for key, wrong in (
         *(("n_episodes", wrong) for wrong in (-1, 0.5, 10**400, True, "240", [240])),
         *(("shards", wrong) for wrong in (None, {}, *([{**shard, **changed}] for changed in of_no_shard))),
-        *(("campaign_hash", 5), ("stopped_by", "the moon"), ("distance_per_test_m", float("nan")), ("versions", ["x"])),
+        *(("campaign_hash", 5), ("stopped_by", "the moon"), ("distance_per_test_m", "far"), ("versions", ["x"])),
     ):
         content = (stored / "manifest.json").read_text()
         edit(stored, **{key: wrong})

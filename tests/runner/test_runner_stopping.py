@@ -122,15 +122,6 @@ def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(campaign, run_h
     assert unlike_columns(on.folder, others.folder) == []
 
 
-def test_a_second_limit_is_answered_and_said(campaign, run_here, tmp_path):
-    """The first one that is asked again is no second one."""
-    for limit, before in (("5e-8", []), ("5e-8", []), ("3e-8", [5e-8]), ("5e-8", [3e-8])):
-        asked = campaign(*SHELLS, "world.engine=twin", f"accept.crash_rate_below={limit}")
-        found = run_here(asked, tmp_path / "run", resume=(tmp_path / "run").exists()).estimates["decision"]
-        assert (found["verdict"], found["asked_before"]) == ("rejected", before)
-        assert ("This is the second limit asked of these tests" in found["sentence"]) == bool(before)
-
-
 def test_nothing_is_accepted_given_what_the_vehicle_does_not_do(campaign, run_here, tmp_path):
     """SM-II crashes 8.8e-6 times per test, mostly outside, and brakes later than the need-based driver."""
     changes = (

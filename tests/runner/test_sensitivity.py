@@ -17,7 +17,7 @@ from harness.runner.sensitivity import Move, bar_of, moves, sensitivity
 from harness.runner.stored_shells import Nearby
 from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER
-from tests.stored_runs import copy_of, manifest
+from tests.stored_runs import copy_of, edit, manifest
 
 SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
 
@@ -53,12 +53,19 @@ def test_a_number_whose_end_the_tests_say_nothing_of_has_one_end(folder):
     assert bar["note"] == "unlike what was tested"
 
 
-def test_the_page_shows_the_tornado_of_these_tests_and_of_no_others(folder, capsys):
+def test_of_traffic_in_which_nobody_crashes_nothing_is_said(folder, capsys):
+    """Tests too short for a crash: the reference driver's rate is 0, to which there is no ratio."""
+    assert main(["sensitivity", str(folder), "--range", "scenario.duration_s=1:2", "--json"]) == 0
+    (bar,) = (each for each in json.loads(capsys.readouterr().out)["bars"] if each["what"] == "scenario.duration_s")
+    assert (bar["rate"], bar["ratio"], bar["note"]) == ([None, None], [None, None], "unlike what was tested")
+
+
+def test_the_page_shows_the_tornado_of_these_tests_and_of_no_others(folder):
     assert main(["sensitivity", str(folder), "--range", "cut_in.ignore_share=0.005:0.02", "--json"]) == 0
-    content, page = json.loads(capsys.readouterr().out), folder / "report.html"
+    page = folder / "report.html"
     assert "plot-sensitivity" in page.read_text()
     assert (folder / "plots" / "sensitivity.svg").is_file()
-    (folder / "sensitivity.json").write_text(json.dumps({**content, "campaign_hash": "0" * 16}))
+    edit(folder, "sensitivity.json", campaign_hash="0" * 16)
     assert main(["report", str(folder)]) == 0
     assert "plot-sensitivity" not in page.read_text()
 

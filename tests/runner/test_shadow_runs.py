@@ -12,7 +12,6 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import RunFolderError, TooManyFailedError
-from harness.pool.shells import CANDIDATES
 from harness.records.schemas import baseline_schema
 from harness.report.page import write_report
 from tests.in_process import run_here as run_golden
@@ -171,22 +170,6 @@ def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
     with pytest.raises(RunFolderError, match="baseline runs of 1 of 2 files"):
         replay(folder, 5)
     assert estimate(folder) == estimates(folder)  # needs no path
-
-
-def test_tests_that_do_not_say_which_runs_they_repeat_have_the_bound_of_the_error(stored_run, tmp_path):
-    """As those of earlier days do not: the same rate, and no estimate of the error below its bound."""
-    folder = copy_of(stored_run(ACTS), tmp_path / "run")
-    design = json.loads((folder / "shells.json").read_text())
-    del design["crc32"]
-    assert design.pop("candidates") == CANDIDATES
-    (folder / "shells.json").write_text(json.dumps(design))
-    for shard in shard_files(folder):
-        assert {"shadow", "cut_in_mass"} < set(pq.read_schema(shard).names)
-    former, now = (of["estimates"]["shells"] for of in (estimate(folder), estimates(folder)))
-    assert former["crash_rate"] == now["crash_rate"]
-    assert former["ci_low"] == pytest.approx(now["ci_low"], rel=1e-3)  # so few crashes tell no better than the bound
-    least = [of["details"]["rhw_from_pool_at_least"] for of in (former, now)]
-    assert least[0] > 1.5 * least[1]
 
 
 def test_a_page_is_written_where_so_few_paths_crashed_that_the_pool_s_error_is_not_known(stored_run, tmp_path):

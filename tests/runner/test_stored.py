@@ -23,7 +23,7 @@ from studies.alarm import alarm_of_run
 from tests.golden.record import column_hash
 from tests.in_process import run_here
 from tests.retracing import retraced
-from tests.stored_runs import ROOT, copy_of, edit, estimates, golden, manifest, of_before, shard_files, stored_table
+from tests.stored_runs import ROOT, copy_of, edit, estimates, golden, manifest, shard_files, stored_table, unnoted
 
 ESTIMATOR = {"shells-twin": "shells", "nde-twin": "nde"}
 RECORDS = (ROOT / "docs/records.md").read_text()
@@ -67,7 +67,7 @@ def test_shards_are_read_in_groups_without_changing_a_bit(most, sizes, twin_run,
 
 
 def test_shards_with_columns_of_other_types_are_refused(twin_run, tmp_path, monkeypatch):
-    folder = of_before(copy_of(twin_run, tmp_path / "run"))
+    folder = unnoted(copy_of(twin_run, tmp_path / "run"))
     table = pq.read_table(path := shard_files(folder)[2])
     column = table.schema.get_field_index("cut_in_step")
     pq.write_table(table.set_column(column, "cut_in_step", table.column(column).cast("float64")), path)
@@ -140,7 +140,7 @@ def one_bit(value: float) -> float:
 @pytest.mark.parametrize(("table", "column"), [("traces", "x_m"), ("traces", "v_mps"), ("episodes", "log_weight")])
 def test_a_record_that_was_tampered_with_is_noticed(table, column, twin_run, tmp_path, capsys):
     """By one unit in the last place."""
-    folder = of_before(copy_of(twin_run, tmp_path / "run"))
+    folder = unnoted(copy_of(twin_run, tmp_path / "run"))
     path = shard_files(folder, table)[1]
     rows = pq.read_table(path, partitioning=None)
     pq.write_table(with_value(rows, column, 30, one_bit), path)
