@@ -143,7 +143,13 @@ class Testing(Section):
     challenge: Literal["immediate", "recursive"] = Field(
         "recursive", description="immediate: crash if BV cuts in now (published); recursive: backward induction"
     )
-    epsilon: Probability = Field(0.1, description="share of natural driving in every importance function")
+    epsilon: float = Field(
+        0.1,
+        ge=1e-6,
+        le=1.0,
+        description="share of natural driving in every importance function; at 0 what no surrogate crashes on would "
+        "never be drawn, and the rate be too low",
+    )
     alpha: dict[SurrogateName, Probability] | None = Field(
         None, description="weight of each surrogate, summing to 1; none: equal"
     )
@@ -226,7 +232,7 @@ class Stop(Section):
         gt=0.0,
         le=1e6,
         description="with rhw and shells: stop, too, once the rate is known to be below so many times that of the "
-        "library's first reference driver",
+        "library's first reference driver; not where --set says rhw alone",
     )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = Field(

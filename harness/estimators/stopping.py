@@ -301,7 +301,7 @@ class RoundRule(Rule):
     def _below(self, seen: Shells) -> Decision | None:
         """That the rate is below the asked multiple of a reference driver's, at the level of decisions."""
         limit, first = self._below_reference, seen.first_reference
-        if limit is None or self._target is None or first is None:
+        if limit is None or first is None:
             return None
         driver, rate = first
         # Limits of a ratio take a hundred times as long as those of a rate: most looks are far from an end.
