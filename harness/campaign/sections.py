@@ -167,6 +167,9 @@ class Testing(Section):
         return alpha
 
 
+LEAST_POOL_ERROR, MOST_CUT_INS = 0.001, 1_000_000
+
+
 class PoolSettings(Section):
     """The pool of cut-ins that shells are drawn from; built once, in the twin."""
 
@@ -175,12 +178,12 @@ class PoolSettings(Section):
     )
     relative_error: float = Field(
         0.005,
-        ge=0.001,
+        ge=LEAST_POOL_ERROR,
         le=0.2,
         description="relative standard error of the surrogates' crash rates; four times that beyond the boundary",
     )
     cut_ins_per_shell: Whole = Field(
-        25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: its most tests"
+        25_000, ge=100, le=MOST_CUT_INS, description="cut-ins kept of each shell: its most tests"
     )
     shadow_paths: Whole = Field(
         500,

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
-from harness.estimators.answer import conclusion, expected_for
+from harness.estimators.answer import conclusion, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
 from harness.pool.build import campaign_pool
 from harness.pool.replay import Retracing
@@ -255,6 +255,7 @@ class Run:
         if decision is not None:
             code = EXIT_OF[decision.verdict]
             decided["decision"] = replace(decision, asked_before=manifest.limits_before).to_json()
+        decided["remedy"] = pool_remedy(rule, self.campaign, stopped_by) or None
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         retraced = self._retracing.summary(manifest.n_retraced)
