@@ -79,7 +79,7 @@ class Sampling:
     baseline_runs : bool
         Whether an AV that does not is driven along each path without a cut-in first.
     bounded : bool
-        Whether something bounds the weights; else no precision can be promised.
+        Whether weights are bounded whatever ``testing.epsilon`` is; else no precision can be promised.
     strata : bool
         Whether tests are cut-ins of the pool, counted within strata of known probability.
     controlled : bool

@@ -187,11 +187,18 @@ REFUSED = (
     ),
     Combination(
         "stop.rhw",
-        lambda c, _: c.stop.rhw is not None and not c.sampling.bounded,
+        lambda c, _: c.stop.rhw is not None and not c.sampling.bounded and c.testing.epsilon < 1.0,
         "{stop.rhw:g}, with testing.method {testing.method}",
-        "no precision to stop at: nothing bounds the weights of the step mixture, and while the large ones are missing "
-        "its interval looks narrow",
+        "no precision to stop at: weights of the step mixture may reach 1/epsilon to the power of its steps, and while "
+        "the large ones are missing its interval looks narrow",
         "Set it to null for a fixed number of tests (stop.episodes), or choose shells, forced or episode_mixture.",
+    ),
+    Combination(
+        "stop.below_reference",
+        lambda c, _: c.stop.below_reference is not None and (c.stop.rhw is None or not c.sampling.strata),
+        "{stop.below_reference:g}, where no stop.rhw is asked of tests from shells",
+        "nothing: all it does is to end a run of shells before its stop.rhw is reached",
+        "Write null; or ask for that limit alone, by accept.times_reference.",
     ),
     # -- cut-ins that take time --
     Combination(

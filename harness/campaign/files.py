@@ -64,8 +64,13 @@ def load_campaign(
     laid = [] if av is None else [Override(("av",), named_vehicle(av, "--av "), f"--av {av}")]
     of_file, folder = names_a_campaign(path), Path(path).parent
     data, lines = read_yaml(path) if of_file else (_default_campaign(str(path)), {})
-    place = Places(str(path), lines, [*laid, *map(parse_override, overrides)])
+    typed = [parse_override(each) for each in overrides]
+    place = Places(str(path), lines, [*laid, *_nothing_sooner(typed), *typed])
     campaign = _checked(data, Campaign, place)
+    if campaign.accept is not None and not any(each.path[0] == "accept" for each in typed):
+        for each in filter(_asks_for_precision, typed):
+            found, expected = "a precision, in a campaign with a limit", "one of the two: a limit ends it at a decision"
+            raise CampaignError(each.option, found, expected, "Add --set accept=null.")
     for where, expected in _FILES.items():
         name, end = campaign.at(where), ""
         if where[-1] == "controller" and name is not None and ".py:" in name:
@@ -141,6 +146,18 @@ def parse_override(text: str) -> Override:
     if not equals or not all(parts):
         raise CampaignError(option, "no path and value", "section.key=value", "For example: --set testing.epsilon=0.2")
     return Override(parts, parse_value(value, option), option)
+
+
+def _asks_for_precision(override: Override) -> bool:
+    return override.path in (("stop", "rhw"), ("stop", "min_crashes")) and override.value is not None
+
+
+def _nothing_sooner(typed: Sequence[Override]) -> Iterator[Override]:
+    """What is asked for by hand is what ends a run: what would end it sooner holds where that is typed, too."""
+    for each in typed:
+        other_method = each.path == ("testing", "method") and each.value != "shells"
+        if other_method or each.path == ("stop", "rhw") or _asks_for_precision(each):
+            yield Override(("stop", "below_reference"), None, each.option)
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:

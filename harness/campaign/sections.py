@@ -137,7 +137,13 @@ class Testing(Section):
     challenge: Literal["immediate", "recursive"] = Field(
         "recursive", description="immediate: crash if BV cuts in now (published); recursive: backward induction"
     )
-    epsilon: Probability = Field(0.1, description="share of natural driving in every importance function")
+    epsilon: float = Field(
+        0.1,
+        ge=1e-6,
+        le=1.0,
+        description="share of natural driving in every importance function; at 0 what no surrogate crashes on would "
+        "never be drawn, and the rate be too low",
+    )
     alpha: dict[SurrogateName, Probability] | None = Field(
         None, description="weight of each surrogate, summing to 1; none: equal"
     )
@@ -155,6 +161,9 @@ class Testing(Section):
         return alpha
 
 
+LEAST_POOL_ERROR, MOST_CUT_INS = 0.001, 1_000_000
+
+
 class PoolSettings(Section):
     """The pool of cut-ins that shells are drawn from; built once, in the twin."""
 
@@ -163,12 +172,12 @@ class PoolSettings(Section):
     )
     relative_error: float = Field(
         0.005,
-        ge=0.001,
+        ge=LEAST_POOL_ERROR,
         le=0.2,
         description="relative standard error of the surrogates' crash rates; four times that beyond the boundary",
     )
     cut_ins_per_shell: Whole = Field(
-        25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: its most tests"
+        25_000, ge=100, le=MOST_CUT_INS, description="cut-ins kept of each shell: its most tests"
     )
     shadow_paths: Whole = Field(
         500,
@@ -218,7 +227,7 @@ class Stop(Section):
         gt=0.0,
         le=1e6,
         description="with rhw and shells: stop, too, once the rate is known to be below so many times that of the "
-        "library's first reference driver",
+        "library's first reference driver; not where --set says rhw alone",
     )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = Field(

@@ -168,7 +168,8 @@ def _bar(bar: dict[str, Any]) -> dict[str, str]:
 
     values = "" if bar["values"] is None else " … ".join(map(plain, bar["values"]))
     told = {"number": bar["what"], "known": f"{bar['known']} {values}", "rate": ends(bar["rate"])}
-    return {**told, "ratio": ends(bar["ratio"]), "off by": share(bar["off"]), "remark": bar["note"]}
+    off = " … ".join(map(share, bar["off"])) if bar["off"] != [None, None] else ""
+    return {**told, "ratio": ends(bar["ratio"]), "off by": off, "remark": bar["note"]}
 
 
 @click.command(

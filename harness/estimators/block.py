@@ -69,8 +69,9 @@ class Drawn:
     """How all tests of a campaign are drawn.
 
     ``alpha`` (M,) are mixture weights of the importance functions; ``weight_cap`` is the bound on Y = 1{crash}·weight
-    that the design guarantees for every episode, seen or not, None if there is none; ``shells`` is what is known of the
-    strata, where tests are drawn from some. Crashes count with an impact above ``counts_above_mps``, all of them at 0.
+    that the design guarantees for every episode, seen or not, None if there is none; ``epsilon`` is the least share of
+    its exposure with which the step mixture draws a maneuver; ``shells`` is what is known of the strata, where tests
+    are drawn from some. Crashes count with an impact above ``counts_above_mps``, all of them at 0.
     """
 
     method: Method
@@ -78,6 +79,7 @@ class Drawn:
     weight_cap: float | None = None
     shells: ShellDesign | None = None
     counts_above_mps: float = 0.0
+    epsilon: float = 0.0
 
     @property
     def sampling(self) -> Sampling:
@@ -158,8 +160,14 @@ class Block:
         with np.errstate(over="ignore"):
             return np.asarray(np.exp(self.log_q + self.log_weight[:, None]))
 
-    def log_path_cap(self) -> float:
-        """Log of the largest P(cut-in | path)/share of forced cut-ins, a bound on Y of these paths; inf if unknown."""
+    def log_cap(self) -> float:
+        """Log of a bound on Y of these tests, whatever the AV does; inf if none is known.
+
+        Of forced cut-ins it is P(cut-in | path)/share, the largest. The step mixture draws each maneuver with ε times
+        its exposure at least: after l control steps, no more than the longest test has steps, W ≤ ε^-l.
+        """
+        if self.drawn.sampling.mixes_steps and self.drawn.epsilon > 0.0 and "n_steps" in self.columns:
+            return -math.log(self.drawn.epsilon) * int(self.n_steps.max())
         if "log_p_cut_in" not in self.columns or not (share := self.drawn.forced_share):
             return math.inf
         return float(np.max(self.log_p_cut_in, initial=-math.inf)) - math.log(share)
@@ -211,6 +219,7 @@ def block_from_tables(
     alpha: Sequence[float],
     shells: ShellDesign | None = None,
     counts_above_mps: float = 0.0,
+    epsilon: float = 0.0,
 ) -> Block:
     """Block of one shard; rows that are missing, out of order, or contradict each other are a `RunFolderError`.
 
@@ -236,6 +245,7 @@ def block_from_tables(
     if "impact_speed_mps" in episodes.column_names:
         columns["impact_mps"] = np.asarray(episodes.column("impact_speed_mps").to_numpy(), dtype=np.float64)
     if "n_steps" in episodes.column_names:
+        columns["n_steps"] = _integers(episodes, "n_steps")
         left = pc.subtract(episodes.column("n_steps"), episodes.column("cut_in_step"))
         close = pc.and_(pc.less(left, CUT_OFF_STEPS), pc.less(episodes.column("min_ttc_s"), DANGER_TTC_S))
         columns["cut_off"] = (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy()
@@ -259,7 +269,7 @@ def block_from_tables(
             danger = pc.fill_null(pc.less(episodes.column("min_ttc_s"), DANGER_TTC_S), fill_value=False).to_numpy()
             columns["ahead"] = _known(episodes, "ahead_step") & (danger | (outcome == CRASH) | failed)
     cap = None if SAMPLING[method].controlled else 1.0
-    drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), cap, shells, counts_above_mps)
+    drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), cap, shells, counts_above_mps, epsilon)
     block = Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
     return block.harder_than(counts_above_mps) if counts_above_mps > 0.0 else block
 

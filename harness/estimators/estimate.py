@@ -66,6 +66,16 @@ class Estimate:
         return "shells" in self.details and not self.cautions and self.rhw > WIDE_RHW
 
     @property
+    def untested(self) -> float:
+        """Probability of shells without a test: it adds nothing to the rate, and all of it to the upper end."""
+        return math.fsum(each["p"] for each in self.details.get("shells", ()) if not each["n_episodes"])
+
+    @property
+    def is_open_above(self) -> bool:
+        """Whether crashes were seen, and the upper end says hardly more than what has not been tested."""
+        return self.n_crashes > 0 and self.untested > self.ci_high / 2.0
+
+    @property
     def shown(self) -> Estimate:
         """What is written of it: without an RHW that says nothing."""
         return replace(self, rhw=self.precision)

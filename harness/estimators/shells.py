@@ -335,6 +335,11 @@ class Shells:
                 return math.inf
         return times
 
+    def cut_ins_for(self, times: float) -> float:
+        """How many times the cut-ins that the pool keeps so many times the tests would need; at least 1."""
+        kept = np.array(self._design.available or [math.inf])
+        return max(float(np.max(self.tally.tests[kept > 0] * times / kept[kept > 0], initial=1.0)), 1.0)
+
     def contradicts(self, statement: str) -> bool:
         """Whether a test crashed beyond the boundary of a statement, or was ahead of it where that is checked."""
         beyond = self.tally.crashes[self._design.n_within(statement) :]
@@ -400,10 +405,7 @@ class Shells:
                 f"runs alone leave ±{share(free.from_pool_relative()[0])} of the rate, as far as these can tell"
             )
         if used_up := ", ".join(name for name, n, available in kept if n >= available > 0):
-            found.append(
-                f"all cut-ins that the pool has kept of {used_up} were tested: for more precision raise "
-                "pool.cut_ins_per_shell, and run into a new folder"
-            )
+            found.append(f"all cut-ins that the pool has kept of {used_up} were tested")
         found += [
             f"{crashes:,} crashes beyond {each.boundary}: the statement {each.name} does not hold for this vehicle"
             for each in design.statements

@@ -97,7 +97,7 @@ def short_answer(
         tests=f"{count(best.n_episodes)} tests in {engine}",
         rows=tuple(_rows(campaign, best, severity, manifest, distance_km)),
         warnings=(*_warnings(campaign, best, severity, manifest), *_before_overlap(campaign, manifest, counts)),
-        scope=_scope(campaign, best, manifest.get("stopped_by")),
+        scope=_scope(campaign, best, manifest.get("stopped_by"), manifest.get("remedy")),
     )
 
 
@@ -135,8 +135,11 @@ def _rows(
     from_mps = campaign.crash.counts_above_mps
     counted = f"crash rate > {plain(from_mps)} m/s" if from_mps else "crash rate"
     wide, less = best.is_wide, ""
+    from_below = wide and (best.is_open_above or (decision is not None and decision["verdict"] == "rejected"))
     shown, ends = best.crash_rate, interval(best.ci_low, best.ci_high)
-    if not best.n_crashes or wide:
+    if from_below:  # the other end says nothing
+        less, shown, ends = "> ", best.ci_low, f"{number(best.crash_rate)} seen"
+    elif not best.n_crashes or wide:
         less, shown = "< ", best.ci_high if best.n_crashes else best.upper_bound
         ends = f"{number(best.crash_rate)} seen" if best.n_crashes else "no crash seen"
     unseen = no_lower_limit(best, manifest)
@@ -145,28 +148,28 @@ def _rows(
         shown = unseen[1] * (best.ci_high if best.n_crashes else best.upper_bound)
     per_km = "" if not distance_km else f"{less}{number(shown * 1e6 / distance_km)} per million km"
     remark = per_km if unseen is None else f"none seen at {unseen[0]}"
-    untested = any(each["p"] > 0.0 and not each["n_episodes"] for each in best.details.get("shells", ()))
-    # A shell without tests adds nothing to the rate, and all of its probability to the upper limit.
-    so_far = " so far" if untested and best.n_crashes else ""
+    so_far = " so far" if best.untested and best.n_crashes else ""
     rows = [Row("rate", f"{counted}{so_far}", f"{less}{number(shown)} per test", ends, remark)]
     beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
-    rows += [_beside(each, acts=campaign.av.acts_before_cut_in, wide=wide) for each in beside]
+    acts = campaign.av.acts_before_cut_in
+    rows += [_beside(each, acts=acts, wide=wide, from_below=from_below) for each in beside]
     # Where little else is known of the rate than a limit, what is known comes first: the ratio.
     yield from reversed(rows) if unseen or (wide and beside and beside[0]["ratio_high"] < 1.0) else rows
     if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
     if "ends" in (manifest.get("assumed") or {}) and (moved := assumed_times(best, manifest)) is not None:
-        high = number(moved[1] * (best.ci_high if best.n_crashes else best.upper_bound))
+        high = moved[1] * (best.ci_high if best.n_crashes else best.upper_bound)
+        ends = "" if from_below else f"up to {number(high)}"
         remark = f"if {share(manifest['assumed']['ends'][1])} do not look"
-        yield Row("assumed", "traffic", f"at most × {number(moved[1], 2)} (assumed)", f"up to {high}", remark)
+        yield Row("assumed", "traffic", f"at most × {number(moved[1], 2)} (assumed)", ends, remark)
     if campaign.has_baseline_runs and best.n_crashes:
         yield from _whence(campaign, best, manifest.get("expected"))
     if severity is not None:
-        above = _share_within(severity.share_above_5_mps, severity.limits_above_5_mps)
-        below = _share_within(severity.share_below_1_mps, severity.limits_below_1_mps)
+        above = _share_within(severity.share_above_5_mps, severity.limits_above_5_mps, f" > {plain(HARD_MPS)} m/s")
+        below = _share_within(severity.share_below_1_mps, severity.limits_below_1_mps, f" < {plain(TOUCH_MPS)} m/s")
         value = f"median {tenths(severity.median_mps)} m/s"
         what = f"impact{so_far}"
-        yield Row("impact", what, value, f"{above} > {plain(HARD_MPS)} m/s", f"{below} < {plain(TOUCH_MPS)} m/s")
+        yield Row("impact", what, value, above, below)
         # What a driver who brakes less hard does not avoid another one may.
         if (of := severity.unavoidable) is not None and of.driver == _BRAKES_HARDEST:
             ends, why = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}", "not even 8 m/s² avoids it"
@@ -216,9 +219,12 @@ def _whence(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | No
     yield Row("width", "half-width", f"± {share(whole)}, most by {which}", alone, remark)
 
 
-def _share_within(value: float, limits: tuple[float, float] | None) -> str:
-    """A share with its interval in whole per cent, where there is one."""
-    return share(value) + (f" ({100.0 * limits[0]:.0f}–{100.0 * limits[1]:.0f} %)" if limits else "")
+def _share_within(value: float, limits: tuple[float, float] | None, of: str) -> str:
+    """A share with its interval in whole per cent, where there is one; nothing where that may be any."""
+    if limits is None:
+        return share(value) + of
+    low, high = (f"{100.0 * each:.0f}" for each in limits)
+    return "" if (low, high) == ("0", "100") else f"{share(value)} ({low}–{high} %){of}"
 
 
 def _decided(decision: Mapping[str, Any]) -> Row:
@@ -234,7 +240,7 @@ def _decided(decision: Mapping[str, Any]) -> Row:
     return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
 
 
-def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool) -> Row:
+def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: bool) -> Row:
     low, high = found["ratio_low"], found["ratio_high"]
     who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
     if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
@@ -244,10 +250,13 @@ def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool) -> Row:
     if wide and high < 1.0:
         seen = f"{ratio(found['ratio'])} seen, ≥ {ratio(low)}"
         return Row("ratio", "× competent driver", f"< {ratio(high)} (crashes less)", seen, who)
+    if from_below and low > 1.0:
+        return Row(
+            "ratio", "× competent driver", f"> {ratio(low)} (crashes more)", f"{ratio(found['ratio'])} seen", who
+        )
     apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
-    return Row(
-        "ratio", "× competent driver", f"{ratio(found['ratio'])} ({apart})", f"{ratio(low)} to {ratio(high)}", who
-    )
+    ends = f"≥ {ratio(low)}" if from_below else f"{ratio(low)} to {ratio(high)}"
+    return Row("ratio", "× competent driver", f"{ratio(found['ratio'])} ({apart})", ends, who)
 
 
 def _within(found: Mapping[str, Any]) -> Row:
@@ -303,7 +312,7 @@ def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Map
         yield f"in {count(n)} tests it asked to speed up before BV was on its lane, and was held (av.takes_over)"
 
 
-def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None) -> str:
+def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None, remedy: str | None) -> str:
     ended, target = ENDED.get(stopped_by or "", "interrupted"), campaign.stop.rhw
     if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference"):
         asked = best.precision
@@ -313,8 +322,7 @@ def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None) -> str:
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
         ended += f"{reached}, asked: ± {share(target)}"
-        if stopped_by == "pool":
-            ended += "; raise pool.cut_ins_per_shell"
+        ended += f"; {remedy}" if remedy else ""
     elif stopped_by == "episodes" and campaign.accept is None:
         ended = "all tests done"
     return f"sampling error in this simulated traffic only ({share(best.confidence)}); ended by: {ended}"

@@ -265,7 +265,8 @@ class RoundRule(Rule):
     that is continued is looked at where it would have been without the break, and once more where that was.
     """
 
-    _seen: Shells
+    seen: Shells
+    """All tests at the last look."""
     level_at = staticmethod(decision_level)
 
     def __init__(self, campaign: Campaign, held: int = 0) -> None:
@@ -276,7 +277,7 @@ class RoundRule(Rule):
 
     def observe(self, seen: Shells) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
-        self._seen = seen
+        self.seen = seen
         if self._accept is not None:
             return self._decided(seen, self._accept)
         limits, tally = seen.limits_of(self._statement, Level.two_sided(self._confidence)), seen.tally
@@ -290,12 +291,12 @@ class RoundRule(Rule):
 
     def more_tests(self, target: float, more_runs: float) -> float:
         """How many times as many tests are expected to reach a relative half-width, see `Shells.more_tests`."""
-        return self._seen.more_tests(self._statement, Level.two_sided(self._confidence), target, more_runs)
+        return self.seen.more_tests(self._statement, Level.two_sided(self._confidence), target, more_runs)
 
     def _below(self, seen: Shells) -> Decision | None:
         """That the rate is below the asked multiple of a reference driver's, at the level of decisions."""
         limit, first = self._below_reference, seen.first_reference
-        if limit is None or self._target is None or first is None:
+        if limit is None or first is None:
             return None
         driver, rate = first
         # Limits of a ratio take a hundred times as long as those of a rate: most looks are far from an end.

@@ -197,7 +197,8 @@ def because(found: TrafficError) -> str:
 class Bar:
     """A number, or a block, by how it is ``known``, and the factors of rate and ratio at the two ends of it.
 
-    ``values`` are its ends, of a block none. ``off`` is by how much a reference driver's rate comes out wrong at most.
+    ``values`` are its ends, of a block none. ``off`` is by how much a reference driver's rate comes out wrong at most,
+    at each end.
     A factor is NaN where the tests cannot answer it, and ``note`` says why.
     """
 
@@ -206,7 +207,7 @@ class Bar:
     values: tuple[float, float] | None
     rate: tuple[Number, Number]
     ratio: tuple[Number, Number]
-    off: Number
+    off: tuple[Number, Number]
     note: str = ""
 
     @property

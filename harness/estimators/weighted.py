@@ -29,7 +29,10 @@ OVERTURNS = 1.0
 """One more crash of the largest known weight, over all those seen, above which an interval is not to be trusted: a
 single test could double the rate. Default IDM under forced cut-ins, nominal 0.90: where nearly all campaigns are above
 (500 and 2,000 tests) intervals cover 0.73 and 0.87, where nearly all are below (25,000) 0.91 (docs/estimators.md)."""
-UNBOUNDED = "the true rate may lie far above this interval: the weights of these tests are unbounded"
+LARGEST_LOG = 700.0
+"""Of a number that is still one, and not infinite."""
+MAY_BE_ABOVE = "the true rate may lie far above this interval"
+UNBOUNDED = f"{MAY_BE_ABOVE}: the weights of these tests are unbounded"
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ class Nade:
     def __init__(self) -> None:
         self.n = self.n_crashes = 0
         self.y = Moments()
-        self._largest_y = self._design_cap = self._log_path_cap = -math.inf
+        self._largest_y = self._design_cap = self._log_cap = -math.inf
         self._largest_log_weight = self._largest_cut_in_log_weight = -math.inf
 
     def add(self, block: Block) -> None:
@@ -125,7 +128,7 @@ class Nade:
         of_cut_ins = block.log_weight[block.cut_in]
         self._largest_cut_in_log_weight = float(np.max(of_cut_ins, initial=self._largest_cut_in_log_weight))
         self._design_cap = max(self._design_cap, math.inf if (cap := block.drawn.weight_cap) is None else cap)
-        self._log_path_cap = max(self._log_path_cap, block.log_path_cap())
+        self._log_cap = max(self._log_cap, block.log_cap())
 
     def largest_share(self) -> float:
         """Largest Y as a share of ΣY, 0 without a crash."""
@@ -134,11 +137,11 @@ class Nade:
     def known_cap(self) -> float:
         """Largest Y that the tests could have had, whatever the AV does; infinite where nothing bounds it.
 
-        Under forced cut-ins a crash weighs P(cut-in | path), which is known before the AV drives; the largest is taken
-        over all paths driven, the few that ended in a crash and the many that did not.
+        Where the design has none it is taken over all tests driven (`Block.log_cap`), the few that ended in a crash and
+        the many that did not.
         """
-        of_paths = math.exp(self._log_path_cap) if math.isfinite(self._log_path_cap) else math.inf
-        return max(self._design_cap if math.isfinite(self._design_cap) else of_paths, self._largest_y)
+        of_tests = math.exp(self._log_cap) if self._log_cap < LARGEST_LOG else math.inf
+        return max(self._design_cap if math.isfinite(self._design_cap) else of_tests, self._largest_y)
 
     def cap(self) -> tuple[float, str]:
         """Cap on Y for the upper bound, and where it comes from, in words."""
@@ -146,11 +149,11 @@ class Nade:
         if math.isfinite(self._design_cap):
             return known, "the weight cap known by design"
         if math.isfinite(known):
-            return known, "the largest P(cut-in | path)/share of forced cut-ins among the paths driven"
+            return known, "the largest weight that the tests driven could have had"
         seen, among = self._largest_cut_in_log_weight, " among episodes with a cut-in"
         if not math.isfinite(seen):
             seen, among = self._largest_log_weight, ""
-        return math.exp(seen) if seen < 700.0 else math.inf, f"the largest weight seen{among} (no cap is known)"
+        return math.exp(seen) if seen < LARGEST_LOG else math.inf, f"the largest weight seen{among} (no cap is known)"
 
     def is_settled(self) -> bool:
         """Whether there are enough crashes for limits from moments to mean what they say."""
@@ -167,9 +170,10 @@ class Nade:
         if not math.isfinite(self.known_cap()):
             found.append(UNBOUNDED)
         elif self.n_crashes and (times := self.known_cap() / self.y.total) > OVERTURNS:
-            found.append(
-                f"the true rate may lie far above this interval: one more crash might add {number(times)} times it"
-            )
+            more = f"one more crash might add {number(times)} times it"
+            if (cap := self.known_cap()) > 1.0:
+                more = f"a crash may weigh {number(cap)}, and all that were seen together weigh {number(self.y.total)}"
+            found.append(f"{MAY_BE_ABOVE}: {more}")
         return found
 
     def warnings(self, half_width: float) -> list[str]:
@@ -181,7 +185,7 @@ class Nade:
             found.append(f"one crash carries {self.largest_share():.0%} of the estimate")
         if not math.isfinite(self._design_cap) and not self.is_settled():
             found.append(f"the upper bound rests on {self.cap()[1]}, not on a cap guaranteed by design")
-        if 0.0 < half_width < cap / self.n < math.inf:  # where it would overturn the rate, there is a caution too
+        if 0.0 < half_width < cap / self.n <= OVERTURNS * self.y.mean(self.n):  # beyond that there is a caution
             found.append(
                 f"one more crash of the largest weight that the design allows ({cap:.3g}) would move the estimate by "
                 f"{cap / self.n:.3g}, farther than the interval reaches: only more tests can rule that out"

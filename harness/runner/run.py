@@ -18,7 +18,7 @@ from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
-from harness.estimators.answer import conclusion, expected_for
+from harness.estimators.answer import conclusion, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
 from harness.pool.build import campaign_pool
 from harness.pool.vehicle_pool import BaselinePaths
@@ -246,7 +246,7 @@ class Run:
 
     def finish(self, rule: Rule) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no shard beyond the stop is left."""
-        manifest, decision, decided = self.manifest, rule.look.decision, {}
+        manifest, decision, decided = self.manifest, rule.look.decision, dict[str, Any]()
         counted = {self.out / file for shard in manifest.shards for file in shard["files"].values()}
         for path in {path for table in TABLES for path in shards_on_disk(self.out, table)} - counted:
             path.unlink()
@@ -257,6 +257,7 @@ class Run:
         if decision is not None:
             code = EXIT_OF[decision.verdict]
             decided["decision"] = decision.to_json()
+        decided["remedy"] = pool_remedy(rule, self.campaign, stopped_by) or None
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         manifest.write("done", stopped_by=stopped_by, ending=said, expected=expected, **decided)

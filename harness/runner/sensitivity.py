@@ -124,11 +124,16 @@ def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:
     """What traffic moved to some ``results`` says; a block's ends are those of what can be answered, half at least."""
     nowhere = np.full((2, 2), np.nan)
     ends = np.array([nowhere[0] if each is None or each.refused else (each.rate, each.ratio) for each in results])
-    off = max((each.off for each in results if each is not None), default=np.nan)
+    off = np.array([np.nan if each is None else each.off for each in results])
     note = " and ".join(sorted({_WHY[each is None] for each in results if each is None or each.refused}))
     if move.values is None:
-        tail, known = (1.0 - CONFIDENCE) / 2.0, ends[~np.isnan(ends[:, 0])]
-        ends = np.quantile(known, [tail, 1.0 - tail], axis=0) if 2 * len(known) >= len(results) else nowhere
+        tail, told = (1.0 - CONFIDENCE) / 2.0, ~np.isnan(ends[:, 0])
+        known, enough = ends[told], 2 * np.count_nonzero(told) >= len(results)
+        ends = np.quantile(known, [tail, 1.0 - tail], axis=0) if enough else nowhere
+        nearest = [int(np.argmin(np.abs(known[:, 0] - end))) for end in ends[:, 0]] if enough else []
+        off = off[told][nearest] if enough else nowhere[0]
         note = note and f"{len(results) - len(known)} of {len(results)}: {note}"
     (rate_low, ratio_low), (rate_high, ratio_high) = ends.tolist()
-    return Bar(move.what, move.known, move.values, (rate_low, rate_high), (ratio_low, ratio_high), float(off), note)
+    off_low, off_high = off.tolist()
+    offs = off_low, off_high
+    return Bar(move.what, move.known, move.values, (rate_low, rate_high), (ratio_low, ratio_high), offs, note)

@@ -199,4 +199,5 @@ def block_of(campaign: Campaign, episodes: pa.Table, moments: pa.Table | None, d
         alpha=mixture_weights(campaign),
         shells=design,
         counts_above_mps=campaign.crash.counts_above_mps,
+        epsilon=campaign.testing.epsilon,
     )

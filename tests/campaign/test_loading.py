@@ -46,6 +46,7 @@ MISTAKES = (
     ("world:", "world", 2, "delete the key for its default"),
     ("seed: " + "9" * 4299, "seed", 2, "999…"),
     ("stop:\n  rhw: 10", "stop.rhw", 3, "less than 10, or null"),
+    ("testing:\n  epsilon: 0", "testing.epsilon", 3, "what no surrogate crashes on would never be drawn"),
     ("testing:\n  method: ndee", "testing.method", 3, "Did you mean 'nde'?"),
     ("av:\n  parameters:\n    desired_speed_mps: 300", "av.parameters.desired_speed_mps", 4, "equal to 60 (m/s)"),
     ("av:\n  model: fvdm\n  parameters: {time_headway_s: 1}", "av.parameters.time_headway_s", 4, "kappa_per_s"),
@@ -72,6 +73,8 @@ BROKEN_RULES = (
     ("av:\n  before_cut_in: controller", "av.before_cut_in", 3, "hold_speed"),
     ("stop:\n  rhw: 1\n  rhw: 2", "stop.rhw", 4, "again, first written on line 3"),
     ("testing: {method: step_mixture}\nstop:\n  rhw: 0.3", "stop.rhw", 4, "a fixed number of tests"),
+    ("stop:\n  below_reference: 0.3", "stop.below_reference", 3, "ask for that limit alone"),
+    ("testing: {method: forced}\nstop:\n  below_reference: 1\n  rhw: 1", "stop.below_reference", 4, "Write null"),
     ("testing: {method: forced}\naccept: {crash_rate_below: 0.1}", "accept", 3, "testing.method shells"),
 )
 SCHEMA = jsonschema.Draft202012Validator(json.loads(schema_text()))
@@ -130,6 +133,7 @@ def test_parameter_files_are_read_with_the_place_of_every_problem(tmp_path):
 def test_values_of_several_kinds(load):
     campaign = load("testing: {epsilon: 1e-5}\nstop: {episodes: 1e8, rhw: 1}\nav: {model: fvdm, parameters: {c2: 1.6}}")
     assert (campaign.testing.epsilon, campaign.stop.rhw) == (1e-5, 1.0)
+    assert load("testing: {method: step_mixture, epsilon: 1}\nstop: {rhw: 0.3}").stop.rhw == 0.3  # plain simulation
     assert (campaign.stop.episodes, type(campaign.stop.episodes)) == (100_000_000, int)
     assert (campaign.av.parameters.c2, campaign.av.parameters.kappa_per_s) == (1.6, 0.85)
     # These fit the built-in IDM as well; tried as a union they would become its parameters, and be lost.
@@ -164,6 +168,33 @@ def test_later_overrides_win_and_follow_the_rules_of_the_file(load):
     campaign = load("stop: {rhw: 0.1}", "stop.rhw=0.2", "stop={rhw: 0.3}", "stop.rhw=4e-1", "description=12:30")
     assert (campaign.stop.rhw, campaign.description) == (0.4, "12:30")
     assert load("stop: {rhw: 0.1}", "stop.rhw=null").stop.rhw is None
+
+
+@pytest.mark.parametrize(
+    ("typed", "rhw", "below"),
+    [
+        ((), 0.3, 0.3),
+        (("stop.episodes=1000", "testing.method=shells"), 0.3, 0.3),
+        (("stop.rhw=0.1",), 0.1, None),
+        (("stop.rhw=null",), None, None),
+        (("stop.min_crashes=500",), 0.3, None),
+        (("testing.method=forced",), 0.3, None),
+        (("stop.below_reference=0.5",), 0.3, 0.5),
+        (("stop.below_reference=0.5", "stop.rhw=0.1"), 0.1, 0.5),
+    ],
+)
+def test_what_is_asked_for_by_hand_is_what_ends_a_run(load, typed, rhw, below):
+    for found in (load("stop: {rhw: 0.3, below_reference: 0.3}", *typed), load_campaign("idm", typed)):
+        assert (found.stop.rhw, found.stop.below_reference) == (rhw, below)
+
+
+def test_a_precision_by_hand_and_a_limit_of_the_file_do_not_go_together(load):
+    gate = "accept: {crash_rate_below: 1e-7}"
+    with pytest.raises(CampaignError, match="a precision, in a campaign with a limit") as caught:
+        load(gate, "stop.rhw=0.1")
+    assert (caught.value.where, caught.value.mend) == ("--set stop.rhw=0.1", "Add --set accept=null.")
+    assert load(gate, "stop.rhw=0.1", "accept=null").stop.rhw == 0.1
+    assert load(gate, "stop.rhw=0.1", "accept.crash_rate_below=2e-7").accept.crash_rate_below == 2e-7
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,7 @@ def block(
     first_episode: int = 0,
     alpha: np.ndarray | None = None,
     weight_cap: float | None = None,
+    epsilon: float = 0.0,
     **more: np.ndarray,
 ) -> Block:
     """Episodes with the given outcomes; those with a crash have a cut-in."""
@@ -43,7 +44,7 @@ def block(
         [np.array([False] * n if failed is None else failed, bool), crashed], [FAILED, CRASH], TIMEOUT
     ).astype(np.int8)
     columns = {"cut_in": crashed, "log_q": np.zeros((n, 2)), "n_control_steps": np.ones(n, dtype=np.int64), **more}
-    drawn = Drawn(method, np.full(2, 0.5) if alpha is None else alpha, weight_cap)
+    drawn = Drawn(method, np.full(2, 0.5) if alpha is None else alpha, weight_cap, epsilon=epsilon)
     return Block(
         first_episode, outcome, np.array([0.0] * n if log_weight is None else log_weight, np.float64), columns, drawn
     )

@@ -19,7 +19,7 @@ from tests.stored_runs import estimates, golden
 
 SAID = {
     "nde-twin": ["lane-change level 3,000,000: never compare", "impact "],
-    "step-immediate-twin": ["the true rate may lie far above this interval: the weights of these tests are unbounded"],
+    "step-immediate-twin": ["the true rate may lie far above this interval: a crash may weigh 1.00 × 10²⁰⁰, and all"],
     "forced-failing-twin": [" of 240 tests FAILED; had they all crashed, the rate would be "],
     "shells-twin": [
         "× competent driver  ",
@@ -162,10 +162,12 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
     folder = stored_run("shells-acting-twin")
     best = read_run_folder(folder).headline
     best = replace(best, n_crashes=0, rhw=math.inf, cautions=(), details={**best.details, "references": []})
-    answer = short_answer(golden("shells-acting-twin", "stop.rhw=0.3"), best, None, {"stopped_by": "pool"}, None, {})
+    answer = short_answer(
+        golden("shells-acting-twin", "stop.rhw=0.3"), best, None, {"stopped_by": "pool", "remedy": "x"}, None, {}
+    )
     [row] = [row for row in answer.rows if row.key == "ratio"]
     assert (row.value, row.remark) == ("no ratio", "such drivers never crash here")
-    assert answer.scope.endswith("was tested, no crash seen, asked: ± 30 %; raise pool.cut_ins_per_shell")
+    assert answer.scope.endswith("was tested, no crash seen, asked: ± 30 %; x")
     forced = replace(read_run_folder(stored_run("forced-acting-twin")).headline, cautions=())  # asks no other driver
     answer = short_answer(golden("forced-acting-twin"), forced, None, {}, None, {})
     assert "ratio" not in {row.key for row in answer.rows}
@@ -196,12 +198,38 @@ def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, va
     low = 0.0 if seen == 0.0 else 0.05
     beside = {**beside, "reference": "r157-cc", "crash_rate": 3e-8, "ratio": seen, "ratio_low": low, "ratio_high": high}
     rate = {"crash_rate": 1e-9 * (seen > 0.0), "ci_low": 5e-10 * (seen > 0.0), "ci_high": 3e-8, "rhw": 15.0}
-    best = replace(best, **rate, n_crashes=2 * (seen > 0.0), details={**best.details, "references": [beside]})
+    tested = [{**each, "n_episodes": 9} for each in best.details["shells"]]
+    details = {**best.details, "references": [beside], "shells": tested}
+    best = replace(best, **rate, n_crashes=2 * (seen > 0.0), details=details)
     rows = short_answer(golden("shells-lateral-twin", "stop.rhw=0.3"), best, None, {}, None, {}).rows
     assert (rows[0].key, rows[0].value, rows[0].interval) == (first, value, ends)
     [told, *_] = reference_statements(best)
     assert ("this vehicle crashes less than 0.20 times as often as" in told) == (high < 1.0)
     assert statement(best, 1.0, None).count("is below 3.00 × 10⁻⁸") == (seen > 0.0)
+
+
+@pytest.mark.parametrize(("verdict", "untested"), [("rejected", False), ("rejected", True), ("accepted", True)])
+def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
+    """Where a limit is rejected, or the upper end is what has not been tested: the lower end alone says something."""
+    run = read_run_folder(stored_run("shells-accepted"))
+    decision = {**run.manifest["decision"], "verdict": verdict}
+    shells = [{**each, "n_episodes": each["n_episodes"] * (not untested)} for each in run.headline.details["shells"]]
+    [beside, *others] = run.headline.details["references"]
+    details = {
+        **run.headline.details,
+        "references": [{**beside, "ratio": 3.98, "ratio_low": 2.0, "ratio_high": 980.0}, *others],
+    }
+    rate = {"crash_rate": 2e-7, "ci_low": 1e-7, "ci_high": 5e-5, "rhw": 100.0}
+    best = replace(run.headline, **rate, details={**details, "shells": shells})
+    limits = {"limits_above_5_mps": (0.0, 1.0), "limits_below_1_mps": (0.001, 0.41)}
+    severity = replace(run.estimates.severity, **limits, share_below_1_mps=0.0)
+    rows = short_answer(run.campaign, best, severity, {"decision": decision}, None, {}).rows
+    found = {row.key: (row.value, row.interval) for row in rows}
+    assert found["rate"] == ("> 1.00 × 10⁻⁷ per test", "2.00 × 10⁻⁷ seen")
+    assert found["ratio"] == ("> 2.00 (crashes more)", "3.98 seen")
+    assert found["impact"][1] == ""
+    assert [row.remark for row in rows if row.key == "impact"] == ["0 % (0–41 %) < 1 m/s"]
+    assert ("is above 1.00 × 10⁻⁷" in statement(best, 1.0, None)) == untested
 
 
 def severe(stored_run, cut_off=0.0, **of_rate):

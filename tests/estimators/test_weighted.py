@@ -72,6 +72,24 @@ def test_what_a_user_must_be_told(weights, cap, told):
     assert (estimate.precision == math.inf) == (cap != 1.0)
 
 
+@pytest.mark.parametrize(
+    ("epsilon", "log_weight", "cap", "told"),
+    [
+        (1.0, 0.0, 1.0, ""),
+        (0.99, 0.0, 0.99**-200, ""),
+        (0.99, -9.0, 0.99**-200, "a crash may weigh 7.46, and all that were seen together weigh 7.40 × 10⁻³"),
+        (0.1, 0.0, 1e200, "a crash may weigh 1.00 × 10²⁰⁰, and all that were seen together weigh 60.0"),
+        (0.01, 0.0, math.inf, "the weights of these tests are unbounded"),
+    ],
+)
+def test_a_step_mixture_has_the_cap_that_its_share_of_natural_driving_gives(epsilon, log_weight, cap, told):
+    n = 60
+    some = block([True] * n, [log_weight] * n, epsilon=epsilon, n_steps=np.array([20] * (n - 1) + [200]))
+    found = nade(some).result(0.9)
+    assert found.weight_cap == pytest.approx(cap)
+    assert [each.partition(": ")[2] for each in found.cautions] == [told] * bool(told)
+
+
 # -- running moments: exact, whatever the blocks, and of the zeros that were never added --
 
 

@@ -26,7 +26,7 @@ SEEN = {
     "failed": ({"severity"}, ["9 of 300 tests FAILED", "step: returned nan, expected"]),
     "shells": ({"severity", "shells"}, ["not even 8 m/s² avoids it"]),
     "shells_refuted": ({"severity", "shells"}, ["Statement library: refuted by these tests", "outermost no. 1"]),
-    "shells_inside_only": ({"severity", "shells"}, ["Statement library: not put to the test", "is below "]),
+    "shells_inside_only": ({"severity", "shells"}, ["Statement library: not put to the test", "is above "]),
 }
 """Plots, and words that no other kind of run has."""
 

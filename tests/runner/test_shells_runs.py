@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -28,7 +29,9 @@ def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
     tests = [shell["n_episodes"] for shell in result.estimates["estimates"]["shells"]["details"]["shells"]]
     assert tests[-1] >= 100
     assert result.estimates["n_episodes"] < 1000
-    assert any("raise pool.cut_ins_per_shell" in said for said in result.estimates["estimates"]["shells"]["warnings"])
+    told = json.dumps(result.estimates) + result.ending
+    assert set(re.findall(r"pool\.[a-z_]+", told)) == {"pool.cut_ins_per_shell"}
+    assert re.search(r"; raise pool\.cut_ins_per_shell to \d,?\d+$", result.estimates["answer"]["scope"])
 
 
 def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
@@ -39,6 +42,10 @@ def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
     assert (fresh.exit_code, fresh.stopped_by) == (4, "pool_error")
     found = fresh.estimates["estimates"]["shells"]
     assert found["rhw"] > found["details"]["rhw_from_pool"] > 0.05
+    assert re.search(
+        r"wider; lower pool\.relative_error to 0\.0\d+(?: and [^;]+)?, and use a new folder\.$", fresh.ending
+    )
+    assert "pool." not in "".join(found["warnings"])
 
 
 SPENT, MORE = "stop.episodes=150", "stop.episodes=400"
