@@ -161,6 +161,10 @@ class Testing(Section):
         return alpha
 
 
+MOST_KEPT = 1_000_000
+"""Cut-ins of a shell."""
+
+
 class PoolSettings(Section):
     """The pool of cut-ins that shells are drawn from; built once, in the twin."""
 
@@ -174,7 +178,7 @@ class PoolSettings(Section):
         description="relative standard error of the surrogates' crash rates; four times that beyond the boundary",
     )
     cut_ins_per_shell: Whole = Field(
-        25_000, ge=100, le=1_000_000, description="cut-ins kept of each shell: its most tests"
+        25_000, ge=100, le=MOST_KEPT, description="cut-ins kept of each shell: its most tests"
     )
     shadow_paths: Whole = Field(
         500,

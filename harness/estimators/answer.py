@@ -310,6 +310,7 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
     stopped_by: StoppedBy = "pool"
     if look.stopped:
         stopped_by = "accept" if look.decision is not None else "rhw" if look.below is None else "below_reference"
+        stopped_by = getattr(rule, "ended", None) or stopped_by
     elif look.decision is not None and look.decision.is_final:
         stopped_by = "contradicted"
     elif look.pool_error_above_target:  # whatever else is spent: more of it would not help
@@ -320,9 +321,9 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
     if look.below is not None:
         limit = limit_words(look.below.limit, look.below.driver)
         why = f"with confidence {plain(look.below.confidence)} the crash rate is below {limit} (stop.below_reference)"
-    elif stopped_by in ("rhw", "accept"):
+    elif look.stopped:
         why = f"the last condition to be met was {unmet}" if unmet else "every condition was met at the first look"
-    elif campaign.stop.rhw is not None or look.decision is not None:
+    elif campaign.stop.rhw is not None or look.unmet:
         after, why = f"{after} without {unmet}", MENDS[stopped_by]
         if campaign.has_baseline_runs and stopped_by in ("episodes", "pool_error"):
             why = _runs_or_tests(rule, campaign, n_episodes) or why
@@ -400,13 +401,9 @@ def conditional_paired_statement(found: PairedEstimate) -> str:
 
 
 def _apart(found: Mapping[str, Any], confidence: float) -> str:
-    """Which of them crashes more often, and by how much."""
-    low, high, verdict = found["ci_low"], found["ci_high"], "the difference is not distinguishable from 0"
-    if found["n_differing"] and low > 0.0:
-        verdict = "A crashes more often"
-    elif found["n_differing"] and high < 0.0:
-        verdict = "A crashes less often"
-    apart = f"{verdict}, A − B = {number(found['difference'])} ({share(confidence)} interval {interval(low, high)})"
+    """By how much one of them crashes more often."""
+    within = interval(found["ci_low"], found["ci_high"])
+    apart = f"A − B = {number(found['difference'])} ({share(confidence)} interval {within})"
     if not math.isfinite(found["ratio"]):
         return apart
     most = ratio(found["ratio_high"]) if math.isfinite(found["ratio_high"]) else "no limit"
