@@ -315,22 +315,22 @@ def compare(
         found = compare_campaigns(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )
+    from harness.estimators.short_answer import pair_lines  # noqa: PLC0415 - keeps --help fast
+    from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
+
+    took_s = (read_manifest(folder / "b")["wall_time_s"] or 0.0) / found.content["n_pairs"]
+    told = pair_lines(found.content, a.crash.counts_above_mps, found.report, took_s)
     if junit is not None:
         from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
 
-        case = Case("difference", found.content["statement"], outcome_of(found.exit_code))
+        case = Case("difference", "\n".join(told), outcome_of(found.exit_code))
         write_junit(junit, " and ".join(labels), [case], [found.report, folder / "compare.json"])
     if as_json:
         print_json(found.content)
     else:
-        from harness.estimators.short_answer import pair_lines  # noqa: PLC0415 - keeps --help fast
-        from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
-
         if verbose:
-            remarks = [f"note: {remark}" for remark in found.content["warnings"]]
-            say(*found.content["statements"], *remarks, folder / "compare.json", "")
-        took_s = (read_manifest(folder / "b")["wall_time_s"] or 0.0) / found.content["n_pairs"]
-        say(*pair_lines(found.content, a.crash.counts_above_mps, found.report, took_s))
+            say(*(f"note: {remark}" for remark in found.content["warnings"]), folder / "compare.json", "")
+        say(*told)
     ctx.exit(found.exit_code)
 
 

@@ -1,4 +1,4 @@
-"""What a run answers: ``estimates.json``, and the sentences that are functions of estimates, decisions and pairs."""
+"""What a run answers: ``estimates.json``, and the sentences that are functions of estimates and decisions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from harness.campaign.campaign import Campaign
 from harness.estimators.block import CUT_OFF_STEPS, DANGER_TTC_S, Block
 from harness.estimators.estimate import WIDE_RHW, Estimate, Number, Point, Unavailable, finite_json
 from harness.estimators.one_pass import one_pass
-from harness.estimators.pairs import PairedEstimate
 from harness.estimators.severity import Severity
 from harness.estimators.short_answer import ShortAnswer, assumed_times, no_lower_limit, short_answer
 from harness.estimators.stopping import RoundRule, Rule, limit_words
@@ -359,52 +358,3 @@ def expected_for(rule: Rule, campaign: Campaign, n_tests: int) -> dict[str, int]
         return None  # a stratum that cannot be tested: nothing will do
     runs, tests = two_digits_up(n_runs * more_runs), two_digits_up(n_tests * more_tests)
     return {"runs": n_runs if more_runs == 1.0 else runs, "tests": n_tests if more_tests <= 1.0 else tests}
-
-
-def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
-    """Without an assumption: both rates, what lies between them, where only one of the two crashes, failed tests."""
-    free, a, b = found.free, found.a, found.b
-    alone_a, alone_b = (
-        interval(free[of]["ci_low"], free[of]["ci_high"], free[of]["value"]) for of in ("only_a", "only_b")
-    )
-    text = (
-        f"A ({name_a}) crashes {interval(a.ci_low, a.ci_high, a.crash_rate)} times per test, "
-        f"B ({name_b}) {interval(b.ci_low, b.ci_high, b.crash_rate)} times: {_apart(free, a.confidence)}, "
-        f"from {free['n_pairs']:,} pairs of tests. Alone, where the other one does not, "
-        f"A crashes {alone_a} times per test, B {alone_b}."
-    )
-    if (failed_a := a.details["n_failed"]) + (failed_b := b.details["n_failed"]):
-        text += (
-            f" Of these tests A FAILED in {failed_a:,} and B in {failed_b:,}: each limit counts them as crashes or as "
-            "none, whichever takes it farther."
-        )
-    return warned([f"{name}: {caution}" for name, of in (("A", a), ("B", b)) for caution in of.cautions], text)
-
-
-def conditional_paired_statement(found: PairedEstimate) -> str:
-    """If both crash only where the boundary surrogate or a more conservative one does."""
-    library, inside = found.pairs.design.library, found.conditional
-    if found.refuted:
-        beyond = [int(found.pairs.tally(side).crashes[library.n_inside :].sum()) for side in (0, 1)]
-        who = " and ".join(f"{name} has {n:,} times" for name, n in zip("AB", beyond, strict=True) if n)
-        return (
-            f"{who} crashed where the surrogate {library.boundary} does not crash: nothing can be said under the "
-            f"assumption that they crash only where {library.boundary} does."
-        )
-    text = (
-        f"If A and B crash only where the surrogate {library.boundary} or a more careful one crashes: "
-        f"{_apart(inside, found.a.confidence)}, from {inside['n_pairs']:,} pairs of tests."
-    )
-    if not (n_outside := found.free["n_pairs"] - inside["n_pairs"]):
-        return f"{text} Nothing was tested outside: whether the assumption holds is not known."
-    return f"{text} In {n_outside:,} pairs of tests outside neither crashed."
-
-
-def _apart(found: Mapping[str, Any], confidence: float) -> str:
-    """By how much one of them crashes more often."""
-    within = interval(found["ci_low"], found["ci_high"])
-    apart = f"A − B = {number(found['difference'])} ({share(confidence)} interval {within})"
-    if not math.isfinite(found["ratio"]):
-        return apart
-    most = ratio(found["ratio_high"]) if math.isfinite(found["ratio_high"]) else "no limit"
-    return f"{apart}, A/B = {ratio(found['ratio'])} ({ratio(found['ratio_low'])} to {most})"

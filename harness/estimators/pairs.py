@@ -20,7 +20,7 @@ from harness.estimators.estimate import Estimate, FailureBounds, finite_json
 from harness.estimators.likelihood import Counts, Level, contrast_limit, ratio_limits, spread
 from harness.estimators.shells import Shells
 from harness.estimators.tally import Tally, mean_square
-from harness.numbers import plain, share
+from harness.numbers import share
 from harness.strata import ShellDesign
 from harness.vocabulary import FloatArray, IntArray
 
@@ -65,13 +65,6 @@ class PairDecision:
         told = {"proven": f"B is at most {most} worse than A", "refuted": f"B is more than {most} worse than A"}
         return told.get(self.verdict, f"Open whether B is more than {most} worse than A")
 
-    @property
-    def sentence(self) -> str:
-        """The same, with what it rests on."""
-        given = ", given the library" if self.given_the_library else ""
-        held = f"holds with confidence {plain(self.confidence)}, a look after each round allowed for"
-        return f"{self.words}{given}{'' if self.verdict == 'open' else f': that {held}'}."
-
 
 class Interval(NamedTuple):
     """A number with its interval."""
@@ -113,7 +106,7 @@ class PairCounts:
         within = slice(0, self.design.library.n_inside if n is None else n)
         return PairCounts(self.design, self.ends[within], self.mass[within, :, :, within])
 
-    def outcomes(self, *, failed_a: bool = False, failed_b: bool = False) -> IntArray:
+    def outcomes(self, *, failed_a: bool = False, failed_b: bool = False) -> Counts:
         """How often both crash, only A, only B, neither, shape (S, 4), with failed tests as crashes or as none."""
         return np.tensordot(self.ends, _kinds(failed_a, failed_b))
 
@@ -315,7 +308,9 @@ class PairedEstimate:
         ]
         each = {"a": self.a.shown, "b": self.b.shown}
         more = {"confidence": self.a.confidence, "conditional": inside, "shells": shells}
-        warnings = [f"{name}: {text}" for name, of in (("A", self.a), ("B", self.b)) for text in of.warnings]
+        both = (("A", self.a), ("B", self.b))
+        warnings = [f"{n:,} tests of {name} FAILED" for name, of in both if (n := of.details["n_failed"])]
+        warnings += [f"{name}: {text}" for name, of in both for text in of.warnings]
         return finite_json({**each, **self.free, **more, "warnings": warnings})
 
 

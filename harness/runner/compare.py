@@ -21,7 +21,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.sections import MOST_KEPT
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
-from harness.estimators.answer import conclusion, conditional_paired_statement, paired_statement
+from harness.estimators.answer import conclusion
 from harness.estimators.pairs import PairedEstimate, PairedShells, PairVerdict, paired_estimate
 from harness.estimators.short_answer import unseen_words
 from harness.estimators.stopping import PairRule
@@ -100,10 +100,6 @@ def compare_campaigns(
     rule = PairRule(sides[0].campaign, margin, rhw)
     rounds, found = _compared(sides, folders, rule, workers, progress or Progress())
     labels = labels or (a.name, b.name)
-    statements = [paired_statement(found, *labels), conditional_paired_statement(found)]
-    if rule.conditional:
-        statements.reverse()
-    statements.insert(0, rule.decision.sentence)
     content = {
         "format": 1,
         "method": a.testing.method,
@@ -116,10 +112,8 @@ def compare_campaigns(
         **found.to_json(),
         "decision": {**asdict(rule.decision), "words": rule.decision.words},
         "to_decide": _to_decide(sides[0].campaign, rounds, found),
-        "statement": statements[0],
         "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
         "ended": conclusion(a, rule, found.free["n_pairs"])[0],
-        "statements": statements,
     }
     code = EXIT_DONE if rule.ended else EXIT_BUDGET_SPENT
     if margin is not None:

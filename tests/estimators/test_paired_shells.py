@@ -7,7 +7,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness.estimators.answer import conditional_paired_statement, paired_statement
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import (
     A_CRASHES,
@@ -72,7 +71,7 @@ def test_failed_tests_widen_both_ways():
     assert ratio.ci_low == pytest.approx(worst_b.ratio(LEVEL).ci_low)
     estimate = paired_estimate(failed, 0.9)
     assert (estimate.a.details["n_failed"], estimate.b.details["n_failed"]) == (3, 2)
-    assert "A FAILED in 3 and B in 2" in paired_statement(estimate, "x", "y")
+    assert estimate.to_json()["warnings"][:2] == ["3 tests of A FAILED", "2 tests of B FAILED"]
     assert estimate.to_json()["shells"][0]["n_failed_tests"] == 5
 
 
@@ -101,10 +100,7 @@ def test_a_margin_is_where_the_ratio_ends():
 def test_a_crash_of_either_outside_refutes_the_assumption():
     found = paired_estimate(pairs_of((30, 10, 2, 8), (0, 5, 0, 45), (0, 0, 1, 3999)), 0.9)
     assert found.refuted
-    assert "B has 1 times crashed where the surrogate b does not" in conditional_paired_statement(found)
-    assert "In 4,000 pairs of tests outside neither crashed" in conditional_paired_statement(
-        paired_estimate(PAIRS, 0.9)
-    )
+    assert not paired_estimate(PAIRS, 0.9).refuted
 
 
 def test_equal_vehicles_are_not_told_apart_and_json_has_no_infinity():
@@ -121,16 +117,16 @@ def test_equal_vehicles_are_not_told_apart_and_json_has_no_infinity():
 @pytest.mark.parametrize(
     ("margin", "verdict", "said"),
     [
-        (0.0, "proven", "B crashes less often than A, given the library: that holds with confidence 0.95, a look"),
+        (0.0, "proven", "B crashes less often than A"),
         (0.0, "refuted", "B crashes more often than A"),
-        (0.0, "open", "Not told apart, given the library."),
+        (0.0, "open", "Not told apart"),
         (0.1, "proven", "B is at most 10 % worse than A"),
         (0.1, "refuted", "B is more than 10 % worse than A"),
         (0.1, "open", "Open whether B is more than 10 % worse than A"),
     ],
 )
 def test_the_verdict_in_words(margin, verdict, said):
-    assert PairDecision(margin, verdict, 0.95, True).sentence.startswith(said)
+    assert PairDecision(margin, verdict, 0.95, True).words == said
 
 
 def test_more_pairs_that_end_as_often_say_the_same_with_less_doubt():

