@@ -57,10 +57,12 @@ def writing(path: Path) -> Iterator[None]:
 class HarnessError(Exception):
     """Base of all errors that a user can cause and mend; its parts are `shortened`, for they may repeat what was given.
 
-    ``where`` is a YAML path (``testing.alpha``), a file, or an option of the command line.
+    ``where`` is a YAML path (``testing.alpha``), a file, or an option of the command line. ``problems`` are those of a
+    file in which several were found at once, each with its own place; empty where there is one.
     """
 
     exit_code = EXIT_BAD_INPUT
+    problems: tuple[HarnessError, ...] = ()
 
     def __init__(self, where: str, found: str, expected: str, mend: str) -> None:
         super().__init__(where, found, expected, mend)
@@ -68,7 +70,8 @@ class HarnessError(Exception):
         self.mend = shortened(mend, LONGEST_ADVICE)
 
     def __str__(self) -> str:
-        return f"{self.where}: found {self.found}; expected {self.expected}. {self.mend}"
+        of_each = (f"\n  {problem}" for problem in self.problems)
+        return "".join((f"{self.where}: found {self.found}; expected {self.expected}. {self.mend}", *of_each))
 
 
 class CampaignError(HarnessError):

@@ -125,6 +125,12 @@ class ShellDesign:
         return np.asarray((np.array(self.cell_references) >> r) & 1, np.bool_)
 
     @property
+    def first_reference(self) -> tuple[str, float] | None:
+        """The first reference driver of the library that crashes at all, and its crash rate; None without one."""
+        rates = zip(self.references, self.reference_rate.tolist(), strict=True)
+        return next(((each.name, rate) for each, rate in rates if rate > 0.0), None)
+
+    @property
     def n_independent(self) -> float:
         """Paths that would err as the pool's do; fewer where they were chosen from a finite number, which errs too."""
         return self.n_paths / (1.0 + self.n_paths / self.candidates) if self.candidates else self.n_paths

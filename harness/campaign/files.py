@@ -313,9 +313,8 @@ def _one_error(path: str, problems: Sequence[CampaignError]) -> CampaignError:
     if len(problems) == 1:
         return problems[0]
     at_least = "at least " if len(problems) == MOST_SHOWN else ""
-    error = CampaignError(path, f"{at_least}{len(problems)} problems", "none", "")
-    # Not shortened: each of its lines is short.
-    error.mend = "Mend each:\n" + "\n".join(f"  {problem}" for problem in problems)
+    error = CampaignError(path, f"{at_least}{len(problems)} problems", "none", "Mend each:")
+    error.problems = tuple(problems)
     return error
 
 

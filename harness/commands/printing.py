@@ -40,11 +40,10 @@ def go_on_unread(stream: TextIO) -> None:
 
 def show_error(error: HarnessError) -> None:
     """Print an error on stderr: where it is, and what was found, expected and can be done, each on its line."""
-    parts = getattr(error, "problems", (error,))
-    if len(parts) > 1:
+    if error.problems:
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
         say(f" {error.where}: {error.found}", err=True)
-    for part in parts:
+    for part in error.problems or (error,):
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
         told = (getattr(part, each).replace("`", "'") for each in _PARTS)  # commands in docs and in Python have these
         say(f" {part.where}", *(f"  {each + ':':<9} {text}" for each, text in zip(_PARTS, told, strict=True)), err=True)

@@ -1,4 +1,4 @@
-"""What a run answers: ``estimates.json``, and the sentences that are functions of estimates, decisions and pairs."""
+"""What a run answers: ``estimates.json``, and the sentences that are functions of estimates and decisions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from harness.estimators.block import CUT_OFF_STEPS, DANGER_TTC_S, Block
 from harness.estimators.estimate import WIDE_RHW, Estimate, Number, Point, Unavailable, finite_json
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import one_pass
-from harness.estimators.pairs import PairedEstimate
 from harness.estimators.severity import Severity
 from harness.estimators.short_answer import ShortAnswer, assumed_times, no_lower_limit, short_answer
 from harness.estimators.stopping import RoundRule, Rule, limit_words
@@ -313,6 +312,7 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
     stopped_by: StoppedBy = "pool"
     if look.stopped:
         stopped_by = "accept" if look.decision is not None else "rhw" if look.below is None else "below_reference"
+        stopped_by = getattr(rule, "ended", None) or stopped_by
     elif look.decision is not None and look.decision.is_final:
         stopped_by = "contradicted"
     elif look.pool_error_above_target:  # whatever else is spent: more of it would not help
@@ -326,9 +326,9 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
     if look.below is not None:
         limit = limit_words(look.below.limit, look.below.driver)
         why = f"with confidence {plain(look.below.confidence)} the crash rate is below {limit} (stop.below_reference)"
-    elif stopped_by in ("rhw", "accept"):
+    elif look.stopped:
         why = f"the last condition to be met was {unmet}" if unmet else "every condition was met at the first look"
-    elif campaign.stop.rhw is not None or look.decision is not None:
+    elif campaign.stop.rhw is not None or look.unmet:
         after, why = f"{after} without {unmet}", mend
         if campaign.has_baseline_runs and stopped_by in ("episodes", "pool_error"):
             why = _runs_or_tests(rule, campaign, n_episodes) or why
@@ -386,56 +386,3 @@ def expected_for(rule: Rule, campaign: Campaign, n_tests: int) -> dict[str, int]
         return None  # a stratum that cannot be tested: nothing will do
     runs, tests = two_digits_up(n_runs * more_runs), two_digits_up(n_tests * more_tests)
     return {"runs": n_runs if more_runs == 1.0 else runs, "tests": n_tests if more_tests <= 1.0 else tests}
-
-
-def paired_statement(found: PairedEstimate, name_a: str, name_b: str) -> str:
-    """Without an assumption: both rates, what lies between them, where only one of the two crashes, failed tests."""
-    free, a, b = found.free, found.a, found.b
-    alone_a, alone_b = (
-        interval(free[of]["ci_low"], free[of]["ci_high"], free[of]["value"]) for of in ("only_a", "only_b")
-    )
-    text = (
-        f"A ({name_a}) crashes {interval(a.ci_low, a.ci_high, a.crash_rate)} times per test, "
-        f"B ({name_b}) {interval(b.ci_low, b.ci_high, b.crash_rate)} times: {_apart(free, a.confidence)}, "
-        f"from {free['n_pairs']:,} pairs of tests. Alone, where the other one does not, "
-        f"A crashes {alone_a} times per test, B {alone_b}."
-    )
-    if (failed_a := a.details["n_failed"]) + (failed_b := b.details["n_failed"]):
-        text += (
-            f" Of these tests A FAILED in {failed_a:,} and B in {failed_b:,}: each limit counts them as crashes or as "
-            "none, whichever takes it farther."
-        )
-    return warned([f"{name}: {caution}" for name, of in (("A", a), ("B", b)) for caution in of.cautions], text)
-
-
-def conditional_paired_statement(found: PairedEstimate) -> str:
-    """If both crash only where the boundary surrogate or a more conservative one does."""
-    library, inside = found.pairs.design.library, found.conditional
-    if found.refuted:
-        beyond = [int(found.pairs.tally(side).crashes[library.n_inside :].sum()) for side in (0, 1)]
-        who = " and ".join(f"{name} has {n:,} times" for name, n in zip("AB", beyond, strict=True) if n)
-        return (
-            f"{who} crashed where the surrogate {library.boundary} does not crash: nothing can be said under the "
-            f"assumption that they crash only where {library.boundary} does."
-        )
-    text = (
-        f"If A and B crash only where the surrogate {library.boundary} or a more careful one crashes: "
-        f"{_apart(inside, found.a.confidence)}, from {inside['n_pairs']:,} pairs of tests."
-    )
-    if not (n_outside := found.free["n_pairs"] - inside["n_pairs"]):
-        return f"{text} Nothing was tested outside: whether the assumption holds is not known."
-    return f"{text} In {n_outside:,} pairs of tests outside neither crashed."
-
-
-def _apart(found: Mapping[str, Any], confidence: float) -> str:
-    """Which of them crashes more often, and by how much."""
-    low, high, verdict = found["ci_low"], found["ci_high"], "the difference is not distinguishable from 0"
-    if found["n_differing"] and low > 0.0:
-        verdict = "A crashes more often"
-    elif found["n_differing"] and high < 0.0:
-        verdict = "A crashes less often"
-    apart = f"{verdict}, A − B = {number(found['difference'])} ({share(confidence)} interval {interval(low, high)})"
-    if not math.isfinite(found["ratio"]):
-        return apart
-    most = ratio(found["ratio_high"]) if math.isfinite(found["ratio_high"]) else "no limit"
-    return f"{apart}, A/B = {ratio(found['ratio'])} ({ratio(found['ratio_low'])} to {most})"

@@ -10,17 +10,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, FailureBounds, finite_json
-from harness.estimators.likelihood import Level, contrast_limit, ratio_limits, spread
+from harness.estimators.likelihood import Counts, Level, contrast_limit, ratio_limits, spread
 from harness.estimators.shells import Shells
 from harness.estimators.tally import Tally, mean_square
+from harness.numbers import share
 from harness.strata import ShellDesign
-from harness.vocabulary import BoolArray, FloatArray, IntArray
+from harness.vocabulary import FloatArray, IntArray
 
 NO_CRASH, CRASH, FAILED = range(3)
 """How a test of a pair ended."""
@@ -31,35 +33,37 @@ ONLY_A, ONLY_B = np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0, 0.0])
 DIFFERENCE = A_CRASHES - B_CRASHES
 
 
-def _kinds(failed_a: bool, failed_b: bool) -> tuple[BoolArray, ...]:
-    """Of the four outcomes, which ends of A and B belong to each, shape (3, 3)."""
+@cache
+def _kinds(failed_a: bool, failed_b: bool) -> IntArray:
+    """Of the four outcomes, which ends of A and B belong to each, shape (3, 3, 4)."""
     a, b = np.meshgrid([False, True, failed_a], [False, True, failed_b], indexing="ij")
-    return a & b, a & ~b, ~a & b, ~a & ~b
+    return np.stack((a & b, a & ~b, ~a & b, ~a & ~b), axis=2).astype(np.int64)
 
 
-MarginVerdict = Literal["proven", "refuted", "open"]
+PairVerdict = Literal["proven", "refuted", "open"]
 
 
 @dataclass(frozen=True)
-class MarginDecision:
-    """Whether B's rate is at most 1 + ``margin`` times A's; ``given_the_library`` it is asked of what lies inside."""
+class PairDecision:
+    """Whether B's rate is at most 1 + ``margin`` times A's: at no margin, who crashes less often.
+
+    A verdict holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
+    """
 
     margin: float
-    verdict: MarginVerdict
+    verdict: PairVerdict
     confidence: float
     given_the_library: bool
 
     @property
-    def sentence(self) -> str:
+    def words(self) -> str:
         """The verdict in words."""
-        answer = {
-            "proven": "B is not worse than A by more than",
-            "refuted": "B IS WORSE than A by more than",
-            "open": "It is open whether B is worse than A by more than",
-        }[self.verdict]
-        given = ", given the library" if self.given_the_library else ""
-        looks = f" (decided at {self.confidence:.1%}, which allows for a look after each round)"
-        return f"{answer} {self.margin:.3g} times A's rate{given}{looks}."
+        if not self.margin:
+            told = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
+            return told.get(self.verdict, "Not told apart")
+        most = share(self.margin)
+        told = {"proven": f"B is at most {most} worse than A", "refuted": f"B is more than {most} worse than A"}
+        return told.get(self.verdict, f"Open whether B is more than {most} worse than A")
 
 
 class Interval(NamedTuple):
@@ -84,7 +88,7 @@ class PairCounts:
     """
 
     design: ShellDesign
-    ends: IntArray
+    ends: Counts
     mass: FloatArray
 
     @property
@@ -102,9 +106,9 @@ class PairCounts:
         within = slice(0, self.design.library.n_inside if n is None else n)
         return PairCounts(self.design, self.ends[within], self.mass[within, :, :, within])
 
-    def outcomes(self, *, failed_a: bool = False, failed_b: bool = False) -> IntArray:
+    def outcomes(self, *, failed_a: bool = False, failed_b: bool = False) -> Counts:
         """How often both crash, only A, only B, neither, shape (S, 4), with failed tests as crashes or as none."""
-        return np.stack([self.ends[:, kind].sum(1) for kind in _kinds(failed_a, failed_b)], axis=1)
+        return np.tensordot(self.ends, _kinds(failed_a, failed_b))
 
     def tally(self, side: int) -> Tally:
         """Tests of A (0) or B (1) by themselves."""
@@ -112,9 +116,9 @@ class PairCounts:
         return Tally(self.tests, ends[:, CRASH], ends[:, FAILED], mass[:, CRASH], mass[:, FAILED])
 
     @property
-    def n_differing(self) -> int:
-        """Pairs of which one vehicle is known to have crashed, and the other not to have."""
-        return int(self.ends[:, CRASH, NO_CRASH].sum() + self.ends[:, NO_CRASH, CRASH].sum())
+    def n_alone(self) -> tuple[int, int]:
+        """Pairs of which A, or B, is known to have crashed, and the other not to have."""
+        return int(self.ends[:, CRASH, NO_CRASH].sum()), int(self.ends[:, NO_CRASH, CRASH].sum())
 
     @property
     def n_crashes(self) -> int:
@@ -130,6 +134,14 @@ class PairCounts:
         """That of the vehicle that has crashed more often; infinite where neither has."""
         return max(self.rate(A_CRASHES), self.rate(B_CRASHES)) or math.inf
 
+    def expected(self, rate: float) -> float:
+        """Crashes that these tests of one vehicle would have brought at a rate, spread evenly over the strata."""
+        return rate * int(self.tests.sum()) / float(self.p.sum())
+
+    def times(self, factor: float) -> PairCounts:
+        """So many times as many pairs of each stratum, ending as often."""
+        return PairCounts(self.design, np.asarray(self.ends * factor, np.float64), self.mass * factor)
+
     def pool_variance(self, weights: FloatArray, *, failed_a: bool = False, failed_b: bool = False) -> float:
         """Variance of a weighted sum that comes from the pool's finite number of paths.
 
@@ -140,8 +152,8 @@ class PairCounts:
         kinds = _kinds(failed_a, failed_b)
         for sign in (1.0, -1.0):
             part = np.maximum(sign * weights, 0.0)
-            mass = sum(w * self.mass[:, kind].sum(1) for w, kind in zip(part, kinds, strict=True))
-            square += float(part.max()) * mean_square(scale, np.asarray(mass))
+            mass = np.tensordot(self.mass, kinds @ part, ((1, 2), (0, 1)))
+            square += float(part.max()) * mean_square(scale, mass)
             rate += sign * float(scale @ (self.outcomes(failed_a=failed_a, failed_b=failed_b) @ part))
         return max(square - rate**2, 0.0) / self.design.n_paths
 
@@ -161,6 +173,10 @@ class PairCounts:
         sign, weights = ((1.0, ONLY_A), (-1.0, ONLY_B))[side]  # `limit` is of what does not fall where A crashes more
         low, high = sorted(sign * self.limit(sign * weights, level, end) for end in (-1.0, 1.0))
         return Interval(self.rate(weights), max(low, 0.0) + 0.0, min(high, 1.0))
+
+    def highest_rate(self, level: Level) -> float:
+        """Upper limit of the crash rate of A or B, whichever is higher."""
+        return max(self.limit(A_CRASHES, level, 1.0), -self.limit(-B_CRASHES, level, -1.0))
 
     def ratio(self, level: Level) -> Interval:
         """A over B; NaN where B has no crash, and open upwards where it may have none."""
@@ -189,10 +205,10 @@ class PairCounts:
         lower, upper = self.outcomes(failed_b=True), self.outcomes(failed_a=True)
         return spread(self.p[:, None] * DIFFERENCE, lower, upper, level, size, most)
 
-    def verdict(self, margin: float, level: Level) -> MarginVerdict:
+    def verdict(self, margin: float, level: Level) -> PairVerdict:
         """Whether B's rate is at most 1 + margin times A's: proven, refuted, or open."""
         excess = (1.0 + margin) * A_CRASHES - B_CRASHES
-        if self.limit(excess, level, -1.0) >= 0.0:
+        if self.limit(excess, level, -1.0) > 0.0:
             return "proven"
         return "refuted" if self.limit(excess, level, 1.0) < 0.0 else "open"
 
@@ -249,7 +265,8 @@ def contrast(pairs: PairCounts, level: Level) -> dict[str, Any]:
         "only_a": pairs.alone(0, level)._asdict(),
         "only_b": pairs.alone(1, level)._asdict(),
         "n_pairs": int(pairs.tests.sum()),
-        "n_differing": pairs.n_differing,
+        "n_only_a": pairs.n_alone[0],
+        "n_only_b": pairs.n_alone[1],
     }
 
 
@@ -291,7 +308,9 @@ class PairedEstimate:
         ]
         each = {"a": self.a.shown, "b": self.b.shown}
         more = {"confidence": self.a.confidence, "conditional": inside, "shells": shells}
-        warnings = [f"{name}: {text}" for name, of in (("A", self.a), ("B", self.b)) for text in of.warnings]
+        both = (("A", self.a), ("B", self.b))
+        warnings = [f"{n:,} tests of {name} FAILED" for name, of in both if (n := of.details["n_failed"])]
+        warnings += [f"{name}: {text}" for name, of in both for text in of.warnings]
         return finite_json({**each, **self.free, **more, "warnings": warnings})
 
 

@@ -294,9 +294,8 @@ class Shells:
 
     @property
     def first_reference(self) -> tuple[str, float] | None:
-        """The first reference driver of the library that crashes at all, and its crash rate; None without one."""
-        rates = zip(self._design.references, self._design.reference_rate.tolist(), strict=True)
-        return next(((each.name, rate) for each, rate in rates if rate > 0.0), None)
+        """See `ShellDesign`."""
+        return self._design.first_reference
 
     def expected(self, limit: float, driver: str | None, statement: str) -> float:
         """Crashes that these tests of a statement would have brought at a limit, spread evenly over its strata.

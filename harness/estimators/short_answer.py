@@ -27,6 +27,7 @@ from harness.numbers import (
     ratio,
     share,
     tenths,
+    two_digits_up,
     words,
 )
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
@@ -46,7 +47,6 @@ ENDED = {
     "pool": "every cut-in of the pool was tested",
     "contradicted": "vehicle does not do what the statement assumes",
     "pool_error": "the pool’s own error is too wide",
-    "open": "budget spent before the margin was decided",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
 
@@ -314,7 +314,7 @@ def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Map
 
 def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None, remedy: str | None) -> str:
     ended, target = ENDED.get(stopped_by or "", "interrupted"), campaign.stop.rhw
-    if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference"):
+    if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept"):
         asked = best.precision
         for each in best.details.get("statements", ()):
             asked = each["rhw"] if each["name"] == campaign.testing.shells.statement else asked
@@ -368,15 +368,16 @@ def _wrapped(texts: Iterable[str]) -> Iterator[str]:
         yield from (line.replace("\u00a0", " ") for line in fill.wrap(whole))
 
 
-def verdict_of_pair(found: Mapping[str, Any], margin: Mapping[str, Any] | None) -> str:
-    """The answer of a comparison in one line, given what lies between A and B."""
-    if margin is not None:
-        most = share(margin["margin"])
-        told = {"proven": f"B is at most {most} worse than A", "refuted": f"B is more than {most} worse than A"}
-        return told.get(margin["verdict"], f"Open whether B is more than {most} worse than A")
-    if found["n_differing"] and found["ci_low"] > 0.0:
-        return "B crashes less often than A"
-    return "B crashes more often than A" if found["n_differing"] and found["ci_high"] < 0.0 else "Not told apart"
+def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) -> str | None:
+    """What would decide a comparison (``compare.json``) that was left open, and its cost; None of a decided one."""
+    if content["decision"]["verdict"] != "open":
+        return None
+    if (needed := content["to_decide"]) is None:
+        return "no number of pairs is known that would decide: as far as was seen, they are too much alike"
+    where, done = (" and a new --out", 0) if needed["new_folder"] else ("", content["n_pairs"])
+    n = two_digits_up(needed["pairs"] - done)
+    cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
+    return f"to decide, give the same command with {needed['options']}{where}: some {count(n)} more pairs{cost}"
 
 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -386,8 +387,10 @@ def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
     return asked
 
 
-def pair_lines(content: Mapping[str, Any], counts_above_mps: float, report: Path) -> list[str]:
-    """A comparison (``compare.json``) for a terminal, as short as `lines`."""
+def pair_lines(
+    content: Mapping[str, Any], counts_above_mps: float, report: Path, s_per_pair: float | None = None
+) -> list[str]:
+    """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is what a pair takes."""
     asked = pair_asked(content)
     rows = []
     for name in "AB":
@@ -406,7 +409,8 @@ def pair_lines(content: Mapping[str, Any], counts_above_mps: float, report: Path
     if asked["ratio"] is not None:
         most = "no limit" if asked["ratio_high"] is None else ratio(asked["ratio_high"])
         rows.append(("A / B", ratio(asked["ratio"]), f"{ratio(asked['ratio_low'])} to {most}", ""))
-    rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), ""))
+    alone = f"A alone {count(asked['n_only_a'])}, B alone {count(asked['n_only_b'])}"
+    rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), alone))
     remarks = [f"! {text}" for text in content["warnings"]]
     if asked is not content:
         remarks.insert(
@@ -416,5 +420,6 @@ def pair_lines(content: Mapping[str, Any], counts_above_mps: float, report: Path
     scope = f"sampling error in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"
     counted = f" above {plain(counts_above_mps)} m/s" if counts_above_mps else ""
     pairs = f"{count(content['n_pairs'])} pairs on the same cut-ins"
-    head = f"{verdict_of_pair(asked, content['margin'])} · {pairs} · crashes{counted} per test"
-    return [head, *_columns(rows), *_wrapped([*remarks[:2], scope]), f"  report  {report}"]
+    head = f"{content['decision']['words']} · {pairs} · crashes{counted} per test"
+    last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
+    return [head, *_columns(rows), *_wrapped([*remarks[: 3 - len(last)], *last]), f"  report  {report}"]

@@ -27,7 +27,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept, Stop
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
-from harness.estimators.pairs import MarginDecision, PairCounts
+from harness.estimators.pairs import PairCounts, PairDecision, PairVerdict
 from harness.estimators.shells import Shells
 from harness.numbers import number, plain, ratio
 from harness.strata import ASSUMPTION_FREE
@@ -41,9 +41,10 @@ DEFAULT_MIN_CRASHES = 100
 FIRST_TESTS = "the first tests of each shell (testing.shells.first_tests)"
 POOL_SHARE = 0.5
 """Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
-MARGIN_LOOKS = 6
-"""A margin is decided at a level that leaves out so many times less than the campaign's, as it is looked at after each
-round. Measured where B's rate is 1 + margin times A's, by looks from 40 to 3,000 pairs: docs/compare.md."""
+NARROW = 0.1
+"""Half-width of a difference over the larger rate at which two vehicles are as good as told apart."""
+MOST_TIMES = 1e3
+"""As many pairs as there are that nobody foresees what would be seen."""
 Verdict = Literal["accepted", "rejected", "undecided"]
 DECISION_THRESHOLDS = ((2.5, 4.5), (10.0, 3.4), (100.0, 4.5), (1_000.0, 5.0), (math.inf, 5.5))
 """Below so many crashes, the threshold of the likelihood ratio at which a limit is decided with an error of 5 % a side.
@@ -325,27 +326,65 @@ class RoundRule(Rule):
 
 
 class PairRule(Rule):
-    """Looks at the difference of two vehicles after each round, or whether B is worse than A by more than a margin.
+    """Looks at two vehicles after each round: who crashes less often, or whether B is worse by more than a ``margin``.
 
-    ``look.rhw`` is that of the difference, over the larger rate; ``margin`` is what is known about the margin, None
-    where none is asked about; ``conditional`` says whether only what lies within the boundary is looked at.
-    Nothing stops in a round of first tests.
+    What is known of that is ``decision``. Without a margin it is enough, too, once the half-width of the difference is
+    `NARROW` of the larger rate, or both rates are below ``stop.below_reference``. An ``rhw`` that is asked for is all
+    that is waited for (``ends_at_rhw``); then a decision is looked for once. ``look.rhw`` is that half-width;
+    ``conditional`` says whether only what lies within the boundary is looked at; ``ended`` is why it is enough.
     """
 
-    def __init__(self, campaign: Campaign, margin: float | None) -> None:
-        super().__init__(campaign.stop.rhw, campaign.min_crashes)
-        self._confidence, self._statement = campaign.stop.confidence, campaign.testing.shells.statement
-        self.conditional, level = self._statement != ASSUMPTION_FREE, 1.0 - (1.0 - self._confidence) / MARGIN_LOOKS
-        self.margin = None if margin is None else MarginDecision(margin, "open", level, self.conditional)
+    level_at = staticmethod(decision_level)
+
+    def __init__(self, campaign: Campaign, margin: float | None = None, rhw: float | None = None) -> None:
+        stop, self._statement = campaign.stop, campaign.testing.shells.statement
+        super().__init__(NARROW if margin is None and rhw is None else rhw, campaign.min_crashes)
+        self._confidence, self.ends_at_rhw = stop.confidence, rhw is not None
+        self._below_reference = stop.below_reference if margin is None and rhw is None else None
+        self._asked = "who crashes less often" if margin is None else f"--margin ({margin:g})"
+        self.conditional = self._statement != ASSUMPTION_FREE
+        self.decision = PairDecision(margin or 0.0, "open", (1.0 + stop.confidence) / 2.0, self.conditional)
+        self.ended: Literal["accept", "below_reference", "rhw"] | None = None
 
     def observe(self, pairs: PairCounts) -> bool:
         """Whether to stop at the end of a round."""
         watched, level = pairs.inside(pairs.design.n_within(self._statement)), Level.two_sided(self._confidence)
-        rhw, pool = watched.rhw(level), watched.rhw_from_pool(level)
-        if self.margin is None:
-            more = {FIRST_TESTS: not self.of_first_tests}
-            return self._looked(rhw, pairs.n_crashes, of=", of the difference", more=more, pool=(pool, pool))
-        verdict = watched.verdict(self.margin.margin, Level.two_sided(self.margin.confidence))
-        self.margin = replace(self.margin, verdict=verdict)
-        self.look = Look(rhw, stopped=verdict != "open", unmet=(f"--margin ({self.margin.margin:g})",))
-        return self.look.stopped
+        self.decision = replace(self.decision, verdict=self._verdict(watched))
+        pool, more = watched.rhw_from_pool(level), {FIRST_TESTS: not self.of_first_tests}
+        seen = watched.rhw(level), pairs.n_crashes
+        given_up = self._looked(*seen, of=", of the difference", more=more, pool=(pool, pool))
+        self.ended = "rhw" if self.look.stopped else None
+        if not self.ends_at_rhw:
+            if self.decision.verdict != "open":
+                self.ended = "accept"
+            elif self.ended is None and self._both_below(watched):
+                self.ended = "below_reference"
+            unmet = self.look.unmet if self.ended == "rhw" else (self._asked,)
+            self.look = replace(self.look, stopped=self.ended is not None, unmet=unmet)
+        return self.look.stopped or given_up
+
+    def more_pairs(self, pairs: PairCounts) -> float:
+        """How many times as many pairs would decide, if they end as often; infinite where nobody can tell."""
+        watched, times = pairs.inside(pairs.design.n_within(self._statement)), 1.0
+        while times < MOST_TIMES:
+            times *= LOOK_RATIO
+            if self._verdict(watched.times(times)) != "open":
+                return times
+        return math.inf
+
+    def _verdict(self, watched: PairCounts) -> PairVerdict:
+        level = Level.two_sided(self._confidence)
+        if watched.n_crashes and not self.ends_at_rhw:
+            level = self.level_at(watched.expected(watched.larger_rate), self._confidence)
+        return watched.verdict(self.decision.margin, level)
+
+    def _both_below(self, watched: PairCounts) -> bool:
+        """Whether both are known to crash less than so many times as often as the reference driver does at least."""
+        design, limit = watched.design, self._below_reference
+        if limit is None or design.first_reference is None:
+            return False
+        r = [each.name for each in design.references].index(design.first_reference[0])
+        rate, square = float(design.reference_rate[r]), float(design.reference_square[r])
+        level = self.level_at(watched.expected(limit * rate), self._confidence)
+        error = math.sqrt(max(square - rate * rate, 0.0) / design.n_independent)
+        return watched.highest_rate(level) < limit * (rate - level.z * error)

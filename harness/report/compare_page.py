@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from harness import numbers
 from harness.errors import HarnessError, RunFolderError, printable
-from harness.estimators.short_answer import pair_asked, vehicle_words, verdict_of_pair
+from harness.estimators.short_answer import deciding_words, pair_asked, vehicle_words
 from harness.numbers import count, tenths
 from harness.pool.replay import LEAD, PATH_COLUMNS
 from harness.records.folder import read_as, write_bytes
@@ -50,7 +50,7 @@ def write_comparison(folder: str | Path) -> Path:
     environment.filters.update(getmembers(numbers, isfunction), sentence=sentence, vehicle=vehicle_words)
     page = environment.get_template("compare.html.j2").render(
         compared=stored, asked=asked, given=asked is not stored,
-        verdict=verdict_of_pair(asked, stored["margin"]), above=runs[0].campaign.crash.counts_above_mps,
+        to_decide=deciding_words(stored), above=runs[0].campaign.crash.counts_above_mps,
         sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
         plot=plot, scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
     )  # fmt: skip

@@ -1,7 +1,8 @@
 """An episode as OpenSCENARIO XML 1.2 on an OpenDRIVE road, by scenariogeneration (extra ``harness[export]``).
 
 Every vehicle follows a polyline with a point for each step of 0.1 s, so that a player shows what was simulated and
-decides nothing. A cut-in of one step crosses the lane within 0.1 s.
+decides nothing. BV goes on sideways as fast after the overlap as before it; only a cut-in of one step crosses the lane
+within 0.1 s.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def write_openscenario(trace: pa.Table, file: Path) -> None:
 def _positions(track: pa.Table) -> list[xosc.WorldPosition]:
     """Of a vehicle's rear axle in each step: x along the road, y from the left edge of the left lane to the left."""
     x = track.column("x_m").to_numpy() - VEHICLE_LENGTH_M + OVERHANG_M
-    y = -LANE_M * (0.5 + share_over(track))
+    y = -LANE_M * (0.5 + share_over(track)[: x.size])
     return [xosc.WorldPosition(*place, 0.0, 0.0, 0.0, 0.0) for place in zip(x.tolist(), y.tolist(), strict=True)]
 
 

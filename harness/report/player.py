@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import math
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -165,9 +166,20 @@ def _states(rows: pa.Table) -> dict[str, Any]:
 
 
 def share_over(track: pa.Table) -> FloatArray:
-    """How far a vehicle has come over from the left lane in each row of its trace: 0 to 1."""
+    """How far a vehicle has come over from the left lane in each row of its trace, 0 to 1, and until it is all over.
+
+    Where lane changes take time, it moves on as fast after the overlap, with which its record of it ends.
+    """
     over: FloatArray = 1.0 - floats(track.column("lane"))
-    return np.maximum(over, floats(track.column("lateral_m")) / LANE_M) if "lateral_m" in track.column_names else over
+    overlap = int(np.count_nonzero(over == 0.0))
+    if "lateral_m" not in track.column_names or not overlap:
+        return over
+    lateral_m = floats(track.column("lateral_m"))
+    if overlap < over.size:
+        at, step = lateral_m[overlap], lateral_m[overlap] - lateral_m[overlap - 1]
+        rest = max(over.size - overlap, math.ceil((LANE_M - at) / step) + 1)
+        lateral_m = np.append(lateral_m[:overlap], at + step * np.arange(rest))
+    return np.minimum(lateral_m / LANE_M, 1.0)
 
 
 def _of(traces: pa.Table, vehicle: str) -> pa.Table:

@@ -6,6 +6,7 @@ folder holds already, from an earlier call or because it is the copy of a stored
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -21,12 +22,13 @@ from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.files import campaign_of
+from harness.campaign.sections import MOST_CUT_INS
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
-from harness.estimators.answer import conditional_paired_statement, paired_statement
-from harness.estimators.pairs import MarginVerdict, PairedEstimate, PairedShells, paired_estimate
+from harness.estimators.answer import conclusion
+from harness.estimators.pairs import PairedEstimate, PairedShells, PairVerdict, paired_estimate
 from harness.estimators.short_answer import unseen_words
 from harness.estimators.stopping import PairRule
-from harness.numbers import leaves
+from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, sole_use, write_sealed
@@ -44,7 +46,7 @@ from harness.vocabulary import COMPARISON
 SIDES = ("a", "b")
 MAY_DIFFER = frozenset({"av", "name", "description"})
 PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: same initial state, paths and cut-in"
-EXIT_OF: Mapping[MarginVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
+EXIT_OF: Mapping[PairVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
 
 Both = tuple[Resolved, Resolved]
 
@@ -53,8 +55,8 @@ Both = tuple[Resolved, Resolved]
 class Comparison:
     """Two finished campaigns, in run folders ``a`` and ``b``, and the difference.
 
-    ``content`` is that of ``compare.json``, ``report`` the page. The exit code is 4 when the budget was spent before
-    the asked precision, or with the margin open, and 5 when B is worse than A by more than the margin.
+    ``content`` is that of ``compare.json``, ``report`` the page. The exit code is 4 when budget or pool were spent
+    before what was asked was known, and 5 when B is worse than A by more than the margin.
     """
 
     folder: Path
@@ -75,22 +77,27 @@ def compare_campaigns(
     labels: tuple[str, str] | None = None,
     stored: str | Path | None = None,
     margin: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None,
+    rhw: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None,
 ) -> Comparison:
-    """Drive two vehicles on the same cut-ins until the difference, or the margin, is known well enough.
+    """Drive two vehicles on the same cut-ins until it is known who crashes less often, or to half-width 0.1.
 
     The campaigns, or those that paths or vehicles' names stand for, are equal but for ``av``, ``name`` and
     ``description``; ``labels`` name them in the answer, by default as they do themselves. ``out/a`` and ``out/b``
     become run folders; what an earlier call has finished there is used again. ``stored`` is a run folder of A, whose
-    tests are not driven again: it is copied to ``out/a``. A ``margin`` asks whether B's rate is at most 1 + margin
-    times A's. ``workers`` and ``progress`` are those of `run_campaign`.
+    tests are not driven again: it is copied to ``out/a``. A ``margin`` asks instead whether B's rate is at most
+    1 + margin times A's, ``rhw`` for a half-width of A - B over the larger rate; the campaigns' own ``stop.rhw`` is
+    about one vehicle. ``workers`` and ``progress`` are those of `run_campaign`.
 
-    Raises `CampaignError`: the campaigns differ in something else, or do not draw from the same shells. Raises
-    `RunFolderError`: ``out`` holds other runs.
+    Raises `CampaignError`: the campaigns differ in something else, or do not draw from the same shells; a margin and a
+    half-width are asked for. Raises `RunFolderError`: ``out`` holds other runs.
     """
     a, b = campaign_of(a), campaign_of(b)
     if stored is not None:
         mend = f"Read that code; then name {Path(stored) / CAMPAIGN} for A, which drives it anew."
         require_trust(Path(stored), read_manifest(Path(stored)), a.av, mend)
+    if margin is not None and rhw is not None:
+        expected = "one end of the comparison"
+        raise CampaignError("--margin", f"stop.rhw={rhw:g} beside it", expected, "Leave out --margin or stop.rhw.")
     sides = require_ready(a, "compare"), require_ready(b, "compare")
     require_comparable(*(side.campaign for side in sides))
     require_same_shells(sides, stored)
@@ -100,13 +107,9 @@ def compare_campaigns(
         _take_over(Path(stored), folders[0], sides[0])
     for side, folder in zip(sides, folders, strict=True):  # both, before either is touched
         require_own_folder(folder, side, resume=True)
-    found, rule = _compared(sides, folders, margin, workers, progress or Progress())
+    rule = PairRule(sides[0].campaign, margin, rhw)
+    rounds, found = _compared(sides, folders, rule, workers, progress or Progress())
     labels = labels or (a.name, b.name)
-    statements = [paired_statement(found, *labels), conditional_paired_statement(found)]
-    if rule.conditional:
-        statements.reverse()
-    if rule.margin is not None:
-        statements.insert(0, rule.margin.sentence)
     content = {
         "format": 1,
         "method": a.testing.method,
@@ -117,16 +120,14 @@ def compare_campaigns(
             for name, label, side in zip(SIDES, labels, sides, strict=True)
         },
         **found.to_json(),
-        "margin": None if rule.margin is None else asdict(rule.margin),
-        "statement": statements[0],
+        "decision": {**asdict(rule.decision), "words": rule.decision.words},
+        "to_decide": _to_decide(sides[0].campaign, rounds, found),
         "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
-        "ended": "rhw" if rule.margin is None else "accept",
-        "statements": statements,
+        "ended": conclusion(a, rule, found.free["n_pairs"])[0],
     }
-    missed = a.stop.rhw is not None and not rule.look.stopped
-    code = (EXIT_BUDGET_SPENT if missed else EXIT_DONE) if rule.margin is None else EXIT_OF[rule.margin.verdict]
-    if code == EXIT_BUDGET_SPENT:
-        content["ended"] = "episodes" if rule.margin is None else "open"
+    code = EXIT_DONE if rule.ended else EXIT_BUDGET_SPENT
+    if margin is not None:
+        code = EXIT_OF[rule.decision.verdict]
     if where := load_parameters(a.environment).unseen:
         content["warnings"].append(unseen_words(where))
     write_sealed(out / COMPARISON, content)
@@ -136,8 +137,8 @@ def compare_campaigns(
 
 
 def _compared(
-    sides: Both, folders: tuple[Path, Path], margin: float | None, workers: int | None, progress: Progress
-) -> tuple[PairedEstimate, PairRule]:
+    sides: Both, folders: tuple[Path, Path], rule: PairRule, workers: int | None, progress: Progress
+) -> tuple[PairRounds, PairedEstimate]:
     """Rounds of pairs until the rule is content: what those say that it has seen."""
     campaign = sides[0].campaign
     with ExitStack() as held, ExitStack() as working:
@@ -151,14 +152,14 @@ def _compared(
         if not isinstance(source, Shells):
             raise TypeError("the campaigns do not draw from shells")
         design, available = source.prescribed.design, source.prescribed.available
-        rounds, pairs = PairRounds(campaign, design, available, margin), PairedShells(design)
+        rounds, pairs = PairRounds(campaign, design, available, rule), PairedShells(design)
 
         def drive(side: int, requests: Sequence[ShardRequest]) -> None:
             for shard in runs[side].results(iter(requests)):
                 pairs.add(side, shard.block)
-                runs[side].follow(rounds.rule, shard)
+                runs[side].follow(rule, shard)
 
-        progress.stage("tests of A and B", None if margin is not None else 2 * campaign.stop.episodes)
+        progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
         for side, requests in enumerate(stored):
             drive(side, requests)
         n_pairs = np.zeros_like(pairs.tests(0))
@@ -171,12 +172,28 @@ def _compared(
                     places = len(done.shards), done.n_episodes, campaign.run.smallest_shard
                     drive(side, round_requests(tested, missing, *places))
             counts = pairs.first(n_pairs)
-            if rounds.rule.observe(counts):
+            if rule.observe(counts):
                 break
         working.close()
         for run in runs:
-            run.finish(rounds.rule)
-    return paired_estimate(counts, campaign.stop.confidence), rounds.rule
+            run.finish(rule)
+    return rounds, paired_estimate(counts, campaign.stop.confidence)
+
+
+def _to_decide(campaign: Campaign, rounds: PairRounds, found: PairedEstimate) -> dict[str, Any] | None:
+    """How many pairs would decide what was left open, and what to ask for; None where nobody can tell."""
+    rule, n_pairs = rounds.rule, found.free["n_pairs"]
+    if rule.decision.verdict != "open" or math.isinf(times := rule.more_pairs(found.pairs)):
+        return None
+    options, needed = [f"--margin {rule.decision.margin:g}"], two_digits_up(n_pairs * times)
+    if needed > campaign.stop.episodes:
+        options.append(f"--set stop.episodes={needed}")
+    if new_folder := (more := rounds.used_of_pool(found.pairs) * times) > 1.0:
+        kept = two_digits_up(campaign.pool.cut_ins_per_shell * more)
+        if kept > MOST_CUT_INS:
+            return None
+        options.append(f"--set pool.cut_ins_per_shell={kept}")
+    return {"pairs": needed, "options": " ".join(options), "new_folder": new_folder}
 
 
 def _stored_requests(folder: Path, earlier: Mapping[str, Any]) -> Iterator[ShardRequest]:

@@ -172,11 +172,11 @@ class PairRounds:
 
     Rounds are those of one vehicle, with pairs in place of tests; within a round pairs go to where the likelihood ratio
     says that one more narrows the interval of the difference most. The campaigns are equal but for the vehicle;
-    ``available``, shape (S,), are the most pairs of each stratum, for ``margin`` see `PairRule`.
+    ``available``, shape (S,), are the most pairs of each stratum; ``rule`` looks at each round.
     """
 
-    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, margin: float | None) -> None:
-        self.rule, self._budget = PairRule(campaign, margin), campaign.stop.episodes
+    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, rule: PairRule) -> None:
+        self.rule, self._budget = rule, campaign.stop.episodes
         self._allocation = Allocation.of(campaign.testing.shells, design, available)
         self._level = Level.two_sided(CONFIDENCE)
 
@@ -190,6 +190,10 @@ class PairRounds:
         )
         self.rule.of_first_tests = self._allocation.is_first(pairs.tests, added)
         return added
+
+    def used_of_pool(self, pairs: PairCounts) -> float:
+        """Largest share of the pool's cut-ins of a stratum that these pairs have used."""
+        return float(np.max(pairs.tests / np.maximum(self._allocation.available, 1)))
 
 
 def _differing(pairs: PairCounts) -> Tally:

@@ -356,22 +356,25 @@ class PairedCampaign(_Drawn):
     """A comparison of two vehicles to replicate, by both statements."""
 
     def _replicate(self, replication: int, drawn: Sequence[DrawnPool], rng: np.random.Generator) -> Iterator[Row]:
-        planner = PairRounds(self.campaign, drawn[0].design, drawn[0].available(self.campaign), None)
-        pairs, early = no_pairs(drawn[0].design), None
-        inside, enough = PairRule(self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT), None), False
+        rule, given = (
+            PairRule(each, rhw=each.stop.rhw)
+            for each in (self.campaign, self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT))
+        )
+        planner = PairRounds(self.campaign, drawn[0].design, drawn[0].available(self.campaign), rule)
+        pairs, early, enough = no_pairs(drawn[0].design), None, False
         while not enough and (added := planner.next_round(pairs)).any():
             pairs = _with_round(pairs, drawn, added, rng)
             enough = planner.rule.observe(pairs)
             if early is None:
-                inside.observe(pairs)
-                early = pairs.inside() if inside.look.stopped else None
+                given.observe(pairs)
+                early = pairs.inside() if given.look.stopped else None
         yield self._row(DIFFERENCE, replication, pairs, reached=planner.rule.look.stopped)
         yield self._row(CONDITIONAL_DIFFERENCE, replication, early or pairs.inside(), reached=early is not None)
 
     def _row(self, result: str, replication: int, pairs: PairCounts, *, reached: bool) -> Row:
         level = Level.two_sided(self.campaign.stop.confidence)
         found, beyond = pairs.difference(level), pairs.ends[pairs.design.library.n_inside :]
-        counts = int(pairs.tests.sum()), pairs.n_differing
+        counts = int(pairs.tests.sum()), sum(pairs.n_alone)
         numbers = found.value, found.half_width / level.z, found.ci_low, found.ci_high
         outside = int(beyond.sum() - beyond[:, NO_CRASH, NO_CRASH].sum())
         return Row(result, replication, *counts, *numbers, reached, outside)

@@ -103,6 +103,7 @@ def test_all_mistakes_are_named_at_once(load):
         load("stop:\n  rhw: x\ntesting:\n  alpha: {SM-I: 0.9}\n  epsilom: 1\nwordl: {}")
     where = {place.partition(" ")[0] for place in places_in(caught.value)}
     assert where == {"stop.rhw", "testing.alpha", "testing.epsilom", "wordl"}
+    assert {problem.where.partition(" ")[0] for problem in caught.value.problems} == where
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
     with pytest.raises(CampaignError, match=r"at least 20 problems"):
         load("".join(f"key_{i}: 1\n" for i in range(1000)))

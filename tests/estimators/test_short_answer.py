@@ -10,7 +10,16 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.estimators.answer import estimate_blocks, reference_statements, statement
-from harness.estimators.short_answer import LINES, WIDTH, _whence, lines, pair_lines, short_answer, vehicle_words
+from harness.estimators.short_answer import (
+    LINES,
+    WIDTH,
+    _whence,
+    deciding_words,
+    lines,
+    pair_lines,
+    short_answer,
+    vehicle_words,
+)
 from harness.records.folder import read_manifest
 from harness.report.summary import read_run_folder
 from harness.runner.stored import stored_blocks
@@ -261,19 +270,41 @@ def test_a_comparison_is_as_short():
     side = {"crash_rate": 1.4e-7, "ci_low": 1e-10, "ci_high": 2e-7, "n_crashes": 93, "upper_bound": 1e-6}
     inside = {
         "ratio": 138.0, "ratio_low": 0.1, "ratio_high": None, "difference": -2e-7, "ci_low": -3e-7, "ci_high": -1e-7,
-        "n_differing": 9, "boundary": "brakes-2-late-1s",
+        "n_only_a": 31, "n_only_b": 1000, "boundary": "brakes-2-late-1s",
     }  # fmt: skip
     content = {
         **inside, "conditional": inside, "a": side, "b": {**side, "n_crashes": 0}, "n_pairs": 1234, "confidence": 0.9,
         "campaigns": {"a": {"label": "a" * 40}, "b": {"label": "b c " * 20}}, "warnings": ["w" * 120] * 4,
-        "margin": None, "asked": "library", "ended": "rhw",
+        "decision": {"verdict": "open", "words": "Open whether B is more than 10 % worse than A"}, "ended": "rhw",
+        "to_decide": {"pairs": 7000, "options": "--margin 0.1 --set stop.episodes=7000", "new_folder": False},
+        "asked": "library",
     }  # fmt: skip
-    text = pair_lines(content, 2.0, "runs/ab/report.html")
+    text = pair_lines(content, 2.0, "runs/ab/report.html", 0.01)
     assert len(text) - sum(line.startswith("    ") for line in text) <= LINES
     assert max(map(len, text)) <= WIDTH
-    assert text[0].startswith("B crashes more often than A · 1,234 pairs on the same cut-ins")
+    assert text[0].startswith("Open whether B is more than 10 % worse than A · 1,234 pairs on the same cut-ins")
     assert text[0].endswith(" · crashes above 2 m/s per test")
     shown = "\n".join(text)
     assert "1.00 × 10⁻¹⁰ to 2.00 × 10⁻⁷" in shown
-    for said in ("0.10 to no limit", "no crash seen", "only where brakes-2-late-1s of", "by: precision reached"):
-        assert said in shown
+    for said in (
+        "0.10 to no limit", "no crash seen", "only where brakes-2-late-1s of", "by: precision reached",
+        "A alone 31, B alone 1,000", "with --margin 0.1 --set stop.episodes=7000: some 5,800 more pairs, 58.0 s",
+    ):  # fmt: skip
+        assert said in " ".join(shown.split())
+
+
+@pytest.mark.parametrize(
+    ("verdict", "needed", "said"),
+    [
+        ("proven", None, None),
+        ("open", None, "too much alike"),
+        (
+            "open",
+            {"pairs": 1000, "options": "--margin 0", "new_folder": True},
+            "--margin 0 and a new --out: some 1,000",
+        ),
+    ],
+)
+def test_what_would_decide(verdict, needed, said):
+    told = deciding_words({"decision": {"verdict": verdict}, "to_decide": needed, "n_pairs": 900})
+    assert told is None if said is None else said in told

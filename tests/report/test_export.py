@@ -47,8 +47,14 @@ def test_openscenario_moves_everybody_as_the_trace_does(name, stored_run, tmp_pa
         centre = float(scenario.find(f".//Vehicle[@name='{vehicle}']/BoundingBox/Center").get("x"))
         np.testing.assert_allclose(x + centre + 2.5, rows.x_m, rtol=0, atol=1e-9)  # the middle, and half a vehicle
         ends = {"LV": (-0.5, -0.5), "BV": (-0.5, -1.5), "AV": (-1.5, -1.5)}[vehicle]
+        steps = -np.diff(y)[np.diff(y) != 0.0]
+        if vehicle == "BV" and "lateral_m" in rows:  # as fast after the overlap as before, until it is all over
+            assert steps[:-1] == pytest.approx(steps[0])
+            assert 0.0 < steps[-1] <= steps[0] + 1e-9
+            assert y[rows.lane.to_numpy() == 0][0] == pytest.approx(-0.5 * LANE_M - 1.7)
+            ends = ends[0], y[-1] / LANE_M
         assert (y[0], y[-1]) == pytest.approx([LANE_M * end for end in ends])
-        assert (np.diff(y) <= 0.0).all()
+        assert (steps >= 0.0).all()
     actors = [each.get("entityRef") for each in scenario.iterfind(".//EntityRef") if each.get("entityRef")]
     assert set(actors) == set(VEHICLES)
 

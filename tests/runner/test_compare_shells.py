@@ -39,7 +39,7 @@ def campaigns(campaign):
 
 @pytest.fixture(scope="module")
 def done(campaigns, tmp_path_factory):
-    return compare_campaigns(*campaigns, tmp_path_factory.mktemp("pairs") / "out", workers=1)
+    return compare_campaigns(*campaigns, tmp_path_factory.mktemp("pairs") / "out", workers=1, rhw=0.15)
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def test_both_meet_the_same_cut_ins_and_the_difference_is_that_of_the_records(do
 def test_a_stored_run_of_a_is_taken_over(done, campaigns, run_here, campaign, tmp_path, driven):
     run_here(campaign(*SHELLS, "stop.rhw=0.9"), tmp_path / "stored")
     before = sum(driven)
-    again = compare_campaigns(*campaigns, tmp_path / "out", workers=1, stored=tmp_path / "stored")
+    again = compare_campaigns(*campaigns, tmp_path / "out", workers=1, stored=tmp_path / "stored", rhw=0.15)
     assert again.content == done.content
     assert sum(driven) - before < 2 * done.content["n_pairs"]
     assert sum(driven) == manifest(tmp_path / "out" / "a")["n_episodes"] + done.content["n_pairs"]
@@ -106,10 +106,10 @@ def test_an_interrupted_comparison_goes_on(done, campaigns, tmp_path, monkeypatc
 
     monkeypatch.setattr(Run, "results", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        compare_campaigns(*campaigns, tmp_path, workers=1)
+        compare_campaigns(*campaigns, tmp_path, workers=1, rhw=0.15)
     assert manifest(tmp_path / "a")["status"] == manifest(tmp_path / "b")["status"] == "interrupted"
     for _ in range(2):  # what is finished is not driven again
-        assert compare_campaigns(*campaigns, tmp_path, workers=1).content == done.content
+        assert compare_campaigns(*campaigns, tmp_path, workers=1, rhw=0.15).content == done.content
         assert sum(driven) == 2 * done.content["n_pairs"]
 
 
@@ -117,16 +117,26 @@ def test_an_interrupted_comparison_goes_on(done, campaigns, tmp_path, monkeypatc
 def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_code):
     a, b = reversed(campaigns) if swapped else campaigns
     found = compare_campaigns(a, b, tmp_path, workers=1, margin=0.1)
-    assert (found.content["margin"]["verdict"], found.exit_code) == (verdict, exit_code)
-    assert found.content["margin"]["confidence"] > 0.98
-    assert "10 %" in found.content["statement"] or "0.1 times" in found.content["statement"]
+    assert (found.content["decision"]["verdict"], found.exit_code) == (verdict, exit_code)
+    assert "10 %" in found.content["decision"]["words"]
     assert "--margin (0.1)" in manifest(tmp_path / "a")["ending"]
+
+
+def test_it_ends_when_it_is_known_who_crashes_less_often(campaigns, done, tmp_path):
+    """Sooner than at a half-width that is asked by hand, and whatever the campaigns' stop.rhw says of one vehicle."""
+    found = compare_campaigns(*campaigns, tmp_path, workers=1)
+    content = found.content
+    assert content["decision"]["words"] == "B crashes less often than A"
+    assert (content["ended"], manifest(tmp_path / "b")["stopped_by"], found.exit_code) == ("accept", "accept", 0)
+    assert content["n_pairs"] < done.content["n_pairs"]
+    assert content["conditional"]["rhw"] > 0.15 >= done.content["conditional"]["rhw"]
+    assert (content["to_decide"], done.content["ended"]) == (None, "rhw")
 
 
 def test_a_margin_that_the_budget_leaves_open(campaign, tmp_path):
     few = campaign(*SHELLS, "stop.episodes=60"), campaign(*SHELLS, "stop.episodes=60", "name=same")
     found = compare_campaigns(*few, tmp_path, workers=1, margin=0.01)
-    assert (found.content["margin"]["verdict"], found.exit_code) == ("open", 4)
+    assert (found.content["decision"]["verdict"], found.content["ended"], found.exit_code) == ("open", "episodes", 4)
     assert found.content["n_pairs"] == 60
     assert found.content["ci_low"] <= 0.0 <= found.content["ci_high"]
 
@@ -156,6 +166,11 @@ def test_what_cannot_be_compared_is_refused(campaign, tmp_path, shared, other, s
     assert not (tmp_path / "out" / "a").exists()
 
 
+def test_one_end_is_asked_for(campaigns, tmp_path):
+    with pytest.raises(CampaignError, match=r"--margin: found stop\.rhw=0\.1 beside it"):
+        compare_campaigns(*campaigns, tmp_path / "out", margin=0.1, rhw=0.1)
+
+
 def test_a_run_that_nobody_limited_is_to_be_run_again(campaign, tmp_path):
     """Which the folder of the comparison does not hinder: the run is not copied."""
     early = "av={controller: 'tests.controllers.early:Speeds'}"
@@ -175,7 +190,7 @@ def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
     assert out.startswith("B crashes less often than A · ")
     assert len(out.splitlines()) <= 9
     assert main([*call, "--set", "stop.rhw=0.15", "-v"]) == 0
-    assert capsys.readouterr().out.startswith("If A and B crash only where the surrogate")
+    assert str(tmp_path / "out" / "compare.json") in capsys.readouterr().out
     again = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert again["shells"] == done.content["shells"]
     assert main(["compare", str(MIXTURE_FILE), str(MIXTURE_FILE), "--out", str(tmp_path / "x"), "--margin", "0.1"]) == 2
