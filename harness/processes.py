@@ -38,6 +38,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from weakref import finalize
 
+from harness.cache import SAID
 from harness.errors import writing
 
 if TYPE_CHECKING:
@@ -234,7 +235,7 @@ def _fresh_python(connection: Connection) -> subprocess.Popen[bytes]:
     return subprocess.Popen(  # noqa: S603 - our own words
         [sys.executable, "-c", f"{code}_begin({connection.fileno()}, {os.getpid()})"],
         stdin=subprocess.DEVNULL,
-        env={"OPENBLAS_NUM_THREADS": "1", **os.environ},
+        env={"OPENBLAS_NUM_THREADS": "1", **os.environ, SAID: "1"},
         pass_fds=[connection.fileno()],
         start_new_session=True,
     )

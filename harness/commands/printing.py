@@ -66,10 +66,7 @@ def show_interrupted(command: str, signal_name: str | None) -> None:
 
 def system_error(error: OSError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
-    from harness.compiled import cache_root  # noqa: PLC0415 - keeps --help fast
-
-    # Numba does not say of a file in its cache which it was.
-    where = str(error.filename or f"disk of the output folder, or of the cache {cache_root()}")
+    where = str(error.filename or "disk of the output folder")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return HarnessError(where, "no space left", "room for what is written there", f"Free some space. {_AGAIN}")
     if error.errno in (errno.EFBIG, errno.EIO):

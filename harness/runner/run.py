@@ -18,6 +18,7 @@ from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import conclusion, expected_for
 from harness.estimators.stopping import Rule, Verdict
+from harness.files import remove_unfinished
 from harness.pool.build import campaign_pool
 from harness.pool.replay import Retracing
 from harness.pool.vehicle_pool import BaselinePaths
@@ -28,7 +29,6 @@ from harness.records.folder import (
     StoppedBy,
     checksum,
     parquet,
-    remove_unfinished,
     shards_on_disk,
     sole_use,
     write_bytes,
