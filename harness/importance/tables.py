@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,6 +18,7 @@ from harness import cache
 from harness.campaign.drivers import FVDMParameters, IDMParameters
 from harness.importance.challenge import LEVELS, build_after_cut_in, build_before_cut_in, build_immediate
 from harness.importance.grid import AFTER, BEFORE
+from harness.processes import usable_cpus
 from harness.traffic.laws import Environment
 from harness.vocabulary import Float32Array, RecordArray
 
@@ -95,7 +95,7 @@ def build_tables(
         done(1)
         return built
 
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(usable_cpus()) as threads:
         parts = list(threads.map(one, range(drivers.size)))
     tables = Tables(*(np.stack(arrays) for arrays in zip(*parts, strict=True)))
     return _load(cache.keep(name, lambda path: _save(path, tables)))

@@ -28,7 +28,7 @@ from harness.compiled import source_hash
 from harness.controllers.find import require_controller
 from harness.controllers.hosts import Death
 from harness.errors import CampaignError, HarnessError
-from harness.processes import WorkerDeath, fit_to_travel, handlers_restored
+from harness.processes import WorkerDeath, fit_to_travel, handlers_restored, usable_cpus
 from harness.resolved import Resolved
 from harness.runner.resume import cpu_name
 from harness.runner.workers import (
@@ -328,7 +328,7 @@ def _room(settings: RaySettings) -> int:
     """How many workers the cluster has room for."""
     have, want = ray.cluster_resources(), settings.resources
     room = [have.get(name, 0.0) / n for name, n in (("CPU", want.cpus), ("GPU", want.gpus)) if n > 0.0]
-    n = int(min(room, default=float(os.cpu_count() or 1)))
+    n = int(min(room, default=float(usable_cpus())))
     if n == 0:
         raise HarnessError(
             "run.ray.resources",
