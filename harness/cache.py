@@ -67,8 +67,8 @@ def places(name: str) -> Iterator[Path]:
 
 
 def has(name: str) -> bool:
-    """Whether there is something of a name, sound or not."""
-    return any(path.exists() for path in places(name))
+    """Whether there is something of a name, which may be a pattern, sound or not."""
+    return any(any(path.parent.glob(path.name)) for path in places(name))
 
 
 def find(name: str) -> Path | None:

@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from weakref import finalize
 
 from harness.cache import SAID
-from harness.errors import writing
+from harness.errors import HarnessError, writing
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -321,7 +321,7 @@ class Forked:
 def _serve_forks(connection: Connection, modules: Sequence[str]) -> None:
     """Tell the exit code of a child, or make one: the copy leaves this function to do its own work."""
     for name in modules:
-        with suppress(ImportError):  # who needs it will say so
+        with suppress(ImportError, HarnessError):  # who needs it will say so
             import_module(name)
     gc.freeze()  # what is never looked through is never copied
     server, parent = os.getpid(), os.getppid()

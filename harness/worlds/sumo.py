@@ -120,7 +120,7 @@ def committed_file(name: str) -> Path:
 
 @cache
 def as_shared(file: Path) -> SharedFile:
-    """A file under a path that SUMO takes as it is: others it splits at commas, and fills in what is like ``${HOME}``."""
+    """A file under a path that SUMO takes as it is: it splits others at commas, and fills in ``${HOME}``."""
     return SharedFile(file.read_bytes())
 
 
