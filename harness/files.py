@@ -1,8 +1,9 @@
-"""Atomic writing: a file is there completely, or not at all."""
+"""Atomic writing: a file is there completely, or not at all; and where a path leads."""
 
 from __future__ import annotations
 
 import fcntl
+import os
 import time
 import uuid
 from collections.abc import Callable, Iterable
@@ -15,6 +16,11 @@ _UNFINISHED = ".harness-{}.part"
 """A file that is being written; nobody else's temporary files have such names."""
 _ABOUT_TO_BE_S = 60.0
 """Age from which an empty one is no longer about to be locked."""
+
+
+def real_path(path: Path | str) -> Path:
+    """The path without links; of links that lead in a circle as far as it goes, for whoever opens it to complain."""
+    return Path(os.path.realpath(path))
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
