@@ -19,14 +19,15 @@ from sumolib.miscutils import getFreeSocketPort
 
 from harness.vocabulary import AV, BV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import World
-from harness.worlds.sumo import EXACT_OPTIONS, committed_file, network_file
+from harness.worlds.sumo import EXACT_OPTIONS, as_shared, committed_file, network_file
 
 LEFT, RIGHT = 1, 0
 
 
 def sumo_arguments() -> list[str]:
     """Network, vehicle types and options, the same as for the harness."""
-    return ["-n", str(network_file(1)), "-a", str(committed_file("vehicles.add.xml")), *EXACT_OPTIONS]
+    files = as_shared(network_file(1)), as_shared(committed_file("vehicles.add.xml"))
+    return ["-n", str(files[0].path), "-a", str(files[1].path), *EXACT_OPTIONS]
 
 
 class OneAtATime(World):

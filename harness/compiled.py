@@ -2,24 +2,26 @@
 
 Bit-exactness rests on three choices made here. No fast-math and no fused operations, so that SUMO's C++ arithmetic can
 be matched. No short-vector math library, whose `exp` and `log` differ from the scalar ones depending on how a loop was
-vectorised. And a cache folder named after a hash of *all* sources of compiled code: numba's own cache looks only at the
-file that a function stands in and would keep a caller compiled with yesterday's callee. In it a file is known by its
-place in the package, not on the disk, so that the same sources are compiled once, wherever they are installed; by two
-versions of numba in two folders, since each throws away what the other has kept.
+vectorised. And a cache of our own under a hash of *all* sources of compiled code: numba's own looks only at the file
+that a function stands in, and would keep a caller compiled with yesterday's callee; it unpickles what it finds, damaged
+or not; and where it cannot write it takes another place, whatever lies there. A function is known by its module, so
+that the same sources are compiled once, wherever they are installed.
 """
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import os
+import pickle
 import struct
+import sys
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import platformdirs
+from harness import cache
+from harness.errors import HarnessError
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
 _PACKAGE = Path(__file__).parent
@@ -51,54 +53,59 @@ def source_hash(patterns: tuple[str, ...] = KERNEL_SOURCES) -> str:
     return digest.hexdigest()[:16]
 
 
-def cache_root() -> Path:
-    """Folder for everything that can be made again: compiled kernels and criticality tables.
-
-    ``HARNESS_CACHE_DIR`` moves it, for instance to a folder that CI keeps.
-    """
-    return Path(os.environ.get("HARNESS_CACHE_DIR") or platformdirs.user_cache_dir("harness"))
-
-
 os.environ.setdefault("NUMBA_DISABLE_INTEL_SVML", "1")
-os.environ["NUMBA_CACHE_DIR"] = str(cache_root() / f"kernels-{source_hash()}-numba-{version('numba')}")
 
 import numba  # noqa: E402  (its settings are read at import)
 import numpy as np  # noqa: E402
 from llvmlite import ir  # noqa: E402
 from numba import extending  # noqa: E402
-from numba.core import caching, cgutils, codegen, compiler, types  # noqa: E402
+from numba.core import caching, cgutils, codegen, compiler, serialize, types  # noqa: E402
 from numba.core.registry import cpu_target  # noqa: E402
 from numba.core.typing.templates import AttributeTemplate  # noqa: E402
 
-
-class KernelCacheLocator(caching.UserProvidedCacheLocator):
-    """Where numba keeps the package's kernels: by folder of the package."""
-
-    @classmethod
-    def from_function(cls, py_func: Callable[..., object], py_file: str) -> Any:
-        """None for a function from outside of the package, which is another locator's."""
-        if Path(py_file).is_relative_to(_PACKAGE):
-            return super().from_function(py_func, py_file)  # type: ignore[no-untyped-call]
-        return None
-
-    @classmethod
-    def get_suitable_cache_subpath(cls, py_file: str) -> str:
-        """Name of the folder within the cache."""
-        return "-".join(("harness", *Path(py_file).relative_to(_PACKAGE).parent.parts))
-
-
 _settings: Any = numba.config
 if _settings.USING_SVML:
-    raise ImportError(
-        "numba was imported before harness, and uses Intel's short-vector math library, which changes results: "
-        "import harness first, or set NUMBA_DISABLE_INTEL_SVML=1"
-    )
-_settings.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"]  # where numba was imported before, it has not read it
-# Not by numba's environment variable: programs that a controller starts inherit that, and may not have this package.
-_OTHERS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,IPythonCacheLocator,ZipCacheLocator"
-_settings.CACHE_LOCATOR_CLASSES = (
-    f"{__name__}.{KernelCacheLocator.__name__},{_settings.CACHE_LOCATOR_CLASSES or _OTHERS}"
-)
+    found = "Intel's short-vector math library, which changes results"
+    mend = "Import harness before numba, and leave NUMBA_DISABLE_INTEL_SVML alone."
+    raise HarnessError("numba", found, "the mathematics of the C library", mend)
+if _settings.DISABLE_JIT:
+    mend = "Unset NUMBA_DISABLE_JIT (or disable_jit in .numba_config.yaml)."
+    raise HarnessError("NUMBA_DISABLE_JIT", "that nothing is to be compiled", "kernels as machine code", mend)
+
+KERNELS = f"kernels-{source_hash()}-{sys.implementation.cache_tag}-numba-{version('numba')}"
+"""What the cache keeps kernels under."""
+
+
+class _KernelCache(caching.NullCache):
+    """Where numba finds what has been compiled of a kernel, and leaves what has not."""
+
+    def __init__(self, function: Callable[..., object]) -> None:
+        self._name = f"{KERNELS}/{function.__module__}.{function.__qualname__}-"
+        file = Path(function.__code__.co_filename)
+        # What comes from outside of the package is not among the sources that the folder is named after.
+        self._outside = b"" if file.is_relative_to(_PACKAGE) else file.read_bytes()
+
+    def _name_for(self, signature: Any, codegen: Any) -> str:
+        kinds = [(str(kind), repr(kind.key)) for kind in signature]
+        content = repr((kinds, codegen.magic_tuple())).encode() + self._outside
+        return self._name + hashlib.sha256(content).hexdigest()[:24]
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """What has been compiled for these types and this processor; None if nothing has."""
+        target_context.refresh()
+        if (kept := cache.read(self._name_for(sig, target_context.codegen()))) is None:
+            return None
+        return compiler.CompileResult._rebuild(target_context, *pickle.loads(kept))  # type: ignore[no-untyped-call] # noqa: S301 - sound, and our own
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep what has been compiled, unless it holds addresses."""
+        if not data.library.has_dynamic_globals:
+            cache.keep_bytes(self._name_for(sig, data.codegen), serialize.dumps(data._reduce()))  # type: ignore[no-untyped-call]
+
+    @property
+    def is_filled(self) -> bool:
+        """Whether anything has been compiled."""
+        return cache.has(f"{self._name}*")
 
 
 class _NoMachineCode:
@@ -137,10 +144,15 @@ class PartCompiler(compiler.Compiler):
         return super().define_pipelines()  # type: ignore[no-untyped-call]
 
 
-_SETTINGS: dict[str, Any] = {"cache": True, "fastmath": False, "error_model": "numpy", "no_cfunc_wrapper": True}
-_njit: Any = functools.partial(numba.njit, **_SETTINGS)
+_SETTINGS: dict[str, Any] = {"fastmath": False, "error_model": "numpy", "no_cfunc_wrapper": True}
 _register: Any = extending.register_jitable
 """Untyped, because ``_nrt`` is not among the options that numba's own types know."""
+
+
+def _njit(function: _Function, **settings: Any) -> _Function:
+    kernel: Any = cast("Any", numba.njit)(**_SETTINGS, **settings)(function)
+    kernel._cache = _KernelCache(function)
+    return cast("_Function", kernel)
 
 
 def compiled(function: _Function) -> _Function:
@@ -149,8 +161,7 @@ def compiled(function: _Function) -> _Function:
     Kernels allocate nothing: scratch arrays come from the caller. So reference counts can be left out; counting those
     of the arrays that travel in named tuples took two thirds of the time.
     """
-    result: _Function = _njit(function, _nrt=False)
-    return result
+    return _njit(function, _nrt=False)
 
 
 def compiled_inline(function: _Function) -> _Function:
@@ -159,21 +170,19 @@ def compiled_inline(function: _Function) -> _Function:
     A process compiles it once for all kernels, half of the way: what LLVM does takes most of the time, and is left to
     the kernels that it becomes part of.
     """
-    settings = {**_SETTINGS, "cache": False, "no_cpython_wrapper": True, "pipeline_class": PartCompiler}
+    settings = {**_SETTINGS, "no_cpython_wrapper": True, "pipeline_class": PartCompiler}
     result: _Function = _register(forceinline=True, _nrt=False, **settings)(function)
     return result
 
 
 def compiled_threads(function: _Function) -> _Function:
     """Compile a kernel that may allocate and lets go of the interpreter lock, so that threads run side by side."""
-    result: _Function = _njit(function, nogil=True)
-    return result
+    return _njit(function, nogil=True)
 
 
 def is_cached(kernel: Callable[..., object]) -> bool:
     """Whether this or another process has compiled a kernel, for whatever arguments."""
-    stats = cast("Any", kernel).stats
-    return any(Path(stats.cache_path).glob(f"*.{kernel.__name__}-*.nbi"))
+    return cast("_KernelCache", cast("Any", kernel)._cache).is_filled
 
 
 # -- named tuples that kernels are given as one pointer, because they have been taken apart before --

@@ -6,6 +6,7 @@ Anything that is *not* a `HarnessError` is a defect of the harness itself and is
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +18,8 @@ EXIT_TOO_MANY_FAILED = 3
 EXIT_BUDGET_SPENT = 4
 EXIT_REFUTED = 5
 
+OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""Errors of the system that tell of the disk, not of the file."""
 LONGEST_PART = 400
 """Characters of a part of a message: five lines of a terminal. What a user typed may be as long as they like."""
 LONGEST_ADVICE = 1200

@@ -38,7 +38,8 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from weakref import finalize
 
-from harness.errors import writing
+from harness.cache import SAID
+from harness.errors import HarnessError, writing
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -234,7 +235,7 @@ def _fresh_python(connection: Connection) -> subprocess.Popen[bytes]:
     return subprocess.Popen(  # noqa: S603 - our own words
         [sys.executable, "-c", f"{code}_begin({connection.fileno()}, {os.getpid()})"],
         stdin=subprocess.DEVNULL,
-        env={"OPENBLAS_NUM_THREADS": "1", **os.environ},
+        env={"OPENBLAS_NUM_THREADS": "1", **os.environ, SAID: "1"},
         pass_fds=[connection.fileno()],
         start_new_session=True,
     )
@@ -320,7 +321,7 @@ class Forked:
 def _serve_forks(connection: Connection, modules: Sequence[str]) -> None:
     """Tell the exit code of a child, or make one: the copy leaves this function to do its own work."""
     for name in modules:
-        with suppress(ImportError):  # who needs it will say so
+        with suppress(ImportError, HarnessError):  # who needs it will say so
             import_module(name)
     gc.freeze()  # what is never looked through is never copied
     server, parent = os.getpid(), os.getppid()
@@ -545,11 +546,38 @@ def last_call(path: Path) -> Call | None:
 # -- threads: what is done, and in which order, is the same as without them, so every bit is --
 
 
+_CONTROL_GROUPS, _OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+
+
+@cache
+def usable_cpus() -> int:
+    """CPUs that this process may use: its affinity allows so many, and the quota of its control groups, rounded up."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, math.ceil(min([allowed, *_quotas()])))
+
+
+def _quotas() -> Iterator[float]:
+    """CPUs that a control group (version 1 or 2) allows, of each that this process is in and that has a quota."""
+    with suppress(OSError):
+        for line in _OWN_GROUPS.read_text(encoding="utf-8").splitlines():
+            _, controllers, inner = line.split(":", 2)
+            if controllers and "cpu" not in controllers.split(","):
+                continue
+            group = _CONTROL_GROUPS / ("cpu" if controllers else "") / inner.strip("/")
+            # Within a container groups are named as outside, and are not there, but for the one at the top.
+            for folder in (group, *group.parents):
+                files = ("cpu.cfs_quota_us", "cpu.cfs_period_us") if controllers else ("cpu.max",)
+                with suppress(OSError, ValueError):  # no such file, or no limit, which is "max"
+                    quota, period = " ".join((folder / name).read_text(encoding="utf-8") for name in files).split()
+                    if int(quota) > 0:
+                        yield int(quota) / int(period)
+
+
 @cache
 def _shared_threads() -> tuple[ThreadPoolExecutor, ThreadpoolController]:
     from threadpoolctl import ThreadpoolController  # noqa: PLC0415 - keeps --help fast
 
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="estimators"), ThreadpoolController()
+    return ThreadPoolExecutor(usable_cpus(), thread_name_prefix="estimators"), ThreadpoolController()
 
 
 def side_by_side(
@@ -569,10 +597,10 @@ def made_ahead(
 ) -> Iterator[_Result]:
     """What is made of each item, in order; the next ones are being made in threads while the present one is in use.
 
-    ``n_threads`` (as many as there are cores by default) of them at a time: one where ``make`` is not to be called by
+    ``n_threads`` (as many as there are CPUs by default) of them at a time: one where ``make`` is not to be called by
     two threads at once.
     """
-    n_threads = n_threads or os.cpu_count() or 1
+    n_threads = n_threads or usable_cpus()
     with ThreadPoolExecutor(n_threads, thread_name_prefix="made-ahead") as threads:
         coming: deque[Future[_Result]] = deque()
         for item in items:

@@ -29,6 +29,7 @@ from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import TrajectoryError
 from harness.estimators.traffic import ONE_LAW
+from harness.files import write_atomically
 from harness.fitting.fit import fit_traffic
 from harness.fitting.laws import KINDS, TTC_EDGES_S, Traffic
 from harness.fitting.observations import Tally, observations, require_enough
@@ -37,7 +38,6 @@ from harness.fitting.uncertainty import replicates
 from harness.pool.build import take_aim
 from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
-from harness.records.folder import write_atomically
 from harness.resolved import resolve
 from harness.traffic.loading import evaluate_laws, load_environment, load_parameters
 from harness.traffic.parameters import FIXED, REPLACED, EnvironmentParameters

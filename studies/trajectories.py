@@ -22,8 +22,8 @@ import pandas as pd
 from scipy.ndimage import gaussian_filter1d
 
 from harness.compiled import compiled_threads, unboxed
+from harness.files import write_atomically
 from harness.random_stream import BV_DRAWS, CUT_IN, LV_DRAWS, uniform
-from harness.records.folder import write_atomically
 from harness.traffic import laws
 from harness.traffic.lateral import draw_lead
 from harness.traffic.laws import AccelerationLaw, Environment, InitialStates

@@ -37,14 +37,15 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile kernels before workers of xdist would, each of them all."""
     if not getattr(session.config.option, "numprocesses", None):
         return
-    from harness.compiled import source_hash  # noqa: F401 - sets the variable, and takes a second
+    from harness import cache
+    from harness.compiled import KERNELS
 
-    if (mark := Path(os.environ["NUMBA_CACHE_DIR"]) / "compiled-for-tests").exists():
+    if cache.has(mark := f"{KERNELS}/compiled-for-tests"):
         return
     command = [sys.executable, "-m", "tests.golden.record", "--digits", "1e-9", "--only"]
     compiling = [subprocess.Popen([*command, *names]) for names in TO_COMPILE]
     if not any([process.wait() for process in compiling]):  # noqa: C419 - wait for all
-        mark.touch()
+        cache.keep_bytes(mark, b"done")
 
 
 @pytest.fixture(scope="session", autouse=True)

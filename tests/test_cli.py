@@ -162,6 +162,7 @@ WRONG = "episodes/0.parquet", "half a file", "a whole one", "Delete it."
         (errno.EDQUOT, 2, "--resume"),
         (errno.EACCES, 2, "permissions"),
         (errno.EFBIG, 2, "limit"),
+        (errno.ELOOP, 2, "Correct the path"),
     ],
 )
 def test_errors_that_can_be_mended_are_told_in_words_and_keep_their_exit_code(raising, capsys, error, code, said):

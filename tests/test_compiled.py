@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 import harness
-from harness.compiled import KERNEL_SOURCES, compiled, source_hash, unboxed
+from harness.compiled import KERNEL_SOURCES, KERNELS, compiled, source_hash, unboxed
 
 ROOT = Path(harness.__file__).parent
+SMOKE = ROOT.parent / "scenarios" / "smoke.yaml"
 DECORATORS = {"compiled", "compiled_inline", "compiled_threads"}
 
 
@@ -67,7 +68,8 @@ def test_every_file_that_kernels_come_from_is_hashed():
     assert needed <= covered(KERNEL_SOURCES)
     assert not needed <= covered([pattern for pattern in KERNEL_SOURCES if pattern != "vocabulary.py"])
     assert all(covered([pattern]) for pattern in KERNEL_SOURCES)
-    assert os.environ["NUMBA_CACHE_DIR"].endswith(f"kernels-{source_hash()}-numba-{numba.__version__}")
+    assert source_hash() in KERNELS
+    assert KERNELS.endswith(f"-numba-{numba.__version__}")
 
 
 def of_another_process(lines: str, **environment: str) -> subprocess.CompletedProcess:
@@ -78,10 +80,19 @@ def of_another_process(lines: str, **environment: str) -> subprocess.CompletedPr
 def test_numba_with_a_vector_library_is_refused():
     refused = of_another_process("import numba; numba.config.USING_SVML = True; import harness.compiled")
     assert refused.returncode != 0
-    assert "ImportError: numba was imported before harness" in refused.stderr
+    assert "Import harness before numba" in refused.stderr
 
 
-def test_a_copy_of_the_package_finds_what_another_has_compiled_and_says_so_before(tmp_path):
+def test_a_numba_that_compiles_nothing_is_refused(tmp_path):
+    arguments = ["run", str(SMOKE), "--out", str(tmp_path)]
+    refused = of_another_process(
+        f"import sys; from harness.cli import main; sys.exit(main({arguments}))", NUMBA_DISABLE_JIT="1"
+    )
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("error: NUMBA_DISABLE_JIT\n")
+
+
+def test_a_copy_of_the_package_finds_what_another_has_compiled_unless_it_is_damaged(tmp_path):
     (tmp_path / "of_a_user.py").write_text("import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n")
     say_hits = (
         "from harness import compiled, random_stream; cached = compiled.is_cached(random_stream._fill_uniforms);"
@@ -90,12 +101,16 @@ def test_a_copy_of_the_package_finds_what_another_has_compiled_and_says_so_befor
         "print(*(sum(kernel.stats.cache_hits.values()) for kernel in (random_stream._fill_uniforms, twice)), cached)"
     )
     hits = []
-    for copy in ("one", "another"):
+    for copy in ("one", "another", "after damage", "after that"):
         shutil.copytree(ROOT, tmp_path / copy / "harness", ignore=shutil.ignore_patterns("__pycache__"))
+        if copy == "after damage":
+            (kernel,) = tmp_path.glob(f"{KERNELS}/*_fill_uniforms-*")
+            content = kernel.read_bytes()
+            kernel.write_bytes(content[:900] + bytes([content[900] ^ 4]) + content[901:])
         path = f"{tmp_path / copy}:{tmp_path}"
         said = of_another_process(say_hits, HARNESS_CACHE_DIR=str(tmp_path), PYTHONPATH=path)
         hits.append(said.stdout.split())
-    assert hits == [["0", "0", "False"], ["1", "1", "True"]]
+    assert hits == [["0", "0", "False"], ["1", "1", "True"], ["0", "1", "True"], ["1", "1", "True"]]
 
 
 # -- named tuples that kernels are given as one pointer: what compiled code reads is the tuple's own --

@@ -1,9 +1,13 @@
+import os
+import subprocess
+import sys
 import threading
 from functools import partial
 
 import pytest
 
-from harness.processes import made_ahead, side_by_side
+from harness import processes
+from harness.processes import made_ahead, side_by_side, usable_cpus
 
 
 @pytest.mark.parametrize(
@@ -30,3 +34,41 @@ def test_the_next_item_is_made_while_the_present_one_is_in_use():
 
     for item in made_ahead(make, [1, 2], 1):
         assert item == 2 or second_made.wait(10)
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "n_cpus"),
+    [
+        ("0::/\n", {"cpu.max": "max 100000"}, 8),
+        ("0::/\n", {"cpu.max": "200000 100000"}, 2),
+        ("0::/a/b\n", {"a/cpu.max": "150000 100000", "a/b/cpu.max": "max 100000"}, 2),
+        ("0::/named/as/outside\n", {"cpu.max": "50000 100000"}, 1),
+        (
+            "3:cpu,cpuacct:/x\n1:memory:/y\n",
+            {"cpu/x/cpu.cfs_quota_us": "3000", "cpu/x/cpu.cfs_period_us": "1000"},
+            3,
+        ),
+        ("3:cpu:/outside\n0::/\n", {"cpu/cpu.cfs_quota_us": "4000", "cpu/cpu.cfs_period_us": "1000"}, 4),
+        ("3:cpu:/\n", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "1000"}, 8),
+        ("0::/\n", {"cpu.max": "2000000 100000"}, 8),
+    ],
+)
+def test_the_share_of_cpus_is_what_affinity_and_the_quotas_of_all_control_groups_allow(
+    tmp_path, monkeypatch, groups, files, n_cpus
+):
+    for name, content in files.items():
+        (tmp_path / "groups" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "groups" / name).write_text(content + "\n")
+    (tmp_path / "own").write_text(groups)
+    monkeypatch.setattr(processes, "_CONTROL_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(processes, "_OWN_GROUPS", tmp_path / "own")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    assert usable_cpus.__wrapped__() == n_cpus
+
+
+def test_the_share_of_cpus_is_at_most_the_affinity():
+    code = (
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}); from harness.processes import usable_cpus"
+    )
+    asked = subprocess.run([sys.executable, "-c", f"{code}; print(usable_cpus())"], capture_output=True, check=True)
+    assert asked.stdout == b"1\n"

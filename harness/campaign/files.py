@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import difflib
 import json
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from harness.campaign.sections import Section
 from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_text, read_yaml, yaml_text
 from harness.errors import CampaignError
+from harness.files import real_path
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -106,7 +108,7 @@ def _absolute(value: Any, folder: Path) -> Any:
     if isinstance(value, list):
         return [_absolute(each, folder) for each in value]
     if isinstance(value, str) and "://" not in value:
-        return str((folder / Path(value).expanduser()).resolve())
+        return str(real_path(folder / os.path.expanduser(value)))  # noqa: PTH111 - Path's own fails without a home
     return value
 
 
@@ -252,11 +254,11 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     """
     place, colon, name = text.rpartition(":")
     if text.endswith(".fmu"):
-        return {"fmu": {"file": str(Path(text).resolve())}}
+        return {"fmu": {"file": str(real_path(text))}}
     if place == "sumo":
         return {"sumo": {"carFollowModel": name}}
     if colon and not place.endswith((".yaml", ".yml")):
-        return {"controller": f"{Path(place).resolve()}:{name}" if place.endswith(".py") else text}
+        return {"controller": f"{real_path(place)}:{name}" if place.endswith(".py") else text}
     panel = load_panel(place or SHIPPED_PANEL).avs
     if name in panel:
         return panel[name].model_dump(exclude_unset=True)

@@ -58,7 +58,8 @@ av_option = click.option(
 workers_option = click.option(
     "--workers",
     type=click.IntRange(min=1),
-    help="Processes that simulate. Default: one per core; with Ray, as many as the cluster has room for.",
+    help="Processes that simulate. Default: one per CPU that this process may use (affinity and quota counted); with "
+    "Ray, as many as the cluster has room for.",
 )
 executor_option = click.option(
     "--executor",

@@ -65,10 +65,7 @@ def show_interrupted(command: str, signal_name: str | None) -> None:
 
 def system_error(error: OSError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
-    from harness.compiled import cache_root  # noqa: PLC0415 - keeps --help fast
-
-    # Numba does not say of a file in its cache which it was.
-    where = str(error.filename or f"disk of the output folder, or of the cache {cache_root()}")
+    where = str(error.filename or "disk of the output folder")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return HarnessError(where, "no space left", "room for what is written there", f"Free some space. {_AGAIN}")
     if error.errno in (errno.EFBIG, errno.EIO):
@@ -78,6 +75,9 @@ def system_error(error: OSError) -> HarnessError | None:
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         mend = "Change its permissions, or choose another place."
         return HarnessError(where, f"no permission ({error.strerror})", "a place that may be read and written", mend)
+    if error.errno in (errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR):
+        found = f"a path that leads to no file ({error.strerror})"
+        return HarnessError(where, found, "a file, or a place for one", "Correct the path.")
     return None
 
 

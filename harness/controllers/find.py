@@ -29,6 +29,7 @@ from harness.controllers.hosts import (
 )
 from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
+from harness.files import real_path
 from harness.processes import CONSTRUCTOR, Apart, ForkServer, WorkerDeath, first_to_answer, tell
 
 _Answer = TypeVar("_Answer")
@@ -48,7 +49,7 @@ def controller_class(name: str) -> Callable[..., Any]:
     """
     module_name, _, class_name = name.rpartition(":")
     is_file = module_name.endswith(".py")
-    if (here := str(Path(module_name).parent.resolve() if is_file else Path.cwd())) not in sys.path:
+    if (here := str(real_path(Path(module_name).parent) if is_file else Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
         module = _of_file(Path(module_name)) if is_file else importlib.import_module(module_name)
@@ -68,7 +69,7 @@ def controller_class(name: str) -> Callable[..., Any]:
 
 def _of_file(file: Path) -> ModuleType:
     """The module that a file makes; its name is not that of another file, or of an installed module, of this name."""
-    name = f"{file.stem}_{hashlib.sha256(bytes(file.resolve())).hexdigest()[:8]}"
+    name = f"{file.stem}_{hashlib.sha256(bytes(real_path(file))).hexdigest()[:8]}"
     if name not in sys.modules:
         spec = spec_from_file_location(name, file)
         if spec is None or spec.loader is None:

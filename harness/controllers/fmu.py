@@ -11,26 +11,28 @@ import errno
 import hashlib
 import re
 import shutil
+import uuid
 import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any, NamedTuple
 
+from harness import cache
 from harness.campaign.problems import did_you_mean
 from harness.campaign.vehicle import FmuController
-from harness.compiled import cache_root
 from harness.controllers.protocol import BatchObservation, EpisodeStart, Observation, VehicleController
-from harness.errors import CampaignError, writing
+from harness.errors import OF_THE_DISK, CampaignError, HarnessError, writing
+from harness.records.folder import checksum
 from harness.vehicles.kinematics import STEP_S
 
 OBSERVATIONS: dict[str, Callable[[Observation], float]] = {
     name: attrgetter(re.sub("^(bv|lv)_(position|speed|lane)", r"\1.\2", name)) for name in BatchObservation._fields[2:]
 }
 """What an FMU's inputs can be connected to, named as in `BatchObservation`: ``bv_lane`` is ``bv.lane``."""
-_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EACCES, errno.EPERM, errno.EROFS)
+_NOT_THE_FMUS = (*OF_THE_DISK, errno.EACCES, errno.EPERM, errno.EROFS)
 """Errors that unpacking a sound FMU meets as well."""
 
 
@@ -55,7 +57,7 @@ def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
         folder = _unpacked(Path(fmu.file))
         description = fmpy.read_model_description(str(folder))
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in _OF_THE_DISK:
+        if isinstance(error, HarnessError) or (isinstance(error, OSError) and error.errno in _NOT_THE_FMUS):
             raise  # it names the file or the cache: nothing is wrong with the FMU
         found = f"{fmu.file}, which cannot be read ({' '.join(str(error).split())[:300]})"
         mend = "Export it again, and try 'fmpy validate' on it."
@@ -89,19 +91,30 @@ def _fmpy() -> Any:
 
 def _unpacked(file: Path) -> Path:
     """Folder with the FMU's content, in the cache, by its hash: workers share it."""
-    folder = cache_root() / "fmu" / hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-    if not folder.exists():
+    name = f"fmu/{hashlib.sha256(file.read_bytes()).hexdigest()[:16]}"
+    with zipfile.ZipFile(file) as archive:
+        whole = (folder for folder in cache.places(name) if _is_whole(folder, archive))
+        return next(whole, None) or cache.put(name, partial(_unpack, archive))
+
+
+def _is_whole(folder: Path, archive: zipfile.ZipFile) -> bool:
+    files = (each for each in archive.infolist() if not each.is_dir())
+    with suppress(OSError):
+        return all(checksum(folder / each.filename) == each.CRC for each in files)
+    return False
+
+
+def _unpack(archive: zipfile.ZipFile, folder: Path) -> None:
+    fresh = folder.with_name(f"{folder.name}-{uuid.uuid4().hex}")
+    try:
         with writing(folder):
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            fresh = Path(mkdtemp(prefix=f"{folder.name}-", dir=folder.parent))
-        try:
-            with zipfile.ZipFile(file) as archive, writing(folder):
-                archive.extractall(fresh)
-            with suppress(OSError):  # another worker was faster
-                fresh.rename(folder)
-        finally:
-            shutil.rmtree(fresh, ignore_errors=True)
-    return folder
+            fresh.mkdir(parents=True)
+            archive.extractall(fresh)
+            shutil.rmtree(folder, ignore_errors=True)  # what is there is damaged
+        with suppress(OSError):  # another worker was faster
+            fresh.rename(folder)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
 
 
 def wire(fmu: FmuController, description: Any) -> Wiring:

@@ -28,13 +28,13 @@ naturalistic (R1, R1dot). Within a hold period the future is known; only its end
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.importance.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of, state_at
+from harness.processes import usable_cpus
 from harness.traffic import laws
 from harness.traffic.laws import Environment, InitialStates, acceleration
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
@@ -221,7 +221,7 @@ def build_immediate(environment: Environment, driver: RecordArray) -> tuple[Floa
         part = points._replace(speed=points.speed[here])
         roll_out(driver, hold, level_steps(hold), part, value[:, here], maneuvers[here], least[:, here])
 
-    with ThreadPoolExecutor(os.cpu_count()) as threads:  # one surrogate may take as long as all others together
+    with ThreadPoolExecutor(usable_cpus()) as threads:  # one surrogate may take as long as all others together
         list(threads.map(at_speed, range(points.speed.size)))
     return value, maneuvers, least
 

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from harness import cache
 from harness.campaign.drivers import FVDMParameters, IDMParameters
-from harness.compiled import cache_root
-from harness.errors import writing
 from harness.importance.challenge import LEVELS, build_after_cut_in, build_before_cut_in, build_immediate
 from harness.importance.grid import AFTER, BEFORE
+from harness.processes import usable_cpus
 from harness.traffic.laws import Environment
 from harness.vocabulary import Float32Array, RecordArray
 
@@ -53,31 +51,21 @@ def tables_hash(environment: Environment, drivers: RecordArray, challenge: str) 
     return hashlib.sha256(content.encode()).hexdigest()[:24]
 
 
-def table_path(environment: Environment, drivers: RecordArray, challenge: str) -> Path:
-    """Where the tables of a set of surrogates are cached."""
-    return cache_root() / "tables" / f"{tables_hash(environment, drivers, challenge)}.npy"
+def tables_name(environment: Environment, drivers: RecordArray, challenge: str) -> str:
+    """What the tables of a set of surrogates are kept under."""
+    return f"tables/{tables_hash(environment, drivers, challenge)}.npy"
 
 
-def _load(path: Path) -> Tables | None:
-    try:
-        stored = np.asarray(np.load(path, mmap_mode="r"))  # a plain array: numba would take a memmap for something else
-        return Tables(*(stored[name][0] for name in Tables._fields))
-    except (OSError, ValueError, IndexError, EOFError):
-        return None  # absent or damaged: it is built again
+def _load(path: Path) -> Tables:
+    stored = np.asarray(np.load(path, mmap_mode="r"))  # a plain array: numba would take a memmap for something else
+    return Tables(*(stored[name][0] for name in Tables._fields))
 
 
 def _save(path: Path, tables: Tables) -> None:
     """Write the tables as the fields of one record: one file, in which each lies in one piece."""
     dtype = [(name, table.dtype, table.shape) for name, table in zip(Tables._fields, tables, strict=True)]
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.save(file, np.array([tuple(tables)], dtype))
-            Path(name).replace(path)
-        finally:
-            Path(name).unlink(missing_ok=True)
+    with path.open("wb") as file:
+        np.save(file, np.array([tuple(tables)], dtype))
 
 
 def build_one(environment: Environment, driver: RecordArray, challenge: str) -> Tables:
@@ -97,17 +85,17 @@ def build_tables(
 
     ``challenge`` is ``recursive`` or ``immediate``; ``done`` is called with the number of those that have become ready.
     """
-    path = table_path(environment, drivers, challenge)
-    if (tables := _load(path)) is not None:
+    name = tables_name(environment, drivers, challenge)
+    if (path := cache.find(name)) is not None:
         done(drivers.size)
-        return tables
+        return _load(path)
 
     def one(j: int) -> Tables:
         built = build_one(environment, drivers[j : j + 1], challenge)
         done(1)
         return built
 
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
+    with ThreadPoolExecutor(usable_cpus()) as threads:
         parts = list(threads.map(one, range(drivers.size)))
-    _save(path, Tables(*(np.stack(arrays) for arrays in zip(*parts, strict=True))))
-    return build_tables(environment, drivers, challenge, lambda _: None)
+    tables = Tables(*(np.stack(arrays) for arrays in zip(*parts, strict=True)))
+    return _load(cache.keep(name, lambda path: _save(path, tables)))

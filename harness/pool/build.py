@@ -10,15 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from harness import cache
 from harness.campaign.sections import PoolSettings
-from harness.compiled import WORLD_SOURCES, cache_root, source_hash
-from harness.errors import RunFolderError
-from harness.pool.cut_ins import FORMAT, CutIns, Pool, environment_hash, read_pool, write_pool
+from harness.compiled import WORLD_SOURCES, source_hash
+from harness.pool.cut_ins import FORMAT, CutIns, Pool, environment_hash, pool_content, pool_from
 from harness.pool.shells import cells_of, conservative_first, shells_of
 from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator, write_script
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
-from harness.records.folder import require_place
 from harness.resolved import Resolved
 from harness.traffic.laws import Environment
 from harness.vehicles.library import Library
@@ -60,36 +59,29 @@ def campaign_pool_key(resolved: Resolved, order: Sequence[str] = ()) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:24]
 
 
-def pool_path(key: str) -> Path:
-    """Where a pool is cached."""
-    return cache_root() / "pools" / f"{key}.parquet"
+def pool_name(key: str) -> str:
+    """What a pool is kept under."""
+    return f"pools/{key}"
 
 
 def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: Sequence[str] = ()) -> Pool:
     """The pool of a campaign's environment and library, from the cache or built and cached.
 
     Surrogates are in the ``order`` of their rates, or of those in other traffic.
-
-    Raises `RunFolderError`: the pool could not be kept.
     """
     key = campaign_pool_key(resolved, order)
     if (cached := cached_pool(resolved, order)) is not None:
         return cached
-    require_place(pool_path(key).parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
     pool = build_pool(resolved.environment, resolved.library, resolved.campaign.pool, key, progress, order)
-    write_pool(pool_path(key), pool)
+    cache.keep_bytes(pool_name(key), pool_content(pool))
     return pool
 
 
 def cached_pool(resolved: Resolved, order: Sequence[str] = ()) -> Pool | None:
-    """The pool of a campaign; None if none has been built on this machine, or its file is damaged or another's."""
-    key = campaign_pool_key(resolved, order)
-    try:
-        pool = read_pool(pool_path(key)) if pool_path(key).is_file() else None
-    except RunFolderError:
-        return None
+    """The pool of a campaign; None if none has been built on this machine, or its file is damaged."""
+    content = cache.read(pool_name(campaign_pool_key(resolved, order)))
     # The key does not hold the words of statements: they are those of today.
-    return replace(pool, library=resolved.library) if pool is not None and pool.key == key else None
+    return None if content is None else replace(pool_from(content), library=resolved.library)
 
 
 def build_pool(

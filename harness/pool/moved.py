@@ -9,21 +9,16 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pyarrow as pa
 
-from harness.compiled import cache_root
-from harness.errors import RunFolderError
+from harness import cache
 from harness.pool.build import take_aim
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.shells import shells_in_strata, shells_of
 from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
-from harness.records.folder import parquet, read_table, write_bytes
-from harness.records.schemas import rows
 from harness.resolved import Resolved
 from harness.strata import ShellDesign
 from harness.traffic.laws import Environment
@@ -82,19 +77,20 @@ class FewPaths:
         self._n_strata = len(design.strata)
         self._reaches_last = self._stratum[-1] >= 0
         self._range = ranges(pool)
-        self._seen: dict[str, Moved] = {}
         self._aimed: Enumerator | None = None
         about = FORMAT, pool.key, environment_hash(resolved.environment), design.strata, settings.seed, N_PATHS
         key = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:24]
-        self._file = cache_root() / "moved" / f"{key}.parquet"
-        self._read()
+        self._name = f"moved/{key}"
+        kept: dict[str, list[float]] = json.loads(cache.read(self._name) or "{}")
+        self._seen = {key: Moved.of(np.array(row), self._n_strata) for key, row in kept.items()}
+        self._n_kept = len(self._seen)
 
     def of(self, environments: Sequence[Environment]) -> Iterator[Moved]:
         """What is found in each."""
         for environment in environments:
             if (key := environment_hash(environment)) not in self._seen:
                 self._seen[key] = self._walk(environment)
-                if len(self._seen) % KEPT_EVERY == 0:
+                if len(self._seen) - self._n_kept == KEPT_EVERY:
                     self._keep()
             yield self._seen[key]
             self._progress.advance(1)
@@ -119,17 +115,11 @@ class FewPaths:
         beyond = (by_path * outside).sum(0) @ in_stratum
         return Moved(of_shell @ in_stratum, np.array(rate), beyond, float(of_shell[unknown].sum()))
 
-    def _read(self) -> None:
-        with suppress(RunFolderError):
-            table = read_table(self._file)
-            found = table["numbers"].combine_chunks().flatten().to_numpy().reshape(table.num_rows, -1)
-            keys = table["environment"].to_pylist()
-            self._seen |= {key: Moved.of(row, self._n_strata) for key, row in zip(keys, found, strict=True)}
-
     def _keep(self) -> None:
-        if self._seen:
-            kept = rows(np.array([each.numbers for each in self._seen.values()]))
-            write_bytes(self._file, parquet(pa.table({"environment": list(self._seen), "numbers": kept})))
+        if len(self._seen) > self._n_kept:
+            content = json.dumps({key: each.numbers.tolist() for key, each in self._seen.items()})
+            cache.keep_bytes(self._name, content.encode())
+            self._n_kept = len(self._seen)
 
 
 def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:

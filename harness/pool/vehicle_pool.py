@@ -15,13 +15,13 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
+from harness import cache
 from harness.campaign.sections import PoolSettings
-from harness.compiled import cache_root
 from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
@@ -31,7 +31,6 @@ from harness.pool.shells import CANDIDATES, conservative_first, shells_of, wides
 from harness.pool.walk import PILOT_PATHS, BaselineRuns, EnumeratedPaths, contributions, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
-from harness.records.folder import require_place, write_atomically
 from harness.resolved import Resolved
 from harness.strata import LEARNED
 from harness.traffic.laws import Environment
@@ -123,32 +122,22 @@ def _candidates_key(resolved: Resolved) -> str:
     return hashlib.sha256(json.dumps([campaign_pool_key(resolved), own]).encode()).hexdigest()[:24]
 
 
-def baseline_paths_file(resolved: Resolved) -> Path:
-    """Where the candidates of a campaign's paths are cached."""
-    return cache_root() / "pools" / f"shadow-{_candidates_key(resolved)}.npz"
+def baseline_paths_name(resolved: Resolved) -> str:
+    """What the candidates of a campaign's paths are kept under."""
+    return f"pools/shadow-{_candidates_key(resolved)}.npz"
 
 
 def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None) -> BaselinePaths:
-    """The paths that a campaign's vehicle is to walk, of candidates from the cache, or walked and cached.
-
-    Raises `RunFolderError`: the candidates could not be kept.
-    """
-    key, path, settings = _candidates_key(resolved), baseline_paths_file(resolved), resolved.campaign.pool
-    if (candidates := _cached(path, key)) is None:
-        require_place(path.parent, mend="Change its permissions, or name another place in HARNESS_CACHE_DIR.")
-        candidates = walk_candidates(resolved.environment, resolved.library, settings, key, progress)
-        write_atomically(path, candidates.save)
-    return candidates.draw(settings.shadow_paths)
-
-
-def _cached(path: Path, key: str) -> Candidates | None:
-    """What is kept under a key; None if there is none, or the file is damaged or of another key."""
-    try:
-        with np.load(path) as stored:
+    """The paths that a campaign's vehicle is to walk, of candidates from the cache, or walked and cached."""
+    key, name, settings = _candidates_key(resolved), baseline_paths_name(resolved), resolved.campaign.pool
+    if (content := cache.read(name)) is not None:
+        with np.load(BytesIO(content)) as stored:
             columns = {name: stored[name] for name in ("order", "index", "state", "weight", "chance")}
-            return Candidates(key, int(stored["seed"]), **columns) if stored["key"] == key else None
-    except (OSError, EOFError, KeyError, ValueError, BadZipFile):
-        return None
+            candidates = Candidates(key, int(stored["seed"]), **columns)
+    else:
+        candidates = walk_candidates(resolved.environment, resolved.library, settings, key, progress)
+        cache.keep(name, candidates.save)
+    return candidates.draw(settings.shadow_paths)
 
 
 def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, learned: Learned | None = None) -> Pool:

@@ -1,4 +1,4 @@
-"""Where things are in a run folder, and atomic writing: a file is there completely, or not at all.
+"""Where things are in a run folder, and how they are written and read.
 
 Whatever reads raises a `RunFolderError` that names a file which is missing, damaged, or not what a run has written.
 """
@@ -10,10 +10,8 @@ import fnmatch
 import json
 import os
 import tempfile
-import time
-import uuid
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +22,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from harness.errors import RunFolderError, shortened, writing
+from harness.errors import RunFolderError, shortened
+from harness.files import write_atomically
 from harness.records.schemas import ShardTables
 
 T = TypeVar("T")
@@ -43,10 +42,6 @@ MEND_SHARD = (
 SEAL = "crc32"
 """Key of a JSON file's checksum."""
 _BLOCK_BYTES = 1 << 20
-_UNFINISHED = ".harness-{}.part"
-"""A file that is being written; nobody else's temporary files have such names."""
-_ABOUT_TO_BE_S = 60.0
-"""Age from which an empty one is no longer about to be locked."""
 ROWS_FOR_THREADS = 10_000
 """Of a file below this, handing columns to threads costs more than decoding them (measured: 1.8 against 1.4 ms)."""
 NO_RUN = "Give a folder that `harness run` has written."
@@ -69,37 +64,6 @@ def shards_on_disk(folder: Path, table: str) -> list[Path]:
         names = fnmatch.filter(os.listdir(folder / table), "shard-*.parquet")  # noqa: PTH208 - glob takes three times as long
         return [folder / table / name for name in sorted(names)]
     return []
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then put it in place.
-
-    A full disk or a killed process leaves no half-written file under the final name. The temporary file of a killed
-    process goes when the next one writes into this folder.
-    """
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove_unfinished(path.parent.glob(_UNFINISHED.format("*")))
-        temporary = path.with_name(_UNFINISHED.format(uuid.uuid4().hex))
-        try:
-            with temporary.open("xb") as file:
-                with suppress(OSError):  # some network file systems have no locks
-                    fcntl.flock(file, fcntl.LOCK_EX)
-                write(temporary)
-                temporary.chmod(0o644)
-                temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-
-
-def remove_unfinished(files: Iterable[Path]) -> None:
-    """Remove temporary files whose writers were killed: those of living ones are locked, or about to be if new."""
-    for path in files:
-        with suppress(OSError), path.open("rb+") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            found = path.stat()
-            if found.st_size or time.time() - found.st_mtime > _ABOUT_TO_BE_S:
-                path.unlink()
 
 
 def require_place(folder: Path, *, mend: str = "Choose another place, or change its permissions.") -> None:

@@ -11,7 +11,7 @@ from pyarrow import csv
 
 from harness.arguments import checked
 from harness.errors import HarnessError
-from harness.records.folder import write_atomically
+from harness.files import write_atomically
 from harness.report.player import write_player
 from harness.runner.stored import ReplayResult
 from harness.vehicles.kinematics import STEP_S

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from scenariogeneration import xodr, xosc
 
-from harness.records.folder import write_atomically
+from harness.files import write_atomically
 from harness.report.player import LANE_M, share_over
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import VEHICLES

@@ -9,8 +9,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import math
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +16,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from jinja2 import Environment as Templates
-from jinja2 import FileSystemBytecodeCache, PackageLoader, StrictUndefined
+from jinja2 import PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from harness.campaign.campaign import Campaign
-from harness.compiled import cache_root, unboxed
+from harness.compiled import unboxed
 from harness.episode.path import Trajectory, empty_trajectory
 from harness.errors import printable
 from harness.numbers import tenths
@@ -260,11 +258,7 @@ def templates() -> Templates:
     css, more_css, script = (
         (place / name).read_text(encoding="utf-8") for name in ("report.css", "player.css", "player.js")
     )
-    cache = cache_root() / "templates"
-    with suppress(OSError):
-        cache.mkdir(parents=True, exist_ok=True)
     found = Templates(
-        bytecode_cache=FileSystemBytecodeCache(str(cache)) if os.access(cache, os.W_OK) else None,
         loader=PackageLoader("harness.report", "."),
         autoescape=True,
         undefined=StrictUndefined,

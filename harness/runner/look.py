@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from collections import Counter
@@ -23,6 +22,7 @@ from harness.controllers.find import has_foreign_code, run_apart
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
+from harness.processes import usable_cpus
 from harness.resolved import require_ready, require_world, resolve
 from harness.runner.workers import Bits, bits_of
 from harness.sampling import EPISODES_PER_S, prepare, source_of
@@ -329,7 +329,7 @@ def plan_campaign(campaign: Campaign) -> dict[str, Any]:
     """
     resolved, source = require_ready(campaign), source_of(campaign)
     engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
-    rate = float(f"{EPISODES_PER_S[campaign.testing.method][engine] * (os.cpu_count() or 1):.2g}")
+    rate = float(f"{EPISODES_PER_S[campaign.testing.method][engine] * usable_cpus():.2g}")
     own = {} if campaign.av.model else {"av": "its own time comes on top: `harness av-check` measures it"}
     return {
         "most_tests": campaign.stop.episodes,

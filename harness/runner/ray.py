@@ -22,13 +22,13 @@ import ray
 from ray.exceptions import RayError, RayTaskError, RuntimeEnvSetupError
 from ray.runtime_env import RuntimeEnv
 
+from harness import cache
 from harness.campaign.sections import RaySettings
-from harness.compiled import cache_root, source_hash
+from harness.compiled import source_hash
 from harness.controllers.find import require_controller
 from harness.controllers.hosts import Death
 from harness.errors import CampaignError, HarnessError
-from harness.processes import WorkerDeath, fit_to_travel, handlers_restored
-from harness.records.folder import write_bytes
+from harness.processes import WorkerDeath, fit_to_travel, handlers_restored, usable_cpus
 from harness.resolved import Resolved
 from harness.runner.resume import cpu_name
 from harness.runner.workers import (
@@ -113,8 +113,8 @@ class OnMachine:
 
 def _fill_cache(files: Files) -> None:
     for name, content in files.items():
-        if not (path := cache_root() / name).exists():
-            write_bytes(path, ray.get(content))
+        if cache.find(name) is None:
+            cache.keep_bytes(name, ray.get(content).tobytes())
 
 
 # -- where the run is --
@@ -191,11 +191,11 @@ class RayWorkers(Workers):
         self.baseline: list[ray.ObjectRef[bytes]] = []
         """Baseline runs, once they have all been made."""
         self._content = ray.put(resolved)
-        cached = source_of(resolved.campaign).cached_files(resolved)
+        names = source_of(resolved.campaign).cached_files(resolved)
         self._cached = (
             {}
             if address == LOCAL
-            else {str(path.relative_to(cache_root())): ray.put(np.fromfile(path, np.uint8)) for path in cached}
+            else {name: ray.put(np.frombuffer(cache.read(name) or b"", np.uint8)) for name in names}
         )
         self._actor_class = ray.remote(OnMachine).options(
             num_cpus=settings.resources.cpus / n_runs,
@@ -328,7 +328,7 @@ def _room(settings: RaySettings) -> int:
     """How many workers the cluster has room for."""
     have, want = ray.cluster_resources(), settings.resources
     room = [have.get(name, 0.0) / n for name, n in (("CPU", want.cpus), ("GPU", want.gpus)) if n > 0.0]
-    n = int(min(room, default=float(os.cpu_count() or 1)))
+    n = int(min(room, default=float(usable_cpus())))
     if n == 0:
         raise HarnessError(
             "run.ray.resources",

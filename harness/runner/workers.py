@@ -6,9 +6,9 @@ Here workers are processes of this machine; `harness.runner.ray` makes those of 
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import signal
+import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -39,6 +39,7 @@ from harness.processes import (
     first_to_answer,
     fork_server,
     tell,
+    usable_cpus,
     worker_modules,
 )
 from harness.records.folder import Repeated, encoded, read_table
@@ -380,7 +381,10 @@ class LocalWorkers(Workers):
     """Processes of this machine, each started when it is first needed."""
 
     def __init__(self, resolved: Resolved, n_workers: int | None) -> None:
-        super().__init__(resolved, n_workers or os.cpu_count() or 1)
+        n_cpus = usable_cpus()
+        super().__init__(resolved, n_workers or n_cpus)
+        if self.n_workers > n_cpus:
+            sys.stderr.write(f"note: {self.n_workers} workers share the {n_cpus} CPUs that this process may use.\n")
         # As a file: what a pipe cannot hold is waited for until the new process has imported all that it needs.
         self._resolved, self._baseline = SharedFile(pickle.dumps(resolved)), SharedFile()
         self._server = fork_server(*worker_modules(resolved.campaign.world.engine))

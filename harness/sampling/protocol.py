@@ -15,6 +15,7 @@ from typing import ClassVar, Protocol
 
 import pyarrow as pa
 
+from harness import cache
 from harness.campaign.campaign import Campaign
 from harness.controllers.find import build_host
 from harness.controllers.hosts import Death
@@ -24,7 +25,7 @@ from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import Rule, StopRule
 from harness.importance.functions import build_importance, mixture_weights
-from harness.importance.tables import Tables, build_tables, table_path
+from harness.importance.tables import Tables, build_tables, tables_name
 from harness.pool.learned import Learned
 from harness.pool.shells import Draw
 from harness.pool.vehicle_pool import BaselinePaths
@@ -114,17 +115,17 @@ class Source:
         self.baseline_paths: BaselinePaths | None = None
 
     @classmethod
-    def cached_files(cls, resolved: Resolved) -> list[Path]:
-        """What building leaves in the cache, or has found there: with these another machine builds nothing."""
+    def cached_files(cls, resolved: Resolved) -> list[str]:
+        """What building leaves in the cache, or has found there, by names: with it another machine builds nothing."""
         if not resolved.campaign.sampling.mixes:
             return []
-        return [table_path(resolved.environment, resolved.surrogates, resolved.campaign.testing.challenge)]
+        return [tables_name(resolved.environment, resolved.surrogates, resolved.campaign.testing.challenge)]
 
     @classmethod
     def building(cls, resolved: Resolved) -> str:
         """What is to be built, and how long that takes, in words."""
         files = cls.cached_files(resolved)
-        if not files or all(file.is_file() for file in files):
+        if not files or all(map(cache.has, files)):
             return "cached" if files else "none needed"
         per_driver_s = 5 if resolved.campaign.environment.acceleration_hold_s >= 0.5 else 40
         return f"to build (about {per_driver_s * len(resolved.campaign.surrogates)} s of one core)"

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from harness import cache
 from harness.campaign.campaign import Campaign
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard
@@ -27,11 +28,11 @@ from harness.estimators.shells import Shells as SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
 from harness.numbers import plain
-from harness.pool.build import campaign_pool, campaign_pool_key, pool_path
+from harness.pool.build import campaign_pool, campaign_pool_key, pool_name
 from harness.pool.cut_ins import Pool
 from harness.pool.learned import Learned
 from harness.pool.shells import Draw, PrescribedEpisodes
-from harness.pool.vehicle_pool import baseline_paths_file, campaign_baseline_paths, vehicle_pool
+from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_paths, vehicle_pool
 from harness.pool.walk import BaselineRuns
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as
@@ -72,16 +73,16 @@ class Shells(Source):
         self.policy = self.policy._replace(boundary=boundary)
 
     @classmethod
-    def cached_files(cls, resolved: Resolved) -> list[Path]:
+    def cached_files(cls, resolved: Resolved) -> list[str]:
         own = resolved.campaign.has_baseline_runs
-        return [baseline_paths_file(resolved) if own else pool_path(campaign_pool_key(resolved))]
+        return [baseline_paths_name(resolved) if own else pool_name(campaign_pool_key(resolved))]
 
     @classmethod
     def building(cls, resolved: Resolved) -> str:
         what, make = "pool of cut-ins", "build"
         if resolved.campaign.has_baseline_runs:
             what, make = f"paths of {resolved.campaign.pool.shadow_paths:,} baseline runs", "choose"
-        cached = all(file.is_file() for file in cls.cached_files(resolved))
+        cached = all(map(cache.has, cls.cached_files(resolved)))
         return f"{what}: " + ("cached" if cached else f"to {make} ({POOL_S} on two cores)")
 
     @classmethod

@@ -17,6 +17,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from functools import cache
 from itertools import compress
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,10 +25,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from harness.errors import CampaignError, WorldDisagreementError
+from harness.processes import SharedFile
 from harness.vocabulary import AV, BV, LV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import MOST_SUMO_CELLS, World
 from harness.worlds.shim import Shim, open_shim
-from harness.worlds.system_libraries import not_importable
+from harness.worlds.system_libraries import SUMO_VERSION, not_importable
 from harness.worlds.twin import advance
 
 EXACT_OPTIONS = (
@@ -62,11 +64,11 @@ class SumoCells(World):
     def _arguments(self) -> list[str]:
         """SUMO's command line, without the name of the program."""
         types = ",".join(map(str, self._type_files()))
-        return ["-n", str(network_file(self.n_cells)), "-a", types, *EXACT_OPTIONS]
+        return ["-n", str(as_shared(network_file(self.n_cells)).path), "-a", types, *EXACT_OPTIONS]
 
     def _type_files(self) -> list[Path]:
         """Files with the vehicle types."""
-        return [committed_file("vehicles.add.xml")]
+        return [as_shared(committed_file("vehicles.add.xml")).path]
 
     def _type_of(self, vehicle: int) -> str:  # noqa: ARG002 - worlds whose AV is of another type look at it
         """Name of the vehicle type of LV, BV or AV."""
@@ -114,6 +116,12 @@ def committed_file(name: str) -> Path:
     if not path.exists():
         raise CampaignError(str(path), "no file", "the committed network", "Reinstall the harness from a checkout.")
     return path
+
+
+@cache
+def as_shared(file: Path) -> SharedFile:
+    """A file under a path that SUMO takes as it is: it splits others at commas, and fills in ``${HOME}``."""
+    return SharedFile(file.read_bytes())
 
 
 def sumo_program(name: str, where: str) -> Path:
@@ -257,7 +265,7 @@ class SumoWorld(SumoCells):
 
 
 def _disobeyed(where: str, found: float, expected: float) -> WorldDisagreementError:
-    mend = "The bits are promised for libsumo 1.28.0; check `pip show libsumo`. Otherwise please report it."
+    mend = f"The bits are promised for libsumo {SUMO_VERSION}; check `pip show libsumo`. Otherwise please report it."
     wanted = f"{float(expected).hex()}, as commanded"
     return WorldDisagreementError(f"SUMO, {where}", float(found).hex(), wanted, mend)
 

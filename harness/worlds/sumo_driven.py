@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 
 from harness.campaign.problems import did_you_mean
 from harness.errors import CampaignError
+from harness.processes import SharedFile
 from harness.random_stream import controller_random
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import AV, BoolArray, FloatArray, Int8Array, IntArray
@@ -145,32 +145,23 @@ class SumoAvWorld(SumoWorld):
         self._wanted: FloatArray = np.zeros((n_cells, 3))
         attributes = av_type(av)
         written = " ".join(f"{name}={quoteattr(str(value))}" for name, value in attributes.items())
-        self._xml = f'<additional>\n    <vType id="{TYPE_NAME}" {written}/>\n</additional>\n'
-        with self._written_type() as folder:
-            stderr = folder / "stderr"
-            try:
-                with _stderr_to(stderr):
-                    super().__init__(n_cells, **options)
-            except Exception as error:
-                lines = stderr.read_text(encoding="utf-8").splitlines()
-                messages = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
-                if not messages:
-                    raise
-                named = max((name for name in attributes if name.lower() in messages[0].lower()), key=len, default="")
-                where, values = (f"av.sumo.{named}", attributes[named]) if named else ("av.sumo", "values")
-                found, mend = f"{values}, which SUMO refuses", f"SUMO says: {messages[0]}"
-                raise CampaignError(where, found, "a vType that SUMO accepts", mend) from error
-
-    @contextmanager
-    def _written_type(self) -> Iterator[Path]:
-        """A folder with the file of the AV's type, for as long as SUMO reads it."""
-        with tempfile.TemporaryDirectory(prefix="harness-av-") as folder:
-            self._type_file = Path(folder) / "av.add.xml"
-            self._type_file.write_text(self._xml, encoding="utf-8")
-            yield Path(folder)
+        xml = f'<additional>\n    <vType id="{TYPE_NAME}" {written}/>\n</additional>\n'
+        self._type_file, stderr = SharedFile(xml.encode()), SharedFile()
+        try:
+            with _stderr_to(stderr.path):
+                super().__init__(n_cells, **options)
+        except Exception as error:
+            lines = stderr.path.read_text(encoding="utf-8").splitlines()
+            messages = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
+            if not messages:
+                raise
+            named = max((name for name in attributes if name.lower() in messages[0].lower()), key=len, default="")
+            where, values = (f"av.sumo.{named}", attributes[named]) if named else ("av.sumo", "values")
+            found, mend = f"{values}, which SUMO refuses", f"SUMO says: {messages[0]}"
+            raise CampaignError(where, found, "a vType that SUMO accepts", mend) from error
 
     def _type_files(self) -> list[Path]:
-        return [*super()._type_files(), self._type_file]
+        return [*super()._type_files(), self._type_file.path]
 
     def _type_of(self, vehicle: int) -> str:
         return TYPE_NAME if vehicle == AV else super()._type_of(vehicle)
@@ -218,8 +209,7 @@ class FreshWorld(SumoAvWorld):
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - there is one cell
         """Load a new simulation for the coming episode."""
         self._sumo_seed = sumo_seed(self._seed, int(episodes[0]))
-        with self._written_type():
-            self.load_again()
+        self.load_again()
 
     def _arguments(self) -> list[str]:
         return [*super()._arguments(), "--seed", str(self._sumo_seed)]

@@ -1,4 +1,4 @@
-"""Shared libraries that SUMO's wheels expect of the system: which they are, which are missing, and their installation.
+"""Which libsumo is here, and shared libraries that SUMO's wheels expect of the system: missing ones, how they come.
 
 The wheels bring the others along (policy manylinux_2_28, PEP 600, names what they may leave out). The list is what the
 files of libsumo 1.28.0 and of eclipse-sumo 1.28.0 need and do not bring, the C library and the compiler's runtime
@@ -14,9 +14,15 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, distribution
+from importlib.util import find_spec
+from pathlib import Path
 from typing import NamedTuple
 
 from harness.errors import HarnessError
+
+SUMO_VERSION = "1.28.0"
+"""The one that `pyproject.toml` pins, for which bits are promised."""
 
 
 class SystemLibrary(NamedTuple):
@@ -45,6 +51,7 @@ _INSTALL = {
     "apk": ("apk add --no-cache",),
 }
 _ASK_NOTHING = ("env", "DEBIAN_FRONTEND=noninteractive", "LC_ALL=C")
+_REINSTALL = f"install libsumo again: pip install --force-reinstall libsumo=={SUMO_VERSION}"
 _QUOTED = 2
 """Lines of each command that an error repeats."""
 
@@ -63,9 +70,42 @@ def _loads(soname: str) -> bool:
 
 
 def require_libraries() -> None:
-    """Refuse a machine that SUMO cannot be loaded on, naming the packages that are missing."""
+    """Refuse a machine that SUMO cannot be loaded on, naming the packages that are missing, or with another SUMO."""
     if missing := missing_libraries():
         raise _cannot_load(missing, "Run `harness setup`, which installs them")
+    _require_version()
+
+
+def _require_version() -> None:
+    """Refuse another version; one that has the right version, but is not the installed package's, is named.
+
+    Python looks for it wherever PYTHONPATH says, and what the installed package's version is says nothing of that.
+    """
+    spec = find_spec("libsumo")
+    if spec is None:
+        raise not_importable("there is none")
+    place = Path(next(iter(spec.submodule_search_locations or [spec.origin or "?"])))
+    try:
+        package = distribution("libsumo")
+        installed, version = Path(str(package.locate_file("libsumo"))), package.version
+    except PackageNotFoundError:
+        installed, version = None, "unknown"
+    if installed is None or place.resolve() != installed.resolve():
+        version = _version_of_libsumo(place)
+        sys.stderr.write(f"note: libsumo is that of {place}.\n")
+    if version != SUMO_VERSION:
+        mend = f"Take its folder off PYTHONPATH, or {_REINSTALL}."
+        raise HarnessError("libsumo", f"version {version} in {place}", f"version {SUMO_VERSION}", mend)
+
+
+def _version_of_libsumo(place: Path) -> str:
+    """As the compiled library tells it."""
+    try:
+        import libsumo  # noqa: PLC0415 - takes half a second
+
+        return str(libsumo.getVersion()[1]).removeprefix("SUMO ")
+    except (ImportError, AttributeError) as error:
+        raise not_importable(f"{error}; it is that of {place}") from error
 
 
 def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
@@ -118,9 +158,8 @@ def require_libsumo() -> None:
 
 def not_importable(words: str) -> HarnessError:
     """Error for a libsumo that does not load though the known libraries are there, with the loader's own words."""
-    expected = "libsumo 1.28.0 as `pip install` brings it, and the system libraries that it names"
-    again = "pip install --force-reinstall libsumo==1.28.0"
-    mend = f"Install the package of this system that holds the named file, or libsumo again: {again}."
+    expected = f"libsumo {SUMO_VERSION} as `pip install` brings it, and the system libraries that it names"
+    mend = f"Install the package of this system that holds the named file, or {_REINSTALL}."
     return HarnessError("libsumo", f"that it cannot be imported: {words}", expected, mend)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from harness.campaign.drivers import IDMParameters
 from harness.importance import tables as cache
-from harness.importance.tables import MODEL_FIELDS, Tables, build_tables, table_path, tables_hash
+from harness.importance.tables import MODEL_FIELDS, Tables, build_tables, tables_hash, tables_name
 from harness.vehicles.drivers import driver_records
 from tests.kernels import environment
 
@@ -49,10 +49,14 @@ def test_a_set_of_surrogates_is_built_once_and_another_one_is_another_file(folde
     assert not equal([array[1:] for array in both], one)
 
 
-@pytest.mark.parametrize("damage", [lambda _: b"", lambda content: content[:-5000]])
-def test_a_truncated_file_is_built_again(folder, built, damage):
+def one_bit(content):
+    return content[:5000] + bytes([content[5000] ^ 1]) + content[5001:]
+
+
+@pytest.mark.parametrize("damage", [lambda _: b"", lambda content: content[:-5000], one_bit])
+def test_a_damaged_file_is_built_again(folder, built, damage):
     first = build_tables(environment(), DRIVER, "immediate")
-    path = table_path(environment(), DRIVER, "immediate")
+    path = folder.parent / tables_name(environment(), DRIVER, "immediate")
     content = path.read_bytes()
     path.unlink()  # the tables are mapped: a file that shrinks under them would take this process down
     path.write_bytes(damage(content))

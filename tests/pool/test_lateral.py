@@ -8,7 +8,7 @@ from harness.controllers.find import build_host
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.importance.functions import build_importance
 from harness.pool.build import campaign_pool
-from harness.pool.cut_ins import read_pool, write_pool
+from harness.pool.cut_ins import pool_content, pool_from
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
@@ -80,12 +80,10 @@ def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name)
     assert np.array_equal(episode["onset_step"], lateral_pool.cut_ins.onset[rows])
 
 
-def test_leads_are_kept_with_the_pool(lateral_pool, pool, tmp_path):
+def test_leads_are_kept_with_the_pool(lateral_pool, pool):
     assert np.unique(lateral_pool.cut_ins.lead).size > 15
-    write_pool(tmp_path / "pool.parquet", lateral_pool)
-    assert np.array_equal(read_pool(tmp_path / "pool.parquet").cut_ins.lead, lateral_pool.cut_ins.lead)
-    write_pool(tmp_path / "paper.parquet", pool)
-    assert not read_pool(tmp_path / "paper.parquet").cut_ins.lead.any()
+    assert np.array_equal(pool_from(pool_content(lateral_pool)).cut_ins.lead, lateral_pool.cut_ins.lead)
+    assert not pool_from(pool_content(pool)).cut_ins.lead.any()
 
 
 def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow():

@@ -18,11 +18,11 @@ import pyarrow as pa
 import pytest
 
 from harness.errors import HarnessError, RunFolderError
+from harness.files import write_atomically
 from harness.records.folder import (
     encoded,
     read_as,
     shard_file,
-    write_atomically,
     write_json,
     write_sealed,
     write_shard,
@@ -60,6 +60,16 @@ def test_a_write_that_fails_leaves_nothing_but_the_old_file(tmp_path):
         assert files_below(tmp_path) == old
         write_atomically(path, lambda temporary: temporary.write_text("old"))
     assert path.read_text() == "old"
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o077, 0o600), (0o027, 0o640), (0o002, 0o664)])
+def test_who_may_read_a_file_is_what_the_umask_says(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        write_atomically(tmp_path / "file", lambda temporary: temporary.write_text("new"))
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == mode
 
 
 def test_files_that_belong_together_are_all_old_or_all_new(tmp_path, monkeypatch):

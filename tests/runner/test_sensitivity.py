@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -23,10 +24,12 @@ SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
 
 
 @pytest.fixture(autouse=True)
-def few(monkeypatch, tmp_path):
-    """Paths enough for these tests, kept where no other test does."""
+def few(monkeypatch):
+    """Paths enough for these tests, kept where no other test does; returns what is kept."""
+    kept: dict[str, bytes] = {}
     monkeypatch.setattr(moved, "N_PATHS", 512)
-    monkeypatch.setattr(moved, "cache_root", lambda: tmp_path / "cache")
+    monkeypatch.setattr(moved, "cache", SimpleNamespace(read=kept.get, keep_bytes=kept.__setitem__))
+    return kept
 
 
 @pytest.fixture

@@ -1,0 +1,132 @@
+"""What can be made again, kept from run to run: compiled kernels, challenge tables, pools; nothing else is kept there.
+
+A file ends with a checksum of its name and content. One that is damaged, or is another's, is as good as none: what it
+held is made anew. What cannot be written where it should be goes to a folder of this user among the temporary files, so
+that a folder that may only be read is a cache, too, and a user without a home has one.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import stat
+import sys
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import platformdirs
+
+from harness.errors import OF_THE_DISK, HarnessError
+from harness.files import write_atomically
+
+FOLDER = "HARNESS_CACHE_DIR"
+"""Environment variable that names the cache; the default is the user's own, if there is a home to have it in."""
+SAID = "HARNESS_CACHE_SAID"
+"""Environment variable that keeps a process from saying what another of the same command has said, or will say."""
+_SEAL_BYTES = 4
+
+
+def own_folder() -> Path | None:
+    """Where the cache should be; None where there is no home folder."""
+    if named := os.environ.get(FOLDER):
+        return Path(named)
+    with suppress(RuntimeError):  # nobody knows where this user is at home
+        return platformdirs.user_cache_path("harness")
+    return None
+
+
+def _spare_folder(*, make: bool = False) -> Path:
+    """Folder of this user for what cannot be written to the cache.
+
+    Raises `HarnessError`: others may write there, and what they have put there may be anything; or an `OSError`.
+    """
+    try:
+        folder = Path(tempfile.gettempdir()) / f"harness-{os.geteuid()}"
+    except FileNotFoundError as error:
+        mend = f"Set TMPDIR to a folder that can be written to, or {FOLDER}."
+        raise HarnessError("TMPDIR", "no place for temporary files", "a folder", mend) from error
+    if make:
+        with suppress(FileExistsError):
+            folder.mkdir(0o700)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+        mend = f"Remove it, or set {FOLDER} or TMPDIR to another folder."
+        raise HarnessError(str(folder), "what is not this user's alone", "a folder that nobody else can write to", mend)
+    return folder
+
+
+def places(name: str) -> Iterator[Path]:
+    """Where something of a name, such as ``pools/0123``, may be."""
+    if (own := own_folder()) is not None:
+        yield own / name
+    with suppress(HarnessError, OSError):
+        yield _spare_folder() / name
+
+
+def has(name: str) -> bool:
+    """Whether there is something of a name, which may be a pattern, sound or not."""
+    return any(any(path.parent.glob(path.name)) for path in places(name))
+
+
+def find(name: str) -> Path | None:
+    """A sound file of a name, with its checksum at the end; None if there is none."""
+    return next((path for path in places(name) if _is_sound(path, name)), None)
+
+
+def read(name: str) -> bytes | None:
+    """What is kept under a name; None if nothing is, or it is damaged."""
+    return None if (path := find(name)) is None else path.read_bytes()[:-_SEAL_BYTES]
+
+
+def put(name: str, write: Callable[[Path], object]) -> Path:
+    """Let ``write`` put something under a name, where it can; returns where.
+
+    Where that is not in the cache, it is said, once in a command.
+    """
+    why = "there is no home folder"
+    if (own := own_folder()) is not None:
+        try:
+            write(own / name)
+            return own / name
+        except OSError as error:
+            if error.errno in OF_THE_DISK:
+                raise
+            why = f"{own} cannot be written ({error.strerror})"
+    spare = _spare_folder(make=True)
+    write(spare / name)
+    if SAID not in os.environ:
+        os.environ[SAID] = "1"
+        sys.stderr.write(f"note: what is compiled or built is kept in {spare}, as {why}. Set {FOLDER}.\n")
+    return spare / name
+
+
+def keep(name: str, write: Callable[[Path], object]) -> Path:
+    """Let ``write`` fill a file, and keep it under a name; returns where."""
+
+    def sealed(path: Path) -> None:
+        write(path)
+        with path.open("rb+") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            file.seek(0, os.SEEK_END)
+            file.write(zlib.crc32(content, zlib.crc32(name.encode())).to_bytes(_SEAL_BYTES))
+
+    return put(name, lambda path: write_atomically(path, sealed))
+
+
+def keep_bytes(name: str, content: bytes) -> None:
+    """Keep some bytes under a name."""
+    keep(name, lambda path: path.write_bytes(content))
+
+
+def _is_sound(path: Path, name: str) -> bool:
+    with (
+        suppress(OSError, ValueError),  # none, or an empty one
+        path.open("rb") as file,
+        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
+        memoryview(content) as view,
+    ):
+        seal = zlib.crc32(view[:-_SEAL_BYTES], zlib.crc32(name.encode()))
+        return seal == int.from_bytes(view[-_SEAL_BYTES:])
+    return False

@@ -1,0 +1,53 @@
+"""Atomic writing: a file is there completely, or not at all; and where a path leads."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+import uuid
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from harness.errors import writing
+
+_UNFINISHED = ".harness-{}.part"
+"""A file that is being written; nobody else's temporary files have such names."""
+_ABOUT_TO_BE_S = 60.0
+"""Age from which an empty one is no longer about to be locked."""
+
+
+def real_path(path: Path | str) -> Path:
+    """The path without links; of links that lead in a circle as far as it goes, for whoever opens it to complain."""
+    return Path(os.path.realpath(path))
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Let ``write`` fill a temporary file beside ``path``, then put it in place.
+
+    A full disk or a killed process leaves no half-written file under the final name. The temporary file of a killed
+    process goes when the next one writes into this folder.
+    """
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        remove_unfinished(path.parent.glob(_UNFINISHED.format("*")))
+        temporary = path.with_name(_UNFINISHED.format(uuid.uuid4().hex))
+        try:
+            with temporary.open("xb") as file:
+                with suppress(OSError):  # some network file systems have no locks
+                    fcntl.flock(file, fcntl.LOCK_EX)
+                write(temporary)
+                temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(files: Iterable[Path]) -> None:
+    """Remove temporary files whose writers were killed: those of living ones are locked, or about to be if new."""
+    for path in files:
+        with suppress(OSError), path.open("rb+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            found = path.stat()
+            if found.st_size or time.time() - found.st_mtime > _ABOUT_TO_BE_S:
+                path.unlink()
