@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from harness.fitting.table import Recording
+from harness.fitting.recording import Recording
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 IN_VIEW_M = 100.0

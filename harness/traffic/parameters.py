@@ -335,6 +335,17 @@ class Lateral(Section):
         return log_normal_speed(self.distance_m.value, median, log_sd, longest)
 
 
+OF_REPLICATES = b"harness fit"
+"""Key in the metadata of a file of replicates: hash of the numbers that they belong to."""
+
+
+class Replicates(Section):
+    """Which environments other data of the same kind would have given: a file beside this one, and its hash."""
+
+    file: Annotated[str, Field(pattern=r"^[^\x00-\x1f]+$", examples=["mine.replicates.parquet"])]
+    sha256: str
+
+
 class EnvironmentParameters(Section):
     """All numbers of the environment."""
 
@@ -350,7 +361,7 @@ class EnvironmentParameters(Section):
     hazard_table: HazardTable | None = None
     acceptance_steps: AcceptanceSteps | None = None
     lateral: Lateral | None = None
-    replicates: str | None = None
+    replicates: Replicates | None = None
 
     @model_validator(mode="after")
     def _one_law_each(self) -> Self:
@@ -426,7 +437,12 @@ class EnvironmentParameters(Section):
 
     def content_hash(self) -> str:
         """Hash of the numbers alone: a corrected note does not change a campaign."""
-        return hashlib.sha256(json.dumps(self.values(), sort_keys=True).encode()).hexdigest()[:16]
+        return content_hash(json.dumps(self.values(), sort_keys=True).encode())
+
+
+def content_hash(content: bytes) -> str:
+    """Hash of some bytes, as files name it."""
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: float, hold_s: float) -> Record:
