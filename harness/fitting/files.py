@@ -121,9 +121,16 @@ def _require_ours(written: Mapping[Path, bytes], inputs: Sequence[Path], *, forc
         where = f"--out {next(iter(written))}"
         if os.path.realpath(path) in map(os.path.realpath, inputs):
             raise HarnessError(where, f"{path}, which is also an input", "another file", "Choose another name.")
-        if path.is_dir() or (path.exists() and not force and mark not in path.read_bytes()):
+        if path.is_dir() or (not force and not _may_replace(path, mark)):
             found = f"{path}, which harness fit has not written"
             raise HarnessError(where, found, "a new file, or one of a fit", "Choose another name, or give --force.")
+
+
+def _may_replace(path: Path, mark: bytes) -> bool:
+    try:
+        return mark in path.read_bytes()
+    except OSError:
+        return not os.path.lexists(path)
 
 
 def _yaml(

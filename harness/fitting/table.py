@@ -1,7 +1,7 @@
-"""Trajectories as a table: read from CSV or Parquet one recording at a time, by a mapping of columns.
+"""Trajectories as a table: read from CSV or Parquet by a mapping of columns, one recording at a time.
 
-One row per vehicle and time. The rows of a recording stand together in a file, in any order among themselves, so that
-no more than one recording is held in memory (some 400 bytes a row); without ``recording_id`` a file is one recording.
+One row per vehicle and time, in any order; without ``recording_id`` a file is one recording. In memory are held one
+file (some 200 bytes a row), and one of its recordings (some 400).
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import re
 import stat
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -113,29 +112,23 @@ def recordings(files: Sequence[str | Path], mapping: Mapping) -> Iterator[Record
     where = places(paths)
     if not kept:
         raise TrajectoryError(where, "no file with tracks", "NN_tracks.csv", "Give highD's tracks as well.")
-    classes: set[str] = set()
-    names: set[str] = set()
+    seen: dict[str, set[str]] = {"recording": set(), "class": set()}
     for i, path in enumerate(kept):
-        pieces = _pieces(path, mapping)
-        for name, rows, share in pieces:
-            names.add(name)
-            if name in mapping.leave_out:
-                continue
-            try:
-                standard = _standard(rows, path, mapping)
-                classes.update(standard["class"].unique() if mapping.classes else ())
-                recording = recording_of(name, str(path), standard, (i + share) / len(kept))
-            except TrajectoryError:
-                deque(pieces, 0)  # if rows of it follow further down, that is why, and is said instead
-                raise
-            yield recording
-    none = [] if classes.intersection(mapping.classes) else mapping.classes
-    unknown = [name for name in mapping.leave_out if name not in names]
-    for asked, known, key in ((unknown, names, "recording"), (none, classes, "class")):
+        table, done = _read(path, mapping), 0
+        for name, rows in table.groupby("recording_id", sort=False):
+            done += len(rows)
+            seen["recording"].add(str(name))
+            if name not in mapping.leave_out:
+                standard = _standard(rows.reset_index(drop=True), path, mapping)
+                seen["class"].update(standard["class"].unique() if mapping.classes else ())
+                yield recording_of(str(name), str(path), standard, (i + done / len(table)) / len(kept))
+    none = [] if seen["class"].intersection(mapping.classes) else mapping.classes
+    unknown = [name for name in mapping.leave_out if name not in seen["recording"]]
+    for kind, asked in (("recording", unknown), ("class", none)):
         if asked:
-            found = f"no {key} {' or '.join(asked)}; there are {', '.join(sorted(map(str, known)))}"
+            found = f"no {kind} {' or '.join(asked)}; there are {', '.join(sorted(map(str, seen[kind])))}"
             raise TrajectoryError(where, found, "names that are there", "Correct the name, or leave it out.")
-    if names.issubset(mapping.leave_out):
+    if seen["recording"].issubset(mapping.leave_out):
         raise TrajectoryError(where, "no recording that is not left out", "one or more", "Leave out fewer.")
 
 
@@ -174,77 +167,45 @@ def _reading(path: Path) -> Iterator[None]:
         raise TrajectoryError(str(path), f"a file that cannot be read ({first})", expected, mend) from None
 
 
-def _pieces(path: Path, mapping: Mapping) -> Iterator[tuple[str, pd.DataFrame, float]]:
-    """Name and rows of each recording of a file, and the share of the file that is read by then."""
-    parts: list[pd.DataFrame] = []
-    current: str | None = None
-    done: set[str] = set()
-    share = 0.0
+def _read(path: Path, mapping: Mapping) -> pd.DataFrame:
+    """Rows of a file with the columns of the input table that it has, and ``row``."""
     with _reading(path):
-        for rows, upto in _batches(path, mapping):
-            for key, part in rows.groupby("recording_id", sort=False):
-                name = str(key)
-                if name in done:
-                    where, found = f"{path}, row {part.row.iloc[0]}", f"recording {name} again, after another one"
-                    by = mapping.columns.get("recording_id", "recording_id")
-                    mend = f"Sort the file by {by}, or write a file for each."
-                    raise TrajectoryError(where, found, "all its rows together", mend)
-                if current is not None and name != current:
-                    yield current, pd.concat(parts, ignore_index=True), share
-                    done.add(current)
-                    parts = []
-                current = name
-                parts.append(part)
-            share = upto
-    if current is None:
+        if path.suffix in (".parquet", ".pq") or _unpacked(path).read(4) == b"PAR1":
+            with pq.ParquetFile(path, page_checksum_verification=True) as file:
+                columns, text = _columns(path, file.schema_arrow.names, mapping), None
+                table = file.read(list(columns.values()))
+        else:
+            text = _Text.of(path, mapping)
+            columns = _columns(path, text.names, mapping)
+            types = dict.fromkeys(columns.values(), pa.string())
+            table = pa.csv.read_csv(
+                text.content,
+                pa.csv.ReadOptions(column_names=text.names, skip_rows=text.row - 1, block_size=1 << 22),
+                pa.csv.ParseOptions(delimiter=text.delimiter),
+                pa.csv.ConvertOptions(column_types=types, include_columns=list(types)),
+            )
+    if not len(table):
         raise TrajectoryError(str(path), "no rows", "one row per vehicle and time", "Is it the right file?")
-    yield current, pd.concat(parts, ignore_index=True), 1.0
+    row, commas = (text.row, text.commas) if text else (1, False)
+    return _renamed(table, columns, row, path, mapping, commas=commas)
 
 
-def _batches(path: Path, mapping: Mapping) -> Iterator[tuple[pd.DataFrame, float]]:
-    """Rows of a file with the columns of the input table that it has, and ``row``; and the share that is read."""
-    if path.suffix in (".parquet", ".pq") or _unpacked(path)[0].read(4) == b"PAR1":
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            columns = _columns(path, file.schema_arrow.names, mapping)
-            row, total = 1, max(file.metadata.num_rows, 1)
-            for batch in file.iter_batches(columns=list(columns.values())):
-                yield _renamed(batch, columns, row, path, mapping), (row - 1 + batch.num_rows) / total
-                row += batch.num_rows
-        return
-    text = _Text.of(path, mapping)
-    columns = _columns(path, text.names, mapping)
-    reader = pa.csv.open_csv(
-        text.content,
-        read_options=pa.csv.ReadOptions(column_names=text.names, skip_rows=text.row - 1, block_size=1 << 22),
-        parse_options=pa.csv.ParseOptions(delimiter=text.delimiter),
-        convert_options=pa.csv.ConvertOptions(
-            column_types=dict.fromkeys(columns.values(), pa.string()), include_columns=list(columns.values())
-        ),
-    )
-    row = text.row
-    for batch in reader:
-        share = min(text.raw.tell() / max(text.raw.size(), 1), 1.0)
-        yield _renamed(batch, columns, row, path, mapping, commas=text.commas), share
-        row += batch.num_rows
-
-
-def _unpacked(path: Path) -> tuple[Any, Any]:
-    """Content of a file, unpacked as it is read; and the file, by whose place one knows how far that is."""
+def _unpacked(path: Path) -> Any:
+    """Content of a file, unpacked as it is read."""
     raw = pa.OSFile(str(path))  # after an error pyarrow's threads read on: from a file of Python they abort its exit
     first = raw.read(4)
     raw.seek(0)
     kind = next((kind for magic, kind in COMPRESSED.items() if first.startswith(magic)), None)
-    return (raw if kind is None else pa.CompressedInputStream(raw, kind)), raw
+    return raw if kind is None else pa.CompressedInputStream(raw, kind)
 
 
 class _Text(NamedTuple):
-    """A text file: its ``content`` in UTF-8, made from ``raw``; ``row`` is that of its first values.
+    """A text file: its ``content`` in UTF-8; ``row`` is that of its first values.
 
     Decimal signs are ``commas`` where those are more, and do not separate columns.
     """
 
     content: Any
-    raw: Any
     names: list[str]
     delimiter: str
     commas: bool
@@ -253,11 +214,11 @@ class _Text(NamedTuple):
     @classmethod
     def of(cls, path: Path, mapping: Mapping) -> _Text:
         """Find out how a file is written; what is no text is refused by its kind (`TrajectoryError`)."""
-        sample = _unpacked(path)[0].read(SAMPLE)
+        sample = _unpacked(path).read(SAMPLE)
         for magic, kind in FOREIGN.items():
             if sample.startswith(magic):
                 raise TrajectoryError(str(path), kind, "a CSV or Parquet file", "Unpack or convert it.")
-        content, raw = _unpacked(path)
+        content = _unpacked(path)
         if sample.startswith(UTF_16):
             sample = content.read().decode("utf-16").encode()
             content = pa.BufferReader(sample)
@@ -278,7 +239,7 @@ class _Text(NamedTuple):
             mend = "Add a header; or list the names in a mapping (header: [vehicle_id, time_s, …])."
             raise TrajectoryError(str(path), found, "names of columns in the first row", mend)
         commas = delimiter != "," and marks[0] > marks[1]
-        return cls(content, raw, names if headed else mapping.header, delimiter, commas, 1 + headed)
+        return cls(content, names if headed else mapping.header, delimiter, commas, 1 + headed)
 
 
 def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, str]:
@@ -297,9 +258,7 @@ def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, st
         elif column in NEEDED or (column in mapping.columns and column != "recording_id"):
             known = {} if mapping.columns else {"xvelocity": "highd", "local_y": "ngsim"}
             of = [f"Is it a file for --mapping {known[name]}?" for name in lower if name in known]
-            unused = [name for name in names if name.lower() not in _asked(mapping)]
-            other = f"Is it one of these: {', '.join(unused[:12])}?" if wanted != column and unused else ""
-            mend = of[0] if of else did_you_mean(wanted, names) or other or NO_COLUMN[column == "length_m"]
+            mend = of[0] if of else did_you_mean(wanted, names) or NO_COLUMN[column == "length_m"]
             what = f"a column {wanted}" + (f" for {column}" if wanted != column else "")
             raise TrajectoryError(str(path), f"the columns {', '.join(names)}", what, mend)
     if mapping.classes and "class" not in found and mapping.layout != "highd":
@@ -308,24 +267,19 @@ def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, st
     return found
 
 
-def _asked(mapping: Mapping) -> set[str]:
-    """Names in a file that a mapping reads, in small letters."""
-    return {str(mapping.columns.get(column, column)).lower() for column in (*NEEDED, *OPTIONAL)}
-
-
 def _renamed(
-    batch: Any, columns: dict[str, str], first: int, path: Path, mapping: Mapping, *, commas: bool = False
+    table: Any, columns: dict[str, str], first: int, path: Path, mapping: Mapping, *, commas: bool = False
 ) -> pd.DataFrame:
-    """Rows of a batch by the names of the input table, constants filled in."""
+    """Rows of a table by the names of the input table, constants filled in."""
     data: dict[str, Any] = {}
     for column, name in columns.items():
-        values = batch.column(name)
+        values = table.column(name)
         if column in NAMES:
             text = values.cast(pa.string()).fill_null("")
             if column in ("recording_id", "vehicle_id") and (i := text.index("").as_py()) >= 0:
                 where, mend = f"{path}, row {first + i}, {name}", "Fill it in, or delete the row."
                 raise TrajectoryError(where, "nothing", "an identifier in every row", mend)
-            data[column] = pd.arrays.ArrowExtensionArray(pa.chunked_array([text]))
+            data[column] = pd.arrays.ArrowExtensionArray(text)
         elif column == "lane" and mapping.lane_names:
             order = {lane: i for i, lane in enumerate(mapping.lane_names)}
             data[column] = values.cast(pa.string()).to_pandas().map(order).fillna(-1)  # others are left out
@@ -347,7 +301,7 @@ def _numbers(values: Any, name: str, first: int, path: Path, *, commas: bool) ->
         if commas:  # points beside them may be those of thousands
             text = pc.replace_substring(pc.replace_substring(text, ".", "?"), ",", ".")
     try:
-        return np.asarray(text.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False))
+        return np.asarray(text.cast(pa.float64(), safe=False).to_numpy())
     except pa.ArrowException:
         if not is_text:
             found, mend = f"values of type {values.type}", "Write the column as numbers."
