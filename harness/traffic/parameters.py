@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Collection, Mapping, Sequence
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -14,8 +15,9 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
-from harness.campaign.problems import broken_rule
+from harness.campaign.problems import broken_rule, describe_found
 from harness.campaign.sections import Section
+from harness.campaign.yaml_text import read_yaml
 from harness.numbers import plain
 from harness.traffic.lateral import LateralMotion, constant_lead, log_normal_speed
 from harness.traffic.laws import Wish
@@ -346,6 +348,11 @@ class Replicates(Section):
     sha256: str
 
 
+@cache
+def _shipped(name: str) -> dict[str, Any]:
+    return read_yaml(SHIPPED_FOLDER / f"{name}.yaml")[0]
+
+
 class EnvironmentParameters(Section):
     """All numbers of the environment."""
 
@@ -362,6 +369,22 @@ class EnvironmentParameters(Section):
     acceptance_steps: AcceptanceSteps | None = None
     lateral: Lateral | None = None
     replicates: Replicates | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_those_that_it_is_like(cls, given: Any) -> Any:
+        """Numbers and sections that are not given are those of the environment that ``like`` names."""
+        if not isinstance(given, dict) or "like" not in given:
+            return given
+        shipped = sorted(file.stem for file in SHIPPED_FOLDER.glob("*.yaml"))
+        if given["like"] not in shipped:
+            found = describe_found(given["like"])
+            raise broken_rule("like", found, f"one of {', '.join(shipped)}", "Name one, or write all numbers.")
+        whole = dict(cls._with_those_that_it_is_like(_shipped(given["like"])))
+        for key, of in given.items():
+            both = isinstance(of, dict) and isinstance(whole.get(key), dict)
+            whole[key] = {**whole[key], **of} if both else of
+        return {key: of for key, of in whole.items() if key != "like"}
 
     @model_validator(mode="after")
     def _one_law_each(self) -> Self:
