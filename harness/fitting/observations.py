@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from harness.errors import TrajectoryError
-from harness.fitting.recording import Recording
+from harness.fitting.recording import ONE_CLOCK, Recording
 from harness.fitting.table import Mapping, recordings
 from harness.fitting.tracks import USUAL_RANGE, FitRange, Scene, States, Track, durations_s, noise_of, slopes, track_of
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
@@ -83,8 +83,6 @@ class Tally(NamedTuple):
     overlapping_rears_s: float = 0.0
     """The same, if positions were those of front or rear bumpers."""
     first_overlap: str = ""
-    own_clocks: int = 0
-    """Recordings all of whose vehicles begin at the same time."""
     flickers: int = 0
     changes: int = 0
     """Lane changes to the target lane."""
@@ -210,7 +208,6 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         overlapping_fronts_s=float(duration_s[state.follows & (state.r1 + longer < OVERLAP_M)].sum()),
         overlapping_rears_s=float(duration_s[state.follows & (state.r1 - longer < OVERLAP_M)].sum()),
         first_overlap=_overlap(recording, rows, state, overlaps),
-        own_clocks=int(track.vehicle[-1] > 0 and (track.frame[track.begins()] == track.frame.min()).all()),
         flickers=flickers,
         changes=changes.size,
         used=int((state.at_risk & crosses).sum()),
@@ -356,8 +353,9 @@ def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) 
     total = functools.reduce(Tally.plus, (each.tally for each in found), Tally())
 
     def refuse(words: str, expected: str, mend: str, column: str = "", most: str = "") -> TrajectoryError:
-        if most and len(found) > 1:
-            name = max(found, key=lambda each: float(getattr(each.tally, most))).recording
+        largest = max(found, key=lambda each: float(getattr(each.tally, most or "used")))
+        if most and len(found) > 1 and getattr(largest.tally, most) > 0.5 * getattr(total, most):
+            name = largest.recording
             words, mend = f"{words}; most of it in recording {name}", f"{mend} Or leave it out: --leave-out '{name}'."
         return TrajectoryError(f"{where}, {column}" if column else where, words, expected, mend)
 
@@ -414,5 +412,4 @@ def _how_they_overlap(total: Tally) -> str:
         return "Positions seem to be front bumpers': set origin: front in a mapping (or centre, if it says rear)."
     if total.overlapping_rears_s < 0.2 * total.overlapping_s:
         return "Positions seem to be rear bumpers': set origin: rear in a mapping (or centre, if it says front)."
-    mend = "Check lengths, and that lanes and positions are of the same time; or do several recordings share a name?"
-    return f"If times begin anew with each vehicle, use one clock for all. {mend}" if total.own_clocks else mend
+    return f"Check lengths, and that lanes and positions are of the same time. {ONE_CLOCK}"

@@ -19,6 +19,7 @@ UNITS: dict[Unit, float] = dict(
 NAMES = ["recording_id", "vehicle_id", "class", "direction"]
 """Columns that are read as text."""
 NO_LENGTH = "Gaps need lengths: correct them, or give one for all in a mapping (columns: {length_m: 4.6})."
+ONE_CLOCK = "Do several recordings share a name, or do times begin anew with each vehicle? Use one clock for all."
 CORRECT = "Correct the value, or delete the row."
 SLOWEST_HZ = 9.5
 FASTEST_MEDIAN_MPS = 70.0
@@ -67,7 +68,7 @@ NUMBERS = tuple(
 WHOLE_LANE = Rule("lane", lambda x: x % 1 == 0, "{:g}", "a whole number", "Number the lanes by whole numbers.")
 SOME_LENGTH = Rule("length_m", lambda x: x > 0.0, "no length", "a length above 0 m", NO_LENGTH)
 NEAR_TIME = _near("time_s", 1e7)
-NEAR = _near("s_m", 1e5), _near("lane", 1e3), _near("length_m", 50.0)
+NEAR = _near("s_m", 1e5), _near("lane", 20), _near("length_m", 50.0)
 
 
 def require(rule: Rule, rows: pd.DataFrame, where: Callable[[int], str]) -> None:
@@ -147,6 +148,9 @@ def recording_of(name: str, file: str, rows: pd.DataFrame, share_read: float) ->
         mend = "Interpolate all vehicles to the same times."
         raise TrajectoryError(recording.where(np.argmax(odd)), found, "times in equal steps", mend)
     rows["frame"] = frame + round(time_s.min() * rate)
+    if (same_place := rows.duplicated(["frame", "road", "lane", "s_m"]).to_numpy()).any():
+        where = recording.where(np.argmax(same_place))
+        raise TrajectoryError(where, "the time, lane and s_m of another vehicle", "one at a place", ONE_CLOCK)
     recording = replace(recording, rate_hz=rate)
     _check_motion(recording)
     return recording
@@ -198,7 +202,7 @@ def _check_motion(recording: Recording) -> None:
     dt = (frame[step + 1] - frame[step]) / rate
     off = np.abs(np.diff(v))[step] > JUMP_MPS + HARDEST_MPS2 * dt
     _require_agreement(recording, step[off], 1, "speed_mps")
-    off = np.abs(np.diff(s) - np.diff(driven_m) / ratio)[step] > OFF_IN_STEP_M + HARDEST_MPS2 / 8.0 * dt * dt
+    off = np.abs(np.diff(s) - np.diff(driven_m) / ratio)[step] > OFF_IN_STEP_M + JUMP_MPS * dt
     _require_agreement(recording, step[off], 1, "s_m", driven_m / ratio)
     off = np.abs(way_m - of_speeds_m / ratio) > OFF_IN_SECOND_M
     _require_agreement(recording, begin[off], n, "s_m", driven_m / ratio)

@@ -52,10 +52,6 @@ class Track(NamedTuple):
         """Frames per second, rounded."""
         return round(self.rate_hz)
 
-    def begins(self) -> IntArray:
-        """First rows of vehicles."""
-        return np.flatnonzero(np.diff(self.vehicle, prepend=-1))
-
     def crosses(self, side: int) -> BoolArray:
         """Rows (n,) after which the vehicle is in the next lane."""
         same = np.diff(self.piece, append=-1) == 0

@@ -102,7 +102,7 @@ REFUSED = {
         lambda: pd.concat([ROWS, ROWS.assign(vehicle_id=ROWS.vehicle_id + 5, s_m=ROWS.s_m + 2)]).sort_values(
             "recording_id"
         ),
-        "do several recordings share a name",
+        "Do several recordings share a name",
     ),
     "ft/s as km/h": (changed(speed_mps=ROWS.speed_mps * FEET / 3.6), r"speeds in ft/s read as km/h.*speed_mps: km/h"),
     "one lane": (changed(lane=0), "no vehicle with another lane beside it"),
@@ -143,6 +143,11 @@ REFUSED = {
     "the end of time": (with_value(7, "time_s", 1e12), r"row 8 .*found time_s 1e\+12"),
     "far away": (with_value(7, "s_m", 1e12), r"row 8 .*found s_m 1e\+12"),
     "lanes": (with_value(7, "lane", 1e12), r"row 8 .*found lane 1e\+12"),
+    "another time": (with_value(7, "time_s", -38.5), r"row 8 .*found s_m"),
+    "a lane of its own": (
+        changed(lane=ROWS.lane.where(ROWS.recording_id > 0, 40 * ROWS.vehicle_id)),
+        r"found lane \d+",
+    ),
     "long": (with_value(7, "length_m", 70.0), r"row 8 .*found length_m 70"),
     "one recording stands still": (
         changed(
@@ -150,11 +155,15 @@ REFUSED = {
                 ROWS.recording_id != 3, ROWS.groupby(["recording_id", "vehicle_id"]).s_m.transform("first")
             )
         ),
-        r"of recording 3, t = 0 s\): found s_m 0, and 0 in row 4709, where speeds say 3.* such pairs of rows",
+        r"of recording 3, t = 0 s\): found s_m -40, and -40 in row 4981, where speeds say -36.* such pairs of rows",
     ),
     "all stand still": (
         changed(s_m=ROWS.groupby(["recording_id", "vehicle_id"]).s_m.transform("first")),
-        r"row 567 .*found s_m -40, and -40 in row 568",
+        r"row 1 .*found s_m 60, and 60 in row 11, where speeds say 8",
+    ),
+    "a vehicle twice": (
+        lambda: pd.concat([ROWS, ROWS[(ROWS.vehicle_id == 1) & (ROWS.recording_id == 3)].assign(vehicle_id=9)]),
+        "vehicle 9 of recording 3, t = 0 s.: found the time, lane and s_m of another vehicle",
     ),
     "one twice": (
         lambda: pd.concat([ROWS, ROWS[ROWS.recording_id == 3].assign(recording_id="3 b")]).astype(
