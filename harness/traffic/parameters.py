@@ -350,7 +350,22 @@ class Replicates(Section):
 
 @cache
 def _shipped(name: str) -> dict[str, Any]:
-    return read_yaml(SHIPPED_FOLDER / f"{name}.yaml")[0]
+    return _completed(read_yaml(SHIPPED_FOLDER / f"{name}.yaml")[0])
+
+
+def _completed(given: dict[str, Any]) -> dict[str, Any]:
+    """What a file says, with numbers and sections that it leaves out as in the environment that it is ``like``."""
+    if "like" not in given:
+        return given
+    shipped = sorted(file.stem for file in SHIPPED_FOLDER.glob("*.yaml"))
+    if given["like"] not in shipped:
+        found, expected = describe_found(given["like"]), f"one of {', '.join(shipped)}"
+        raise broken_rule("like", found, expected, "Name one, or write all numbers.")
+    whole = dict(_shipped(given["like"]))
+    for key, of in given.items():
+        both = isinstance(of, dict) and isinstance(whole.get(key), dict)
+        whole[key] = {**whole[key], **of} if both else of
+    return {key: of for key, of in whole.items() if key != "like"}
 
 
 class EnvironmentParameters(Section):
@@ -372,19 +387,8 @@ class EnvironmentParameters(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _with_those_that_it_is_like(cls, given: Any) -> Any:
-        """Numbers and sections that are not given are those of the environment that ``like`` names."""
-        if not isinstance(given, dict) or "like" not in given:
-            return given
-        shipped = sorted(file.stem for file in SHIPPED_FOLDER.glob("*.yaml"))
-        if given["like"] not in shipped:
-            found = describe_found(given["like"])
-            raise broken_rule("like", found, f"one of {', '.join(shipped)}", "Name one, or write all numbers.")
-        whole = dict(cls._with_those_that_it_is_like(_shipped(given["like"])))
-        for key, of in given.items():
-            both = isinstance(of, dict) and isinstance(whole.get(key), dict)
-            whole[key] = {**whole[key], **of} if both else of
-        return {key: of for key, of in whole.items() if key != "like"}
+    def _is_like_another(cls, given: Any) -> Any:
+        return _completed(given) if isinstance(given, dict) else given
 
     @model_validator(mode="after")
     def _one_law_each(self) -> Self:
