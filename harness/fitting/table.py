@@ -219,6 +219,13 @@ class _Text(NamedTuple):
             if sample.startswith(magic):
                 raise TrajectoryError(str(path), kind, "a CSV or Parquet file", "Unpack or convert it.")
         content = _unpacked(path)
+        if isinstance(content, pa.OSFile) and sample:
+            content.seek(max(content.size() - 2, 0))  # of a character in UTF-16, too
+            last = content.read()
+            content.seek(0)
+            if not last.rstrip(b"\0").endswith((b"\n", b"\r")):
+                mend = "Copy it again; or, if it is complete, end it with a newline."
+                raise TrajectoryError(str(path), "a last row that does not end: a part of a file", "whole rows", mend)
         if sample.startswith(UTF_16):
             sample = content.read().decode("utf-16").encode()
             content = pa.BufferReader(sample)

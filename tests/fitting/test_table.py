@@ -219,6 +219,7 @@ FILES = {
     "latin.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n\xfcber,0,0,30,0,5\n", "text in UTF-8"),
     "book.csv": (b"PK\x03\x04\x14\x00", "found a ZIP archive, or an Excel workbook"),
     "cut.csv": (gzip.compress(ROWS.to_csv(index=False).encode())[:-2000], "cannot be read"),
+    "part.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,0,4.", "a last row that does not end"),
     "headless.csv": (b"1,0,0,30,0,5\n1,0.1,3,30,0,5\n", r"numbers in place of a header: 6 columns.*header: \["),
 }
 
