@@ -32,7 +32,7 @@ from harness.estimators.traffic import ONE_LAW
 from harness.files import write_atomically
 from harness.fitting.fit import fit_traffic
 from harness.fitting.laws import KINDS, TTC_EDGES_S, Traffic
-from harness.fitting.observations import Tally, observations, require_enough
+from harness.fitting.observations import observations, require_enough
 from harness.fitting.table import load_mapping
 from harness.fitting.uncertainty import replicates
 from harness.pool.build import take_aim
@@ -448,8 +448,8 @@ def misread() -> dict[str, str]:
             path = Path(folder, "trajectories.parquet")
             write(wrong(table), path)
             try:
-                tally = functools.reduce(Tally.plus, (each.tally for each, _ in observations([path], load_mapping())))
-                require_enough(tally, path.name, load_mapping())
+                found_in = [each for each, _ in observations([path], load_mapping())]
+                require_enough(found_in, path.name, load_mapping())
                 found[name] = "not noticed"
             except TrajectoryError as error:
                 found[name] = error.found

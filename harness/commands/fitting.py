@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -23,18 +24,24 @@ from harness.commands.printing import print_json, say
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", type=FILE, required=True, callback=written_file(".yaml"), help="Environment file to write.")
 @click.option("--mapping", metavar="highd|ngsim|FILE.yaml", help="How to read columns that differ from these.")
-@click.option("--mirror", is_flag=True, help="Fit lane changes to the left: vehicles close in from behind there.")
+@click.option(
+    "--mirror/--no-mirror", default=None, help="Fit lane changes to the left: vehicles close in there, or not."
+)
+@click.option("--leave-out", multiple=True, metavar="NAME", help="A recording that is not fitted; also several times.")
 @click.option("--replicates", type=click.IntRange(min=2), default=200, show_default=True, help="Environments to draw.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the replicates.")
+@click.option("--force", is_flag=True, help="Write over files that no fit has written.")
 @json_option
 def fit(
     files: Sequence[Path],
     out: Path,
     *,
     mapping: str | None,
-    mirror: bool,
+    mirror: bool | None,
+    leave_out: Sequence[str],
     replicates: int,
     seed: int,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Fit the traffic's laws to trajectories in CSV or Parquet FILEs, and write an environment file.
@@ -51,9 +58,8 @@ def fit(
     from harness.fitting.page import CONFIDENCE  # noqa: PLC0415 - keeps --help fast
 
     with progress_bar() as bar:
-        found = fit_files(
-            files, out, mapping=mapping, mirror=mirror or None, n_replicates=replicates, seed=seed, progress=bar
-        )
+        given: dict[str, Any] = {"mapping": mapping, "mirror": mirror, "leave_out": leave_out, "force": force}
+        found = fit_files(files, out, n_replicates=replicates, seed=seed, progress=bar, **given)
     written = [str(found.environment), str(found.page), str(found.replicates)]
     if as_json:
         print_json({"files": written, **found.facts})

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,18 +15,21 @@ import yaml
 
 from harness.campaign.files import read_model
 from harness.campaign.yaml_text import yaml_text
-from harness.errors import HarnessError, TrajectoryError, printable
+from harness.errors import HarnessError, printable
 from harness.fitting.fit import Fit, fit_traffic
 from harness.fitting.laws import Traffic
-from harness.fitting.observations import Observations, Tally, observations, require_enough
+from harness.fitting.observations import Observations, Tally, observations, require_distinct, require_enough
 from harness.fitting.page import page
-from harness.fitting.table import load_mapping
+from harness.fitting.table import Mapping as Columns
+from harness.fitting.table import load_mapping, places
 from harness.fitting.tracks import FitRange
 from harness.fitting.uncertainty import REPLICATES, replicates
 from harness.progress import Progress
 from harness.records.folder import parquet, require_place, write_together
-from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
+from harness.traffic.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
 
+OF_YAML, OF_PAGE = b"Traffic fitted by harness", b"Traffic fitted to trajectories"
+"""What marks files that a fit has written."""
 BASE = "ndd-overtaking-2"
 """Numbers that are not fitted are taken from it."""
 SEED = 1
@@ -66,29 +70,25 @@ def fit_files(
     *,
     mapping: str | None = None,
     mirror: bool | None = None,
+    leave_out: Sequence[str] = (),
     n_replicates: int = REPLICATES,
     seed: int = SEED,
+    force: bool = False,
     progress: Progress | None = None,
 ) -> FittedFiles:
     """Fit traffic to trajectories and write it: ``out`` (YAML), and beside it its replicates and a page.
 
-    ``mapping`` is ``highd``, ``ngsim`` or a YAML file; ``mirror``, if given, takes the place of what it says. The same
+    ``mapping`` is ``highd``, ``ngsim`` or a YAML file; ``mirror``, if given, takes the place of what it says, and
+    recordings to ``leave_out`` are added to its own. Files that no fit has written stay, unless ``force``. The same
     files and seed give the same bytes.
 
     Raises `HarnessError`: a file, its mapping or what was read cannot be used, or ``out`` cannot be written.
     """
     progress, out = progress or Progress(), Path(out)
     paths = [Path(file) for file in files]
-    read, where = load_mapping(mapping, mirror=mirror), ", ".join(map(str, paths))
+    read, where = load_mapping(mapping, mirror=mirror, leave_out=leave_out), places(paths)
     beside, shown = out.with_name(f"{out.stem}.replicates.parquet"), out.with_suffix(".html")
-    inputs = {path.resolve() for path in paths}
-    if len(inputs) < len(paths):
-        raise TrajectoryError(where, "a file that is named twice", "each file once", "Leave one of them out.")
-    for path in (out, beside, shown):
-        if path.resolve() in inputs | {Path(mapping or ".").resolve()}:
-            raise HarnessError(
-                f"--out {out}", f"{path}, which is also an input", "another file", "Choose another name."
-            )
+    _require_ours({out: OF_YAML, beside: OF_REPLICATES, shown: OF_PAGE}, [*paths, Path(mapping or ".")], force=force)
     require_place(out.parent)
     base = read_model(SHIPPED_FOLDER / f"{BASE}.yaml", EnvironmentParameters)
     numbers = base.values()
@@ -96,34 +96,57 @@ def fit_files(
 
     progress.stage("reading trajectories", 1000)
     gathered: list[Observations] = []
-    tally, done = Tally(), 0
+    done = 0
     for each, share in observations(paths, read, fit_range):
         gathered.append(each)
-        tally = tally.plus(each.tally)
         progress.advance(round(1000 * share) - done)
         done = round(1000 * share)
-    require_enough(tally, where, read)
+    require_distinct(gathered)
+    tally = require_enough(gathered, where, read)
     fit = fit_traffic(Traffic.of(gathered), base, BASE, where, progress)
     rows = replicates(fit, n_replicates, seed, progress)
 
     noise_mps2 = math.sqrt(math.fsum(each.noise_mps2**2 for each in gathered) / len(gathered))
-    environment = _yaml(fit, tally, paths, beside.name, mapping, read.mirror)
+    drawn = parquet(pa.table(rows, metadata={OF_REPLICATES: fit.environment.content_hash()}))
+    tied = {"file": beside.name, "sha256": content_hash(drawn)}
+    environment = _yaml(fit, tally, paths, tied, mapping, read)
     text = page(fit, tally, noise_mps2, rows, out.name, paths)
-    write_together({out: environment.encode(), beside: parquet(pa.table(rows)), shown: text.encode()})
+    write_together({out: environment.encode(), beside: drawn, shown: text.encode()})
     return FittedFiles(out, beside, shown, fit, tally)
 
 
-def _yaml(fit: Fit, tally: Tally, files: Sequence[Path], beside: str, mapping: str | None, mirrored: bool) -> str:
+def _require_ours(written: Mapping[Path, bytes], inputs: Sequence[Path], *, force: bool) -> None:
+    """Refuse to write over an input, or over what has not the mark of a file that a fit has written."""
+    for path, mark in written.items():
+        where = f"--out {next(iter(written))}"
+        if os.path.realpath(path) in map(os.path.realpath, inputs):
+            raise HarnessError(where, f"{path}, which is also an input", "another file", "Choose another name.")
+        if path.is_dir() or (not force and not _may_replace(path, mark)):
+            found = f"{path}, which harness fit has not written"
+            raise HarnessError(where, found, "a new file, or one of a fit", "Choose another name, or give --force.")
+
+
+def _may_replace(path: Path, mark: bytes) -> bool:
+    try:
+        return mark in path.read_bytes()
+    except OSError:
+        return not os.path.lexists(path)
+
+
+def _yaml(
+    fit: Fit, tally: Tally, files: Sequence[Path], tied: dict[str, str], mapping: str | None, read: Columns
+) -> str:
     """The environment file: its provenance, then one number per line."""
     from importlib.metadata import version  # noqa: PLC0415 - takes a while
 
     clusters = "recording" if fit.traffic.by_recording else "vehicle, as recordings are few"
     lines = [
-        f"Traffic fitted by harness {version('harness')} to {fit.traffic.n_recordings} recordings: "
+        f"{OF_YAML.decode()} {version('harness')} to {fit.traffic.n_recordings} recordings: "
         f"{tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the target lane,",
         f"{tally.used} lane changes to it. Standard errors (se) and replicates are by {clusters}.",
         f"Numbers that are not fitted are those of {fit.base_name}. Use lane_change_level 1 with this traffic.",
-        f"mapping: {mapping or 'that of the input table'}{', mirrored' if mirrored else ''}",
+        f"mapping: {mapping or 'that of the input table'}{', mirrored' if read.mirror else ''}",
+        *(f"left out: {name}" for name in read.leave_out),
         *(f"sha256 {_sha256(file)} {file.name}" for file in files),
     ]
     text = "".join(f"# {printable(' '.join(line.split()))}\n" for line in lines)
@@ -137,7 +160,7 @@ def _yaml(fit: Fit, tally: Tally, files: Sequence[Path], beside: str, mapping: s
                 text += f"  {key}:\n" + "".join(f"    - {_flow(each)}\n" for each in number)
             else:
                 text += f"  {key}: {_flow(number)}\n"
-    return f"{text}\n{yaml_text({'replicates': beside})}"
+    return f"{text}\n{yaml_text({'replicates': tied})}"
 
 
 def _flow(value: Any) -> str:

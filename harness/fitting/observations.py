@@ -11,15 +11,18 @@ row stands for the time nearest to it.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from harness.errors import TrajectoryError
-from harness.fitting.table import Mapping, Recording, recordings
+from harness.fitting.recording import ONE_CLOCK, Recording
+from harness.fitting.table import Mapping, recordings
 from harness.fitting.tracks import USUAL_RANGE, FitRange, Scene, States, Track, durations_s, noise_of, slopes, track_of
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
@@ -55,6 +58,9 @@ MOST_OVERLAPPING = 0.005
 MOST_OUTSIDE = 0.5
 FEWEST_CHANGES = 20
 LEAST_CLOSING_S = 1.0
+ONE_OF = 8
+MOST_SHARED = 0.1
+"""Share of the rows of a recording that may be in another one by chance [assumed]."""
 OTHER_SIDE = 10.0
 """If vehicles close in this many times as long on the other side, that side must be meant."""
 
@@ -77,8 +83,6 @@ class Tally(NamedTuple):
     overlapping_rears_s: float = 0.0
     """The same, if positions were those of front or rear bumpers."""
     first_overlap: str = ""
-    own_clocks: int = 0
-    """Recordings all of whose vehicles begin at the same time."""
     flickers: int = 0
     changes: int = 0
     """Lane changes to the target lane."""
@@ -129,6 +133,10 @@ class Observations:
         Standard deviation of ``acceleration_mps2`` by white measurement noise.
     tally : Tally
         Counts for `require_enough`.
+    place : str
+        File and recording, for messages.
+    marks : IntArray
+        Hashes (m,) of a part of the rows, the same ones in a copy of them.
     """
 
     recording: str
@@ -139,6 +147,8 @@ class Observations:
     leads: RecordArray
     noise_mps2: float = 0.0
     tally: Tally = field(default_factory=Tally)
+    place: str = ""
+    marks: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 def observations(
@@ -198,7 +208,6 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         overlapping_fronts_s=float(duration_s[state.follows & (state.r1 + longer < OVERLAP_M)].sum()),
         overlapping_rears_s=float(duration_s[state.follows & (state.r1 - longer < OVERLAP_M)].sum()),
         first_overlap=_overlap(recording, rows, state, overlaps),
-        own_clocks=int(track.vehicle[-1] > 0 and (track.frame[track.begins()] == track.frame.min()).all()),
         flickers=flickers,
         changes=changes.size,
         used=int((state.at_risk & crosses).sum()),
@@ -217,7 +226,32 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         leads,
         noise_of(track),
         tally,
+        recording.place,
+        _marks(track),
     )
+
+
+def _marks(track: Track) -> IntArray:
+    """Hashes of one row in `ONE_OF`, by what it says of a vehicle, whatever clock, order and identifiers there are."""
+    state = np.rint(np.column_stack([track.s * 1e3, track.v * 1e3, track.length * 1e2])).astype(np.int64)
+    of_row = pd.util.hash_pandas_object(pd.DataFrame(state), index=False).to_numpy()
+    return np.unique(of_row[of_row % ONE_OF == 0]).astype(np.int64)
+
+
+def require_distinct(found: Sequence[Observations]) -> None:
+    """Refuse a recording that has come before, under whatever name, or a notable part of one (`TrajectoryError`)."""
+    sizes = [each.marks.size for each in found]
+    marks, of = np.concatenate([each.marks for each in found]), np.repeat(np.arange(len(found)), sizes)
+    order = np.lexsort((of, marks))
+    marks, of = marks[order], of[order]
+    again = np.flatnonzero(marks[1:] == marks[:-1])
+    pairs, counts = np.unique(np.column_stack([of[again], of[again + 1]]), axis=0, return_counts=True)
+    for (first, second), n in zip(pairs.tolist(), counts.tolist(), strict=True):
+        if n > MOST_SHARED * min(sizes[first], sizes[second]):
+            share = n / min(sizes[first], sizes[second])
+            words = f"{share:.0%} of its rows also in {found[first].place}: positions, speeds and lengths are the same"
+            mend = "Leave one of them out: what comes twice would count twice."
+            raise TrajectoryError(found[second].place, words, "other vehicles, or other times", mend)
 
 
 def _records(dtype: np.dtype[np.void], columns: dict[str, RecordArray], inside: BoolArray) -> RecordArray:
@@ -295,80 +329,87 @@ def _overlap(recording: Recording, rows: IntArray, state: States, overlaps: Bool
 def _other_side(mapping: Mapping) -> str:
     """How to mend lanes or a mirror that are the wrong way round."""
     if mapping.mirror:
-        return "Leave --mirror out (or set mirror: false in the mapping)."
+        return "Give --no-mirror (in a mapping, mirror: false)."
     if isinstance(mapping.lanes, list):
         return "Turn `lanes` of the mapping round: they go from right to left. If they do, set mirror: true (--mirror)."
     other = "from_left" if mapping.lanes == "from_right" else "from_right"
     return f"Set mirror: true in a mapping (or --mirror); or lanes: {other}, if they are numbered so."
 
 
-def require_enough(total: Tally, where: str, mapping: Mapping) -> None:
-    """Refuse recordings that are too few, or that were read wrongly.
+def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) -> Tally:
+    """Refuse recordings that are too few, or that were read wrongly; the sum of their counts.
 
     Parameters
     ----------
-    total : Tally
+    found : sequence of Observations
         Of all recordings.
     where : str
         Files, for messages.
     mapping : Mapping
         How they were read.
 
-    Raises `TrajectoryError`: a rule is broken; it says which.
+    Raises `TrajectoryError`: a rule is broken; it says which, and by which recording most.
     """
+    total = functools.reduce(Tally.plus, (each.tally for each in found), Tally())
+
+    def refuse(words: str, expected: str, mend: str, column: str = "", most: str = "") -> TrajectoryError:
+        largest = max(found, key=lambda each: float(getattr(each.tally, most or "used")))
+        if most and len(found) > 1 and getattr(largest.tally, most) > 0.5 * getattr(total, most):
+            name = largest.recording
+            words, mend = f"{words}; most of it in recording {name}", f"{mend} Or leave it out: --leave-out '{name}'."
+        return TrajectoryError(f"{where}, {column}" if column else where, words, expected, mend)
+
     if total.recorded <= total.recordings:
-        found = "only one vehicle" + (" in each recording" if total.recordings > 1 else "")
-        mend = "Check the columns vehicle_id and recording_id."
-        raise TrajectoryError(where, found, "the vehicles around it as well", mend)
+        words = "only one vehicle" + (" in each recording" if total.recordings > 1 else "")
+        raise refuse(words, "the vehicles around it as well", "Check the columns vehicle_id and recording_id.")
     side = _other_side(mapping)
     if total.driven_s == 0.0:
-        found, expected = "no vehicle with another lane beside it, on the side where vehicles close in", "lanes 0, 1, …"
-        raise TrajectoryError(f"{where}, lane", found, expected, f"Check the column of lanes. {side}")
+        words = "no vehicle with another lane beside it, on the side where vehicles close in"
+        raise refuse(words, "lanes 0, 1, …", f"Check the column of lanes. {side}", "lane")
     if total.overlapping_s > MOST_OVERLAPPING * total.followed_s:
-        share = total.overlapping_s / total.followed_s
-        mend = (
-            "Check lengths, and that lanes and positions are of the same time; or do several recordings share a name?"
-        )
-        if total.overlapping_fronts_s < 0.2 * total.overlapping_s:
-            mend = "Positions seem to be front bumpers': set origin: front in a mapping (or centre, if it says rear)."
-        elif total.overlapping_rears_s < 0.2 * total.overlapping_s:
-            mend = "Positions seem to be rear bumpers': set origin: rear in a mapping (or centre, if it says front)."
-        elif total.own_clocks:
-            mend = f"If times begin anew with each vehicle, use one clock for all. {mend}"
-        found = f"vehicles that overlap in {share:.1%} of the time; first {total.first_overlap}"
-        raise TrajectoryError(where, found, f"at most {MOST_OVERLAPPING:.1%}", mend)
+        share, expected = total.overlapping_s / total.followed_s, f"at most {MOST_OVERLAPPING:.1%}"
+        words = f"vehicles that overlap in {share:.1%} of the time; first {total.first_overlap}"
+        raise refuse(words, expected, _how_they_overlap(total), most="overlapping_s")
     if total.flickers > max(total.changes, FEWEST_CHANGES):
-        found = f"lanes that come back within a second {total.flickers:,} times, against {total.changes:,} lane changes"
-        mend = "Smooth lanes, or take them from lateral positions."
-        raise TrajectoryError(f"{where}, lane", found, "fewer", mend)
+        words = f"lanes that come back within a second {total.flickers:,} times, against {total.changes:,} lane changes"
+        raise refuse(words, "fewer", "Smooth lanes, or take them from lateral positions.", "lane", "flickers")
     how = {
-        "without lateral motion": total.straight,
-        "more than 0.8 s from the lane's marking": total.shifted,
-        "in one jump of lateral_m, as of a lane's middle": total.jumping,
+        "straight": "without lateral motion",
+        "shifted": "more than 0.8 s from the lane's marking",
+        "jumping": "in one jump of lateral_m, as of a lane's middle",
     }
-    odd = max(how, key=how.__getitem__)
-    if how[odd] > 0.5 * total.changes:
-        found = f"{how[odd]:,} of {total.changes:,} lane changes {odd}"
+    odd = max(how, key=lambda each: int(getattr(total, each)))
+    if (n := getattr(total, odd)) > 0.5 * total.changes:
+        words = f"{n:,} of {total.changes:,} lane changes {how[odd]}"
         mend = "Correct the shift between lanes and lateral positions, or leave out lateral_m."
-        raise TrajectoryError(f"{where}, lane", found, "lane and lateral_m of the same time", mend)
+        raise refuse(words, "lane and lateral_m of the same time", mend, "lane", odd)
     if total.outside_s > MOST_OUTSIDE * total.driven_s:
-        found = f"{total.outside_s / total.driven_s:.0%} of the time at speeds outside the fit range"
+        words = f"{total.outside_s / total.driven_s:.0%} of the time at speeds outside the fit range"
         mend = "Use recordings of flowing traffic: laws are fitted at 20 to 40 m/s."
-        raise TrajectoryError(f"{where}, speed_mps", found, f"at most {MOST_OUTSIDE:.0%}", mend)
+        raise refuse(words, f"at most {MOST_OUTSIDE:.0%}", mend, "speed_mps", "outside_s")
     if total.closing_s < max(LEAST_CLOSING_S, total.closing_other_s / OTHER_SIDE):
-        found = (
+        words = (
             f"vehicles that close in from behind in the target lane (TTC < 8 s) for {total.closing_s:.0f} s, "
             f"and for {total.closing_other_s:.0f} s in the lane on the other side"
         )
         mend = side if total.closing_other_s > total.closing_s else "Use recordings in which vehicles overtake."
-        raise TrajectoryError(f"{where}, lane", found, "most of it in the target lane", mend)
+        raise refuse(words, "most of it in the target lane", mend, "lane")
     if total.used < FEWEST_CHANGES:
         hours = total.driven_s / 3600.0
-        found = (
+        words = (
             f"{total.used} lane changes to the target lane behind a leader within the fit range (of {total.changes} in "
             f"all), in {hours:.1f} vehicle-hours beside the target lane"
         )
-        enough = (
+        more = (
             f"some {hours * FEWEST_CHANGES / total.used:.2g} such hours are needed" if total.used else "they are rare"
         )
-        raise TrajectoryError(where, found, f"at least {FEWEST_CHANGES}", f"Add recordings: {enough}.")
+        raise refuse(words, f"at least {FEWEST_CHANGES}", f"Add recordings: {more}.")
+    return total
+
+
+def _how_they_overlap(total: Tally) -> str:
+    if total.overlapping_fronts_s < 0.2 * total.overlapping_s:
+        return "Positions seem to be front bumpers': set origin: front in a mapping (or centre, if it says rear)."
+    if total.overlapping_rears_s < 0.2 * total.overlapping_s:
+        return "Positions seem to be rear bumpers': set origin: rear in a mapping (or centre, if it says front)."
+    return f"Check lengths, and that lanes and positions are of the same time. {ONE_CLOCK}"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from harness.fitting.table import Recording
+from harness.fitting.recording import Recording
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 IN_VIEW_M = 100.0
@@ -51,10 +51,6 @@ class Track(NamedTuple):
     def second(self) -> int:
         """Frames per second, rounded."""
         return round(self.rate_hz)
-
-    def begins(self) -> IntArray:
-        """First rows of vehicles."""
-        return np.flatnonzero(np.diff(self.vehicle, prepend=-1))
 
     def crosses(self, side: int) -> BoolArray:
         """Rows (n,) after which the vehicle is in the next lane."""

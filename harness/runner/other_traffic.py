@@ -46,7 +46,14 @@ from harness.runner.stored_shells import (
 from harness.sampling import distance_per_test_m
 from harness.strata import ShellDesign
 from harness.traffic.loading import load_parameters
-from harness.traffic.parameters import SHIPPED_FOLDER, SMALLEST_SHARE, AcceptanceSteps, EnvironmentParameters
+from harness.traffic.parameters import (
+    OF_REPLICATES,
+    SHIPPED_FOLDER,
+    SMALLEST_SHARE,
+    AcceptanceSteps,
+    EnvironmentParameters,
+    content_hash,
+)
 from harness.vocabulary import EstimatorName, FloatArray
 
 NOT_LOOKING = "cut_in__ignore_share"
@@ -291,12 +298,18 @@ def _limited(told: Sequence[Mapping[str, Any]], found: TrafficError) -> list[Map
 def read_replicates(name: str, parameters: EnvironmentParameters) -> list[dict[str, float]]:
     """Numbers that vary, of each replicate that an environment, a shipped name or a file, names.
 
-    Raises `HarnessError`: the file is missing or damaged, or has numbers that the environment does not have.
+    Raises `HarnessError`: the file is missing or damaged, or is not of these numbers.
     """
-    file = shipped_or_own(name, SHIPPED_FOLDER, "environment.parameters")
-    path = file.parent / str(parameters.replicates)
-    again = "Write it anew with `harness fit`, or leave out the key replicates."
+    file, tied = shipped_or_own(name, SHIPPED_FOLDER, "environment.parameters"), parameters.replicates
+    if tied is None:
+        return []
+    path, again = file.parent / tied.file, "Write it anew with `harness fit`, or leave out the key replicates."
     table = read_table(path, mend=again)
+    of, expected = (table.schema.metadata or {}).get(OF_REPLICATES), f"the replicates that {file.name} was written with"
+    if content_hash(path.read_bytes()) != tied.sha256:
+        raise RunFolderError(str(path), "replicates of another fit, or changed ones", expected, again)
+    if of != parameters.content_hash().encode():
+        raise RunFolderError(str(path), f"replicates of other numbers than those of {file.name}", expected, again)
     wrong = [] if table.num_rows else ["no rows"]
     for column, of in zip(table.column_names, table.columns, strict=True):
         if column not in parameters.numbers():

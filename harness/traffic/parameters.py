@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Collection, Mapping, Sequence
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -14,8 +15,9 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
-from harness.campaign.problems import broken_rule
+from harness.campaign.problems import broken_rule, describe_found
 from harness.campaign.sections import Section
+from harness.campaign.yaml_text import read_yaml
 from harness.numbers import plain
 from harness.traffic.lateral import LateralMotion, constant_lead, log_normal_speed
 from harness.traffic.laws import Wish
@@ -335,6 +337,37 @@ class Lateral(Section):
         return log_normal_speed(self.distance_m.value, median, log_sd, longest)
 
 
+OF_REPLICATES = b"harness fit"
+"""Key in the metadata of a file of replicates: hash of the numbers that they belong to."""
+
+
+class Replicates(Section):
+    """Which environments other data of the same kind would have given: a file beside this one, and its hash."""
+
+    file: Annotated[str, Field(pattern=r"^[^\x00-\x1f]+$", examples=["mine.replicates.parquet"])]
+    sha256: str
+
+
+@cache
+def _shipped(name: str) -> dict[str, Any]:
+    return _completed(read_yaml(SHIPPED_FOLDER / f"{name}.yaml")[0])
+
+
+def _completed(given: dict[str, Any]) -> dict[str, Any]:
+    """What a file says, with numbers and sections that it leaves out as in the environment that it is ``like``."""
+    if "like" not in given:
+        return given
+    shipped = sorted(file.stem for file in SHIPPED_FOLDER.glob("*.yaml"))
+    if given["like"] not in shipped:
+        found, expected = describe_found(given["like"]), f"one of {', '.join(shipped)}"
+        raise broken_rule("like", found, expected, "Name one, or write all numbers.")
+    whole = dict(_shipped(given["like"]))
+    for key, of in given.items():
+        both = isinstance(of, dict) and isinstance(whole.get(key), dict)
+        whole[key] = {**whole[key], **of} if both else of
+    return {key: of for key, of in whole.items() if key != "like"}
+
+
 class EnvironmentParameters(Section):
     """All numbers of the environment."""
 
@@ -350,7 +383,12 @@ class EnvironmentParameters(Section):
     hazard_table: HazardTable | None = None
     acceptance_steps: AcceptanceSteps | None = None
     lateral: Lateral | None = None
-    replicates: str | None = None
+    replicates: Replicates | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_like_another(cls, given: Any) -> Any:
+        return _completed(given) if isinstance(given, dict) else given
 
     @model_validator(mode="after")
     def _one_law_each(self) -> Self:
@@ -426,7 +464,12 @@ class EnvironmentParameters(Section):
 
     def content_hash(self) -> str:
         """Hash of the numbers alone: a corrected note does not change a campaign."""
-        return hashlib.sha256(json.dumps(self.values(), sort_keys=True).encode()).hexdigest()[:16]
+        return content_hash(json.dumps(self.values(), sort_keys=True).encode())
+
+
+def content_hash(content: bytes) -> str:
+    """Hash of some bytes, as files name it."""
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: float, hold_s: float) -> Record:

@@ -1,7 +1,9 @@
 """`harness fit` from end to end: what it writes, and what it refuses before it reads."""
 
 import json
+import os
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -65,7 +67,6 @@ def test_a_law_with_a_number_that_no_environment_allows_is_named(tmp_path, monke
 @pytest.mark.parametrize(
     ("files", "out", "found"),
     [
-        (["rows.csv", "./rows.csv"], "mine.yaml", "a file that is named twice"),
         (["mine.replicates.parquet"], "mine.yaml", "mine.replicates.parquet, which is also an input"),
         (["rows.csv"], "map.yaml", "map.yaml, which is also an input"),
     ],
@@ -76,3 +77,67 @@ def test_what_is_read_is_neither_counted_twice_nor_written_over(files, out, foun
     with pytest.raises(HarnessError, match=found):
         fit_files(files, out, mapping="map.yaml")
     assert [file.name for file in tmp_path.iterdir()] == ["map.yaml"]
+
+
+@pytest.mark.parametrize("copied", [os.link, os.symlink, shutil.copy])
+def test_a_file_that_comes_twice_is_refused(copied, tmp_path):
+    rows = tmp_path / "rows.parquet"
+    overtaking(2.0).to_parquet(rows, index=False)
+    copied(rows, tmp_path / "b.parquet")
+    with pytest.raises(
+        TrajectoryError, match=r"b\.parquet, recording 0: found 100% of its rows also in .*rows\.parquet, rec"
+    ):
+        fit_files([rows, tmp_path / "b.parquet"], tmp_path / "mine.yaml")
+
+
+def test_what_no_fit_has_written_stays_unless_forced(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    overtaking(2.0).to_parquet("rows.parquet", index=False)
+    command = ["fit", "rows.parquet", "--out", "my.yaml", "--replicates", "2", "--quiet"]
+    for name in ("my.yaml", "my.html", "my.replicates.parquet"):
+        (tmp_path / name).write_text("of my own")
+        assert main(command) == 2
+        assert f"{name}, which harness fit has not written" in capsys.readouterr().err
+        assert (tmp_path / name).read_text() == "of my own"
+        (tmp_path / name).unlink()
+    assert main(command) == main(command) == 0
+    (tmp_path / "my.yaml").write_text("of my own")
+    assert main([*command, "--force"]) == 0
+    assert "of my own" not in (tmp_path / "my.yaml").read_text()
+
+
+def test_replicates_belong_to_one_environment(tmp_path):
+    """Neither those of another fit, nor those of other numbers."""
+    overtaking(2.0).to_parquet(tmp_path / "rows.parquet", index=False)
+    mine, other = (
+        fit_files([tmp_path / "rows.parquet"], tmp_path / f"{i}.yaml", n_replicates=2, seed=i) for i in (1, 2)
+    )
+    text, own = mine.environment.read_text(), mine.replicates.read_bytes()
+
+    def read() -> int:
+        name = str(mine.environment)
+        return len(read_replicates(name, load_parameters(EnvironmentSettings(parameters=name))))
+
+    assert read() == 2
+    mine.replicates.write_bytes(other.replicates.read_bytes())
+    with pytest.raises(HarnessError, match=r"1\.replicates\.parquet: found replicates of another fit, or changed ones"):
+        read()
+    mine.replicates.write_bytes(own)
+    mine.environment.write_text(re.sub(r"v_location_mps: {value: [\d.]+", r"\g<0>1", text))
+    with pytest.raises(HarnessError, match=r"replicates of other numbers than those of 1\.yaml"):
+        read()
+    for wrong in (r"\ud800", r"a\0"):
+        mine.environment.write_text(text.replace("1.replicates.parquet", wrong))
+        with pytest.raises(HarnessError, match=r"replicates\.file"):
+            read()
+
+
+def test_a_mirror_is_given_and_taken_back(tmp_path, capsys):
+    """highD's mapping has one."""
+    overtaking(2.0).to_parquet(tmp_path / "rows.parquet", index=False)
+    (tmp_path / "own.yaml").write_text("mirror: true\n")
+    mapped = ["fit", str(tmp_path / "rows.parquet"), "--mapping", str(tmp_path / "own.yaml"), "--replicates", "2"]
+    assert main([*mapped, "--out", str(tmp_path / "mine.yaml")]) == 2
+    assert "Give --no-mirror" in capsys.readouterr().err
+    assert main([*mapped, "--no-mirror", "--out", str(tmp_path / "mine.yaml")]) == 0
+    assert "mirrored" not in (tmp_path / "mine.yaml").read_text()

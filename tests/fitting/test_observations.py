@@ -1,11 +1,13 @@
 """Observations of motion that is known, and recordings that are refused."""
 
+import functools
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from harness.errors import TrajectoryError
-from harness.fitting.observations import Observations, Tally, observations, require_enough
+from harness.fitting.observations import Observations, Tally, observations, require_distinct, require_enough
 from harness.fitting.table import load_mapping
 from tests.fitting.trajectories import overtaking
 
@@ -14,10 +16,7 @@ def observed(rows: pd.DataFrame, tmp_path, **mapping) -> tuple[list[Observations
     file = tmp_path / "rows.parquet"
     rows.to_parquet(file, index=False)
     found = [each for each, _ in observations([file], load_mapping().model_copy(update=mapping))]
-    total = Tally()
-    for each in found:
-        total = total.plus(each.tally)
-    return found, total
+    return found, functools.reduce(Tally.plus, (each.tally for each in found))
 
 
 def joined(found: list[Observations], name: str) -> np.ndarray:
@@ -27,7 +26,8 @@ def joined(found: list[Observations], name: str) -> np.ndarray:
 def test_states_and_accelerations_of_a_known_motion(tmp_path):
     rows = overtaking(3.0)
     found, total = observed(rows, tmp_path)
-    require_enough(total, "rows.parquet", load_mapping())
+    require_distinct(found)
+    assert require_enough(found, "rows.parquet", load_mapping()) == total
     following, leads, at_risk = (joined(found, name) for name in ("following", "leads", "at_risk"))
 
     # Held accelerations are found exactly, though states are those of the beginning of their second.
@@ -85,7 +85,7 @@ def test_flicker_of_lanes_makes_no_lane_change(tmp_path):
     assert smoothed.changes == total.changes
     assert smoothed.used == total.used
     with pytest.raises(TrajectoryError, match="come back within a second"):
-        require_enough(smoothed, "rows.parquet", load_mapping())
+        require_enough(flickering, "rows.parquet", load_mapping())
     assert joined(flickering, "leads")["lead_s"].size
 
 

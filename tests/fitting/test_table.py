@@ -1,6 +1,8 @@
 """Files and mappings: what is read, and what is refused, by name."""
 
-import functools
+import gzip
+import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import pandas as pd
 import pytest
 
 from harness.errors import EXIT_BAD_INPUT, HarnessError, TrajectoryError
-from harness.fitting.observations import Tally, observations, require_enough
+from harness.fitting.observations import Tally, observations, require_distinct, require_enough
 from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
 
@@ -17,16 +19,12 @@ FEET = 1 / 0.3048
 ROWS = overtaking(2.5)
 
 
-def tallied(file: Path, mapping: str | None = None) -> Tally:
-    found = observations([file], load_mapping(mapping))
-    return functools.reduce(Tally.plus, (each.tally for each, _ in found), Tally())
-
-
-def judged(file: Path, mapping: str | None = None) -> Tally:
-    """What `harness fit` does with a file before it fits."""
-    total = tallied(file, mapping)
-    require_enough(total, file.name, load_mapping(mapping))
-    return total
+def judged(file: Path, mapping: str | None = None, *others: Path, leave_out: tuple[str, ...] = ()) -> Tally:
+    """What `harness fit` does with files before it fits."""
+    read = load_mapping(mapping, leave_out=leave_out)
+    found = [each for each, _ in observations([file, *others], read)]
+    require_distinct(found)
+    return require_enough(found, file.name, read)
 
 
 def changed(**columns: object) -> Callable[[], pd.DataFrame]:
@@ -81,7 +79,7 @@ def flickering() -> pd.DataFrame:
 
 
 REFUSED = {
-    "feet beside m/s": (changed(s_m=ROWS.s_m * FEET), "positions in feet beside speeds in m/s"),
+    "feet beside m/s": (changed(s_m=ROWS.s_m * FEET), "speeds in m/s beside positions in ft"),
     "ft/s beside m": (changed(speed_mps=ROWS.speed_mps * FEET), "speeds in ft/s beside positions in m"),
     "km/h": (changed(speed_mps=ROWS.speed_mps * 3.6), "speeds in km/h"),
     "mph": (changed(speed_mps=ROWS.speed_mps / 0.44704), "speeds in mph"),
@@ -104,7 +102,7 @@ REFUSED = {
         lambda: pd.concat([ROWS, ROWS.assign(vehicle_id=ROWS.vehicle_id + 5, s_m=ROWS.s_m + 2)]).sort_values(
             "recording_id"
         ),
-        "do several recordings share a name",
+        "Do several recordings share a name",
     ),
     "ft/s as km/h": (changed(speed_mps=ROWS.speed_mps * FEET / 3.6), r"speeds in ft/s read as km/h.*speed_mps: km/h"),
     "one lane": (changed(lane=0), "no vehicle with another lane beside it"),
@@ -114,7 +112,7 @@ REFUSED = {
     "twice": (lambda: pd.concat([ROWS[:5], ROWS]), "a second row"),
     "interleaved": (
         lambda: pd.concat([ROWS[ROWS.recording_id < 40]] * 2 + [ROWS]).sort_values("time_s"),
-        "a second row|its rows together",
+        "a second row",
     ),
     "flicker": (flickering, "come back within a second"),
     "few": (
@@ -139,11 +137,51 @@ REFUSED = {
     "without lengths": (lambda: ROWS.drop(columns="length_m"), "Gaps need lengths"),
     "of highD": (lambda: ROWS.rename(columns={"speed_mps": "xVelocity"}), "--mapping highd"),
     "of NGSIM": (lambda: ROWS.rename(columns={"s_m": "Local_Y"}), "--mapping ngsim"),
-    "text": (changed(lane="left"), "numbers"),
+    "text": (changed(lane="left"), r"row 1, column lane: found 'left'.*lanes: \[R, L\]"),
+    "dates": (changed(time_s=pd.Timestamp(0)), "values of type timestamp"),
     "nobody's row": (with_value(7, "vehicle_id", None), "row 8, vehicle_id: found nothing"),
     "the end of time": (with_value(7, "time_s", 1e12), r"row 8 .*found time_s 1e\+12"),
     "far away": (with_value(7, "s_m", 1e12), r"row 8 .*found s_m 1e\+12"),
     "lanes": (with_value(7, "lane", 1e12), r"row 8 .*found lane 1e\+12"),
+    "another time": (with_value(7, "time_s", -38.5), r"row 8 .*found s_m"),
+    "a lane of its own": (
+        changed(lane=ROWS.lane.where(ROWS.recording_id > 0, 40 * ROWS.vehicle_id)),
+        r"found lane \d+",
+    ),
+    "long": (with_value(7, "length_m", 70.0), r"row 8 .*found length_m 70"),
+    "one recording stands still": (
+        changed(
+            s_m=ROWS.s_m.where(
+                ROWS.recording_id != 3, ROWS.groupby(["recording_id", "vehicle_id"]).s_m.transform("first")
+            )
+        ),
+        r"of recording 3, t = 0 s\): found s_m -40, and -40 in row 4981, where speeds say -36.* such pairs of rows",
+    ),
+    "all stand still": (
+        changed(s_m=ROWS.groupby(["recording_id", "vehicle_id"]).s_m.transform("first")),
+        r"row 1 .*found s_m 60, and 60 in row 11, where speeds say 8",
+    ),
+    "a vehicle twice": (
+        lambda: pd.concat([ROWS, ROWS[(ROWS.vehicle_id == 1) & (ROWS.recording_id == 3)].assign(vehicle_id=9)]),
+        "vehicle 9 of recording 3, t = 0 s.: found the time, lane and s_m of another vehicle",
+    ),
+    "one twice": (
+        lambda: pd.concat([ROWS, ROWS[ROWS.recording_id == 3].assign(recording_id="3 b")]).astype(
+            {"recording_id": str}
+        ),
+        "recording 3 b: found 100% of its rows also in .*recording 3: ",
+    ),
+    "a part twice": (
+        lambda: pd.concat(
+            [
+                ROWS,
+                ROWS[(ROWS.recording_id == 3) & (ROWS.time_s > 1)].assign(
+                    recording_id=99, time_s=ROWS.time_s + 3.3, vehicle_id=ROWS.vehicle_id + 7
+                ),
+            ]
+        ),
+        r"recording 99: found \d+% of its rows also in",
+    ),
     "no rows": (lambda: ROWS[:0], "no rows"),
 }
 
@@ -164,13 +202,13 @@ def test_wrong_trajectories_are_refused_by_name(case, tmp_path):
 FILES = {
     "empty.csv": (b"", "an empty file"),
     "header.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n", "no rows"),
-    "ragged.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,0,5\n1,0.1,3\n", "cannot be read"),
+    "ragged.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,0,5\n1,0.1,3\n", "as many values as"),
     "words.csv": (
         b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,fast,0,5\n",
         "row 2, column speed_mps: found 'fast'; expected a number",
     ),
     "names.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,R,5\n", r"found 'R'.*lanes: \[R, L\]"),
-    "comma.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,5,0,5\n", "a row of 7 .*decimal commas"),
+    "comma.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,5,0,5\n", "got 7.*Decimal commas"),
     "both.csv": (
         b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n",
         r"row 2, column s_m: found '996\.58', beside decimal commas.*with a decimal point",
@@ -178,6 +216,11 @@ FILES = {
     "twice.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m,Lane\n1,0,0,30,0,5,1\n", "more than one column lane"),
     "cut.parquet": (b"PAR1 and no more", "cannot be read"),
     "binary.csv": (b"\xff\xfe\x00\x01\x80\n\x80\n", "cannot be read|columns"),
+    "latin.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n\xfcber,0,0,30,0,5\n", "text in UTF-8"),
+    "book.csv": (b"PK\x03\x04\x14\x00", "found a ZIP archive, or an Excel workbook"),
+    "cut.csv": (gzip.compress(ROWS.to_csv(index=False).encode())[:-2000], "cannot be read"),
+    "part.csv": (b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n1,0,0,30,0,4.", "a last row that does not end"),
+    "headless.csv": (b"1,0,0,30,0,5\n1,0.1,3,30,0,5\n", r"numbers in place of a header: 6 columns.*header: \["),
 }
 
 
@@ -199,10 +242,15 @@ def test_missing_and_truncated_files(tmp_path):
     whole.write_bytes(whole.read_bytes()[:-1000])
     with pytest.raises(TrajectoryError, match="cannot be read"):
         judged(whole)
+    os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "loop.csv").symlink_to("loop.csv")
+    for name, words in (("pipe", "a pipe"), ("loop", "cannot be read .*symbolic links")):
+        with pytest.raises(TrajectoryError, match=words):
+            judged(tmp_path / f"{name}.csv")
 
 
 def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):
-    """Also with semicolons and decimal commas, in two files, and with constant lengths from the mapping."""
+    """Also with semicolons and decimal commas, compressed, in UTF-16, in two files, and with lengths of the mapping."""
     rows = ROWS.assign(length_m=4.6, vehicle_id="car " + ROWS.vehicle_id.astype(str))
     rows.to_parquet(tmp_path / "all.parquet", index=False, row_group_size=5000)
     rows.to_csv(tmp_path / "all.csv", index=False)
@@ -211,7 +259,11 @@ def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):
     )
     (tmp_path / "own.yaml").write_text("columns: {length_m: 4.6}\n")
     whole = judged(tmp_path / "all.parquet")
-    assert judged(tmp_path / "all.csv") == whole
+    text = (tmp_path / "all.csv").read_text()
+    (tmp_path / "all.csv.gz").write_bytes(gzip.compress(text.encode()))
+    (tmp_path / "wide.csv").write_bytes(text.encode("utf-16"))
+    for name in ("all.csv", "all.csv.gz", "wide.csv"):
+        assert judged(tmp_path / name)._replace(first_overlap="") == whole
     assert judged(tmp_path / "german.csv", str(tmp_path / "own.yaml")) == whole
     parts = [tmp_path / "first.csv", tmp_path / "second.csv"]
     first = rows.recording_id < 13
@@ -225,9 +277,9 @@ def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):
 
 
 def test_ngsim(tmp_path):
-    """Feet, milliseconds, front bumpers, lanes from the left, and ramps."""
+    """Feet, milliseconds, front bumpers, lanes from the left, and ramps; also the original text without a header."""
     lane = np.where(ROWS.recording_id == 3, 7, 6 - ROWS.lane)
-    pd.DataFrame(
+    rows = pd.DataFrame(
         {
             "Vehicle_ID": ROWS.vehicle_id + 10 * ROWS.recording_id,
             "Global_Time": (1118846980000 + ROWS.time_s * 1000 + ROWS.recording_id * 100000).round().astype(int),
@@ -237,13 +289,57 @@ def test_ngsim(tmp_path):
             "v_Vel": ROWS.speed_mps * FEET,
             "Lane_ID": lane,
         }
-    ).to_csv(tmp_path / "i80.csv", index=False)
-    (recording,) = recordings([tmp_path / "i80.csv"], load_mapping("ngsim"))
+    )
+    rows.to_csv(tmp_path / "i80.csv", index=False)
+    names = [{"v_Length": "v_length"}.get(name, name) for name in load_mapping("ngsim").header]
+    original = rows.reindex(columns=names, fill_value=0).to_string(header=False, index=False)
+    (tmp_path / "i80.txt").write_text("".join(f"   {line} \r\n" for line in original.splitlines()))
     expected = ROWS[ROWS.recording_id != 3]
-    assert recording.rate_hz == pytest.approx(10.0)
-    for column in ("s_m", "speed_mps", "length_m", "lateral_m"):
-        assert recording.rows[column].to_numpy() == pytest.approx(expected[column].to_numpy())
-    assert (recording.rows.lane == expected.lane.to_numpy()).all()
+    for name, exactly in (("i80.csv", 1e-9), ("i80.txt", 1e-5)):
+        (recording,) = recordings([tmp_path / name], load_mapping("ngsim"))
+        assert recording.rate_hz == pytest.approx(10.0)
+        for column in ("s_m", "speed_mps", "length_m", "lateral_m"):
+            assert recording.rows[column].to_numpy() == pytest.approx(
+                expected[column].to_numpy(), rel=1e-6, abs=exactly
+            )
+        assert (recording.rows.lane == expected.lane.to_numpy()).all()
+
+
+def test_sites_need_not_be_sorted(tmp_path):
+    """Also in a file of several of the blocks in which it is read."""
+    ROWS.to_parquet(tmp_path / "rows.parquet", index=False)
+    ROWS.sample(frac=1, random_state=1).assign(note="x" * 200).to_csv(tmp_path / "sites.csv", index=False)
+    assert (tmp_path / "sites.csv").stat().st_size > 1 << 23
+    whole, shuffled = (judged(tmp_path / name)._replace(driven_s=0.0) for name in ("rows.parquet", "sites.csv"))
+    assert shuffled._replace(followed_s=whole.followed_s) == whole
+
+
+def test_a_recording_is_named_and_left_out(tmp_path):
+    still = ROWS.assign(speed_mps=ROWS.speed_mps - 15, s_m=ROWS.s_m - 15 * ROWS.time_s)
+    street = still[still.recording_id < 4].assign(recording_id="street")
+    street["vehicle_id"] = street.vehicle_id + 5 * still.recording_id
+    street["time_s"] += 100 * still.recording_id
+    pd.concat([ROWS[ROWS.recording_id > 3].astype({"recording_id": str})[:3000], street]).to_csv(
+        tmp_path / "all.csv", index=False
+    )
+    with pytest.raises(TrajectoryError, match=r"most of it in recording street.*--leave-out 'street'"):
+        judged(tmp_path / "all.csv")
+    with pytest.raises(TrajectoryError, match="lane changes to the target lane"):
+        judged(tmp_path / "all.csv", leave_out=("street",))
+    with pytest.raises(TrajectoryError, match=r"no recording stret; there are .*street"):
+        judged(tmp_path / "all.csv", leave_out=("stret",))
+
+
+@pytest.mark.parametrize("column", ["s_m", "speed_mps"])
+@pytest.mark.parametrize("row", range(1001, 1007))
+@pytest.mark.parametrize("off", [12.0, 1e4])
+def test_one_wrong_value_is_refused_whatever_its_row(column, row, off, tmp_path):
+    file = tmp_path / "rows.parquet"
+    with_value(row, column, ROWS[column][row] + off)().to_parquet(file, index=False)
+    with pytest.raises(TrajectoryError, match=column) as refused:
+        judged(file)
+    named = {int(each) for each in re.findall(r"row (\d+)", str(refused.value))}
+    assert row + 1 in named
 
 
 def highd(folder: Path) -> Path:
@@ -321,11 +417,11 @@ def test_a_mapping_is_checked(tmp_path):
 
 
 MAPPED = {
-    "classes": ("classes: [car]", "found no row of class car; classes are PKW, van"),
-    "mirror": ("mirror: true", "Leave --mirror out"),
+    "classes": ("classes: [car]", "found no class car; there are PKW, van"),
+    "mirror": ("mirror: true", "Give --no-mirror"),
     "from_left": ("lanes: from_left", "or lanes: from_right"),
     "list": ("lanes: [1, 0]", "Turn `lanes` of the mapping round"),
-    "column": ("columns: {speed_mps: speed_ft, s_m: s_m}", r"speed_ft for speed_mps\. .*these: speed_mps"),
+    "column": ("columns: {speed_mps: speed_ft, s_m: s_m}", r"found the columns .*speed_mps.*speed_ft for speed_mps\."),
 }
 
 
@@ -353,8 +449,9 @@ def test_classes_and_mirror(tmp_path):
     rows = ROWS.assign(**{"class": np.where(ROWS.recording_id % 2 == 0, "car", "truck")})
     rows.to_csv(tmp_path / "rows.csv", index=False)
     (tmp_path / "cars.yaml").write_text("classes: [car]\n")
-    cars, whole = tallied(tmp_path / "rows.csv", str(tmp_path / "cars.yaml")), judged(tmp_path / "rows.csv")
-    assert 0.4 * whole.driven_s < cars.driven_s < 0.6 * whole.driven_s
+    found = observations([tmp_path / "rows.csv"], load_mapping(str(tmp_path / "cars.yaml")))
+    driven_s, whole = sum(each.tally.driven_s for each, _ in found), judged(tmp_path / "rows.csv")
+    assert 0.4 * whole.driven_s < driven_s < 0.6 * whole.driven_s
     fast_lanes().to_csv(tmp_path / "mirrored.csv", index=False)
     (tmp_path / "mirror.yaml").write_text("mirror: true\n")
     mirrored = judged(tmp_path / "mirrored.csv", str(tmp_path / "mirror.yaml"))

@@ -9,8 +9,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from harness.cli import main
@@ -26,12 +24,12 @@ from harness.runner.other_traffic import assumed, estimate_in_other_traffic
 from harness.runner.run import run_campaign
 from harness.runner.stored_shells import Moved, StoredShells, environment_with, nearby
 from harness.traffic.loading import load_parameters
-from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.golden.campaigns import COMPARED
 from tests.in_process import one_process, without_page
 from tests.stored_runs import copy_of, estimates, golden
+from tests.traffic.tables import TEXT as SHIPPED
+from tests.traffic.tables import fitted
 
-SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
 LOOK = "cut_in__ignore_share"
 
 
@@ -42,14 +40,6 @@ def few(monkeypatch):
     monkeypatch.setattr(moved, "N_PATHS", 512)
     monkeypatch.setattr(moved, "cache", SimpleNamespace(read=kept.get, keep_bytes=kept.__setitem__))
     return kept
-
-
-def fitted(folder: Path, **columns: list[float]) -> str:
-    """The shipped environment with replicates."""
-    pq.write_table(pa.table(columns), folder / "replicates.parquet")
-    text = SHIPPED.replace("version: 1\n", "version: 1\nreplicates: replicates.parquet\n", 1)
-    (folder / "mine.yaml").write_text(text)
-    return str(folder / "mine.yaml")
 
 
 def test_the_rate_moves_with_the_share_that_does_not_look_and_the_ratio_does_not(stored_run, tmp_path):
@@ -154,8 +144,7 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
     """Shares of the wishes that are much as those of the tests' traffic, none of them seen below 2 s."""
     text = without_changes()
     a, names = 0.02, [f"acceptance_steps__share__{step}" for step in (0, 1)]
-    pq.write_table(pa.table({name: [a] for name in names}), tmp_path / "rows.parquet")
-    (tmp_path / "mine.yaml").write_text(text.replace("version: 1", "version: 1\nreplicates: rows.parquet", 1))
+    fitted(tmp_path, text, **{name: [a] for name in names})
     content = estimate_in_other_traffic(stored_run("shells-twin"), str(tmp_path / "mine.yaml"))
     traffic = content["traffic"]
     assert traffic["unseen"]["where"] == "TTC < 2 s"

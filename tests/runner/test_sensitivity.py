@@ -7,8 +7,6 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from harness.campaign.sections import EnvironmentSettings
@@ -19,6 +17,7 @@ from harness.runner.stored_shells import Nearby
 from harness.traffic.loading import load_parameters
 from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.stored_runs import copy_of, edit, manifest
+from tests.traffic.tables import TEXT, fitted
 
 SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
 
@@ -80,13 +79,10 @@ def test_what_was_fitted_together_moves_together(tmp_path):
         "cut_in__ignore_share": [0.01, 0.02],
         "free_driving__df": [15.0, 17.0],
     }
-    pq.write_table(pa.table(columns), tmp_path / "rows.parquet")
-    fitted = SHIPPED.replace("df: {value: 16.0, source: ndd}", "df: {value: 16.0, source: fitted, se: 2.0}")
-    (tmp_path / "one.yaml").write_text(fitted)
-    (tmp_path / "both.yaml").write_text(fitted.replace("version: 1\n", "version: 1\nreplicates: rows.parquet\n", 1))
+    text = TEXT.replace("df: {value: 16.0, source: ndd}", "df: {value: 16.0, source: fitted, se: 2.0}")
+    (tmp_path / "one.yaml").write_text(text)
     found = {}
-    for name in ("one", "both"):
-        file = str(tmp_path / f"{name}.yaml")
+    for name, file in (("one", str(tmp_path / "one.yaml")), ("both", fitted(tmp_path, text, **columns))):
         parameters = load_parameters(EnvironmentSettings(parameters=file))
         found[name] = {move.what: move.settings for move in moves(file, parameters, {})}
     assert found["one"] == {"free_driving.df": [{"free_driving__df": pytest.approx(16.0 + k * 3.29)} for k in (-1, 1)]}

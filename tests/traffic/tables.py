@@ -1,15 +1,31 @@
 """Environments with tables in place of formulas."""
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
+from harness.campaign.files import read_model
 from harness.campaign.yaml_text import read_yaml
-from harness.traffic.parameters import REPLACED, SHIPPED_FOLDER
+from harness.traffic.parameters import OF_REPLICATES, REPLACED, SHIPPED_FOLDER, EnvironmentParameters, content_hash
 
 SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
 DATA, _ = read_yaml(SHIPPED)
+TEXT = SHIPPED.read_text()
+
+
+def fitted(folder: Path, text: str = TEXT, **columns: list[float]) -> str:
+    """File of an environment, given as text, with replicates."""
+    file, rows = folder / "mine.yaml", folder / "replicates.parquet"
+    file.write_text(text)
+    of = read_model(file, EnvironmentParameters).content_hash()
+    pq.write_table(pa.table(columns, metadata={OF_REPLICATES: of}), rows)
+    tied = f"{{file: replicates.parquet, sha256: '{content_hash(rows.read_bytes())}'}}"
+    file.write_text(text.replace("version: 1\n", f"version: 1\nreplicates: {tied}\n", 1))
+    return str(file)
 
 
 def of(values, **more):

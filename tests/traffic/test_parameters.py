@@ -139,7 +139,8 @@ def test_other_values_make_another_environment_and_what_is_known_of_them_does_no
     changes = {name for name, value in moved.values().items() if value != values[name]}
     assert changes == {"acceptance_steps__share__4", "free_driving__df"}
     noted = {"acceptance_steps__events": None, "guard__margin_m": {**DATA["guard"]["margin_m"], "range": [0.5, 2.0]}}
-    same = EnvironmentParameters.model_validate({**tabled(**noted), "replicates": "many.parquet"})
+    tied = {"replicates": {"file": "many.parquet", "sha256": "0"}}
+    same = EnvironmentParameters.model_validate({**tabled(**noted), **tied})
     assert same.content_hash() == known.content_hash() != moved.content_hash()
     assert same.with_values({"guard__margin_m": 3.0}).values()["guard__margin_m"] == 3.0  # also beyond its range
 

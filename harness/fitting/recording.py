@@ -1,0 +1,265 @@
+"""One recording: its rows sorted by vehicle and time, and held against what trajectories can be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+import pandas as pd
+
+from harness.errors import TrajectoryError
+from harness.vocabulary import BoolArray, FloatArray, IntArray
+
+Unit = Literal["m", "ft", "km", "m/s", "ft/s", "km/h", "mph", "s", "ms", "us", "ns"]
+UNITS: dict[Unit, float] = dict(
+    zip(get_args(Unit), (1.0, 0.3048, 1e3, 1.0, 0.3048, 1 / 3.6, 0.44704, 1.0, 1e-3, 1e-6, 1e-9), strict=True)
+)
+NAMES = ["recording_id", "vehicle_id", "class", "direction"]
+"""Columns that are read as text."""
+NO_LENGTH = "Gaps need lengths: correct them, or give one for all in a mapping (columns: {length_m: 4.6})."
+ONE_CLOCK = "Do several recordings share a name, or do times begin anew with each vehicle? Use one clock for all."
+CORRECT = "Correct the value, or delete the row."
+SLOWEST_HZ = 9.5
+FASTEST_MEDIAN_MPS = 70.0
+USUAL_LENGTH_M = (2.5, 10.0)
+"""Range of the median length of vehicles, which in feet is about 15."""
+OF_STEP = 0.05
+"""Largest relative difference between speeds and the change of positions."""
+_PAIRS: list[tuple[Unit, Unit]] = [
+    (speed, way) for speed in ("m/s", "ft/s", "km/h", "mph") for way in ("m", "ft", "km")
+]
+SLIPS = {UNITS[way] / UNITS[speed]: f"speeds in {speed} beside positions in {way}" for speed, way in _PAIRS} | {
+    UNITS["km/h"] / UNITS["ft/s"]: "speeds in ft/s read as km/h",
+    -1.0: "positions that fall where vehicles drive forward",
+}
+"""Cause of a ratio of speeds to the change of positions, in units that are taken for m/s and m."""
+LEAST_LAG_S = 0.3
+ANOTHER_VEHICLE_S = 60.0
+"""An identifier that reappears after so long is another vehicle's (as in NGSIM)."""
+OFF_IN_STEP_M = 3.0
+OFF_IN_SECOND_M = 5.0
+"""More than measurement error between the way of a frame, or of a second, and that of the speeds [assumed]."""
+JUMP_MPS, HARDEST_MPS2 = 5.0, 10.0
+"""A speed may change from row to row by measurement error and at this acceleration [assumed]."""
+
+
+class Rule(NamedTuple):
+    """What must hold of a column in every row; ``found`` is formatted with the value of a row for which it does not."""
+
+    column: str
+    holds: Callable[[FloatArray], BoolArray]
+    found: str
+    expected: str
+    mend: str = CORRECT
+
+
+def _near(column: str, most: float) -> Rule:
+    """Values further from the median are wrong [assumed]."""
+    expected = f"at most {most:g} from the median of the recording"
+    return Rule(column, lambda x: np.abs(x - np.median(x)) <= most, f"{column} {{:g}}", expected)
+
+
+NUMBERS = tuple(
+    Rule(name, np.isfinite, "no finite number", "a number in every row")
+    for name in ("time_s", "s_m", "speed_mps", "lane", "length_m")
+)
+WHOLE_LANE = Rule("lane", lambda x: x % 1 == 0, "{:g}", "a whole number", "Number the lanes by whole numbers.")
+SOME_LENGTH = Rule("length_m", lambda x: x > 0.0, "no length", "a length above 0 m", NO_LENGTH)
+NEAR_TIME = _near("time_s", 1e7)
+NEAR = _near("s_m", 1e5), _near("lane", 20), _near("length_m", 50.0)
+
+
+def require(rule: Rule, rows: pd.DataFrame, where: Callable[[int], str]) -> None:
+    """Refuse the first of some rows that breaks a rule; ``where`` names the i-th (`TrajectoryError`)."""
+    values = rows[rule.column].to_numpy()
+    if not (holds := rule.holds(values)).all():
+        i = int(np.argmin(holds))
+        raise TrajectoryError(where(i), rule.found.format(values[i]), rule.expected, rule.mend)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All vehicles on a stretch of road during some time.
+
+    Attributes
+    ----------
+    name, file : str
+        For messages.
+    rows : DataFrame
+        Sorted by vehicle and time: ``vehicle`` (int, a number in the recording), ``time_s``, ``frame`` (int),
+        ``s_m`` (centre, rising as one drives), ``speed_mps``, ``lane`` (int, the target lane's is one less),
+        ``length_m``, ``lateral_m`` (NaN where there is none), ``road`` (int, one of its directions), ``fitted`` (bool,
+        of a class whose driving is fitted), ``row`` (in the file, from 1).
+    rate_hz : float
+        Frames per second.
+    vehicles : list of str
+        Identifiers in the file, by number.
+    share_read : float
+        Of the bytes or rows of all files, with this recording.
+    """
+
+    name: str
+    file: str
+    rows: pd.DataFrame
+    rate_hz: float
+    vehicles: Sequence[str]
+    share_read: float
+
+    @property
+    def place(self) -> str:
+        """For messages."""
+        return f"{self.file}, recording {self.name}"
+
+    def where(self, i: int | np.intp) -> str:
+        """Place in the file of the i-th row."""
+        each = self.rows.iloc[int(i)]
+        return (
+            f"{self.file}, row {each.row} (vehicle {self.vehicles[int(each.vehicle)]} of recording {self.name}, "
+            f"t = {each.time_s:.10g} s)"
+        )
+
+
+def recording_of(name: str, file: str, rows: pd.DataFrame, share_read: float) -> Recording:
+    """Rows of the input table, in metres and seconds, sorted and checked.
+
+    Raises `TrajectoryError`: they cannot be trajectories in these units.
+    """
+    code, identifiers = pd.factorize(rows.vehicle_id)
+    order = np.lexsort((rows.time_s, code))
+    rows, code = rows.drop(columns=NAMES, errors="ignore").iloc[order].reset_index(drop=True), code[order]
+    time_s = rows.time_s.to_numpy()
+    dt = np.diff(time_s)
+    same = np.diff(code) == 0
+    another = np.append(True, ~same | (dt > ANOTHER_VEHICLE_S))
+    rows["vehicle"] = np.cumsum(another) - 1
+    recording = Recording(name, file, rows, 0.0, [str(identifiers[i]) for i in code[another]], share_read)
+    if (twice := same & (dt == 0.0)).any():
+        where = recording.where(np.argmax(twice) + 1)
+        mend = "Delete it; or, if it is another vehicle, add a recording_id."
+        raise TrajectoryError(where, "a second row of this vehicle and time", "one", mend)
+    rate = _rate_hz(recording, dt[same])
+    require(NEAR_TIME, rows, recording.where)
+    since = (time_s - time_s.min()) * rate
+    frame = np.rint(since).astype(np.int64)
+    if (odd := np.abs(since - frame) > 0.3).any():
+        found = f"a time off the steps of {rate:.4g} Hz"
+        mend = "Interpolate all vehicles to the same times."
+        raise TrajectoryError(recording.where(np.argmax(odd)), found, "times in equal steps", mend)
+    rows["frame"] = frame + round(time_s.min() * rate)
+    if (same_place := rows.duplicated(["frame", "road", "lane", "s_m"]).to_numpy()).any():
+        where = recording.where(np.argmax(same_place))
+        raise TrajectoryError(where, "the time, lane and s_m of another vehicle", "one at a place", ONE_CLOCK)
+    recording = replace(recording, rate_hz=rate)
+    _check_motion(recording)
+    return recording
+
+
+def _rate_hz(recording: Recording, steps_s: FloatArray) -> float:
+    """Frames per second."""
+    if not steps_s.size:
+        raise TrajectoryError(recording.place, "one row per vehicle", "many", "Check the column vehicle_id.")
+    step_s = float(np.median(steps_s))
+    regular = steps_s[np.abs(steps_s - step_s) < 0.5 * step_s]
+    rate = 1.0 / float(regular.mean())  # times may be rounded: 0.033, 0.067
+    if rate < SLOWEST_HZ:
+        mend = "Use recordings at 10 Hz or more."
+        if step_s >= 1.0:
+            mend = "If times are milliseconds or frames, use a mapping: units: {time_s: ms}, or seconds per frame."
+        raise TrajectoryError(recording.place, f"a row every {step_s:g} s", "10 Hz or more", mend)
+    return float(round(rate)) if abs(rate / round(rate) - 1.0) < 1e-4 else rate
+
+
+def _check_motion(recording: Recording) -> None:
+    """Refuse wrong units, columns that are shifted in time, and rows whose positions and speeds disagree."""
+    rows, rate, n = recording.rows, recording.rate_hz, round(recording.rate_hz)
+    require(SOME_LENGTH, rows, recording.where)
+    frame, vehicle, s, v = (rows[name].to_numpy() for name in ("frame", "vehicle", "s_m", "speed_mps"))
+    driven_m = np.append(0.0, np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(frame) / rate))
+    begin = np.arange(max(len(rows) - n, 0))
+    begin = begin[(vehicle[begin] == vehicle[begin + n]) & (frame[begin + n] == frame[begin] + n)]
+    way_m, of_speeds_m = s[begin + n] - s[begin], driven_m[begin + n] - driven_m[begin]
+    ratio = _ratio(way_m, of_speeds_m)
+    if abs(ratio - 1.0) > OF_STEP:
+        slip = min(SLIPS, key=lambda each: abs(ratio / each - 1.0))
+        words = f": {SLIPS[slip]}" if abs(ratio / slip - 1.0) < OF_STEP else ""
+        found = f"speeds {ratio:.3g} times the change of positions{words}"
+        mend = "Correct the units of speed_mps or s_m in a mapping (units: {speed_mps: km/h, s_m: ft})."
+        if ratio < 0.0:
+            mend = "s_m must rise in driving direction, and speeds be positive."
+        raise TrajectoryError(recording.place, found, "positions in m and speeds in m/s that agree", mend)
+    _check_sizes(recording, float(np.median(v)), float(np.median(rows.length_m)))
+    few = slice(None, None, max(n // 2, 1))
+    lag_s = _lag(begin[few], frame, vehicle, way_m[few], driven_m, n) / rate
+    if abs(lag_s) >= LEAST_LAG_S:
+        found = f"speeds that belong to positions of {abs(lag_s):.1f} s {'earlier' if lag_s > 0 else 'later'}"
+        mend = "Shift one of the columns."
+        raise TrajectoryError(recording.place, found, "speeds and positions of the same time", mend)
+    for rule in NEAR:
+        require(rule, rows, recording.where)
+    step = np.flatnonzero(np.diff(vehicle) == 0)
+    dt = (frame[step + 1] - frame[step]) / rate
+    off = np.abs(np.diff(v))[step] > JUMP_MPS + HARDEST_MPS2 * dt
+    _require_agreement(recording, step[off], 1, "speed_mps")
+    off = np.abs(np.diff(s) - np.diff(driven_m) / ratio)[step] > OFF_IN_STEP_M + JUMP_MPS * dt
+    _require_agreement(recording, step[off], 1, "s_m", driven_m / ratio)
+    off = np.abs(way_m - of_speeds_m / ratio) > OFF_IN_SECOND_M
+    _require_agreement(recording, begin[off], n, "s_m", driven_m / ratio)
+
+
+def _ratio(way_m: FloatArray, of_speeds_m: FloatArray) -> float:
+    """Median ratio of ways (n,) by speeds to those by positions; few that are wrong do not move it."""
+    moving = np.abs(way_m) > 0.2 * np.quantile(np.abs(way_m), 0.9) if way_m.size else np.zeros(0, np.bool_)
+    return float(np.median(of_speeds_m[moving] / way_m[moving])) if moving.any() else 1.0
+
+
+def _require_agreement(
+    recording: Recording, off: IntArray, frames: int, column: str, driven_m: FloatArray | None = None
+) -> None:
+    """Refuse rows ``off`` (m,) after which a column moves within so many rows as no vehicle at these speeds does."""
+    if not off.size:
+        return
+    first, last = int(off[0]), int(off[0]) + frames
+    a, b = recording.rows[column].iloc[[first, last]]
+    found = f"{column} {a:.6g}, and {b:.6g} in row {recording.rows.row.iloc[last]}"
+    if driven_m is not None:
+        found += f", where speeds say {a + driven_m[last] - driven_m[first]:.6g}"
+    if off.size > 1:
+        found += f"; {off.size:,} such pairs of rows"
+    mend = f"{CORRECT} If they are many, positions or speeds stand still, or are of different vehicles."
+    raise TrajectoryError(recording.where(first), found, "positions and speeds of one motion in all rows", mend)
+
+
+def _check_sizes(recording: Recording, speed: float, length: float) -> None:
+    """Refuse medians of speeds (m/s) and lengths (m) that no road has."""
+    feet = length > USUAL_LENGTH_M[1]
+    if not -0.5 < speed < FASTEST_MEDIAN_MPS:
+        found = f"a median speed of {speed:.4g} m/s" + (f" and a median length of {length:.3g} m: feet" if feet else "")
+        mend = "Give units in a mapping (units: {s_m: ft, speed_mps: ft/s, length_m: ft}); forward is positive."
+        raise TrajectoryError(recording.place, found, "0 to 70 m/s", mend)
+    if feet or length < USUAL_LENGTH_M[0]:
+        mend = "Use a mapping: units: {length_m: ft}." if feet else "Is this the width of vehicles?"
+        found = f"a median length of {length:.3g} m{': feet' if feet else ''}"
+        raise TrajectoryError(recording.place, found, "2.5 to 10 m", mend)
+
+
+def _lag(begin: IntArray, frame: IntArray, vehicle: IntArray, way_m: FloatArray, driven_m: FloatArray, n: int) -> int:
+    """Frames by which speeds lag behind positions; 0 unless a shift explains them better beyond doubt.
+
+    ``way_m`` is that of the ``n`` frames from each of ``begin``; ``driven_m`` is the way by speeds since the first row.
+    """
+    reach = 2 * n
+    inside = (begin >= reach) & (begin + n + reach < driven_m.size)
+    begin, way_m = begin[inside], way_m[inside]
+    first, last = begin - reach, begin + n + reach
+    inside = (vehicle[first] == vehicle[last]) & (frame[last] - frame[first] == n + 2 * reach)
+    begin, way_m = begin[inside], way_m[inside]
+    if begin.size < 50:
+        return 0
+    lags = np.arange(-reach, reach + 1, max(n // 10, 1))
+    error = np.array([np.abs(driven_m[begin + lag + n] - driven_m[begin + lag] - way_m) for lag in lags])
+    best = int(np.argmin(error.mean(axis=1)))
+    gain = error[lags.size // 2] - error[best]
+    sure = gain.mean() > 6.0 * gain.std() / np.sqrt(gain.size) and gain.mean() > 0.2 * error[best].mean()
+    return int(lags[best]) if sure else 0
