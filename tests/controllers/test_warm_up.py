@@ -76,6 +76,18 @@ class DelayedScript(TraciStyleController):
         traci.vehicle.setAcceleration(veh_id, a, 0.1)
 
 
+class SlowsDownOnce(TraciStyleController):
+    """Begins, in its first call, to drive 3 m/s slower within 10 s."""
+
+    def on_start(self, random):
+        self._told = False
+
+    def on_step(self, traci, veh_id, time):
+        if not self._told:
+            traci.vehicle.slowDown(veh_id, traci.vehicle.getSpeed(veh_id) - 3.0, 10.0)
+        self._told = True
+
+
 class Notes(IDM):
     """Writes down what it is shown of the last episode that begins; what it answers meanwhile is nonsense."""
 
@@ -103,6 +115,15 @@ def test_a_state_that_starts_empty_is_filled_when_the_controller_acts(form, fill
     assert motion(av(form), cells=7) == filled
     assert motion(av(form, warm_up_s=0.4)) != filled  # not enough
     assert motion(av(form, warm_up_s=0.0)) != filled
+
+
+def test_a_command_of_the_warm_up_begins_anew_at_the_hand_over():
+    runs = [drive(av("SlowsDownOnce", warm_up_s=s), "av.before_cut_in=hold_speed", n=12) for s in (0.0, 2.0, 20.0)]
+    for row, trace in runs[0].traces.items():
+        onset = int(runs[0].results.episode["onset_step"][row])
+        assert trace[onset + 1, 2, 2] == pytest.approx(-0.3)
+    assert [run.failures for run in runs] == [{}] * 3
+    assert all(run.results.episode.tobytes() == runs[0].results.episode.tobytes() for run in runs[1:])
 
 
 @pytest.mark.parametrize("shim", [True, False])
