@@ -21,7 +21,7 @@ from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.resolved import require_ready, require_world, resolve
-from harness.runner.workers import Bits, bits_of
+from harness.runner.again import Bits, bits_of
 from harness.sampling import EPISODES_PER_S, prepare, source_of
 from harness.sampling.protocol import Source
 from harness.vehicles.kinematics import STEP_S
