@@ -52,15 +52,17 @@ class OtherModules:
     """What the modules that the harness itself rests on hold when it is made."""
 
     def __init__(self) -> None:
-        self._kept = {
-            name: {key: value for key, value in vars(sys.modules[name]).items() if key[:2] != "__"} for name in WATCHED
-        }
+        self._kept = {name: _functions_and_numbers(vars(sys.modules[name])) for name in WATCHED}
 
     def restored(self) -> list[str]:
         """Names, as ``math.sqrt``, that had been replaced or deleted; they are as before."""
         changed = []
         for name, kept in self._kept.items():
-            there: dict[str, Any] = vars(sys.modules[name])
+            there = vars(sys.modules[name])
             changed += [f"{name}.{key}" for key, value in kept.items() if there.get(key, self) is not value]
             there.update(kept)
         return changed
+
+
+def _functions_and_numbers(held: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in held.items() if key[:2] != "__" and (callable(value) or type(value) is float)}

@@ -159,6 +159,11 @@ class EpisodeLoop:
         """Another loop with the same AV, in a world of no more cells, with other records, or another drawing."""
         return EpisodeLoop(world or self._world, drawing or self._policy, keep or self._keep, self._av)
 
+    @property
+    def construction_s(self) -> list[float]:
+        """Time (s) that each constructor of a controller has taken."""
+        return [] if self._av is None else self._av.construction_s
+
     def close(self) -> None:
         """Release what the AV's controllers hold; the loop runs no more."""
         if self._av is not None:

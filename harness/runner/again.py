@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.clock import HOUR_S, Clock
+from harness.controllers.clock import Clock
 from harness.controllers.find import build_host, has_foreign_code, run_apart
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy, Shard, hash_of_index
@@ -32,8 +32,6 @@ ONE_OF = 10
 
 Of a vehicle that is random in one of four tests, ten miss all with a probability of 6 %.
 """
-HELD_S = 0.1
-"""What a clock that is held goes on by at each call: as much as the test does."""
 
 Bits = tuple[bytes, bytes, str | None]
 
@@ -79,7 +77,7 @@ def _run_here(
     *,
     black_box: Path | None,
 ) -> Again:
-    clock, found = Clock(HELD_S if held else HOUR_S, held=held), list[Bits]()
+    clock, found = Clock(held=held), list[Bits]()
     with clock.shown():
         host = build_host(av, n_cells=n_cells, seed=drawing.seed, black_box=black_box)
         with closing(EpisodeLoop(TwinWorld(n_cells), drawing, keep, host)) as loop:
