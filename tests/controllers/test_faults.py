@@ -262,6 +262,16 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
         assert "started, below Python" in printed.err
 
 
+@pytest.mark.parametrize("command", ["run", "av-check --episodes 4"])
+def test_of_much_that_is_printed_the_first_and_the_last_are_passed_on(command, tmp_path, capfd):
+    assert _main(command, tmp_path, _of("PrintsMuch"), "stop.episodes=100") == EXIT_DONE
+    printed = capfd.readouterr().err
+    assert re.search(r"^\[\d\d[\d,]+ bytes more that a worker has printed\]$", printed, re.MULTILINE)
+    assert 2 * 65_536 < len(printed) < 9 * 65_536
+    assert re.match(r"[-\d.]+ s x", printed)
+    assert printed.endswith("x\n")
+
+
 @pytest.mark.parametrize("field", ["cell", "episode", "gap_m", "lv_speed_mps", "cells", "episodes"])
 def test_nothing_that_a_batch_controller_is_handed_can_be_written_into(field):
     failures = drive(f"av={_of('Batch', overwrites=field)}", cells=8, n=24).failures

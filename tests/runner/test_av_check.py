@@ -113,7 +113,7 @@ class WindsUp(Steady):
 
     def step(self, seen):
         self.integral = min(self.integral + 0.1 * (40.0 - seen.speed_mps), self.bound)
-        return -3.0 if seen.bv_overlaps else 0.01 * self.integral
+        return -3.0 + 0.02 * self.integral
 
 
 class Slow(Steady):
