@@ -9,17 +9,18 @@ from __future__ import annotations
 import ctypes
 import platform
 import sys
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 WATCHED = ("builtins", "math", "json", "os", "pickle", "struct", "time", "numpy")
 CHANGED_MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
 
-_ROOM = 64
-_CONTROL = {"x86_64": ((0, 0xFFFFFFFF), (7, 0xFFC0)), "aarch64": ((0, 0xFFFFFFFF),)}
-"""Words of the C library's ``fenv_t`` on Linux, and their bits, that say how to compute: not what has been met.
+_CONTROL, _MXCSR, _MODES = 0, 7, 0xFFC0
+"""Words of ``fenv_t`` in the C library of Linux that say how to compute, not what has been met.
 
-On x86-64 the control word of the x87 and MXCSR: rounding, flush to zero, denormals are zero, masked exceptions.
+On x86-64 the control word of the x87 and the upper bits of MXCSR, on aarch64 FPCR and nothing: rounding, flush to zero,
+denormals are zero, masked exceptions.
 """
 
 
@@ -27,25 +28,24 @@ class FloatingPointModes:
     """Those of this thread when it is made; looking at them again takes half a microsecond."""
 
     def __init__(self) -> None:
-        words = _CONTROL.get(platform.machine(), ()) if sys.platform == "linux" else ()
-        libc = ctypes.CDLL("libm.so.6" if platform.libc_ver()[0] == "glibc" else None)
-        self._kept, now = ctypes.create_string_buffer(_ROOM), ctypes.create_string_buffer(_ROOM)
-        self._words, kept = (memoryview(buffer).cast("B").cast("I") for buffer in (now, self._kept))
-        if words:
-            self._write, self._look = libc.fesetenv, partial(libc.fegetenv, ctypes.byref(now))
-            libc.fegetenv(self._kept)
-        self._expected = [(word, mask, kept[word] & mask) for word, mask in words]
+        self._kept, now = (ctypes.create_string_buffer(64) for _ in range(2))
+        kept, self._words = (memoryview(buffer).cast("B").cast("I") for buffer in (self._kept, now))
+        self._look: Callable[..., object] = lambda: None
+        self._write: Callable[..., object] = lambda _: None
+        if sys.platform == "linux" and platform.machine() in ("x86_64", "aarch64"):
+            libm = ctypes.CDLL("libm.so.6" if platform.libc_ver()[0] == "glibc" else None)
+            libm.fegetenv(self._kept)
+            libm.fegetenv(now)
+            self._look, self._write = partial(libm.fegetenv, ctypes.byref(now)), libm.fesetenv
+        self._control, self._modes = kept[_CONTROL], kept[_MXCSR] & _MODES
 
     def restored(self) -> bool:
         """Whether they had been changed; they are as before."""
-        if not self._expected:
-            return False
         self._look()
-        for word, mask, kept in self._expected:
-            if self._words[word] & mask != kept:
-                self._write(self._kept)
-                return True
-        return False
+        if self._words[_CONTROL] == self._control and self._words[_MXCSR] & _MODES == self._modes:
+            return False
+        self._write(self._kept)
+        return True
 
 
 class OtherModules:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from collections import Counter
@@ -25,12 +24,11 @@ from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.resolved import require_ready, require_world, resolve
 from harness.runner.again import Bits, Tests, bits_of, run_elsewhere
-from harness.sampling import EPISODES_PER_S, prepare, source_of
+from harness.sampling import prepare, source_of
 from harness.sampling.protocol import Source
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, FloatArray
 from harness.worlds import build_world
-from harness.worlds.shim import shim_library
 from harness.worlds.twin import TwinWorld
 
 EPISODES = 48
@@ -416,20 +414,9 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
 
 
 def plan_campaign(campaign: Campaign) -> dict[str, Any]:
-    """Most that a campaign may cost: ``most_tests`` and ``most_seconds``, the budget, and what is left to build.
-
-    ``tests_per_second`` (all cores) is without what an AV of one's own takes; ``tables`` is in words.
+    """Most that a campaign may cost: ``most_tests``, its budget, and in words the ``tables`` that are left to build.
 
     Raises `CampaignError`: a run would refuse the campaign before it starts.
     """
-    resolved, source = require_ready(campaign), source_of(campaign)
-    engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
-    rate = float(f"{EPISODES_PER_S[campaign.testing.method][engine] * (os.cpu_count() or 1):.2g}")
-    own = {} if campaign.av.model else {"av": "its own time comes on top: `harness av-check` measures it"}
-    return {
-        "most_tests": campaign.stop.episodes,
-        "most_seconds": round(campaign.stop.episodes / rate),
-        "tests_per_second": rate,
-        "tables": source.building(resolved),
-        **own,
-    }
+    resolved = require_ready(campaign)
+    return {"most_tests": campaign.stop.episodes, "tables": source_of(campaign).building(resolved)}

@@ -262,7 +262,7 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
         assert "started, below Python" in printed.err
 
 
-@pytest.mark.parametrize("command", ["run", "av-check --episodes 4"])
+@pytest.mark.parametrize("command", ["run", "av-check --episodes 20"])
 def test_of_much_that_is_printed_the_first_and_the_last_are_passed_on(command, tmp_path, capfd):
     assert _main(command, tmp_path, _of("PrintsMuch"), "stop.episodes=100") == EXIT_DONE
     printed = capfd.readouterr().err
