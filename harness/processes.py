@@ -29,6 +29,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
+from io import TextIOWrapper
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import recv_handle, send_handle
@@ -49,6 +50,8 @@ LOOK_S = 0.5
 """Time between two looks at a process whose pipe is silent: a copy that a controller made of it keeps the pipe open."""
 CLOSED_PIPE_EXIT_CODE = 76
 """Exit code of a process whose controller has closed its pipe."""
+PRINTED_BYTES = 65_536
+"""Of what a process prints first, and of what it prints last, that is passed on."""
 _POLL_S, _FORK_ATTEMPTS = 0.005, 3
 _DYING_S, _ENDING_S = 1.0, 5.0
 """How long a process may take to end once its pipe has, and a server to end all that it is left with."""
@@ -138,18 +141,66 @@ class SharedFile:
         self.path = Path(f"/proc/{os.getpid()}/fd/{self._file.fileno()}" if has_proc else str(self._file.name))
 
 
+class Printed:
+    """What a process prints: its first 64 kB pass on to stderr at once, its last 64 kB in the end, no more of it.
+
+    The process writes to ``descriptor``, which is to be closed here once it has it.
+    """
+
+    def __init__(self) -> None:
+        self._read, self.descriptor = os.pipe()
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._pass_on, name="printed", daemon=True)
+
+    def begin(self) -> None:
+        """Listen to the process, which has started."""
+        os.close(self.descriptor)
+        self._thread.start()
+
+    def finish(self) -> None:
+        """Pass on the rest: the process has ended, if perhaps not all that it has started."""
+        self._is_over.set()
+        self._thread.join()
+
+    def _pass_on(self) -> None:
+        left, last, n_lost = PRINTED_BYTES, bytearray(), 0
+        while chunk := self._next():
+            first, rest = chunk[:left], chunk[left:]
+            left -= len(first)
+            last += rest
+            n_lost += max(0, len(last) - PRINTED_BYTES)
+            del last[:-PRINTED_BYTES]
+            _to_stderr(first)
+        os.close(self._read)
+        _to_stderr(f"\n[{n_lost:,} bytes more that a worker has printed]\n".encode() * bool(n_lost) + last)
+
+    def _next(self) -> bytes:
+        """What it has printed since; nothing once all is told."""
+        while not wait([self._read], LOOK_S):
+            if self._is_over.is_set():
+                return b""
+        return os.read(self._read, PRINTED_BYTES)
+
+
+def _to_stderr(text: bytes) -> None:
+    with suppress(OSError), open(2, "wb", closefd=False) as stderr:
+        stderr.write(text)
+
+
 class Child:
     """A process that calls ``target(connection, *arguments)``, at the other end of a pipe.
 
     It is a fresh Python, which finds modules where this one does and runs no script again, or a copy that a
-    ``server`` makes of itself. It prints to stderr: stdout is for the harness's results.
+    ``server`` makes of itself. It prints to stderr (see `Printed`): stdout is for the harness's results.
     """
 
     def __init__(self, target: Callable[..., None], *arguments: Any, server: ForkServer | None = None) -> None:
         work = pickle.dumps((target, arguments))
         self.connection, theirs = Pipe()
+        self._printed, start = Printed(), _fresh_python if server is None else server.fork
         with theirs:  # or its death would not end the pipe
-            self._process = _fresh_python(theirs) if server is None else server.fork(theirs)
+            self._process = start((theirs.fileno(), self._printed.descriptor))
+        self._printed.begin()
         with suppress(OSError):  # it has died already
             self.connection.send_bytes(work)
 
@@ -160,6 +211,7 @@ class Child:
     def kill(self) -> int:
         """End it at once, with everything that it has started; returns its exit code."""
         exit_code = end(self._process)
+        self._printed.finish()
         self.connection.close()
         return exit_code
 
@@ -230,13 +282,13 @@ def first_to_answer(children: Sequence[_Apart]) -> _Apart:
             return found[0]
 
 
-def _fresh_python(connection: Connection) -> subprocess.Popen[bytes]:
+def _fresh_python(descriptors: tuple[int, int]) -> subprocess.Popen[bytes]:
     code = f"import sys; sys.path[:] = {sys.path!r}; from harness.processes import _begin; "
     return subprocess.Popen(  # noqa: S603 - our own words
-        [sys.executable, "-c", f"{code}_begin({connection.fileno()}, {os.getpid()})"],
+        [sys.executable, "-c", f"{code}_begin({descriptors}, {os.getpid()})"],
         stdin=subprocess.DEVNULL,
         env={"OPENBLAS_NUM_THREADS": "1", **os.environ, SAID: "1"},
-        pass_fds=[connection.fileno()],
+        pass_fds=descriptors,
         start_new_session=True,
     )
 
@@ -258,13 +310,14 @@ class ForkServer:
             self._child = Child(_serve_forks, self._modules)
         return self._child
 
-    def fork(self, connection: Connection) -> Forked:
-        """A copy that does the work which it receives; an `OSError` where there can be none."""
+    def fork(self, descriptors: tuple[int, int]) -> Forked:
+        """A copy that does the work which it receives, and prints, there; an `OSError` where there can be none."""
         for _ in range(_FORK_ATTEMPTS):
             child = self.start()
             with suppress(EOFError, OSError):  # it has been killed
                 child.connection.send(None)
-                send_handle(child.connection, connection.fileno(), 0)
+                for descriptor in descriptors:
+                    send_handle(child.connection, descriptor, 0)
                 answer = child.connection.recv()
                 break
         else:
@@ -335,7 +388,7 @@ def _serve_forks(connection: Connection, modules: Sequence[str]) -> None:
                 _reap(ended)
                 connection.send(ended.pop(pid, None))
                 continue
-            descriptor = recv_handle(connection)
+            descriptors = recv_handle(connection), recv_handle(connection)
         except (EOFError, OSError):  # the parent is gone
             _end_children()
             return
@@ -346,9 +399,10 @@ def _serve_forks(connection: Connection, modules: Sequence[str]) -> None:
             answer = error
         if answer == 0:
             connection.close()
-            _begin(descriptor, server)
+            _begin(descriptors, server)
             return
-        os.close(descriptor)
+        for descriptor in descriptors:
+            os.close(descriptor)
         if isinstance(answer, int):
             ended.pop(answer, None)  # of one that had this number before
         connection.send(answer)
@@ -422,13 +476,17 @@ def end(process: subprocess.Popen[bytes] | Forked) -> int:
     return process.wait()
 
 
-def _begin(descriptor: int, parent: int) -> None:
-    """Do what this process has been started for."""
+def _begin(descriptors: tuple[int, int], parent: int) -> None:
+    """Do what this process has been started for: it hears that by one descriptor, and prints to the other."""
+    descriptor, printed = descriptors
     leave_signals_to_parent()
     if sys.platform == "linux":  # what children leave behind becomes a child of this process
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
-    with suppress(OSError):  # stderr may be closed
-        os.dup2(2, 1)
+    for standard in (1, 2):
+        os.dup2(printed, standard)
+    os.close(printed)
+    if isinstance(sys.stdout, TextIOWrapper):  # as on a terminal: nothing is lost if the process dies
+        sys.stdout.reconfigure(line_buffering=True)
     connection = Connection(descriptor)
     _pipe[:] = [descriptor]
     try:

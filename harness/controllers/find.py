@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from copy import deepcopy
-from functools import partial
+from functools import cache, partial
 from importlib.util import module_from_spec, spec_from_file_location
 from inspect import Parameter, Signature, isfunction, signature
 from multiprocessing.connection import Connection
@@ -98,17 +98,16 @@ def build_host(
     if av.source not in ("controller", "fmu"):
         return None
     guard = Guard(av.limits, black_box)
-    make: Callable[[], Any]
-    if av.fmu is None:
-        make = _maker(av)
-        first = _made(make, str(av.controller), guard)
-        if _is_batch(first):
-            return BatchHost(first, av, seed, guard)
-    else:
+    if av.fmu is not None:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
-        make = fmu_maker(av.fmu)
-    return VehicleHost(make, n_cells, av, seed, guard, fatal_episodes)
+        return VehicleHost(fmu_maker(av.fmu), n_cells, av, seed, guard, fatal_episodes)
+    make = _maker(av)
+    guard.restore_modes()
+    first = _made(make, str(av.controller), guard)
+    if _is_batch(first):
+        return BatchHost(first, av, seed, guard)
+    return VehicleHost(make, n_cells, av, seed, guard, fatal_episodes, first)
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
@@ -117,16 +116,31 @@ def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
     found = controller_class(name)
     parameters = av.parameters if isinstance(av.parameters, dict) else {}
     make, handed = _as_class(found, name)
+    if "loaded" in handed:
+        make, parameters = _loaded_once(found, make, parameters)
     try:
         _signature(found).bind(**handed, **parameters)
     except TypeError as error:
-        takes = [each for each in _signature(found).parameters if each not in handed]
+        loads = _signature(getattr(found, "load")).parameters if "loaded" in handed else {}  # noqa: B009 - has one
+        takes = [each for each in {**loads, **_signature(found).parameters} if each not in handed]
         wrong = next((each for each in parameters if each not in takes), "")
         what = f"{', '.join(parameters) or 'none'}, which {name} does not take ({error})"
         mend = did_you_mean(wrong, takes) or "Correct av.parameters, or the constructor."
         expected = f"keyword arguments of the controller: {', '.join(takes) or 'it has none'}"
         raise CampaignError("av.parameters", what, expected, mend) from error
     return lambda: make(**deepcopy(parameters))
+
+
+def _loaded_once(
+    found: Any, make: Callable[..., Any], parameters: dict[str, Any]
+) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """What makes controllers, each handed the one object that ``load`` returns; and the parameters left for them."""
+    own, its = _signature(found).parameters, _signature(found.load).parameters
+    load = cache(partial(found.load, **deepcopy({key: value for key, value in parameters.items() if key in its})))
+    left = {key: value for key, value in parameters.items() if key in own or key not in its}
+    if isinstance(make, partial):  # a listener, which is made anew in every test
+        return lambda **each: StepListenerController(partial(found, loaded=load()), **each), left
+    return lambda **each: make(loaded=load(), **each), left
 
 
 def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
@@ -141,9 +155,11 @@ def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any],
     if isfunction(found) and not _is_controller(made) and first is not None and first.default is Parameter.empty:
         return lambda **parameters: SimpleNamespace(step=partial(found, **parameters)), {first.name: None}
     _require_controller(made, name)
+    loads = isinstance(found, type) and "loaded" in takes and callable(getattr(found, "load", None))
+    handed = {"loaded": None} if loads else {}
     if isinstance(found, type) and "traci" in takes and not _is_batch(found):
-        return partial(StepListenerController, found), {"traci": None}
-    return found, {}
+        return partial(StepListenerController, found), {"traci": None, **handed}
+    return found, handed
 
 
 def _signature(found: Callable[..., Any]) -> Signature:
@@ -186,6 +202,7 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     if wrong is not None:
         mend = "Mend its constructor, or what it needs (av.parameters; av.limits.construction_time_s, if that is time)."
         raise CampaignError("av.controller", f"{name}, whose constructor failed: {wrong}", "a controller", mend)
+    guard.require_untouched()
     _require_controller(controller, name)
     return controller
 
@@ -235,9 +252,7 @@ def require_controller(av: AutomatedVehicle) -> str | None:
 
 
 def _source_of_made(av: AutomatedVehicle, *, black_box: Path | None = None) -> str | None:
-    host = build_host(av, n_cells=1, seed=0, black_box=black_box)
-    if host is not None:
-        host.close()
+    build_host(av, n_cells=1, seed=0, black_box=black_box)  # what it holds ends with the process
     if av.controller is None:
         return None
     module = sys.modules.get(getattr(controller_class(av.controller), "__module__", ""))

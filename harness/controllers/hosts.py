@@ -11,10 +11,10 @@ import math
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from sysconfig import get_path
+from time import monotonic, sleep
 from traceback import walk_tb
 from types import FrameType
 from typing import Any, ClassVar, NamedTuple, Self
@@ -23,6 +23,7 @@ import numpy as np
 
 from harness.campaign.problems import did_you_mean
 from harness.campaign.vehicle import AutomatedVehicle, Limits
+from harness.controllers.process_state import CHANGED_MODES, FloatingPointModes, OtherModules
 from harness.controllers.protocol import (
     BatchController,
     BatchObservation,
@@ -31,6 +32,7 @@ from harness.controllers.protocol import (
     Observation,
     VehicleController,
 )
+from harness.errors import CampaignError
 from harness.processes import (
     CLOSE,
     CLOSED_PIPE_EXIT_CODE,
@@ -92,19 +94,27 @@ def cause_of(error: BaseException) -> str:
         text = f"{type(error).__name__}: {error}"
     except BaseException as again:  # noqa: BLE001 - whatever a user's code raises
         text = f"{type(error).__name__}, whose text raised {type(again).__name__}"
+    if _of_another_traci(error):
+        text = f"{text.rstrip('.')}. Use the traci that is handed in (docs/controllers.md), not the module"
     asked = type(error.obj) if isinstance(error, AttributeError) else object
     if isinstance(error, AttributeError) and asked.__module__.startswith("harness."):
         text += f". {did_you_mean(error.name, [name for name in dir(asked) if name[0] != '_'])}".rstrip(". ")
     return text.encode("utf-8", "backslashreplace").decode().splitlines()[0][:500] + _place_of(error)
 
 
-_NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), "<"
+def _of_another_traci(error: BaseException) -> bool:
+    """Whether a script has asked the module traci, or libsumo, instead of what stands for it here."""
+    origin = error.name if isinstance(error, ImportError) else type(error).__module__
+    return (origin or "").partition(".")[0] in ("traci", "libsumo")
+
+
+NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), "<"
 
 
 def _place_of(error: BaseException) -> str:
     """`` (my_av.py:12)``: the last line of the user's code on the way to an error; empty where there is none."""
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
-    theirs = [place for place in places if not place[0].startswith(_NOT_THE_USERS)]
+    theirs = [place for place in places if not place[0].startswith(NOT_THE_USERS)]
     own = [place for place in theirs if "site-packages" not in place[0]] or theirs
     return f" ({Path(own[-1][0]).name}:{own[-1][1]})" if own else ""
 
@@ -125,6 +135,8 @@ class Guard:
     """
 
     _current: ClassVar[Guard | None] = None
+    n_calls: ClassVar[int] = 0
+    """Of all controllers of this process."""
 
     def __init__(self, limits: Limits, black_box: Path | None) -> None:
         self._low, self._high = limits.min_acceleration_mps2, limits.max_acceleration_mps2
@@ -132,6 +144,9 @@ class Guard:
         self._seconds, self._late = self._limits[False]
         """Of the call under way."""
         self._black_box = BlackBox(black_box)
+        self._modes, self._others = FloatingPointModes(), OtherModules()
+        self.construction_s: list[float] = []
+        """Time that each constructor took."""
         self._since: float | None = None
         """When the call under way began, None between calls: the harness itself may take its time."""
         if black_box is not None:
@@ -160,21 +175,38 @@ class Guard:
 
         One that ``makes`` a controller has a time limit of its own.
         """
+        Guard.n_calls += 1
         self._black_box.enter(kind, episode, step)
         self._seconds, self._late = self._limits[makes]
-        self._since = time.monotonic()
+        self._since = since = monotonic()
         signal.setitimer(signal.ITIMER_REAL, self._seconds)
         try:
             answer = function(*arguments)
-            if (misdeed := self._black_box.misdeed()) is not None:
+            misdeed = CHANGED_MODES if self._modes.restored() else self._black_box.misdeed()
+            if misdeed is not None:
                 return answer, misdeed
             return check(answer) if check else (answer, None)
         except BaseException as error:  # noqa: BLE001 - whatever a user's code raises is its episode's end
             require_fault(error)
+            self._modes.restored()
             return None, cause_of(error)
         finally:
             self._since = None  # the timer itself is set again by the next call
+            if makes:
+                self.construction_s.append(monotonic() - since)
             self._black_box.leave()
+
+    def restore_modes(self) -> None:
+        """After a module has been imported: libraries that were compiled for speed change how this thread computes."""
+        self._modes.restored()
+
+    def require_untouched(self) -> None:
+        """Refuse a vehicle that has replaced what the harness itself calls; a `CampaignError` names it."""
+        if replaced := self._others.restored():
+            more = f" and {len(replaced) - 3} more" if len(replaced) > 3 else ""
+            found = f"a vehicle that has replaced {', '.join(replaced[:3])}{more}, which the harness calls, too"
+            mend = "Give your own function a name of its own, in your own module."
+            raise CampaignError("av.controller", found, "modules of Python and numpy left as they are", mend)
 
     def close(self, controllers: Iterable[Any]) -> None:
         """Close controllers; what they raise is nobody's concern: they have failed before, or the run is over."""
@@ -212,9 +244,9 @@ class Guard:
     def _watch(self) -> None:
         """End the process when a call outlasts the exception that should have ended it."""
         while True:
-            time.sleep(0.5)
+            sleep(0.5)
             since = self._since
-            if since is not None and time.monotonic() - since > 2.0 * self._seconds + 1.0:
+            if since is not None and monotonic() - since > 2.0 * self._seconds + 1.0:
                 os._exit(HUNG_EXIT_CODE)
 
 
@@ -230,10 +262,11 @@ class _Host:
         self.acts_before_cut_in, self.warm_up_steps = av.acts_before_cut_in, av.warm_up_steps
         self.cruises = av.takes_over == "first_braking"
         self._seed, self._guard = seed, guard
+        self.require_untouched, self.construction_s = guard.require_untouched, guard.construction_s
 
 
 class VehicleHost(_Host):
-    """One controller object per cell, made by ``make``.
+    """One controller object per cell, made by ``make``; the ``first``, if there is one already, is that of cell 0.
 
     ``fatal_episodes`` are known to kill the process: they fail just before the call that did. They may become more.
     """
@@ -246,10 +279,11 @@ class VehicleHost(_Host):
         seed: int,
         guard: Guard,
         fatal_episodes: Mapping[int, Death] | None = None,
+        first: VehicleController | None = None,
     ) -> None:
         super().__init__(av, seed, guard)
         self._make = make
-        self._controllers: list[VehicleController | None] = [None] * n_cells
+        self._controllers: list[VehicleController | None] = [first, *[None] * (n_cells - 1)]
         self._episodes = [-1] * n_cells
         self._fatal_episodes = {} if fatal_episodes is None else fatal_episodes
 

@@ -7,9 +7,12 @@ docs/controllers.md lists every difference. What a script may not do here is ref
 
 from __future__ import annotations
 
+import importlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
+from functools import partial
+from types import ModuleType
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -21,16 +24,29 @@ __all__ = ["StepListenerController", "TraCIException", "TraciStyleController"]
 
 VEH_ID = "AV"
 ROAD = "cell0"
+LANES = {"LV": 1, "BV": 1, VEH_ID: 0}
+"""Vehicles of a cell, and their lanes (0 right, 1 left) before a cut-in."""
 LANE_CENTRES_M = (-1.6, 1.6)
 MAX_SPEED_MPS = 100.0
 HEADING_DEGREES = 90.0
 _ROUNDING = 1e-9
+_SAFE_SPEED, _ACCEL, _DECEL = 1, 2, 4
+"""Bits of a speed mode."""
+_CHANGES_LANE = 0b1100_1111_1111
+"""Bits of a lane change mode that let SUMO change lanes, but for how much room it leaves."""
+_DEFAULT_VARIABLES = 0x50, 0x56
+_NUMBERS = 0x32, 0x40, 0x41, 0x42, 0x43, 0x44, 0x4C, 0x4F, 0x50, 0x51, 0x52, 0x56, 0x68, 0x72, 0x78, 0xB8
+_GETTERS = (
+    *("getLateralSpeed", "getSpeed", "getMaxSpeed", "getPosition", "getAngle", "getLength", "getMinGap", "getTypeID"),
+    *("getRoadID", "getLaneID", "getLaneIndex", "getLanePosition", "getLeader", "getAcceleration", "getFollower"),
+    "getLateralLanePosition",
+)
+_VARIABLES = dict(zip(_NUMBERS, _GETTERS, strict=True))
+"""What number of ``traci.constants`` can be subscribed to, and what gets it."""
 
 _WOULD_MOVE = "it would move vehicles past the harness and invalidate the likelihood ratios"
 _STEPS = "the harness itself starts, steps and ends the simulation"
 _WHY = {
-    "setSpeedMode": "it has no effect here: what the AV is told it does exactly, as under speed mode 32",
-    "setLaneChangeMode": "it has no effect here: the AV stays on its lane",
     "addStepListener": "name the listener in the campaign, as av.controller",
     "changeLane": "the AV stays on its lane; " + _WOULD_MOVE,
 }
@@ -76,6 +92,26 @@ def _question(about: str, answer_of: Callable[[VehicleDomain], Any]) -> Callable
     return answer
 
 
+def _neighbours(name: str, mode: int) -> Callable[..., tuple[tuple[str, float], ...]]:
+    def answer(self: VehicleDomain, vehID: str, blockingOnly: bool = False) -> tuple[tuple[str, float], ...]:
+        return self.getNeighbors(vehID, mode | 4 * blockingOnly)
+
+    answer.__doc__, answer.__name__ = f"`getNeighbors` in mode {mode}; with ``blockingOnly`` in {mode | 4}.", name
+    return answer
+
+
+def _accepted(name: str, holds: Callable[[Any], bool], what_holds: str) -> Callable[..., None]:
+    """A setter of the AV that changes nothing: it is refused unless it asks for what holds anyway."""
+
+    def accept(self: VehicleDomain, vehID: str, value: Any, *_more: Any) -> None:
+        self._require_own(vehID, name)
+        if not holds(value):
+            raise TraCIException(f"vehicle.{name}('{vehID}', {value}) is refused: {what_holds}.")
+
+    accept.__doc__ = f"Accepted as far as it changes nothing: {what_holds}."
+    return accept
+
+
 class VehicleDomain(Domain):
     """``traci.vehicle`` of one cell."""
 
@@ -86,12 +122,18 @@ class VehicleDomain(Domain):
         self._set_speed = {"LV": MAX_SPEED_MPS, "BV": MAX_SPEED_MPS, VEH_ID: set_speed_mps}
         self._plan: Iterator[float] = iter(())
         """Accelerations (m/s²) of the coming steps; empty without a command."""
+        self._command: Callable[[], Iterator[float]] | None = None
+        """What begins the plan anew: nothing for a command that is over after a step."""
+        self._told = math.nan
+        """Speed (m/s) that the AV will have if it does what it is told."""
         self._accel = self._decel = math.inf
+        self._speed_mode = _ACCEL | _DECEL
+        self._subscribed: dict[str, tuple[int, ...]] = {}
         self._speed: dict[str, float] = {}
         self._position: dict[str, float] = {}
         self._acceleration: dict[str, float] = {}
-        self._lane = {"LV": 1, "BV": 1, VEH_ID: 0}
-        self._lateral_m = {"LV": 0.0, "BV": 0.0, VEH_ID: 0.0}
+        self._lane = dict(LANES)
+        self._lateral_m = dict.fromkeys(LANES, 0.0)
         self._lateral_mps = dict(self._lateral_m)
 
     def see(self, now: Observation) -> None:
@@ -108,11 +150,21 @@ class VehicleDomain(Domain):
         if before:
             self._acceleration["LV"] = (lv.speed_mps - before["LV"]) / STEP_S
             self._acceleration["BV"] = (bv.speed_mps - before["BV"]) / STEP_S
+        # In the warm-up, and as long as it is held, the AV does not do what it is told. A command of longer than a step
+        # waits for it: else it would ask, at the hand-over, for speeds that it should have reached by then.
+        if self._command is not None and abs(now.speed_mps - self._told) > _ROUNDING:
+            self._plan = self._command()
 
     def next_acceleration(self) -> float:
         """What the AV is told for the coming step (m/s²); without a command it keeps its speed."""
-        acceleration = next(self._plan, None)
-        return 0.0 if acceleration is None else min(max(acceleration, -self._decel), self._accel)
+        if (acceleration := next(self._plan, None)) is None:
+            self._command, acceleration = None, 0.0
+        elif self._speed_mode & _DECEL:
+            acceleration = max(acceleration, -self._decel)
+        if self._speed_mode & _ACCEL:
+            acceleration = min(acceleration, self._accel)
+        self._told = max(0.0, self._speed[VEH_ID] + acceleration * STEP_S)
+        return acceleration
 
     def _of(self, table: dict[str, Any], vehID: str) -> Any:
         try:
@@ -157,6 +209,33 @@ class VehicleDomain(Domain):
         """Road and lane index."""
         return f"{ROAD}_{self.getLaneIndex(vehID)}"
 
+    def getSpeedMode(self, vehID: str) -> int:
+        """What `setSpeedMode` has set; 6 without."""
+        self._require_own(vehID, "getSpeedMode", "is not known of traffic")
+        return self._speed_mode
+
+    def subscribe(self, objectID: str, varIDs: Sequence[int] | None = None, *_when: float) -> None:
+        """Ask for variables (numbers of ``traci.constants``), for the whole test; by default road and position."""
+        self._of(self._lane, objectID)
+        wanted = tuple(_DEFAULT_VARIABLES if varIDs is None else varIDs)
+        if unknown := [hex(number) for number in wanted if number not in _VARIABLES]:
+            raise TraCIException(
+                f"Variable {unknown[0]} of vehicles is not known here: it has {', '.join(map(hex, _VARIABLES))}."
+            )
+        self._subscribed[objectID] = wanted
+
+    def unsubscribe(self, objectID: str) -> None:
+        """Ask for nothing more."""
+        self._subscribed.pop(objectID, None)
+
+    def getSubscriptionResults(self, objectID: str) -> dict[int, Any]:
+        """Values of what has been subscribed to, by number; none without."""
+        return {number: getattr(self, _VARIABLES[number])(objectID) for number in self._subscribed.get(objectID, ())}
+
+    def getAllSubscriptionResults(self) -> dict[str, dict[int, Any]]:
+        """The same of all vehicles that have been subscribed to."""
+        return {name: self.getSubscriptionResults(name) for name in self._subscribed}
+
     def getAccel(self, vehID: str) -> float:
         """Bound that `setAccel` has put on commands (m/s²), infinite without."""
         self._require_own(vehID, "getAccel", "is not known of traffic")
@@ -179,8 +258,23 @@ class VehicleDomain(Domain):
         """Vehicle behind on the lane and the gap from it (m); ``("", -1.0)`` without one."""
         return self._nearest(vehID, -1.0) or ("", -1.0)
 
-    def _nearest(self, vehID: str, direction: float) -> tuple[str, float] | None:
-        here, lane = self._of(self._position, vehID), self._lane[vehID]
+    def getNeighbors(self, vehID: str, mode: int) -> tuple[tuple[str, float], ...]:
+        """Nearest vehicle on a lane beside, and the gap (m): 1 the right one, not the left; 2 ahead, not behind.
+
+        With 4 only one that is in the way of a lane change: one beside.
+        """
+        lane = self._of(self._lane, vehID) + (-1 if mode & 1 else 1)
+        found = self._nearest(vehID, 1.0 if mode & 2 else -1.0, lane)
+        return () if found is None or (mode & 4 and found[1] > 0.0) else (found,)
+
+    getLeftFollowers = _neighbours("getLeftFollowers", 0)
+    getRightFollowers = _neighbours("getRightFollowers", 1)
+    getLeftLeaders = _neighbours("getLeftLeaders", 2)
+    getRightLeaders = _neighbours("getRightLeaders", 3)
+
+    def _nearest(self, vehID: str, direction: float, lane: int | None = None) -> tuple[str, float] | None:
+        here = self._of(self._position, vehID)
+        lane = self._lane[vehID] if lane is None else lane
         found: tuple[str, float] | None = None
         for other, there in self._position.items():
             distance = direction * (there - here)
@@ -195,14 +289,14 @@ class VehicleDomain(Domain):
     def setSpeed(self, vehID: str, speed: float) -> None:
         """Drive at this speed (m/s) from the next step on until told otherwise; -1 releases."""
         self._require_own(vehID, "setSpeed")
-        self._plan = iter(()) if speed < 0.0 else self._hold(_finite(speed))
+        self._begin(None if speed < 0.0 else partial(self._hold, _finite(speed)), math.inf)
 
     def setAcceleration(self, vehID: str, acceleration: float, duration: float) -> None:
         """Accelerate (m/s²) for a duration (s)."""
         self._require_own(vehID, "setAcceleration")
         if duration < 0.0:
             raise TraCIException("Duration must not be negative.")
-        self._plan = self._accelerate(_finite(acceleration), duration)
+        self._begin(partial(self._accelerate, _finite(acceleration), duration), duration)
 
     def slowDown(self, vehID: str, speed: float, duration: float) -> None:
         """Change speed linearly to a value (m/s) in a duration (s)."""
@@ -211,7 +305,11 @@ class VehicleDomain(Domain):
             raise TraCIException("Speed must not be negative.")
         if duration < 0.0:
             raise TraCIException("Invalid time interval.")
-        self._plan = self._approach(self._speed[VEH_ID], _finite(speed), duration)
+        self._begin(partial(self._approach, _finite(speed), duration), duration)
+
+    def _begin(self, command: Callable[[], Iterator[float]] | None, duration: float) -> None:
+        self._plan = iter(()) if command is None else command()
+        self._command = command if duration > STEP_S + _ROUNDING else None
 
     def _hold(self, speed: float) -> Iterator[float]:
         """Until further notice."""
@@ -225,8 +323,8 @@ class VehicleDomain(Domain):
             yield acceleration if left > 1.0 - _ROUNDING else acceleration * left
             left -= 1.0
 
-    def _approach(self, start: float, target: float, duration: float) -> Iterator[float]:
-        steps, done = max(duration / STEP_S, 1.0), 0
+    def _approach(self, target: float, duration: float) -> Iterator[float]:
+        start, steps, done = self._speed[VEH_ID], max(duration / STEP_S, 1.0), 0
         while done <= steps - _ROUNDING:
             done += 1
             share = min(1.0, done / steps)
@@ -241,6 +339,23 @@ class VehicleDomain(Domain):
         """Bound the braking (m/s², positive) that later commands lead to."""
         self._require_own(vehID, "setDecel")
         self._decel = decel
+
+    def setSpeedMode(self, vehID: str, speedMode: int) -> None:
+        """Whether `setAccel` (bit 2) and `setDecel` (bit 4) bound commands."""
+        self._require_own(vehID, "setSpeedMode")
+        if speedMode & _SAFE_SPEED:
+            why = "SUMO's safe speeds (bit 1) do not bound the AV here: what it is told it does, as under speed mode 32"
+            raise TraCIException(f"vehicle.setSpeedMode('{vehID}', {speedMode}) is refused: {why}.")
+        self._speed_mode = speedMode
+
+    setLaneChangeMode = _accepted(
+        "setLaneChangeMode", lambda mode: not mode & _CHANGES_LANE, "the AV stays on its lane, as in mode 0, 256 or 512"
+    )
+    setMinGap = _accepted("setMinGap", lambda gap: gap == 0.0, "gaps are bumper to bumper, minGap is 0")
+    setLength = _accepted("setLength", lambda length: length == VEHICLE_LENGTH_M, "vehicles are 5 m long")
+    setActionStepLength = _accepted("setActionStepLength", lambda step: step == STEP_S, "the AV acts in every 0.1 s")
+    setSpeedFactor = _accepted("setSpeedFactor", lambda factor: factor == 1.0, "the speed factor is 1")
+    setColor = _accepted("setColor", lambda _: True, "nobody sees a colour")
 
     def _require_own(self, vehID: str, name: str, why: str = "") -> None:
         if vehID != VEH_ID:
@@ -266,6 +381,20 @@ class SimulationDomain(Domain):
         """Step (s)."""
         return STEP_S
 
+    def getMinExpectedNumber(self) -> int:
+        """Vehicles that are there as long as a test runs."""
+        return len(LANES)
+
+    def getCollidingVehiclesNumber(self) -> int:
+        """None: a crash ends the test."""
+        return 0
+
+    def getCollidingVehiclesIDList(self) -> tuple[str, ...]:
+        """As `getCollidingVehiclesNumber`."""
+        return ()
+
+    getCollisions = getArrivedIDList = getCollidingVehiclesIDList
+
 
 class Traci(Domain):
     """What stands for the module ``traci``: one episode of one cell."""
@@ -276,6 +405,11 @@ class Traci(Domain):
     def __init__(self, set_speed_mps: float = math.nan) -> None:
         self.vehicle, self.simulation = VehicleDomain(set_speed_mps), SimulationDomain()
         self.exceptions = self  # so that ``traci.exceptions.TraCIException`` is found
+
+    @property
+    def constants(self) -> ModuleType:
+        """Numbers to subscribe by."""
+        return importlib.import_module("traci.constants")
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""

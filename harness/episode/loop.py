@@ -127,8 +127,16 @@ class EpisodeLoop:
 
         ``traffic`` is what LV and BV do, where it is not drawn.
 
-        Raises `WorldDisagreementError`: the world did something else than it was told.
+        Raises `WorldDisagreementError`: the world did something else than it was told. Raises `CampaignError`: the
+        vehicle has replaced what the harness calls, whatever came of that.
         """
+        try:
+            return self._run(first_episode, states, traffic)
+        finally:
+            if self._av is not None:
+                self._av.require_untouched()
+
+    def _run(self, first_episode: int, states: RecordArray, traffic: PrescribedTraffic | None) -> Shard:
         shard = self._empty_shard(first_episode, states, traffic or drawn_traffic())
         kernel = self._kernel_state(shard)
         given = ended = 0
@@ -150,6 +158,11 @@ class EpisodeLoop:
     ) -> EpisodeLoop:
         """Another loop with the same AV, in a world of no more cells, with other records, or another drawing."""
         return EpisodeLoop(world or self._world, drawing or self._policy, keep or self._keep, self._av)
+
+    @property
+    def construction_s(self) -> list[float]:
+        """Time (s) that each constructor of a controller has taken."""
+        return [] if self._av is None else self._av.construction_s
 
     def close(self) -> None:
         """Release what the AV's controllers hold; the loop runs no more."""

@@ -6,8 +6,8 @@ import re
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,28 +18,37 @@ from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.find import has_foreign_code, run_apart
+from harness.controllers.find import build_host, has_foreign_code, run_apart
+from harness.controllers.hosts import ControllerHost, Failures
+from harness.controllers.protocol import BatchObservation
+from harness.episode.cells import drawn_traffic
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
-from harness.processes import usable_cpus
 from harness.resolved import require_ready, require_world, resolve
-from harness.runner.workers import Bits, bits_of
-from harness.sampling import EPISODES_PER_S, prepare, source_of
+from harness.runner.again import Bits, Tests, bits_of, run_elsewhere
+from harness.sampling import prepare, source_of
 from harness.sampling.protocol import Source
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import AV, CRASH, FAILED
+from harness.vocabulary import AV, CRASH, FAILED, FloatArray
 from harness.worlds import build_world
-from harness.worlds.shim import shim_library
+from harness.worlds.twin import TwinWorld
 
 EPISODES = 48
 CELLS, OTHER_CELLS = 16, 5
 """Two layouts in which every episode has other neighbours, and mostly another cell."""
-WARM_UP_EPISODES = 2
+FIRST_EPISODES = 2
+"""Run before the time is taken: they compile."""
 SHORTEST_TIMING_S = 0.3
 BRAKING_MPS2 = -0.1
 """What counts as a reaction to the cut-in."""
 AT_LIMIT_MPS2 = 1e-9
+WARM_UP_EPISODES, LONGER, LONGEST_S = 12, 10.0, 60.0
+"""Tests in which the warm-up is left out, or made ten times as long."""
+MOVES_MPS2 = 0.5
+"""Change of a first answer that says: the warm-up leaves something behind."""
+SLOW_S = 0.1
+"""Time of a constructor that is worth a word."""
 
 
 @dataclass(frozen=True)
@@ -73,15 +82,19 @@ IN_WORDS = {
     "n_crashes": "crashes (no rate: cut-ins are forced)",
     "us_per_step": "time per step, µs",
     "episodes_per_s": "tests per second",
+    "construction_s": "time that its constructor takes, median, s",
+    "constructions": "times that each worker of a run calls it",
 }
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Time per episode step, and episodes per second."""
+    """Time per episode step, episodes per second, and what a worker of a run constructs before its cells are full."""
 
     us_per_step: float
     episodes_per_s: float
+    construction_s: float
+    constructions: int
 
 
 @dataclass(frozen=True)
@@ -90,9 +103,11 @@ class AvCheck:
 
     ``failures`` are numbers of episodes of the first run by the cause that they failed with, where one stands for all
     that differ from it in digits alone; ``differing`` are those whose motion was not the same bits in the two layouts,
-    with the ``likely_cause`` if there are any; ``limits_mps2`` are the accelerations that count as its limits. The
-    built-in IDM has driven the same episodes in the same cells. Cut-ins are of one step, also where they ``take_time``
-    in the campaign, for a vehicle that acts before them: a look makes no baseline runs, which would tell the onset.
+    with the ``likely_cause`` if there are any; ``limits_mps2`` are the accelerations that count as its limits;
+    ``moved_mps2`` says by how much first answers move at most if the warm-up takes so many seconds (key) instead of
+    ``av.warm_up_s``. The built-in IDM has driven the same episodes in the same cells. Cut-ins are of one step, also
+    where they ``take_time`` in the campaign, for a vehicle that acts before them: a look makes no baseline runs, which
+    would tell the onset.
     """
 
     source: str
@@ -104,6 +119,7 @@ class AvCheck:
     differing: tuple[int, ...]
     likely_cause: str
     limits_mps2: tuple[float, float]
+    moved_mps2: dict[float, float]
     behaviour: Behaviour
     idm_behaviour: Behaviour
     speed: Speed
@@ -124,11 +140,28 @@ class AvCheck:
             return f"NOT REPRODUCIBLE: {len(self.differing)} of {n} tests came out otherwise. {self.likely_cause}"
         if not seen.n_cut_ins or not seen.braking_share > 0.0:
             return f"LOOK AGAIN: it braked after none of {seen.n_cut_ins} cut-ins. Does it see BV?"
+        longest, moved = max(self.moved_mps2.items(), default=(0.0, 0.0))
+        if longest and moved > MOVES_MPS2:
+            return (
+                f"LOOK AGAIN: its first answer moves by up to {moved:.1f} m/s² where the warm-up takes {longest:g} s. "
+                "State winds up while its answers are not used, as an integral does: limit it (anti-windup), or begin "
+                "it when BV comes; then av.warm_up_s need be no longer than its filters."
+            )
         slower = self.speed.us_per_step / self.idm_speed.us_per_step
         return (
             f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_cut_ins} "
             f"cut-ins, {seen.reaction_s:.1f} s after they began (median, also where it had no need to brake sooner); "
-            f"a step takes {slower:.1f} times that of IDM."
+            f"a step takes {slower:.1f} times that of IDM.{self._advice}"
+        )
+
+    @property
+    def _advice(self) -> str:
+        of = self.speed
+        if of.construction_s <= SLOW_S or of.constructions == 1:
+            return ""
+        return (
+            f" Its constructor takes {of.construction_s:.1f} s, and each worker of a run calls it {of.constructions} "
+            "times: what all may share, load once (`load`, see docs/controllers.md)."
         )
 
     @property
@@ -145,6 +178,10 @@ class AvCheck:
             ("tests that came out otherwise", found["differing"] or "none", ""),
             ("accelerations allowed, m/s²", [lowest, highest], ""),
             *((text, own[name], idm[name]) for name, text in IN_WORDS.items()),
+            *(
+                (f"its first answer with a warm-up of {s:g} s moves by up to, m/s²", moved, "")
+                for s, moved in self.moved_mps2.items()
+            ),
         ]
         return [{"what": text, "found": value, "built-in IDM": of_idm} for text, value, of_idm in rows]
 
@@ -170,10 +207,13 @@ def check_av(
 
     Raises `HarnessError`: the campaign is wrong, or the AV cannot be found, made or started.
     """
-    tested = _as_checked(campaign_of(campaign))
+    asked = campaign_of(campaign)
+    tested = _as_checked(asked)
     require_world(tested)
     source = prepare(resolve(tested, "av-check"))
     first, own_speed = _timed_run(source, n_episodes, black_box)
+    if own_speed.constructions > 1:  # one for each cell
+        own_speed = replace(own_speed, constructions=asked.world.cells)
     again = _run_in_another_order(source, n_episodes, black_box)
     idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
     of_idm, idm_speed = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
@@ -191,6 +231,7 @@ def check_av(
         differing=differing,
         likely_cause=_likely_cause(source, differing[0], black_box) if differing else "",
         limits_mps2=limits,
+        moved_mps2=_moved_by_warm_up(source, min(n_episodes, WARM_UP_EPISODES), black_box),
         behaviour=_behaviour(first, limits, early=early),
         idm_behaviour=_behaviour(of_idm, limits, early=early),
         speed=own_speed,
@@ -222,6 +263,23 @@ def _as_checked(campaign: Campaign) -> Campaign:
     return campaign.model_copy(update={**asked, "records": records})
 
 
+class FirstAnswers:
+    """A host that notes, by test, what its controllers answer first once they are asked (m/s²)."""
+
+    def __init__(self, host: ControllerHost) -> None:
+        self._host, self.noted = host, dict[int, float]()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._host, name)
+
+    def act(self, seen: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:
+        """As `VehicleHost.act`."""
+        answer, failures = self._host.act(seen, warms_up=warms_up)
+        if not warms_up:
+            self.noted = {**dict(zip(seen.episode.tolist(), answer.tolist(), strict=True)), **self.noted}
+        return answer, failures
+
+
 @contextmanager
 def _opened(source: Source, black_box: Path | None, n_cells: int | None = None) -> Iterator[EpisodeLoop]:
     world = build_world(source.campaign, n_cells)
@@ -236,7 +294,7 @@ def _opened(source: Source, black_box: Path | None, n_cells: int | None = None) 
 def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, Speed]:
     """First run of the episodes, and the speed of the fastest of several."""
     with _opened(source, black_box) as loop:
-        loop.run(0, source.states(0, min(WARM_UP_EPISODES, n_episodes)))  # compiles
+        loop.run(0, source.states(0, min(FIRST_EPISODES, n_episodes)))
         states = source.states(0, n_episodes)
         began = time.perf_counter()
         shard, elapsed_s = loop.run(0, states), time.perf_counter() - began
@@ -244,19 +302,45 @@ def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -
         while (again := time.perf_counter()) < until:
             loop.run(0, states)
             elapsed_s = min(elapsed_s, time.perf_counter() - again)
+        made_s = loop.construction_s
     steps = max(1, int(shard.results.episode["n_steps"].sum()))
-    return shard, Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s)
+    median_s = float(np.median(made_s)) if made_s else 0.0
+    return shard, Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s, median_s, len(made_s))
 
 
 def _run_in_another_order(source: Source, n_episodes: int, black_box: Path | None) -> dict[int, Bits]:
-    """What every episode leaves when it is run in another cell, the second half first."""
+    """What every episode leaves when it is run in another cell, the second half first; a user's code elsewhere."""
     half = n_episodes // 2
-    found: dict[int, Bits] = {}
+    order = [*range(half, n_episodes), *range(half)]
+    parts = order[: n_episodes - half], order[n_episodes - half :]
+    halves = [Tests(part[0], source.states(part[0], len(part)), drawn_traffic()) for part in parts]
+    if has_foreign_code(source.campaign.av):
+        return dict(zip(order, run_elsewhere(source, halves, OTHER_CELLS).bits, strict=True))
     with _opened(source, black_box, OTHER_CELLS) as loop:
-        for begin, end in ((half, n_episodes), (0, half)):
-            shard = loop.run(begin, source.states(begin, end - begin))
-            found.update({begin + row: bits_of(shard, row) for row in range(end - begin)})
-    return found
+        shards = [(loop.run(*tests), row) for tests in halves for row in range(tests.states.size)]
+    return {i: bits_of(shard, row) for i, (shard, row) in zip(order, shards, strict=True)}
+
+
+def _moved_by_warm_up(source: Source, n: int, black_box: Path | None) -> dict[float, float]:
+    """By how much (m/s²) first answers move at most, by the length of the warm-up (s); empty where there is none."""
+    av = source.campaign.av
+    if not av.warm_up_steps:
+        return {}
+    usual = _first_answers(source, av, n, black_box)
+    moved = {}
+    for seconds in (0.0, min(LONGER * av.warm_up_s, LONGEST_S)):
+        other = _first_answers(source, av.model_copy(update={"warm_up_s": seconds}), n, black_box)
+        moved[seconds] = max((abs(usual[i] - other[i]) for i in usual.keys() & other.keys()), default=0.0)
+    return moved
+
+
+def _first_answers(source: Source, av: AutomatedVehicle, n: int, black_box: Path | None) -> dict[int, float]:
+    """Of tests that did not fail."""
+    host = build_host(av, n_cells=1, seed=source.campaign.seed, black_box=black_box)
+    answers: Any = FirstAnswers(host) if host is not None else None
+    with closing(EpisodeLoop(TwinWorld(1), source.policy, source.records(), answers)) as loop:
+        failed = loop.run(0, source.states(0, n)).failures
+    return {i: answer for i, answer in answers.noted.items() if i not in failed}
 
 
 def _by_cause(causes: Iterable[str]) -> dict[str, int]:
@@ -266,7 +350,7 @@ def _by_cause(causes: Iterable[str]) -> dict[str, int]:
 
 
 def _likely_cause(source: Source, episode: int, black_box: Path | None) -> str:
-    """Why an episode is not the same again, by what it takes: nothing, another one before it, or one beside it."""
+    """Why an episode is not the same again, by what it takes: a clock, nothing, another one before or beside it."""
 
     def bits(n_cells: int, begin: int, n_before: int) -> Bits:
         with _opened(source, black_box, n_cells) as loop:
@@ -275,15 +359,35 @@ def _likely_cause(source: Source, episode: int, black_box: Path | None) -> str:
             n = min(n_cells, source.campaign.stop.episodes - episode)
             return bits_of(loop.run(episode, source.states(episode, n)), 0)
 
+    if has_foreign_code(source.campaign.av) and (cause := _cause_outside(source, episode)):
+        return cause
     alone, begin = bits(1, episode, 0), max(0, episode - OTHER_CELLS)
     if any(bits(1, episode, 0) != alone for _ in range(2)):
-        return (
-            "It differs also when nothing does: random numbers of its own (random, numpy.random), the clock, or a "
-            "variable of its module or class that outlives the object. Draw from episode.random; keep state in self."
-        )
+        return _OF_ITS_OWN
     if any(bits(1, first, episode - first or 1) != alone for first in (begin, episode)):
         return "It differs after another episode: it remembers the last one. Set all its state in start."
     return "It differs beside other vehicles: they share something. Keep state in self, not in the class or module."
+
+
+_OF_ITS_OWN = (
+    "It differs also when nothing does: random numbers of its own (random, numpy.random), or a variable of its module "
+    "or class that outlives the object. Draw from episode.random; keep state in self."
+)
+
+
+def _cause_outside(source: Source, episode: int) -> str:
+    """Whether it is the process, or the clock, which is the same in the first two runs and another in the last."""
+    test = [Tests(episode, source.states(episode, 1), drawn_traffic())]
+    one, other, later = (run_elsewhere(source, test, held=held) for held in (True, True, False))
+    if one.bits != other.bits:
+        return (
+            "It differs from process to process: random numbers of its own (random, numpy.random), the number of the "
+            "process, hash() of a text (the order of a set), or an id(). Draw from episode.random."
+        )
+    if one.bits != later.bits:
+        where = "; ".join(later.clock_read_at[:3]) or "in a library"
+        return f"It depends on the clock ({where}): a test may run at any speed. Use time_s of what it sees, or step_s."
+    return ""
 
 
 def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
@@ -321,20 +425,9 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
 
 @checked("plan_campaign")
 def plan_campaign(campaign: Campaign) -> dict[str, Any]:
-    """Most that a campaign may cost: ``most_tests`` and ``most_seconds``, the budget, and what is left to build.
-
-    ``tests_per_second`` (all cores) is without what an AV of one's own takes; ``tables`` is in words.
+    """Most that a campaign may cost: ``most_tests``, its budget, and in words the ``tables`` that are left to build.
 
     Raises `CampaignError`: a run would refuse the campaign before it starts.
     """
-    resolved, source = require_ready(campaign), source_of(campaign)
-    engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
-    rate = float(f"{EPISODES_PER_S[campaign.testing.method][engine] * usable_cpus():.2g}")
-    own = {} if campaign.av.model else {"av": "its own time comes on top: `harness av-check` measures it"}
-    return {
-        "most_tests": campaign.stop.episodes,
-        "most_seconds": round(campaign.stop.episodes / rate),
-        "tests_per_second": rate,
-        "tables": source.building(resolved),
-        **own,
-    }
+    resolved = require_ready(campaign)
+    return {"most_tests": campaign.stop.episodes, "tables": source_of(campaign).building(resolved)}

@@ -270,8 +270,8 @@ def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:
             f"a run that is not reproducible: {len(repeated['differing'])} of {repeated['n_episodes']} tests "
             "that it repeated itself came out otherwise",
             "an AV that does the same again, given the same observations and the same random stream",
-            "Draw only from the generator handed over in start, and keep nothing across episodes (`harness "
-            "av-check` tells whether that is so). The traces that the run has kept (--stored) are what happened.",
+            "Draw only from the generator handed over in start, ask no clock, and keep nothing across episodes "
+            "(`harness av-check` tells whether that is so). The kept traces (--stored) are what happened.",
         )
     found = "a run that is not reproducible: a program outside of the harness drove the AV"
     mend = "Look at the traces that the run has kept (--stored; records.traces: crash), or let the program write a log."

@@ -19,14 +19,11 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import pyarrow as pa
 from scipy.special import bdtrc
 
-from harness.campaign.campaign import Campaign
 from harness.controllers.hosts import Death, death_cause
-from harness.episode.cells import PrescribedTraffic
-from harness.episode.loop import EpisodeLoop, Shard, hash_of_index
+from harness.episode.loop import EpisodeLoop
 from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.processes import (
@@ -45,12 +42,11 @@ from harness.processes import (
 from harness.records.folder import Repeated, encoded, read_table
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
+from harness.runner.again import repeat
 from harness.sampling import prepare
 from harness.sampling.baseline import BaselineResult, as_recorded, learned_in, run_baseline
 from harness.sampling.protocol import ShardRequest, Source
-from harness.vocabulary import FAILED
 from harness.worlds import build_world
-from harness.worlds.twin import TwinWorld
 
 ATTEMPTS = 3
 """A shard whose worker dies is given to another one, this many times in all."""
@@ -63,14 +59,6 @@ CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
 REPEATED = b"harness.repeated"
 """Key in the metadata of an episodes file: what repeating showed is there with the shard, or not at all."""
-MOST_REPEATED, FEWEST_REPEATED = 10, 2
-ONE_OF = 10
-"""Ten tests of the first shard, less than 1 % from 1,000 tests on; of a shard below 100 tests a tenth, or two.
-
-Of a vehicle that is random in one of four tests, ten miss all with a probability of 6 %.
-"""
-
-Bits = tuple[bytes, bytes, str | None]
 
 
 @dataclass(frozen=True)
@@ -153,7 +141,7 @@ class ShardRunner:
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
         if request.index == 0 and campaign.av.model is None and campaign.av.traci is None:
-            tables = tables._replace(episodes=with_repeated(tables.episodes, repeat(self._loop, campaign, shard)))
+            tables = tables._replace(episodes=with_repeated(tables.episodes, repeat(self._loop, self._source, shard)))
         return replace(finished(self._source, request, tables), parquet=encoded(tables))
 
 
@@ -162,43 +150,6 @@ def finished(source: Source, request: ShardRequest, tables: ShardTables) -> Shar
     block = source.block(tables.episodes)
     failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
     return ShardResult(request, block, failures, repeated_of(tables.episodes))
-
-
-def repeat(loop: EpisodeLoop, campaign: Campaign, shard: Shard) -> Repeated:
-    """Run some tests of a loop's shard again, alone and after all the others.
-
-    What an episode brings about follows from the campaign's seed and the episode's index, as long as the AV keeps to
-    its observations and to the random stream that it is given. Code that draws random numbers of its own, remembers
-    earlier episodes, or shares state between cells does not; its tests cannot be replayed, and depend on what ran
-    beside them.
-    """
-    # The twin does one episode at little cost; an AV that SUMO moves has to be moved by SUMO again.
-    alone = loop if campaign.av.sumo is not None else loop.beside(TwinWorld(1))
-    rows = _rows_to_repeat(shard, campaign.seed, acts_early=campaign.av.acts_before_cut_in)
-    differing = []
-    for row in rows:
-        traffic = PrescribedTraffic._make(column[row : row + 1] for column in shard.traffic)
-        again = alone.run(shard.first_episode + row, shard.states[row : row + 1], traffic)
-        if bits_of(shard, row) != bits_of(again, 0):
-            differing.append(shard.first_episode + row)
-    return Repeated(len(rows), sorted(differing))
-
-
-def _rows_to_repeat(shard: Shard, seed: int, *, acts_early: bool) -> list[int]:
-    """Rows by a hash of their index, among those in which the AV had to act."""
-    episode = shard.results.episode
-    acted = (episode["outcome"] != FAILED) & (acts_early | (episode["cut_in_step"] >= 0))
-    rows = np.flatnonzero(acted)
-    order = np.argsort(hash_of_index(seed, shard.first_episode + rows), kind="stable")
-    n = min(MOST_REPEATED, max(FEWEST_REPEATED, episode.size // ONE_OF))
-    return [int(row) for row in rows[order[:n]]]
-
-
-def bits_of(shard: Shard, row: int) -> Bits:
-    """Everything that a test has left: its record, its motion where that was kept, and why it failed if it did."""
-    trace = shard.traces.get(row)
-    record = shard.results.episode[row].tobytes()
-    return record, b"" if trace is None else trace.tobytes(), shard.failures.get(row)
 
 
 def with_repeated(episodes: pa.Table, repeated: Repeated) -> pa.Table:

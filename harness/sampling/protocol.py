@@ -163,12 +163,16 @@ class Source:
         The file ``black_box`` tells in which episode's controller a process died; ``fatal_episodes`` are known to kill
         it, and may grow between two runs.
         """
-        campaign, records = self.campaign, self.campaign.records
-        keep = RecordPolicy(MOMENT_LIMITS[records.moments], traces or records.traces, records.trace_share)
+        campaign = self.campaign
         av = build_host(
             campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box, fatal_episodes=fatal_episodes
         )
-        return EpisodeLoop(world, self.policy, keep, av)
+        return EpisodeLoop(world, self.policy, self.records(traces), av)
+
+    def records(self, traces: str | None = None) -> RecordPolicy:
+        """What the campaign asks to be recorded of its tests, or with other ``traces``."""
+        kept = self.campaign.records
+        return RecordPolicy(MOMENT_LIMITS[kept.moments], traces or kept.traces, kept.trace_share)
 
     def rounds(self, held: int = 0) -> Rounds:  # noqa: ARG002 - only rounds that give up ask for it
         """Rounds of tests, for a folder that holds so many already."""

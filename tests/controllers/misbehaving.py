@@ -1,5 +1,6 @@
 """Controllers that are the built-in IDM until an episode in which they go wrong, in each in its own way."""
 
+import ctypes
 import math
 import os
 import random
@@ -57,7 +58,25 @@ def copies_the_process():
     return 0.0
 
 
+def computes_otherwise(word, bits):
+    """Sets bits of ``fenv_t``: of the x87's control word, or of MXCSR."""
+    libm, modes = ctypes.CDLL("libm.so.6"), (ctypes.c_uint32 * 16)()
+    libm.fegetenv(modes)
+    modes[word] = modes[word] ^ bits
+    return 0.0 * libm.fesetenv(modes)
+
+
+def rounds_up_and_raises():
+    computes_otherwise(7, 0x4000)
+    raises(ZeroDivisionError("no such thing"))
+
+
 FAULTS = {
+    "rounds_down": lambda: 0.0 * ctypes.CDLL("libm.so.6").fesetround(0x400),
+    "rounds_up_and_raises": rounds_up_and_raises,
+    "flushes_to_zero": lambda: computes_otherwise(7, 0x8040),
+    "traps_division": lambda: computes_otherwise(7, 0x0200),
+    "asks_another_traci": lambda: __import__("traci").vehicle.getSpeed("AV"),
     "none": lambda: None,
     "nan": lambda: math.nan,
     "inf": lambda: math.inf,
@@ -176,11 +195,51 @@ class Prints(IDM):
         os.write(1, f"{what}, below Python\n".encode())
 
 
+class PrintsMuch(IDM):
+    def step(self, seen):
+        print(f"{seen.time_s:.1f} s {1000 * 'x'}")  # noqa: T201 - what it is for
+        return super().step(seen)
+
+
 class Global(IDM):
     """Draws from a stream of its own."""
 
     def step(self, seen):
         return super().step(seen) - 1e-9 * random.random()
+
+
+class Replaces(IDM):
+    """Puts nothing in the place of a function of another module."""
+
+    def __init__(self, what, at):
+        super().__init__()
+        self.what, self.at = what.split("."), at
+        self.replace("constructor")
+
+    def replace(self, at):
+        if at == self.at:
+            setattr(sys.modules[self.what[0]], self.what[1], None)
+
+    def step(self, seen):
+        self.replace("step" if seen.bv_overlaps else "warm-up")
+        return super().step(seen)
+
+
+class Learned(IDM):
+    """Has weights, which take long to load."""
+
+    made = []
+
+    @staticmethod
+    def load(note, episodes=3):
+        with Path(note).open("a") as file:
+            file.write(f"loaded {episodes}\n")
+        return object()
+
+    def __init__(self, loaded, braking):
+        super().__init__()
+        self.loaded, self.braking = loaded, braking
+        self.made.append(self)
 
 
 class ChangesItsParameters(IDM):

@@ -11,7 +11,7 @@ from harness.cli import main
 from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.runner.workers import LocalWorkers
-from tests.controllers.misbehaving import ChangesItsParameters
+from tests.controllers.misbehaving import ChangesItsParameters, Learned
 from tests.stored_runs import sets, stored_table
 from tests.worlds.running import drive, forced
 
@@ -66,7 +66,12 @@ def undisturbed(tmp_path_factory):
     return _episodes(folder)
 
 
+MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
 IN_PROCESS = {
+    **dict.fromkeys(("rounds_down", "flushes_to_zero", "traps_division"), f"step: {MODES}"),
+    "rounds_up_and_raises": "step: ZeroDivisionError: no such thing",
+    "asks_another_traci": "step: FatalTraCIError: Not connected. Use the traci that is handed in "
+    "(docs/controllers.md), not the module",
     "raises": "step: ZeroDivisionError: no such thing",
     "none": "step: returned None (is a return missing?), expected an acceleration in m/s2 as a number",
     "nan": "step: returned nan, expected a finite acceleration in m/s2",
@@ -162,6 +167,7 @@ REFUSED = [
     (_of("OnlyStepp"), "av.controller", "Did you mean 'OnlyStep'?"),
     (_of("Misbehaving", badd="x"), "av.parameters", "Did you mean 'bad'?"),
     (_of("only_a_function"), "av.parameters", "min_acceleration_mps2"),
+    (_of("Learned", nott="x"), "av.parameters", "Did you mean 'note'?"),
     (_of("RaisesInClose", pth="x"), "av.parameters", "pth"),
     *(
         (_of("Always", SHORT_MADE, where="constructor", how=how), "av.controller", words)
@@ -183,6 +189,28 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
     assert words in complaints[0].err
     assert not (tmp_path / "run").exists()
     assert not Path("called").exists()
+
+
+@pytest.mark.parametrize("at", ["constructor", "step"])
+@pytest.mark.parametrize("what", ["math.isfinite", "json.dumps", "numpy.stack", "builtins.sorted", "time.monotonic"])
+def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, capsys):
+    assert _run(tmp_path, _of("Replaces", what=what, at=at)) == EXIT_BAD_INPUT
+    err = capsys.readouterr().err
+    assert err.startswith("error: av.controller\n")
+    assert f"a vehicle that has replaced {what}, which the harness calls, too" in err
+    assert (tmp_path / "run").exists() == (at == "step")
+
+
+def test_what_is_loaded_is_loaded_once_a_process_and_shared(tmp_path):
+    av = forced(f"av={_of('Learned', note=str(tmp_path / 'note'), braking=[1.0])}").av
+    host = build_host(av, n_cells=3, seed=1)
+    assert host.start(*3 * (np.arange(3),)) == {}
+    made = Learned.made[-3:]
+    assert (tmp_path / "note").read_text() == "loaded 3\n"
+    assert len({id(each.loaded) for each in made}) == 1
+    assert len({id(each.braking) for each in made}) == 3
+    assert (len(host.construction_s), len(Learned.made)) == (3, 3)  # the first of all is that of a cell
+    host.close()
 
 
 def test_a_constructor_has_a_time_limit_of_its_own_in_tests_too(tmp_path):
@@ -232,6 +260,16 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
         printed = capfd.readouterr()
         assert json.loads(printed.out)["bit_equal"] is True
         assert "started, below Python" in printed.err
+
+
+@pytest.mark.parametrize("command", ["run", "av-check --episodes 20"])
+def test_of_much_that_is_printed_the_first_and_the_last_are_passed_on(command, tmp_path, capfd):
+    assert _main(command, tmp_path, _of("PrintsMuch"), "stop.episodes=100") == EXIT_DONE
+    printed = capfd.readouterr().err
+    assert re.search(r"^\[\d\d[\d,]+ bytes more that a worker has printed\]$", printed, re.MULTILINE)
+    assert 2 * 65_536 < len(printed) < 9 * 65_536
+    assert re.match(r"[-\d.]+ s x", printed)
+    assert printed.endswith("x\n")
 
 
 @pytest.mark.parametrize("field", ["cell", "episode", "gap_m", "lv_speed_mps", "cells", "episodes"])

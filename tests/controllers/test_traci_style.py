@@ -6,7 +6,8 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
-from harness.controllers import EpisodeStart, Neighbour, Observation
+from harness.controllers import traci_style
+from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
 from harness.controllers.traci_style import StepListenerController, Traci, TraciStyleController
 
 
@@ -81,6 +82,61 @@ def test_commands_lead_to_the_speeds_of_sumo(traci, commands, speeds):
     assert drive(traci, 2, speeds[-1]) == [speeds[-1]] * 2
 
 
+def test_questions_about_neighbours_and_subscriptions_are_answered_as_sumo_does(traci):
+    vehicle, constants = traci.vehicle, traci.constants
+    assert (vehicle.getLeftLeaders("AV"), vehicle.getRightFollowers("LV")) == ((("LV", 295.0),), (("BV", 95.0),))
+    assert (vehicle.getLeftFollowers("AV"), vehicle.getRightLeaders("BV")) == ((), ())
+    assert (vehicle.getNeighbors("AV", 2), vehicle.getLeftLeaders("AV", True)) == ((("LV", 295.0),), ())
+    vehicle.subscribe("AV")
+    vehicle.subscribe("BV", (constants.VAR_SPEED, constants.VAR_LANE_INDEX))
+    assert vehicle.getSubscriptionResults("AV") == {constants.VAR_ROAD_ID: "cell0", constants.VAR_LANEPOSITION: 100.0}
+    traci.see(seen(0.1, lead_speed=19.0))
+    assert vehicle.getAllSubscriptionResults()["BV"] == {constants.VAR_SPEED: 19.0, constants.VAR_LANE_INDEX: 0}
+    assert vehicle.getSubscriptionResults("LV") == {}
+    with pytest.raises(traci.TraCIException, match="Variable 0x60 of vehicles is not known here"):
+        vehicle.subscribe("AV", [constants.VAR_CO2EMISSION])
+    for number in traci_style._VARIABLES:
+        vehicle.subscribe("AV", [number])
+        assert list(vehicle.getSubscriptionResults("AV")) == [number]
+    assert traci.simulation.getCollidingVehiclesIDList() == traci.simulation.getCollisions() == ()
+    assert traci.simulation.getMinExpectedNumber() == 3
+
+
+def test_what_scripts_set_first_is_accepted_where_it_holds_anyway(traci):
+    vehicle = traci.vehicle
+    for name, *values in (
+        ("setLaneChangeMode", 0, 256, 512),
+        ("setMinGap", 0.0),
+        ("setLength", 5.0),
+        ("setActionStepLength", 0.1),
+        ("setSpeedFactor", 1.0),
+        ("setColor", (255, 0, 0)),
+    ):
+        for value in values:
+            getattr(vehicle, name)("AV", value)
+    vehicle.setDecel("AV", 4.5)
+    vehicle.setSpeed("AV", 10.0)
+    for mode, asked in ((0, -100.0), (32, -100.0), (6, -4.5), (4, -4.5), (2, -100.0)):
+        vehicle.setSpeedMode("AV", mode)
+        assert (vehicle.getSpeedMode("AV"), vehicle.next_acceleration()) == (mode, pytest.approx(asked))
+
+
+@pytest.mark.parametrize(
+    ("command", "answer"),
+    [(("slowDown", 17.0, 10.0), -0.3), (("setAcceleration", -1.0, 3.0), -1.0), (("setAcceleration", -1.0, 0.1), 0.0)],
+)
+def test_a_command_that_the_av_does_not_follow_waits_until_it_does(traci, command, answer):
+    """In the warm-up it keeps its speed: nothing is owed then; what was for one step is over."""
+    name, *arguments = command
+    getattr(traci.vehicle, name)("AV", *arguments)
+    for step in range(1, 21):
+        traci.vehicle.next_acceleration()
+        traci.see(seen(0.1 * step))
+    n = round(arguments[1] / 0.1)
+    speeds = drive(traci, n + 1, 20.0)
+    assert speeds == pytest.approx([20.0 + 0.1 * answer * min(i + 1, n) for i in range(n + 1)])
+
+
 NAN, RATIOS, UNKNOWN = float("nan"), "invalidate the likelihood ratios", "'AV7' is not known"
 COMMANDS = {"setSpeed": (3.0,), "setAcceleration": (1.0, 1.0), "slowDown": (1.0, 1.0), "setDecel": (1.0,)}
 MOVES = ("moveTo", "moveToXY", "changeLane", "remove", "add", "setRoute", "rerouteTraveltime")
@@ -94,7 +150,9 @@ REFUSED = [
     *((RATIOS, f"vehicle.{name}", "AV", 1, 2) for name in MOVES),
     *(("the harness itself", name) for name in ("simulationStep", "load", "close", "start", "switch")),
     ("as under speed mode 32", "vehicle.setSpeedMode", "AV", 31),
-    ("stays on its lane", "vehicle.setLaneChangeMode", "AV", 0),
+    ("stays on its lane", "vehicle.setLaneChangeMode", "AV", 1621),
+    ("bumper to bumper", "vehicle.setMinGap", "AV", 2.5),
+    (f"setColor.*BV.*{RATIOS}", "vehicle.setColor", "BV", (255, 0, 0)),
     *((UNKNOWN, f"vehicle.{name}", "AV7") for name in ("getSpeed", "getLeader", "getLaneIndex")),
     (UNKNOWN, "vehicle.setSpeed", "AV7", 1.0),
     *((None, f"vehicle.{name}", "AV", *rest) for name, cases in IMPOSSIBLE.items() for rest in cases),

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import datetime
 import json
+import math
+import os
 import re
 import sys
+import time
 
 import pytest
 
@@ -68,6 +72,63 @@ class Sharing(Steady):
         self.all_of_them.discard(id(self))
 
 
+class KeepsItsAnswer(Steady):
+    """As PID controllers of packages do, it computes nothing anew within 10 ms."""
+
+    def start(self, episode):
+        self.at = -1.0
+
+    def step(self, seen):
+        if (now := time.monotonic()) > self.at + 0.01:
+            self.at, self.answer = now, -0.01 * seen.bv.speed_mps
+        return self.answer
+
+
+class ReadsTheTimeOfDay(Steady):
+    def step(self, seen):
+        return -1e-6 * datetime.datetime.now(datetime.UTC).timestamp() % 1.0
+
+
+class LooksAtTheClock(Steady):
+    """It does nothing with it."""
+
+    def step(self, seen):
+        assert isinstance(datetime.datetime.now(), datetime.datetime)
+        return super().step(seen) + 0.0 * time.perf_counter_ns()
+
+
+class OfItsProcess(Steady):
+    def step(self, seen):
+        return -1e-6 * (os.getpid() % 1000)
+
+
+class WindsUp(Steady):
+    """Has an integral without a bound."""
+
+    def __init__(self, bound=math.inf):
+        self.bound = bound
+
+    def start(self, episode):
+        self.integral = 0.0
+
+    def step(self, seen):
+        self.integral = min(max(self.integral + 0.1 * (40.0 - seen.speed_mps), -self.bound), self.bound)
+        return -3.0 + 0.02 * self.integral
+
+
+class Slow(Steady):
+    def __init__(self):
+        time.sleep(0.15)
+
+
+class LoadsOnce(Steady):
+    @staticmethod
+    def load():
+        time.sleep(0.15)
+
+    def __init__(self, loaded): ...
+
+
 class Misspelt(Steady):
     def step(self, seen):
         if seen.speed_mps > 30.0:
@@ -96,6 +157,10 @@ def test_the_built_in_idm_is_fine():
         ("tests.controllers.misbehaving:Global", "random numbers of its own"),
         ("Remembering", "it remembers the last one"),
         ("Sharing", "they share something"),
+        ("LooksAtTheClock", ""),
+        ("KeepsItsAnswer", "It depends on the clock (time.monotonic, test_av_check.py:"),
+        ("ReadsTheTimeOfDay", "It depends on the clock (time.time, test_av_check.py:"),
+        ("OfItsProcess", "It differs from process to process: "),
     ],
 )
 def test_a_controller_that_is_not_reproduced_is_found_out(name, cause):
@@ -106,6 +171,32 @@ def test_a_controller_that_is_not_reproduced_is_found_out(name, cause):
         did = found.behaviour
         assert did.mean_acceleration_mps2 == did.min_acceleration_mps2 == did.max_acceleration_mps2 == -1.5
         assert (did.reaction_s, did.braking_share, did.share_at_min) == (0.0, 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "moves"),
+    [
+        ((), {0.0: 0.0, 20.0: 1.0}),
+        (("av.parameters.bound=1",), {}),
+        (("av.before_cut_in=controller", "testing.method=nde"), None),
+    ],
+    ids=["winds up", "is bounded", "acts early"],
+)
+def test_what_winds_up_in_a_longer_warm_up_is_seen(overrides, moves):
+    found = check("WindsUp", *overrides)
+    assert found.exit_code == 0
+    assert ("LOOK AGAIN" in found.verdict and "winds up" in found.verdict) == bool(moves)
+    assert set(found.moved_mps2) == (set() if moves is None else {0.0, 20.0})
+    assert all(moved < 0.5 for seconds, moved in found.moved_mps2.items() if not moves or seconds == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "n"), [("Slow", 80), ("LoadsOnce", 80), ("tests.controllers.misbehaving:OnlyStepBatch", 1)]
+)
+def test_a_slow_constructor_is_measured_and_counted(name, n):
+    found = check(name, "world.cells=80")
+    assert found.speed.constructions == n
+    assert (found.speed.construction_s > 0.1, "calls it 80 times" in found.verdict) == (name == "Slow",) * 2
 
 
 def test_failures_that_differ_in_digits_are_one_and_name_line_and_what_was_meant():
@@ -233,5 +324,5 @@ def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_at_one_that_acts_befo
 
 def test_check_says_what_the_budget_costs():
     plan = plan_campaign(golden("shells-lateral-twin", "stop.episodes=4000"))
-    assert (plan["most_tests"], plan["most_seconds"]) == (4000, round(4000 / plan["tests_per_second"]))
+    assert plan["most_tests"] == 4000
     assert plan["tables"].startswith("pool of cut-ins: ")

@@ -1,0 +1,100 @@
+"""Another clock in the place of that of Python: what hangs on the time of day shows itself, and where it reads it.
+
+A test must not depend on when it runs, or on how fast. A vehicle that asks a clock does, yet does the same again if
+that is a moment later: a controller that computes nothing within 10 ms of its last answer keeps its first answer in
+every test. So tests are repeated by a clock that is an hour later at every call. Modules may have kept Python's own
+functions (``from time import monotonic``): the clock is there before the vehicle's are imported, in a fresh process.
+"""
+
+from __future__ import annotations
+
+import datetime
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from harness.controllers.hosts import NOT_THE_USERS, Guard
+
+HOUR_S = 3600.0
+HELD_S, LOOK_S = 1e9, 1e-6
+_TRUE_DATETIME: TypeAlias = datetime.datetime
+_READ = ("time", "monotonic", "perf_counter", "process_time", "thread_time")
+_SHOWN = ("localtime", "gmtime", "ctime")
+
+
+class Clock:
+    """An hour later at every call of a controller; or ``held``, but for 1 µs at each look: two runs see the same.
+
+    ``read_at`` says where the user's code has looked at it.
+    """
+
+    def __init__(self, *, held: bool) -> None:
+        self._held, self._n_calls, self._n_looks = held, Guard.n_calls, 0
+        self.read_at: list[str] = []
+
+    def function(self, name: str, read: Callable[[], float]) -> Callable[[], float]:
+        """What stands for ``time.name``, which is ``read``."""
+
+        def now() -> float:
+            self._note(f"time.{name}")
+            if self._held:
+                return HELD_S + LOOK_S * self._n_looks
+            return read() + HOUR_S * (Guard.n_calls - self._n_calls)
+
+        return now
+
+    def _note(self, name: str) -> None:
+        self._n_looks += 1
+        frame = sys._getframe(2)
+        while frame.f_code.co_filename == __file__ and frame.f_back is not None:
+            frame = frame.f_back
+        file = frame.f_code.co_filename
+        place = f"{name}, {Path(file).name}:{frame.f_lineno}"
+        if not file.startswith(NOT_THE_USERS) and place not in self.read_at:
+            self.read_at.append(place)
+
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """In the place of the functions of ``time``, and of ``datetime``, that tell the time."""
+        kept: dict[tuple[Any, str], Any] = {(time, name): getattr(time, name) for name in (*_READ, *_SHOWN)}
+        kept |= {(time, f"{name}_ns"): getattr(time, f"{name}_ns") for name in _READ}
+        kept[datetime, "datetime"] = datetime.datetime
+        now = {name: self.function(name, kept[time, name]) for name in _READ}
+        for name, function in now.items():
+            setattr(time, name, function)
+            setattr(time, f"{name}_ns", lambda function=function: round(1e9 * function()))
+        for name in _SHOWN:
+            show = kept[time, name]
+            setattr(time, name, lambda secs=None, show=show: show(now["time"]() if secs is None else secs))
+        datetime.datetime = _datetime(now["time"])  # type: ignore[misc]
+        try:
+            yield
+        finally:
+            for (module, name), function in kept.items():
+                setattr(module, name, function)
+
+
+def _datetime(now: Callable[[], float]) -> type[datetime.datetime]:
+    """A `datetime.datetime` by another clock; every datetime counts as one of its kind."""
+
+    class Kind(type):
+        def __instancecheck__(cls, instance: object) -> bool:
+            return isinstance(instance, _TRUE_DATETIME)
+
+    class Datetime(_TRUE_DATETIME, metaclass=Kind):
+        @classmethod
+        def now(cls, tz: datetime.tzinfo | None = None) -> Datetime:
+            return cls.fromtimestamp(now(), tz)
+
+        @classmethod
+        def today(cls) -> Datetime:
+            return cls.now()
+
+        @classmethod
+        def utcnow(cls) -> Datetime:
+            return cls.now(datetime.UTC).replace(tzinfo=None)
+
+    return Datetime

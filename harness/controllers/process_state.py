@@ -1,0 +1,68 @@
+"""What a controller must leave as it finds it in the process that it shares with the harness.
+
+Kernels round as the processor is told to, and everything else calls Python's modules and numpy: a vehicle that changes
+either changes numbers of the harness, or breaks it elsewhere.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+WATCHED = ("builtins", "math", "json", "os", "pickle", "struct", "time", "numpy")
+CHANGED_MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
+
+_CONTROL, _MXCSR, _MODES = 0, 7, 0xFFC0
+"""Words of ``fenv_t`` in the C library of Linux that say how to compute, not what has been met.
+
+On x86-64 the control word of the x87 and the upper bits of MXCSR, on aarch64 FPCR and nothing: rounding, flush to zero,
+denormals are zero, masked exceptions.
+"""
+
+
+class FloatingPointModes:
+    """Those of this thread when it is made; looking at them again takes half a microsecond."""
+
+    def __init__(self) -> None:
+        self._kept, now = (ctypes.create_string_buffer(64) for _ in range(2))
+        kept, self._words = (memoryview(buffer).cast("B").cast("I") for buffer in (self._kept, now))
+        self._look: Callable[..., object] = lambda: None
+        self._write: Callable[..., object] = lambda _: None
+        if sys.platform == "linux" and platform.machine() in ("x86_64", "aarch64"):
+            libm = ctypes.CDLL("libm.so.6" if platform.libc_ver()[0] == "glibc" else None)
+            libm.fegetenv(self._kept)
+            libm.fegetenv(now)
+            self._look, self._write = partial(libm.fegetenv, ctypes.byref(now)), libm.fesetenv
+        self._control, self._modes = kept[_CONTROL], kept[_MXCSR] & _MODES
+
+    def restored(self) -> bool:
+        """Whether they had been changed; they are as before."""
+        self._look()
+        if self._words[_CONTROL] == self._control and self._words[_MXCSR] & _MODES == self._modes:
+            return False
+        self._write(self._kept)
+        return True
+
+
+class OtherModules:
+    """What the modules that the harness itself rests on hold when it is made."""
+
+    def __init__(self) -> None:
+        self._kept = {name: _functions_and_numbers(vars(sys.modules[name])) for name in WATCHED}
+
+    def restored(self) -> list[str]:
+        """Names, as ``math.sqrt``, that had been replaced or deleted; they are as before."""
+        changed = []
+        for name, kept in self._kept.items():
+            there = vars(sys.modules[name])
+            changed += [f"{name}.{key}" for key, value in kept.items() if there.get(key, self) is not value]
+            there.update(kept)
+        return changed
+
+
+def _functions_and_numbers(held: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in held.items() if key[:2] != "__" and (callable(value) or type(value) is float)}

@@ -1,0 +1,123 @@
+"""Tests that are run again, to see whether the vehicle does the same: every bit of what they leave is compared.
+
+What a test brings about follows from the campaign's seed and the test's index, as long as the AV keeps to its
+observations and to the random stream that it is given. Code that draws random numbers of its own, remembers earlier
+tests, shares state between cells, or asks a clock or its process does not; its tests cannot be replayed, and depend on
+what ran beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.campaign.vehicle import AutomatedVehicle
+from harness.controllers.clock import Clock
+from harness.controllers.find import build_host, has_foreign_code, run_apart
+from harness.episode.cells import PrescribedTraffic
+from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy, Shard, hash_of_index
+from harness.errors import HarnessError
+from harness.records.folder import Repeated
+from harness.sampling.protocol import Source
+from harness.vocabulary import FAILED, RecordArray
+from harness.worlds.twin import TwinWorld
+
+MOST_REPEATED, FEWEST_REPEATED = 10, 2
+ONE_OF = 10
+"""Ten tests of the first shard, less than 1 % from 1,000 tests on; of a shard below 100 tests a tenth, or two.
+
+Of a vehicle that is random in one of four tests, ten miss all with a probability of 6 %.
+"""
+
+Bits = tuple[bytes, bytes, str | None]
+
+
+class Tests(NamedTuple):
+    """Consecutive tests from the ``first`` on, which begin in ``states`` (n,), in a given or a drawn ``traffic``."""
+
+    first: int
+    states: RecordArray
+    traffic: PrescribedTraffic
+
+
+class Again(NamedTuple):
+    """What tests have left, in order, and where the vehicle has looked at a clock meanwhile."""
+
+    bits: list[Bits]
+    clock_read_at: list[str]
+
+
+def bits_of(shard: Shard, row: int) -> Bits:
+    """Everything that a test has left: its record, its motion where that was kept, and why it failed if it did."""
+    trace = shard.traces.get(row)
+    record = shard.results.episode[row].tobytes()
+    return record, b"" if trace is None else trace.tobytes(), shard.failures.get(row)
+
+
+def run_elsewhere(source: Source, tests: Sequence[Tests], n_cells: int = 1, *, held: bool = False) -> Again:
+    """Run tests one after the other in a fresh process, by a clock of its own (`harness.controllers.clock`).
+
+    Raises `AvEndedProcessError`: the controller ended the process.
+    """
+    drawn = source.campaign.av, source.policy, source.records(), tests, n_cells
+    return run_apart(source.campaign.av, _run_here, *drawn, held)
+
+
+def _run_here(
+    av: AutomatedVehicle,
+    drawing: Drawing,
+    keep: RecordPolicy,
+    tests: Sequence[Tests],
+    n_cells: int,
+    held: bool,
+    *,
+    black_box: Path | None,
+) -> Again:
+    clock, found = Clock(held=held), list[Bits]()
+    with clock.shown():
+        host = build_host(av, n_cells=n_cells, seed=drawing.seed, black_box=black_box)
+        with closing(EpisodeLoop(TwinWorld(n_cells), drawing, keep, host)) as loop:
+            for first, states, traffic in tests:
+                shard = loop.run(first, states, traffic)
+                found += [bits_of(shard, row) for row in range(states.size)]
+    return Again(found, clock.read_at)
+
+
+def repeat(loop: EpisodeLoop, source: Source, shard: Shard) -> Repeated:
+    """Run some tests of a loop's shard again, each alone: a user's code elsewhere, what SUMO drives after the shard."""
+    rows = _rows_to_repeat(shard, source.campaign.seed, acts_early=source.campaign.av.acts_before_cut_in)
+    tests = [_test_of(shard, row) for row in rows]
+    if has_foreign_code(source.campaign.av):
+        again = _each_elsewhere(source, tests)
+    else:
+        again = [bits_of(loop.run(*test), 0) for test in tests]
+    pairs = zip(rows, again, strict=True)
+    return Repeated(len(rows), sorted(shard.first_episode + row for row, bits in pairs if bits != bits_of(shard, row)))
+
+
+def _test_of(shard: Shard, row: int) -> Tests:
+    traffic = PrescribedTraffic._make(column[row : row + 1] for column in shard.traffic)
+    return Tests(shard.first_episode + row, shard.states[row : row + 1], traffic)
+
+
+def _each_elsewhere(source: Source, tests: list[Tests]) -> list[Bits | None]:
+    """What each leaves; None of one that ends its process, or whose controller cannot be made once more."""
+    try:
+        return [*run_elsewhere(source, tests).bits]
+    except HarnessError:
+        half = len(tests) // 2
+        return [None] if not half else _each_elsewhere(source, tests[:half]) + _each_elsewhere(source, tests[half:])
+
+
+def _rows_to_repeat(shard: Shard, seed: int, *, acts_early: bool) -> list[int]:
+    """Rows by a hash of their index, among those in which the AV had to act."""
+    episode = shard.results.episode
+    acted = (episode["outcome"] != FAILED) & (acts_early | (episode["cut_in_step"] >= 0))
+    rows = np.flatnonzero(acted)
+    order = np.argsort(hash_of_index(seed, shard.first_episode + rows), kind="stable")
+    n = min(MOST_REPEATED, max(FEWEST_REPEATED, episode.size // ONE_OF))
+    return [int(row) for row in rows[order[:n]]]
