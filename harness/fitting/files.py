@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -119,6 +118,8 @@ def _require_ours(written: Mapping[Path, bytes], inputs: Sequence[Path], *, forc
     """Refuse to write over an input, or over what has not the mark of a file that a fit has written."""
     for path, mark in written.items():
         where = f"--out {next(iter(written))}"
+        if printable(path.name) != path.name:
+            raise HarnessError(where, "a name with bytes that are no text", "a name in UTF-8", "Choose another name.")
         if os.path.realpath(path) in map(os.path.realpath, inputs):
             raise HarnessError(where, f"{path}, which is also an input", "another file", "Choose another name.")
         if path.is_dir() or (not force and not _may_replace(path, mark)):
@@ -147,7 +148,7 @@ def _yaml(
         f"Numbers that are not fitted are those of {fit.base_name}. Use lane_change_level 1 with this traffic.",
         f"mapping: {mapping or 'that of the input table'}{', mirrored' if read.mirror else ''}",
         *(f"left out: {name}" for name in read.leave_out),
-        *(f"sha256 {_sha256(file)} {file.name}" for file in files),
+        *(f"sha256 {content_hash(file.read_bytes())} {file.name}" for file in files),
     ]
     text = "".join(f"# {printable(' '.join(line.split()))}\n" for line in lines)
     for name, section in fit.environment.model_dump(exclude_defaults=True).items():
@@ -166,8 +167,3 @@ def _yaml(
 def _flow(value: Any) -> str:
     text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=math.inf, allow_unicode=True)
     return str(text).strip()
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()[:16]

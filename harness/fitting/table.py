@@ -51,12 +51,11 @@ COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\x28\xb5\x2f\xfd": "zstd"}
 """Compressions that are read, by the first bytes of a file."""
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 FOREIGN = {
-    b"PK": "a ZIP archive, or an Excel workbook",
+    b"PK\x03\x04": "a ZIP archive, or an Excel workbook",
     b"\xd0\xcf\x11\xe0": "an Excel workbook",
     b"7z\xbc\xaf": "a 7-Zip archive",
     b"\xfd7zXZ": "an xz archive",
     b"\x89HDF": "an HDF5 file",
-    b"SQLite format": "an SQLite database",
     b"<": "a page or XML",
 }
 """What else a file may be, by its first bytes."""

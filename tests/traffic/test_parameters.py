@@ -145,6 +145,22 @@ def test_other_values_make_another_environment_and_what_is_known_of_them_does_no
     assert same.with_values({"guard__margin_m": 3.0}).values()["guard__margin_m"] == 3.0  # also beyond its range
 
 
+def test_an_environment_is_like_another_but_for_what_it_says(mine):
+    own = load_parameters(
+        mine("like: ndd-overtaking-2\nlateral: null\nguard: {margin_m: {value: 2.0, source: user}}\n")
+    )
+    other = load_parameters(EnvironmentSettings(parameters="ndd-overtaking-2"))
+    assert own.values() == {**of_all_but(other, "lateral"), "guard__margin_m": 2.0}
+    assert "like (" in str(refusal(mine("like: ndd-overtaking-3\n")))
+    assert "guard.margn_m" in str(
+        refusal(mine("like: ndd-overtaking-1\nguard: {margn_m: {value: 2.0, source: user}}\n"))
+    )
+
+
+def of_all_but(parameters, section):
+    return {name: value for name, value in parameters.values().items() if not name.startswith(section)}
+
+
 @pytest.mark.parametrize(
     ("content", "named"),
     [
