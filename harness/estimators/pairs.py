@@ -270,61 +270,38 @@ def contrast(pairs: PairCounts, level: Level) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class PairedEstimate:
-    """Two vehicles compared: each by itself, and what lies between them, as `contrast` says it.
+def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
+    """Content of ``compare.json`` that comes from pairs, at least one: each vehicle, what lies between, all shells.
 
-    ``free`` is over all strata, ``conditional`` over those inside: if neither vehicle crashes beyond the boundary,
-    ``refuted`` once one has.
+    What lies between them is told over all strata, and as ``conditional`` over those inside: if neither vehicle crashes
+    beyond the boundary, ``refuted`` once one has.
     """
-
-    a: Estimate
-    b: Estimate
-    free: dict[str, Any]
-    conditional: dict[str, Any]
-    refuted: bool
-    pairs: PairCounts
-
-    def to_json(self) -> dict[str, Any]:
-        """Content of ``compare.json``, as far as it comes from counts."""
-        inside = {
-            **self.conditional,
-            "boundary": self.pairs.design.library.boundary,
-            "n_pairs_outside": self.free["n_pairs"] - self.conditional["n_pairs"],
-            "refuted": self.refuted,
+    level, design, inside = Level.two_sided(confidence), pairs.design, pairs.inside()
+    each, tallies = [_own(pairs, side, confidence) for side in (0, 1)], [pairs.tally(side) for side in (0, 1)]
+    warnings = [
+        f"{n:,} tests of {name} FAILED" for name, of in zip("AB", each, strict=True) if (n := of.details["n_failed"])
+    ]
+    warnings += [f"{name}: {text}" for name, of in zip("AB", each, strict=True) for text in of.warnings]
+    counts = "n_both", "n_only_a", "n_only_b", "n_neither"
+    shells = [
+        {
+            "shell": design.strata[s],
+            "inside": s < design.library.n_inside,
+            "p": float(design.p[s]),
+            "n_pairs": int(pairs.tests[s]),
+            **dict(zip(counts, row.tolist(), strict=True)),
+            "n_failed_tests": sum(int(tally.failed[s]) for tally in tallies),
         }
-        design, columns = self.pairs.design, ("n_both", "n_only_a", "n_only_b", "n_neither")
-        failed = self.pairs.tally(0).failed + self.pairs.tally(1).failed
-        shells = [
-            {
-                "shell": design.strata[s],
-                "inside": s < design.library.n_inside,
-                "p": float(design.p[s]),
-                "n_pairs": int(self.pairs.tests[s]),
-                **dict(zip(columns, row.tolist(), strict=True)),
-                "n_failed_tests": int(failed[s]),
-            }
-            for s, row in enumerate(self.pairs.outcomes())
-        ]
-        each = {"a": self.a.shown, "b": self.b.shown}
-        more = {"confidence": self.a.confidence, "conditional": inside, "shells": shells}
-        both = (("A", self.a), ("B", self.b))
-        warnings = [f"{n:,} tests of {name} FAILED" for name, of in both if (n := of.details["n_failed"])]
-        warnings += [f"{name}: {text}" for name, of in both for text in of.warnings]
-        return finite_json({**each, **self.free, **more, "warnings": warnings})
-
-
-def paired_estimate(pairs: PairCounts, confidence: float) -> PairedEstimate:
-    """Everything that pairs of tests, at least one, say at one level of confidence."""
-    level, n_inside = Level.two_sided(confidence), pairs.design.library.n_inside
-    return PairedEstimate(
-        a=_own(pairs, 0, confidence),
-        b=_own(pairs, 1, confidence),
-        free=contrast(pairs, level),
-        conditional=contrast(pairs.inside(), level),
-        refuted=any(pairs.tally(side).crashes[n_inside:].any() for side in (0, 1)),
-        pairs=pairs,
-    )
+        for s, row in enumerate(pairs.outcomes())
+    ]
+    conditional = {
+        **contrast(inside, level),
+        "boundary": design.library.boundary,
+        "n_pairs_outside": int(pairs.tests.sum() - inside.tests.sum()),
+        "refuted": any(tally.crashes[design.library.n_inside :].any() for tally in tallies),
+    }
+    more = {"confidence": confidence, "conditional": conditional, "shells": shells, "warnings": warnings}
+    return finite_json({"a": each[0].shown, "b": each[1].shown, **contrast(pairs, level), **more})
 
 
 def _own(pairs: PairCounts, side: int, confidence: float) -> Estimate:

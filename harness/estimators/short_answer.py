@@ -398,14 +398,8 @@ def pair_lines(
         rate, ends = number(of["crash_rate"]), interval(of["ci_low"], of["ci_high"])
         if not of["n_crashes"]:
             rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
-        rows.append(
-            (
-                f"{name} {label if len(label) <= LABEL else f'{label[: LABEL - 2]} …'}",
-                rate,
-                ends,
-                f"{count(of['n_crashes'])} crashes",
-            )
-        )
+        label = label if len(label) <= LABEL else f"{label[: LABEL - 2]} …"
+        rows.append((f"{name} {label}", rate, ends, f"{count(of['n_crashes'])} crashes"))
     if asked["ratio"] is not None:
         most = "no limit" if asked["ratio_high"] is None else ratio(asked["ratio_high"])
         rows.append(("A / B", ratio(asked["ratio"]), f"{ratio(asked['ratio_low'])} to {most}", ""))
@@ -413,13 +407,12 @@ def pair_lines(
     rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), alone))
     remarks = [f"! {text}" for text in content["warnings"]]
     if asked is not content:
-        remarks.insert(
-            0, f"A / B and A − B are given that both crash only where {asked['boundary']} of the library does"
-        )
+        given = f"A / B and A − B are given that both crash only where {asked['boundary']} of the library does"
+        remarks.insert(0, given)
     ended = ENDED.get(content.get("ended", ""), "interrupted")
     scope = f"sampling error in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"
     counted = f" above {plain(counts_above_mps)} m/s" if counts_above_mps else ""
-    pairs = f"{count(content['n_pairs'])} pairs on the same cut-ins"
+    pairs = f"{count(content['n_pairs'])} pairs of tests"
     head = f"{content['decision']['words']} · {pairs} · crashes{counted} per test"
     last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
     return [head, *_columns(rows), *_wrapped([*remarks[: 3 - len(last)], *last]), f"  report  {report}"]

@@ -25,7 +25,7 @@ from harness.campaign.files import campaign_of
 from harness.campaign.sections import MOST_CUT_INS
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
 from harness.estimators.answer import conclusion
-from harness.estimators.pairs import PairedEstimate, PairedShells, PairVerdict, paired_estimate
+from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
 from harness.estimators.short_answer import unseen_words
 from harness.estimators.stopping import PairRule
 from harness.numbers import leaves, two_digits_up
@@ -45,7 +45,6 @@ from harness.vocabulary import COMPARISON
 
 SIDES = ("a", "b")
 MAY_DIFFER = frozenset({"av", "name", "description"})
-PAIRING = "the i-th cut-in that A meets of a shell is the i-th that B meets: same initial state, paths and cut-in"
 EXIT_OF: Mapping[PairVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
 
 Both = tuple[Resolved, Resolved]
@@ -60,7 +59,6 @@ class Comparison:
     """
 
     folder: Path
-    difference: PairedEstimate
     content: dict[str, Any]
     exit_code: int
     report: Path
@@ -108,22 +106,22 @@ def compare_campaigns(
     for side, folder in zip(sides, folders, strict=True):  # both, before either is touched
         require_own_folder(folder, side, resume=True)
     rule = PairRule(sides[0].campaign, margin, rhw)
-    rounds, found = _compared(sides, folders, rule, workers, progress or Progress())
+    rounds, pairs = _compared(sides, folders, rule, workers, progress or Progress())
+    found = paired_estimate(pairs, a.stop.confidence)
     labels = labels or (a.name, b.name)
     content = {
         "format": 1,
         "method": a.testing.method,
         "seed": a.seed,
-        "pairing": PAIRING,
         "campaigns": {
             name: {"label": label, "campaign_hash": side.content_hash}
             for name, label, side in zip(SIDES, labels, sides, strict=True)
         },
-        **found.to_json(),
+        **found,
         "decision": {**asdict(rule.decision), "words": rule.decision.words},
-        "to_decide": _to_decide(sides[0].campaign, rounds, found),
+        "to_decide": _to_decide(sides[0].campaign, rounds, pairs),
         "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
-        "ended": conclusion(a, rule, found.free["n_pairs"])[0],
+        "ended": conclusion(a, rule, found["n_pairs"])[0],
     }
     code = EXIT_DONE if rule.ended else EXIT_BUDGET_SPENT
     if margin is not None:
@@ -133,12 +131,12 @@ def compare_campaigns(
     write_sealed(out / COMPARISON, content)
     from harness.report.compare_page import write_comparison  # noqa: PLC0415
 
-    return Comparison(out, found, content, code, write_comparison(out))
+    return Comparison(out, content, code, write_comparison(out))
 
 
 def _compared(
     sides: Both, folders: tuple[Path, Path], rule: PairRule, workers: int | None, progress: Progress
-) -> tuple[PairRounds, PairedEstimate]:
+) -> tuple[PairRounds, PairCounts]:
     """Rounds of pairs until the rule is content: what those say that it has seen."""
     campaign = sides[0].campaign
     with ExitStack() as held, ExitStack() as working:
@@ -177,18 +175,18 @@ def _compared(
         working.close()
         for run in runs:
             run.finish(rule)
-    return rounds, paired_estimate(counts, campaign.stop.confidence)
+    return rounds, counts
 
 
-def _to_decide(campaign: Campaign, rounds: PairRounds, found: PairedEstimate) -> dict[str, Any] | None:
+def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: PairCounts) -> dict[str, Any] | None:
     """How many pairs would decide what was left open, and what to ask for; None where nobody can tell."""
-    rule, n_pairs = rounds.rule, found.free["n_pairs"]
-    if rule.decision.verdict != "open" or math.isinf(times := rule.more_pairs(found.pairs)):
+    rule = rounds.rule
+    if rule.decision.verdict != "open" or math.isinf(times := rule.more_pairs(pairs)):
         return None
-    options, needed = [f"--margin {rule.decision.margin:g}"], two_digits_up(n_pairs * times)
+    options, needed = [f"--margin {rule.decision.margin:g}"], two_digits_up(int(pairs.tests.sum()) * times)
     if needed > campaign.stop.episodes:
         options.append(f"--set stop.episodes={needed}")
-    if new_folder := (more := rounds.used_of_pool(found.pairs) * times) > 1.0:
+    if new_folder := (more := rounds.used_of_pool(pairs) * times) > 1.0:
         kept = two_digits_up(campaign.pool.cut_ins_per_shell * more)
         if kept > MOST_CUT_INS:
             return None
@@ -268,7 +266,5 @@ def _limit_both(sides: Both, harder: int, stored: str | Path | None) -> str:
     if not built_in and "max_acceleration_mps2" not in av.limits.model_fields_set:
         mend += f" Nobody has limited {SIDES[harder].upper()}: its limit is the default."
     if stored is not None:
-        mend += (
-            f" The run in {stored} had no such limit: name A's vehicle or campaign instead, so that it is run again."
-        )
+        mend += f" The run in {stored} had none: name A's vehicle or campaign instead, so that it is run again."
     return mend

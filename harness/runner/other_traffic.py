@@ -169,12 +169,12 @@ def compare_in_other_traffic(
     off = _off(near[0])  # the strata of both are the same
     about = off, n_refused, confidence
     a, b = (
-        uncertain(of.crash_rate, (of.ci_low, of.ci_high), factors, *about, from_below=unseen is None)
-        for of, factors in zip((told.a, told.b), times, strict=True)
+        uncertain(of["crash_rate"], (of["ci_low"], of["ci_high"]), factors, *about, from_below=unseen is None)
+        for of, factors in zip((told["a"], told["b"]), times, strict=True)
     )
     ratios = {}
-    if told.b.n_crashes:
-        ratios["B"] = uncertain(told.free["ratio"], _ends(told.free), times[0] / times[1], off + ONE_LAW, *about[1:])
+    if told["b"]["n_crashes"]:
+        ratios["B"] = uncertain(told["ratio"], _ends(told), times[0] / times[1], off + ONE_LAW, *about[1:])
     error = TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), a, ratios, unseen)
     return {"traffic": finite_json(error), "b": finite_json(b), "sentences": list(sentences(error, "A"))}
 

@@ -41,14 +41,14 @@ PAIRS = pairs_of((30, 10, 2, 8), (0, 5, 0, 45), (0, 0, 0, 4000))
 
 def test_rates_are_those_of_each_and_intervals_hold_what_was_seen():
     found = paired_estimate(PAIRS, 0.9)
-    assert found.a.crash_rate == pytest.approx(1e-7 * 0.8 + 2e-7 * 0.1)
-    assert found.b.crash_rate == pytest.approx(1e-7 * 0.64)
-    assert found.free["difference"] == pytest.approx(found.a.crash_rate - found.b.crash_rate)
-    assert found.free["only_a"]["value"] - found.free["only_b"]["value"] == pytest.approx(found.free["difference"])
-    assert found.free["ratio"] == pytest.approx(found.a.crash_rate / found.b.crash_rate)
-    assert [found.free[key] for key in ("n_pairs", "n_only_a", "n_only_b")] == [4100, 15, 2]
-    assert found.conditional["n_pairs"] == 100
-    free, inside = found.free, found.conditional
+    a, b = (found[side]["crash_rate"] for side in "ab")
+    assert (a, b) == pytest.approx((1e-7 * 0.8 + 2e-7 * 0.1, 1e-7 * 0.64))
+    assert found["difference"] == pytest.approx(a - b)
+    assert found["only_a"]["value"] - found["only_b"]["value"] == pytest.approx(found["difference"])
+    assert found["ratio"] == pytest.approx(a / b)
+    assert [found[key] for key in ("n_pairs", "n_only_a", "n_only_b")] == [4100, 15, 2]
+    free, inside = found, found["conditional"]
+    assert (inside["n_pairs"], inside["n_pairs_outside"], inside["refuted"]) == (100, 4000, False)
     assert free["ci_low"] < inside["ci_low"] < free["difference"] < inside["ci_high"] < free["ci_high"]
     assert free["ratio_low"] < inside["ratio_low"] < free["ratio"] < inside["ratio_high"] < free["ratio_high"]
     assert 0.0 < free["only_a"]["ci_low"] < free["only_a"]["value"] < free["only_a"]["ci_high"]
@@ -70,9 +70,8 @@ def test_failed_tests_widen_both_ways():
     assert ratio.ci_high == pytest.approx(worst_a.ratio(LEVEL).ci_high)
     assert ratio.ci_low == pytest.approx(worst_b.ratio(LEVEL).ci_low)
     estimate = paired_estimate(failed, 0.9)
-    assert (estimate.a.details["n_failed"], estimate.b.details["n_failed"]) == (3, 2)
-    assert estimate.to_json()["warnings"][:2] == ["3 tests of A FAILED", "2 tests of B FAILED"]
-    assert estimate.to_json()["shells"][0]["n_failed_tests"] == 5
+    assert estimate["warnings"][:2] == ["3 tests of A FAILED", "2 tests of B FAILED"]
+    assert estimate["shells"][0]["n_failed_tests"] == 5
 
 
 def test_the_pool_adds_the_error_of_pairs_that_differ():
@@ -99,19 +98,16 @@ def test_a_margin_is_where_the_ratio_ends():
 
 def test_a_crash_of_either_outside_refutes_the_assumption():
     found = paired_estimate(pairs_of((30, 10, 2, 8), (0, 5, 0, 45), (0, 0, 1, 3999)), 0.9)
-    assert found.refuted
-    assert not paired_estimate(PAIRS, 0.9).refuted
+    assert found["conditional"]["refuted"] is True
 
 
 def test_equal_vehicles_are_not_told_apart_and_json_has_no_infinity():
     found = paired_estimate(pairs_of((0, 0, 0, 50), (0, 0, 0, 50), (0, 0, 0, 400)), 0.9)
-    assert found.free["ci_low"] < 0.0 < found.free["ci_high"]
-    assert math.isnan(found.free["ratio"])
-    assert found.free["ratio_high"] == math.inf
-    content = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert found["ci_low"] < 0.0 < found["ci_high"]
+    assert found["ratio"] is None
+    content = json.loads(json.dumps(found, allow_nan=False))
     assert content["ratio_high"] is None
     assert content["only_a"]["ci_low"] == 0.0
-    assert found.pairs.verdict(0.0, LEVEL) == "open"
 
 
 @pytest.mark.parametrize(

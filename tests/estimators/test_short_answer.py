@@ -282,7 +282,7 @@ def test_a_comparison_is_as_short():
     text = pair_lines(content, 2.0, "runs/ab/report.html", 0.01)
     assert len(text) - sum(line.startswith("    ") for line in text) <= LINES
     assert max(map(len, text)) <= WIDTH
-    assert text[0].startswith("Open whether B is more than 10 % worse than A · 1,234 pairs on the same cut-ins")
+    assert text[0].startswith("Open whether B is more than 10 % worse than A · 1,234 pairs of tests")
     assert text[0].endswith(" · crashes above 2 m/s per test")
     shown = "\n".join(text)
     assert "1.00 × 10⁻¹⁰ to 2.00 × 10⁻⁷" in shown
