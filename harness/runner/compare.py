@@ -158,7 +158,8 @@ def _compared(
                 pairs.add(side, shard.block)
                 runs[side].follow(rounds.rule, shard)
 
-        progress.stage("tests of A and B", None if margin is not None else 2 * campaign.stop.episodes)
+        open_ended = margin is not None or campaign.stop.rhw is not None
+        progress.stage("tests of A and B", None if open_ended else 2 * campaign.stop.episodes)
         for side, requests in enumerate(stored):
             drive(side, requests)
         n_pairs = np.zeros_like(pairs.tests(0))

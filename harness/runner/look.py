@@ -1,8 +1,7 @@
-"""Look before anything is spent on a campaign: what the AV does and how fast it is, and what tests cost."""
+"""Look before anything is spent on a campaign: what the AV does, and how fast it is."""
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from collections import Counter
@@ -23,14 +22,13 @@ from harness.controllers.find import has_foreign_code, run_apart
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
-from harness.resolved import require_ready, require_world, resolve
+from harness.resolved import require_world, resolve
 from harness.runner.workers import Bits, bits_of
-from harness.sampling import EPISODES_PER_S, prepare, source_of
+from harness.sampling import prepare
 from harness.sampling.protocol import Source
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED
 from harness.worlds import build_world
-from harness.worlds.shim import shim_library
 
 EPISODES = 48
 CELLS, OTHER_CELLS = 16, 5
@@ -314,27 +312,3 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         n_cut_ins=len(reactions),
         n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
     )
-
-
-# -- what a campaign costs --
-
-
-@checked("plan_campaign")
-def plan_campaign(campaign: Campaign) -> dict[str, Any]:
-    """Most that a campaign may cost: ``most_tests`` and ``most_seconds``, the budget, and what is left to build.
-
-    ``tests_per_second`` (all cores) is without what an AV of one's own takes; ``tables`` is in words.
-
-    Raises `CampaignError`: a run would refuse the campaign before it starts.
-    """
-    resolved, source = require_ready(campaign), source_of(campaign)
-    engine = "sumo with shim" if campaign.world.engine == "sumo" and shim_library() else campaign.world.engine
-    rate = float(f"{EPISODES_PER_S[campaign.testing.method][engine] * (os.cpu_count() or 1):.2g}")
-    own = {} if campaign.av.model else {"av": "its own time comes on top: `harness av-check` measures it"}
-    return {
-        "most_tests": campaign.stop.episodes,
-        "most_seconds": round(campaign.stop.episodes / rate),
-        "tests_per_second": rate,
-        "tables": source.building(resolved),
-        **own,
-    }

@@ -34,14 +34,6 @@ from harness.traffic.laws import Environment, InitialStates
 from harness.vocabulary import Method
 
 _SOURCES: Mapping[Method, type[Source]] = {"forced": Forced, "shells": Shells}
-EPISODES_PER_S: Mapping[Method, Mapping[str, int]] = {
-    "nde": {"sumo": 3500, "sumo with shim": 6000, "twin": 70000},
-    "forced": {"sumo": 1500, "sumo with shim": 2500, "twin": 32000},
-    "step_mixture": {"sumo": 1600, "sumo with shim": 2700, "twin": 25000},
-    "episode_mixture": {"sumo": 2000, "sumo with shim": 3000, "twin": 18000},
-    "shells": {"sumo": 1700, "sumo with shim": 2700, "twin": 30000},
-}
-"""On one core of a 2020s server by engine, recording included: orders of magnitude; `benchmarks/` tells yours."""
 DISTANCE_SEED = 20_000
 DISTANCE_PATHS = 20_000
 """Paths over which the mean distance of a test is taken; its standard error is below 0.5 %."""

@@ -121,15 +121,6 @@ class Source:
         return [table_path(resolved.environment, resolved.surrogates, resolved.campaign.testing.challenge)]
 
     @classmethod
-    def building(cls, resolved: Resolved) -> str:
-        """What is to be built, and how long that takes, in words."""
-        files = cls.cached_files(resolved)
-        if not files or all(file.is_file() for file in files):
-            return "cached" if files else "none needed"
-        per_driver_s = 5 if resolved.campaign.environment.acceleration_hold_s >= 0.5 else 40
-        return f"to build (about {per_driver_s * len(resolved.campaign.surrogates)} s of one core)"
-
-    @classmethod
     def stored_design(cls, folder: Path) -> ShellDesign | None:  # noqa: ARG003 - there is none
         """Strata of a stored run."""
         return None
