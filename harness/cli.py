@@ -61,34 +61,27 @@ def _main(group: click.Group, name: str, arguments: list[str], interruption: Int
     try:
         code = group.main(arguments, prog_name=name, standalone_mode=False)
         sys.stdout.flush()
-    except HarnessError as error:
-        show_error(error)
-        return error.exit_code
-    except click.UsageError as error:
-        if isinstance(error, click.exceptions.NoArgsIsHelpError):
-            error.show()
-        else:
-            show_error(usage_error(error, error.ctx or click.Context(group, info_name=name)))
-        return error.exit_code
-    except (click.Abort, KeyboardInterrupt):
-        return _end_early(arguments, interruption)
-    except OSError as error:
-        if interruption.signal is not None:  # a terminal that is gone takes no last word
-            return _end_early(arguments, interruption)
-        return _show_system_error(error)
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - a library may make any of an interruption
+        if (sent := interruption.signal) is not None or isinstance(error, click.Abort | KeyboardInterrupt):
+            show_interrupted(next(iter(arguments), ""), None if sent is None else sent.name)
+            return interruption.exit_code
+        return _told(error, group, name)
     return code if isinstance(code, int) else EXIT_DONE
 
 
-def _end_early(arguments: list[str], interruption: Interruption) -> int:
-    show_interrupted(next(iter(arguments), ""), None if interruption.signal is None else interruption.signal.name)
-    return interruption.exit_code
-
-
-def _show_system_error(error: OSError) -> int:
+def _told(error: Exception, group: click.Group, name: str) -> int:
+    """Exit code of an error that a user has been told; a defect leaves as it is."""
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        error.show()
+        return error.exit_code
     if isinstance(error, BrokenPipeError):
         go_on_unread(sys.stdout)
         return EXIT_DONE
-    known = system_error(error)
+    known = error if isinstance(error, HarnessError) else None
+    if isinstance(error, click.UsageError):
+        known = usage_error(error, error.ctx or click.Context(group, info_name=name))
+    elif isinstance(error, OSError):
+        known = system_error(error)
     if known is None:
         raise error
     show_error(known)

@@ -41,6 +41,7 @@ from weakref import finalize
 
 from harness.cache import SAID
 from harness.errors import HarnessError, writing
+from harness.progress import Progress
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -82,6 +83,7 @@ class Interruption:
             signal.signal(other, signal.SIG_IGN)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         self.signal = signal.Signals(number)
+        Progress.cancelled = True  # a library may lose what is raised here: then the next report raises it again
         raise KeyboardInterrupt(self.signal.name)
 
 
@@ -116,7 +118,10 @@ def interruptible() -> Iterator[Interruption]:
         for number, handler in before.items():
             if handler in _LEFT_TO_US:
                 signal.signal(number, interruption.arrive)
-        yield interruption
+        try:
+            yield interruption
+        finally:
+            Progress.cancelled = False
 
 
 def leave_signals_to_parent() -> None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Self, TextIO
 
 from harness.numbers import count, duration, words
@@ -15,8 +14,6 @@ if TYPE_CHECKING:
     from rich.progress import Task
 
 Figure = float | int | str
-FORESEEN = 10.0
-"""How many times as many tests as there have been can be foreseen."""
 
 
 class Progress:
@@ -37,7 +34,7 @@ class Progress:
             raise KeyboardInterrupt
 
     def status(self, **figures: Figure) -> None:
-        """Show figures beside the bar, keeping those not named; ``crashes`` and ``rhw`` also give the time left."""
+        """Show figures beside the bar, keeping those not named."""
 
     def __enter__(self) -> Self:
         return self
@@ -46,46 +43,18 @@ class Progress:
         """Show no more."""
 
 
-def episodes_left(
-    done: float, budget: float, target_rhw: float | None, min_crashes: int, figures: Mapping[str, Figure]
-) -> int | None:
-    """Estimate how many more episodes a campaign needs until it stops; None as long as nobody can tell.
-
-    The relative half-width falls as 1/√n and crashes come at a steady rate, so that a target needs about
-    n·(rhw/target)² episodes. One crash of the largest weight moves the estimate in proportion to 1/n, and may do so by
-    no more than the target (`harness.estimators.stopping`). From n episodes no more than `FORESEEN` times n are
-    foreseen. The budget is the answer only where there is no target: else it is a limit, and no forecast.
-    """
-    if not target_rhw or "crashes" not in figures:
-        return max(math.ceil(budget - done), 0)
-    rhw, crashes, one_more_crash = (float(figures.get(name, 0.0)) for name in ("rhw", "crashes", "one_more_crash"))
-    if not done or not crashes or not rhw or not math.isfinite(rhw):
-        return None
-    times = max(min(rhw / target_rhw, FORESEEN) ** 2, min_crashes / crashes, one_more_crash / target_rhw)
-    return max(math.ceil(done * times - done), 0) if times <= FORESEEN and done * times <= budget else None
-
-
 class ShownProgress(Progress):
     """One bar on a terminal; elsewhere, for logs, a line every ``interval_s``: nothing of work that takes less.
 
-    The share is that of the work thought necessary: a campaign that stops on precision (``target_rhw``, after
-    ``min_crashes``) ends at 100 %. The stream is stderr by default, since stdout is for results.
+    The stream is stderr by default, since stdout is for results.
     """
 
-    def __init__(
-        self,
-        target_rhw: float | None = None,
-        min_crashes: int = 0,
-        stream: TextIO | None = None,
-        *,
-        interval_s: float = 30.0,
-    ) -> None:
+    def __init__(self, stream: TextIO | None = None, *, interval_s: float = 30.0) -> None:
         from rich.console import Console  # noqa: PLC0415 - what shows nothing needs none
         from rich.progress import BarColumn, TaskProgressColumn  # noqa: PLC0415
         from rich.progress import Progress as Bars  # noqa: PLC0415
 
         self._stream, self._interval_s = stream or sys.stderr, interval_s
-        self._asked = target_rhw, min_crashes
         columns = "{task.description}", BarColumn(bar_width=12), TaskProgressColumn(), "{task.fields[words]}"
         self._bars = Bars(*columns, console=Console(file=self._stream))
         self._ended, self._told = threading.Event(), False
@@ -110,9 +79,7 @@ class ShownProgress(Progress):
         """Begin a bar in the place of the last stage's; a log that has had a line is told at once."""
         for task_id in self._bars.task_ids:
             self._bars.remove_task(task_id)
-        self._bars.add_task(
-            name + self.remark, total=total, completed=done, before=done, budget=total, figures={}, words=""
-        )
+        self._bars.add_task(name + self.remark, total=total, completed=done, before=done, figures={}, words="")
         if self._told:
             self._print()
 
@@ -126,15 +93,7 @@ class ShownProgress(Progress):
     def status(self, **figures: Figure) -> None:
         """Show figures beside the bar, keeping those not named."""
         for task in self._bars.tasks:
-            told = task.fields["figures"]
-            # A half-width is that of the last look: with tests that came since, it would foresee too many.
-            foreseen = task.total is not None and task.completed < task.total and "rhw" in told
-            outdated = foreseen and figures.get("rhw", told["rhw"]) == told["rhw"]
-            told |= figures
-            if (budget := task.fields["budget"]) is not None and not outdated:
-                # Not by `update`, which begins to measure time anew where the total is another one.
-                left = episodes_left(task.completed, budget, *self._asked, told)
-                task.total = None if left is None else task.completed + left
+            task.fields["figures"] |= figures
             self._bars.update(task.id, words=_words(task))
 
     def _print_lines(self) -> None:
@@ -150,7 +109,6 @@ class ShownProgress(Progress):
         """What a log is told now, with the time of day: nothing until a stage begins."""
         for task in self._bars.tasks:
             of = f" of {count(task.total)}" if task.total is not None else ""
-            of = of or (f" of at most {count(task.fields['budget'])}" if task.fields["budget"] is not None else "")
             done = f" {count(task.completed)}{of}" if task.completed else ""
             yield f"{time.strftime('%H:%M:%S')} {task.description}:{done} · {_words(task)}".rstrip(" ·:")
 
@@ -174,6 +132,6 @@ def _words(task: Task) -> str:
     return " · ".join([rate, *figures, *left])
 
 
-def shown_progress(target_rhw: float | None = None, min_crashes: int = 0, *, quiet: bool = False) -> Progress:
+def shown_progress(*, quiet: bool = False) -> Progress:
     """Give a bar when stderr is a terminal, else lines: a log file is no place for a bar. Nothing at all if quiet."""
-    return Progress() if quiet else ShownProgress(target_rhw, min_crashes)
+    return Progress() if quiet else ShownProgress()

@@ -3,7 +3,9 @@
 import errno
 import json
 import os
+import signal
 import sys
+from contextlib import suppress
 from itertools import filterfalse
 from pathlib import Path
 from unittest.mock import Mock
@@ -19,6 +21,7 @@ from harness.commands.printing import in_folder, say
 from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.estimators.short_answer import lines
 from harness.numbers import interval, words
+from harness.progress import Progress
 from harness.runner.stored import estimate_run
 from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
@@ -50,10 +53,9 @@ def test_check_prints_a_campaign_file(capsys, tmp_path):
     (tmp_path / "resolved.yaml").write_text(output)
     resolved = load_campaign(tmp_path / "resolved.yaml")
     assert resolved == load_campaign(SMOKE, ["stop.rhw=0.2", f"pool.library={OF_TRAFFIC[True]}"])
-    assert "#   most tests: 400,000" in output
     assert main(["check", SMOKE, "--json"]) == 0
     output = json.loads(capsys.readouterr().out)
-    assert (output["campaign"]["stop"]["rhw"], output["plan"]["most_tests"]) == (0.3, 400_000)
+    assert output["stop"] == {**output["stop"], "rhw": 0.3, "episodes": 400_000}
 
 
 def test_run_prints_the_answer_and_where_more_is(folder, capsys):
@@ -177,6 +179,23 @@ def test_errors_that_can_be_mended_are_told_in_words_and_keep_their_exit_code(ra
 def test_an_interrupted_estimate_has_nothing_to_go_on_with(raising, capsys):
     assert raising(KeyboardInterrupt(), "harness.runner.stored.estimate_run", "estimate") == 130
     assert "--resume" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "then", [lambda: Progress().advance(1), lambda: int("x"), Mock(side_effect=RunFolderError(*WRONG))]
+)
+@pytest.mark.parametrize(("number", "code"), [("SIGHUP", 129), ("SIGINT", 130), ("SIGTERM", 143)])
+def test_what_a_signal_ends_has_its_exit_code_whatever_becomes_of_the_interruption(capsys, then, number, code):
+    def work():
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(getattr(signal, number))
+        then()
+
+    assert main([], click.Command("run", callback=work)) == code
+    err = capsys.readouterr().err.strip()
+    assert err.startswith("Interrupted")
+    assert len(err.splitlines()) == 1
+    assert not Progress.cancelled
 
 
 @pytest.mark.parametrize("defect", [OSError(errno.EBADF, "closed too early"), ZeroDivisionError()], ids=repr)

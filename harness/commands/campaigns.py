@@ -30,7 +30,6 @@ from harness.commands.printing import (
     in_folder,
     print_answer,
     print_json,
-    print_plan,
     print_statements,
     print_table,
     say,
@@ -49,7 +48,7 @@ def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None)
 
 
 @click.command(
-    short_help="Validate a campaign, print it resolved, and its cost.",
+    short_help="Validate a campaign, and print it resolved.",
     epilog=examples(
         "harness check scenarios/smoke.yaml",
         "harness check my_av.py:MyClass > my.yaml          # a campaign of one's own to begin with",
@@ -60,21 +59,19 @@ def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None)
 @set_option
 @json_option
 def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_json: bool) -> None:
-    """Validate CAMPAIGN, or that of VEHICLE; print it with every default filled in, and what it will cost.
+    """Validate CAMPAIGN, or that of VEHICLE, and print it with every default filled in.
 
-    No test is run and nothing is written. The output is itself a campaign file; its cost stands in comments.
+    No test is run and nothing is written. The output is itself a campaign file.
     """
     campaign = loaded(campaign_file, overrides, av)
     from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
-    from harness.resolved import resolve  # noqa: PLC0415 - slow to import: only once the campaign is right
-    from harness.runner.look import plan_campaign  # noqa: PLC0415
+    from harness.resolved import require_ready  # noqa: PLC0415 - slow to import: only once the campaign is right
 
-    plan, campaign = plan_campaign(campaign), resolve(campaign).campaign
+    campaign = require_ready(campaign).campaign
     if as_json:
-        print_json({"campaign": campaign.model_dump(mode="json"), "plan": plan})
-        return
-    click.echo(dump_campaign(campaign))
-    print_plan(plan)
+        print_json(campaign.model_dump(mode="json"))
+    else:
+        click.echo(dump_campaign(campaign))
 
 
 @click.command(
@@ -145,7 +142,7 @@ def run(
     with (
         named_if_written(folder, chosen=chosen),
         ahead,
-        progress_bar(campaign.stop.rhw, campaign.min_crashes) as bar,
+        progress_bar() as bar,
     ):
         from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: the bar is there meanwhile
 
@@ -303,7 +300,7 @@ def compare(
     if chosen := folder is None:
         folder = RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b.removeprefix(f'{a.name}, '))}"
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
-    with named_if_written(folder, chosen=chosen), progress_bar(rhw, a.min_crashes) as bar:
+    with named_if_written(folder, chosen=chosen), progress_bar() as bar:
         from harness.runner.compare import compare_campaigns  # noqa: PLC0415 - slow to import: the bar is there meanwhile
 
         found = compare_campaigns(

@@ -73,11 +73,11 @@ quiet_option = click.option(
 """Common to all commands: `progress_bar` asks for it."""
 
 
-def progress_bar(target_rhw: float | None = None, min_crashes: int = 0) -> Progress:
+def progress_bar() -> Progress:
     """What a command shows of its work, unless it is to be quiet."""
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
-    return shown_progress(target_rhw, min_crashes, quiet=click.get_current_context().meta["quiet"])
+    return shown_progress(quiet=click.get_current_context().meta["quiet"])
 
 
 junit_option = click.option(

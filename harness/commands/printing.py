@@ -100,13 +100,6 @@ def print_json(content: Any) -> None:
     say(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
 
 
-def print_plan(plan: dict[str, Any]) -> None:
-    """Print what a campaign will cost as YAML comments, so that the whole output stays a campaign file."""
-    say("# What it will cost")
-    for key, value in plan.items():
-        say(f"#   {key.replace('_', ' ')}: {words(value, 4)}")
-
-
 def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print mappings of the same keys as a table; numbers to four digits and flush right, and nothing is cut off."""
     from rich.console import Console  # noqa: PLC0415 - keeps --help fast

@@ -1,4 +1,4 @@
-"""Look before anything is spent on a campaign: what the AV does and how fast it is, and what tests cost."""
+"""Look before anything is spent on a campaign: what the AV does, and how fast it is."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from harness.episode.cells import drawn_traffic
 from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
-from harness.resolved import require_ready, require_world, resolve
+from harness.resolved import require_world, resolve
 from harness.runner.again import Bits, Tests, bits_of, run_elsewhere
-from harness.sampling import prepare, source_of
+from harness.sampling import prepare
 from harness.sampling.protocol import Source
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, FloatArray
@@ -418,16 +418,3 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         n_cut_ins=len(reactions),
         n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
     )
-
-
-# -- what a campaign costs --
-
-
-@checked("plan_campaign")
-def plan_campaign(campaign: Campaign) -> dict[str, Any]:
-    """Most that a campaign may cost: ``most_tests``, its budget, and in words the ``tables`` that are left to build.
-
-    Raises `CampaignError`: a run would refuse the campaign before it starts.
-    """
-    resolved = require_ready(campaign)
-    return {"most_tests": campaign.stop.episodes, "tables": source_of(campaign).building(resolved)}

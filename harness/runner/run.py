@@ -168,8 +168,9 @@ class Run:
         if (paths := self.source.baseline_paths) is not None:
             self._make_baseline(paths)
             self._keep_design()
-        # Until a decision nobody knows how many.
-        most = self.campaign.stop.episodes if self.campaign.accept is None else None
+        stop = self.campaign.stop
+        # Until a precision or a decision nobody knows how many.
+        most = stop.episodes if self.campaign.accept is None and stop.rhw is None else None
         self._progress.stage(f"episodes{self._workers.where}", most, done=self.held)
 
     def results(self, requests: Iterator[ShardRequest]) -> Iterator[ShardResult]:
@@ -179,14 +180,9 @@ class Run:
             yield shard
 
     def follow(self, rule: Rule, shard: ShardResult) -> None:
-        """Show how far it is, and let the manifest follow.
-
-        Only what a rule asks for is called ``rhw``: a bar reckons from it when the campaign will stop.
-        """
-        watched = "half_width" if self.campaign.stop.rhw is None else "rhw"
-        one_more = {"one_more_crash": rule.look.one_more_crash} if self.campaign.sampling.forces else {}
+        """Show how far it is, and let the manifest follow."""
         self._progress.advance(min(max(self.manifest.n_episodes - self.held, 0), shard.request.n_episodes))
-        self._progress.status(crashes=self.manifest.n_crashes, **{watched: rule.look.rhw}, **one_more)
+        self._progress.status(crashes=self.manifest.n_crashes, rhw=rule.look.rhw)
         self.manifest.follow()
 
     def _known(self, request: ShardRequest) -> ShardResult | None:

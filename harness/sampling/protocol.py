@@ -15,7 +15,6 @@ from typing import ClassVar, Protocol
 
 import pyarrow as pa
 
-from harness import cache
 from harness.campaign.campaign import Campaign
 from harness.controllers.find import build_host
 from harness.controllers.hosts import Death
@@ -120,15 +119,6 @@ class Source:
         if not resolved.campaign.sampling.mixes:
             return []
         return [tables_name(resolved.environment, resolved.surrogates, resolved.campaign.testing.challenge)]
-
-    @classmethod
-    def building(cls, resolved: Resolved) -> str:
-        """What is to be built, and how long that takes, in words."""
-        files = cls.cached_files(resolved)
-        if not files or all(map(cache.has, files)):
-            return "cached" if files else "none needed"
-        per_driver_s = 5 if resolved.campaign.environment.acceleration_hold_s >= 0.5 else 40
-        return f"to build (about {per_driver_s * len(resolved.campaign.surrogates)} s of one core)"
 
     @classmethod
     def stored_design(cls, folder: Path) -> ShellDesign | None:  # noqa: ARG003 - there is none

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from harness import cache
 from harness.campaign.campaign import Campaign
 from harness.episode.cells import PrescribedTraffic
 from harness.episode.loop import EpisodeLoop, Shard
@@ -46,7 +45,6 @@ from harness.vocabulary import IntArray, RecordArray
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
 _FINISH = "Run `harness run` with --resume, which makes what is missing."
-POOL_S = "about 15 s"
 
 
 class Shells(Source):
@@ -76,14 +74,6 @@ class Shells(Source):
     def cached_files(cls, resolved: Resolved) -> list[str]:
         own = resolved.campaign.has_baseline_runs
         return [baseline_paths_name(resolved) if own else pool_name(campaign_pool_key(resolved))]
-
-    @classmethod
-    def building(cls, resolved: Resolved) -> str:
-        what, make = "pool of cut-ins", "build"
-        if resolved.campaign.has_baseline_runs:
-            what, make = f"paths of {resolved.campaign.pool.shadow_paths:,} baseline runs", "choose"
-        cached = all(map(cache.has, cls.cached_files(resolved)))
-        return f"{what}: " + ("cached" if cached else f"to {make} ({POOL_S} on two cores)")
 
     @classmethod
     def stored_design(cls, folder: Path) -> ShellDesign:

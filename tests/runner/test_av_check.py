@@ -16,10 +16,10 @@ from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import CampaignError
 from harness.records.folder import read_manifest
-from harness.runner.look import check_av, plan_campaign
+from harness.runner.look import check_av
 from harness.runner.stored import replay_episode, suspects
 from tests.pool.test_vehicle_pool import ACTING
-from tests.stored_runs import copy_of, edit, golden
+from tests.stored_runs import copy_of, edit
 from tests.worlds.running import EXAMPLE, ROOT
 
 MIXTURE_FILE, FORCED = (str(ROOT / f"scenarios/overtaking_{name}.yaml") for name in ("mixture", "forced"))
@@ -320,9 +320,3 @@ def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_at_one_that_acts_befo
     assert with_lead.behaviour.n_crashes <= without.behaviour.n_crashes
     early = check_av(campaign(LEAD, "testing.method=forced", f"av={ACTING.format('Speeds')}"), 4)
     assert (early.exit_code, early.rows[0]["found"]) == (0, "controller, twin, step_mixture, cut-ins of one step")
-
-
-def test_check_says_what_the_budget_costs():
-    plan = plan_campaign(golden("shells-lateral-twin", "stop.episodes=4000"))
-    assert plan["most_tests"] == 4000
-    assert plan["tables"].startswith("pool of cut-ins: ")

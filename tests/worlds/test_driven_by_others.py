@@ -10,8 +10,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, WorldDisagreementError
-from harness.resolved import resolve
-from harness.runner.look import plan_campaign
+from harness.resolved import require_ready, resolve
 from harness.runner.run import run_campaign
 from harness.runner.stored import replay_episode
 from harness.sampling import prepare
@@ -235,11 +234,11 @@ def test_a_machine_with_a_public_address_is_refused_unless_it_is_allowed(monkeyp
     addresses = {"127.0.0.1", "10.1.2.3", "192.168.0.9"}
     monkeypatch.setattr("harness.worlds.program.own_addresses", lambda: addresses)
     plain, allowed = (load(f"{EXAMPLE} {{port}} {{cells}}", more) for more in ("", ", allow_public: true"))
-    plan_campaign(plain)
+    require_ready(plain)
     addresses.add("8.8.4.4")
-    plan_campaign(allowed)
+    require_ready(allowed)
     with pytest.raises(CampaignError, match=r"8\.8\.4\.4.*allow_public") as caught:
-        plan_campaign(plain)
+        require_ready(plain)
     assert caught.value.where == "av.traci"
     assert plain.av.identity() == allowed.av.identity()
 
