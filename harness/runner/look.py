@@ -37,8 +37,6 @@ from harness.worlds.twin import TwinWorld
 EPISODES = 48
 CELLS, OTHER_CELLS = 16, 5
 """Two layouts in which every episode has other neighbours, and mostly another cell."""
-FIRST_EPISODES = 2
-"""Run before the time is taken: they compile."""
 SHORTEST_TIMING_S = 0.3
 BRAKING_MPS2 = -0.1
 """What counts as a reaction to the cut-in."""
@@ -294,7 +292,7 @@ def _opened(source: Source, black_box: Path | None, n_cells: int | None = None) 
 def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, Speed]:
     """First run of the episodes, and the speed of the fastest of several."""
     with _opened(source, black_box) as loop:
-        loop.run(0, source.states(0, min(FIRST_EPISODES, n_episodes)))
+        loop.run(0, source.states(0, min(CELLS, n_episodes)))  # compiles, and constructs for every cell
         states = source.states(0, n_episodes)
         began = time.perf_counter()
         shard, elapsed_s = loop.run(0, states), time.perf_counter() - began
