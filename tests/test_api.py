@@ -82,7 +82,7 @@ RUN = "shells-twin"
         (lambda _: harness.run({}, "out"), "harness.run(campaign=", "or a path"),
         (lambda _: harness.run("no.yaml", "out"), "no.yaml", "no such file"),
         (lambda _: harness.run("idm", ""), "harness.run(out=", "no text"),
-        (lambda _: harness.run("idm", "a\0b"), "harness.run(out=", "zero byte"),
+        (lambda _: harness.run("idm", "a\0b"), "harness.run(out=", "a zero byte"),
         (lambda _: harness.run("idm", "a\ud800"), "harness.run(out=", "no UTF-8"),
         (lambda _: harness.run("idm", "out", workers=0), "harness.run(workers=", "found 0; expected greater than"),
         (lambda _: harness.run("idm", "out", workers=True), "harness.run(workers=", "a whole number"),
