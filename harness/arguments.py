@@ -5,8 +5,10 @@ A number of numpy's is taken as the plain one that it stands for. A path may be 
 
 from __future__ import annotations
 
+import errno
+import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache, wraps
 from inspect import Signature, signature
 from pathlib import Path
@@ -79,34 +81,35 @@ def _checked(where: str, value: Any, adapter: TypeAdapter[Any], is_path: bool) -
     try:
         found = adapter.validate_python(plain)
     except ValidationError as error:
-        problems = error.errors(include_url=False)
-        expected = " or ".join(dict.fromkeys(_words(problems, is_path=is_path)))
-        wrong = problems[0]["input"]
-        mend = did_you_mean(wrong, re.findall("'(.*?)'", expected))
-        if isinstance(plain, str) and problems[0]["type"] == "sequence_str":
-            mend = f"Write [{plain!r}]."
-        raise HarnessError(where, describe_found(wrong), expected, mend or "Correct the argument.") from None
-    if is_path and isinstance(found, str | Path):
-        _require_name(where, str(found))
+        first, *others = error.errors(include_url=False)
+        expected = " or ".join(
+            dict.fromkeys(filter(None, (_words(each, is_path=is_path) for each in (first, *others))))
+        )
+        mend = did_you_mean(first["input"], re.findall("'(.*?)'", expected)) or "Correct the argument."
+        mend = f"Write [{plain!r}]." if first["type"] == "sequence_str" else mend
+        raise HarnessError(where, describe_found(first["input"]), expected, mend) from None
+    if is_path and isinstance(found, str | Path) and (wrong := _no_name(str(found))):
+        raise HarnessError(where, wrong, "the name of a file or folder", "Correct the argument.")
     return found
 
 
-def _words(problems: list[ErrorDetails], *, is_path: bool) -> Iterator[str]:
-    for each in problems:
-        kind = each.get("ctx", {}).get("class", "")
-        if is_path and (each["type"] == "string_type" or kind == "Path"):
-            yield "a path"
-        elif kind == "Campaign":
-            yield "a campaign (harness.load_campaign)"
-        elif kind != "Resolved":
-            yield KINDS.get(each["type"], each["msg"].removeprefix("Input should be "))
+def _no_name(text: str) -> str:
+    """What keeps a text from being the name of a file or folder; empty if nothing does."""
+    if text.encode(errors="replace").decode() != text:
+        return f"a name with bytes that are no UTF-8 ({text})"
+    try:
+        os.stat(text)  # noqa: PTH116 - an empty path would be this folder
+    except ValueError:
+        return "a zero byte in a name"
+    except OSError as error:
+        refused = error.errno in (errno.ENAMETOOLONG, errno.ELOOP) or not text
+        return f"a name that the system refuses ({error.strerror}): '{text[:40]}'" if refused else ""
+    return ""
 
 
-def _require_name(where: str, text: str) -> None:
-    wrong = {
-        "no text": not text,
-        "a name with a zero byte": "\0" in text,
-        f"a name with bytes that are no UTF-8 ({text})": text.encode(errors="replace").decode() != text,
-    }
-    for found in (problem for problem, is_so in wrong.items() if is_so):
-        raise HarnessError(where, found, "the name of a file or folder", "Correct the argument.")
+def _words(problem: ErrorDetails, *, is_path: bool) -> str | None:
+    kind = problem.get("ctx", {}).get("class", "")
+    if is_path and (problem["type"] == "string_type" or kind == "Path"):
+        return "a path"
+    named = {"Campaign": "a campaign (harness.load_campaign)", "Resolved": ""}
+    return named.get(kind, KINDS.get(problem["type"], problem["msg"].removeprefix("Input should be ")))

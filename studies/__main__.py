@@ -17,12 +17,12 @@ from harness.commands.options import (
     RUN_FOLDER,
     examples,
     json_option,
+    progress_bar,
     quiet_option,
     written_file,
 )
 from harness.commands.printing import print_json, print_table
 from harness.errors import HarnessError, WorldDisagreementError
-from harness.progress import shown_progress
 
 if TYPE_CHECKING:
     from studies.rnot import RnotEstimator
@@ -79,7 +79,7 @@ def cli() -> None:
 @quiet_option
 @json_option
 def validate(
-    experiment_file: Path, folder: Path, overrides: Sequence[str], *, workers: int | None, quiet: bool, as_json: bool
+    experiment_file: Path, folder: Path, overrides: Sequence[str], *, workers: int | None, as_json: bool
 ) -> None:
     """Repeat the campaign of EXPERIMENT for each of its vehicles, pairs or chains, and judge its intervals by that.
 
@@ -96,7 +96,7 @@ def validate(
     from harness.estimators.estimate import finite_json  # noqa: PLC0415 - slow to import: once the file is right
     from studies.replication import run  # noqa: PLC0415
 
-    with (bar := shown_progress(quiet=quiet)):
+    with (bar := progress_bar()):
         judgements = run.validate(experiment, folder, workers=workers, progress=bar)
     if as_json:
         print_json(finite_json(judgements))
@@ -119,7 +119,7 @@ def validate(
 @_workers_option
 @quiet_option
 @json_option
-def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, quiet: bool, as_json: bool) -> None:
+def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, as_json: bool) -> None:
     """Make the steps of STUDY that are not in the folder yet, and the page that puts them beside the paper's numbers.
 
     Each step has a folder of its own under steps/, named after all that it depends on: a second run makes nothing
@@ -136,10 +136,10 @@ def study(study_file: Path, folder: Path, *, quick: bool, workers: int | None, q
         raise HarnessError("studies case", f"no package {error.name}", "the extra 'studies'", mend) from error
 
     def told(name: str, seconds: float | None) -> None:
-        if not (as_json or quiet):
+        if not (as_json or click.get_current_context().meta["quiet"]):
             click.echo(f"{name}: " + ("there already" if seconds is None else f"{seconds:.1f} s"))
 
-    with (bar := shown_progress(quiet=quiet)):
+    with (bar := progress_bar()):
         done = run_study(asked, folder, workers=workers, progress=bar, told=told)
     if as_json:
         print_json(done)
@@ -182,7 +182,7 @@ def rnot(folders: Sequence[Path], *, estimators: Sequence[RnotEstimator], as_jso
     """
     from studies.rnot import SHOWN, Procedure, required_tests_of_runs  # noqa: PLC0415 - keeps --help fast
 
-    with (bar := shown_progress()):
+    with (bar := progress_bar()):
         content = required_tests_of_runs(folders, Procedure(**asked), estimators=estimators, progress=bar)
     if as_json:
         print_json(content)
@@ -211,7 +211,7 @@ def alarm(ctx: click.Context, folder: Path, *, as_json: bool) -> None:
     """
     from studies.alarm import alarm_of_run  # noqa: PLC0415 - slow to import
 
-    with (bar := shown_progress()):
+    with (bar := progress_bar()):
         found = alarm_of_run(folder, bar)
     if as_json:
         print_json(found)
@@ -304,7 +304,7 @@ def _figure_row(row: Mapping[str, Any]) -> dict[str, Any]:
 @click.option("--data-sets", "n", type=click.IntRange(min=10), default=200, help="Of each size.")
 @click.option("--replicates", "n_replicates", type=click.IntRange(min=20), default=100, help="Of each data set.")
 @quiet_option
-def roundtrip(folder: Path, *, hours: Sequence[float], n: int, n_replicates: int, quiet: bool) -> None:
+def roundtrip(folder: Path, *, hours: Sequence[float], n: int, n_replicates: int) -> None:
     """Say how often the errors of `harness fit` hold what was put in: each fitted number, and crash rates.
 
     Trajectories are those of `trajectories`, with vehicles that differ. Sets of 10 vehicle-hours share no recording,
@@ -314,7 +314,7 @@ def roundtrip(folder: Path, *, hours: Sequence[float], n: int, n_replicates: int
     from harness.records.folder import write_json  # noqa: PLC0415 - keeps --help fast
     from studies.roundtrip import fit_data_sets, judge, rounded, table  # noqa: PLC0415
 
-    with (bar := shown_progress(quiet=quiet)):
+    with (bar := progress_bar()):
         for each in hours:
             fit_data_sets(folder, each, n, n_replicates, bar)
         found = judge(folder, hours, bar)

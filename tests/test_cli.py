@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import signal
 import sys
 from contextlib import suppress
@@ -165,6 +166,7 @@ WRONG = "episodes/0.parquet", "half a file", "a whole one", "Delete it."
         (errno.EACCES, 2, "permissions"),
         (errno.EFBIG, 2, "limit"),
         (errno.ELOOP, 2, "Correct the path"),
+        (errno.ENAMETOOLONG, 2, "too long"),
     ],
 )
 def test_errors_that_can_be_mended_are_told_in_words_and_keep_their_exit_code(raising, capsys, error, code, said):
@@ -237,6 +239,15 @@ def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_pat
     never = ZeroDivisionError(), "harness.runner.stored.replay_episode", "replay"
     assert raising(*never, more=["17", "--out", str(tmp_path / "file" / name)]) == 2
     assert "nothing can be written" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others have no DISPLAY")
+def test_without_a_desktop_a_replay_names_an_option_that_it_has(stored_run, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr("harness.worlds.sumo.sumo_program", lambda *_: "sumo-gui")
+    assert main(["replay", str(stored_run("shells-twin")), "3", "--gui"]) == 2
+    options = {name for each in cli.commands["replay"].params for name in each.opts}
+    assert re.search(r"(--\w+) FILE", capsys.readouterr().err)[1] in options
 
 
 def test_every_command_can_be_quiet(monkeypatch):

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
+import harness
 from harness.commands.options import (
     CAMPAIGN,
     FOLDER,
@@ -36,16 +36,6 @@ from harness.commands.printing import (
 )
 from harness.numbers import leaves, words
 
-if TYPE_CHECKING:
-    from harness.campaign.campaign import Campaign
-
-
-def loaded(campaign_file: Path, overrides: Sequence[str], av: str | None = None) -> Campaign:
-    """Read the campaign, or that of the vehicle, that a command was given, with what was replaced beside it."""
-    from harness.campaign.files import load_campaign  # noqa: PLC0415 - keeps --help fast
-
-    return load_campaign(campaign_file, overrides, av=av)
-
 
 @click.command(
     short_help="Validate a campaign, and print it resolved.",
@@ -63,7 +53,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
 
     No test is run and nothing is written. The output is itself a campaign file.
     """
-    campaign = loaded(campaign_file, overrides, av)
+    campaign = harness.load_campaign(campaign_file, overrides, av=av)
     from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
     from harness.resolved import require_ready  # noqa: PLC0415 - slow to import: only once the campaign is right
 
@@ -133,20 +123,14 @@ def run(
     """
     limit = [] if accept is None else accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
-    campaign = loaded(campaign_file, [*overrides, *limit, *where], av)
+    campaign = harness.load_campaign(campaign_file, [*overrides, *limit, *where], av=av)
     chosen, folder = folder is None, folder or _run_folder(campaign.name, resume=resume)
     from harness.processes import imports_ahead, worker_modules  # noqa: PLC0415 - keeps --help fast
 
     is_local = campaign.run.executor == "local"
     ahead = imports_ahead(*worker_modules(campaign.world.engine)) if is_local else nullcontext()
-    with (
-        named_if_written(folder, chosen=chosen),
-        ahead,
-        progress_bar() as bar,
-    ):
-        from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: the bar is there meanwhile
-
-        result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
+    with named_if_written(folder, chosen=chosen), ahead, progress_bar() as bar:
+        result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
     content = in_folder(result.estimates, folder)
     if junit is not None:
         from harness.report.junit import statement_cases, write_junit  # noqa: PLC0415 - keeps --help fast
@@ -215,7 +199,7 @@ def av_check(
     Exit code 3 says that episodes failed, were not reproduced, or ended the process; 2 that the campaign or the
     controller is wrong.
     """
-    campaign = loaded(campaign_file, overrides, av)
+    campaign = harness.load_campaign(campaign_file, overrides, av=av)
     from harness.runner.look import check_av_apart  # noqa: PLC0415 - slow to import: only once the campaign is right
 
     found = check_av_apart(campaign, episodes)
@@ -290,7 +274,8 @@ def compare(
         raise click.UsageError("Name a second campaign, or say with --against or --against-av what is different in B.")
     stored = source_a if source_a.is_dir() else None
     file_a = source_a if stored is None else stored / "campaign.yaml"
-    a, b = loaded(file_a, overrides, av), loaded(file_b or file_a, [*overrides, *against], against_av or av)
+    a = harness.load_campaign(file_a, overrides, av=av)
+    b = harness.load_campaign(file_b or file_a, [*overrides, *against], av=against_av or av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
     from harness.campaign.files import parse_override  # noqa: PLC0415 - keeps --help fast
@@ -301,9 +286,7 @@ def compare(
         folder = RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b.removeprefix(f'{a.name}, '))}"
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
     with named_if_written(folder, chosen=chosen), progress_bar() as bar:
-        from harness.runner.compare import compare_campaigns  # noqa: PLC0415 - slow to import: the bar is there meanwhile
-
-        found = compare_campaigns(
+        found = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )
     from harness.estimators.short_answer import pair_lines  # noqa: PLC0415 - keeps --help fast
@@ -340,7 +323,7 @@ def pool(campaign_file: Path, *, overrides: Sequence[str], as_json: bool) -> Non
     Shown are the surrogates from careful to careless with their crash rates, and how probable it is that a cut-in is
     the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
     """
-    campaign = loaded(campaign_file, overrides)
+    campaign = harness.load_campaign(campaign_file, overrides)
     with progress_bar() as bar:
         from harness.pool.build import campaign_pool  # noqa: PLC0415 - slow to import: the bar is there meanwhile
         from harness.resolved import resolve  # noqa: PLC0415 - slow to import

@@ -23,16 +23,15 @@ RUNS = Path("runs")
 
 
 def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Path | None], Path | None]:
-    """Callback of an option that names a file to write: its suffix says what is written, its folder may be made."""
+    """Callback of an option that names a file to write: it ends in one of ``suffixes``, its folder may be made."""
 
     def checked(_ctx: click.Context, parameter: click.Parameter, value: Path | None) -> Path | None:
         if value is None:
             return None
-        if suffixes and value.suffix not in suffixes:
-            option, endings = parameter.opts[0], " or ".join(suffixes)
-            found = f"a name that ends in '{value.suffix}'" if value.suffix else "a name without a suffix"
+        if value.suffix not in suffixes:
+            option, found = parameter.opts[0], f"a name that ends in '{value.suffix}'"
             mend = f"Write {option} {value.with_suffix(suffixes[0])}."
-            raise HarnessError(f"{option} {value}", found, f"a name that ends in {endings}", mend)
+            raise HarnessError(f"{option} {value}", found, f"a name that ends in {' or '.join(suffixes)}", mend)
         from harness.records.folder import require_place  # noqa: PLC0415 - keeps --help fast
 
         require_place(value.parent)
@@ -77,7 +76,7 @@ def progress_bar() -> Progress:
     """What a command shows of its work, unless it is to be quiet."""
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
 
-    return shown_progress(quiet=click.get_current_context().meta["quiet"])
+    return shown_progress(quiet=click.get_current_context().meta.get("quiet", False))
 
 
 junit_option = click.option(

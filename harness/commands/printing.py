@@ -72,6 +72,9 @@ def system_error(error: OSError) -> HarnessError | None:
         found = f"a file that cannot be written or read on ({error.strerror})"
         expected = "a sound disk, and no limit on the size of files (`ulimit -f`)"
         return HarnessError(where, found, expected, f"Lift the limit or choose another disk. {_AGAIN}")
+    if error.errno in (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR):
+        found = f"a name that the system refuses ({error.strerror})"
+        return HarnessError(where, found, "the name of a file or folder", "Correct it.")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         mend = "Change its permissions, or choose another place."
         return HarnessError(where, f"no permission ({error.strerror})", "a place that may be read and written", mend)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+import harness
 from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar, verbose_option
 from harness.commands.printing import in_folder, print_answer, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
@@ -84,9 +85,7 @@ def estimate(
 
             content = estimate_in_other_traffic(folder, environment, confidence=confidence, own=write, progress=bar)
     else:
-        from harness.runner.stored import estimate_run  # noqa: PLC0415 - keeps --help fast
-
-        content = estimate_run(folder, estimators=estimators or None, confidence=confidence)
+        content = harness.estimate(folder, estimators=estimators or None, confidence=confidence)
     if write:
         from harness.records.folder import write_sealed  # noqa: PLC0415 - keeps --help fast
 
@@ -149,9 +148,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
         from harness.runner.sensitivity import sensitivity as found_by  # noqa: PLC0415 - keeps --help fast
 
         content = found_by(folder, ranges=ranges, progress=bar)
-        from harness.report.page import write_report  # noqa: PLC0415 - keeps --help fast
-
-        page = write_report(folder)
+        page = harness.write_report(folder)
     if as_json:
         print_json(content)
         return
@@ -178,10 +175,9 @@ def _bar(bar: dict[str, Any]) -> dict[str, str]:
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 def report(folder: Path) -> None:
     """Write report.html of the run or of the comparison in DIR anew, and print where the page is."""
+    write = harness.write_report
     if (folder / COMPARISON).is_file():
         from harness.report.compare_page import write_comparison as write  # noqa: PLC0415 - keeps --help fast
-    else:
-        from harness.report.page import write_report as write  # noqa: PLC0415 - keeps --help fast
 
     say(write(folder))
 
@@ -238,17 +234,13 @@ def replay(
     from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
     from harness.records.origin import code_of  # noqa: PLC0415
     from harness.records.reader import read_campaign  # noqa: PLC0415
-    from harness.runner.stored import replay_episode  # noqa: PLC0415
 
     if not stored and (code := code_of(read_campaign(folder, read_manifest(folder)).av)) is not None:
         say(f"The vehicle is {code}.", err=True)
     fcd = next((file for file in files if file.suffix == FCD), None)
-    result = replay_episode(folder, episode, gui=gui, fcd=fcd, stored=stored, trust=trust)
+    result = harness.replay(folder, episode, gui=gui, fcd=fcd, stored=stored, trust=trust)
     written = [] if fcd is None else [fcd]
-    if others := [file for file in files if file.suffix != FCD]:
-        from harness.report.motion import write_motion  # noqa: PLC0415 - keeps --help fast
-
-        written += [each for file in others for each in write_motion(result, file)]
+    written += [each for file in files if file.suffix != FCD for each in harness.write_motion(result, file)]
     if as_json:
         content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
         content |= {"files": [str(file) for file in written]}

@@ -78,7 +78,7 @@ def test_both_meet_the_same_cut_ins_and_the_difference_is_that_of_the_records(do
     assert done.content["conditional"]["difference"] == pytest.approx(difference)
     assert done.content["conditional"]["rhw"] <= 0.15
     assert done.exit_code == 0
-    assert json.loads((done.folder / "compare.json").read_text()) == done.content
+    assert json.loads((done.folder / "compare.json").read_text()).items() >= done.content.items()
     inside = done.content["conditional"]
     assert inside["ci_low"] > 0.0
     assert inside["ratio_low"] < 1.35e-7 / 7.5e-8 < inside["ratio_high"]
@@ -171,10 +171,10 @@ def test_one_end_is_asked_for(campaigns, tmp_path):
         compare_campaigns(*campaigns, tmp_path / "out", margin=0.1, rhw=0.1)
 
 
-def test_a_run_that_nobody_limited_is_to_be_run_again(campaign, tmp_path):
+def test_a_run_that_nobody_limited_is_to_be_run_again(done, campaign, tmp_path):
     """Which the folder of the comparison does not hinder: the run is not copied."""
     early = "av={controller: 'tests.controllers.early:Speeds'}"
-    sides, stored = [campaign(*SHELLS, early), campaign(*SHELLS)], tmp_path / "run"
+    sides, stored = [campaign(*SHELLS, early), campaign(*SHELLS)], done.folder / "a"
     with pytest.raises(CampaignError, match="so that it is run again"):
         compare_campaigns(*sides, tmp_path / "out", stored=stored)
     with pytest.raises(CampaignError, match=r"--against av\.limits\.max_acceleration_mps2=2, which limits B"):
