@@ -244,7 +244,7 @@ class Run:
 
     def finish(self, rule: Rule) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no shard beyond the stop is left."""
-        manifest, decision, decided = self.manifest, rule.look.decision, {}
+        manifest, decision, decided = self.manifest, rule.look.decision, dict[str, Any]()
         counted = {self.out / file for shard in manifest.shards for file in shard["files"].values()}
         for path in {path for table in TABLES for path in shards_on_disk(self.out, table)} - counted:
             path.unlink()
@@ -255,11 +255,11 @@ class Run:
         if decision is not None:
             code = EXIT_OF[decision.verdict]
             decided["decision"] = replace(decision, asked_before=manifest.limits_before).to_json()
-        decided["remedy"] = pool_remedy(rule, self.campaign, stopped_by) or None
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         retraced = self._retracing.summary(manifest.n_retraced)
-        manifest.write("done", stopped_by=stopped_by, ending=said, retraced=retraced, expected=expected, **decided)
+        decided |= {"expected": expected, "remedy": pool_remedy(rule, self.campaign, stopped_by) or None}
+        manifest.write("done", stopped_by=stopped_by, ending=said, retraced=retraced, **decided)
         self._progress.stage("writing estimates and report", None)
         estimates = estimate_run(self.out)
         write_sealed(self.out / ESTIMATES, estimates)
