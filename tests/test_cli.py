@@ -207,6 +207,18 @@ def test_defects_are_not_hidden(raising, defect):
     assert caught.value is defect
 
 
+@pytest.mark.parametrize(
+    ("options", "seeds"),
+    [([], (1, 1)), (["--independent", "7"], (7, 7)), (["--independent=7", "--set=seed=8"], (8, 7))],
+)
+def test_an_independent_repetition_meets_another_pool_too(monkeypatch, options, seeds):
+    runs = Mock(side_effect=RunFolderError("", "", "", ""))
+    monkeypatch.setattr("harness.runner.run.run_campaign", runs)
+    assert main(["run", SMOKE, "--quiet", *options]) == 2
+    campaign = runs.call_args.args[0]
+    assert (campaign.seed, campaign.pool.seed) == seeds
+
+
 def test_estimate_prints_a_table_and_closes_with_what_was_asked(stored_run, capsys):
     folder = stored_run("mixture-twin")
     before, content = sorted(folder.iterdir()), estimate_run(folder, estimators=("mixture_cv", "nde"), confidence=0.95)

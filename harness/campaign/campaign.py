@@ -43,7 +43,9 @@ class Campaign(Section):
 
     name: str = Field(pattern=NAME_PATTERN, description="short name of letters, digits, _ . and -, used in reports")
     description: str = Field("", description="what this campaign is for, in a sentence")
-    seed: Whole = Field(1, ge=0, lt=2**63, description="every random number follows from it")
+    seed: Whole = Field(
+        1, ge=0, lt=2**63, description="random numbers of the tests follow from it; those of the pool from pool.seed"
+    )
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
     crash: CrashSettings = CrashSettings()

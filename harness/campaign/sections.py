@@ -191,7 +191,9 @@ class PoolSettings(Section):
         le=100_000,
         description="its tests that do not count, from which a surrogate is learned; 0: none",
     )
-    seed: Whole = Field(1, ge=0, lt=2**63, description="of the pool's random numbers")
+    seed: Whole = Field(
+        1, ge=0, lt=2**63, description="of the pool and of baseline runs, which another seed alone leaves as they are"
+    )
 
 
 class World(Section):

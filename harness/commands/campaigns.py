@@ -88,6 +88,13 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     help="Run until it is known whether the crash rate is below so many per test, or below that of a reference driver "
     "such as r157-cc, instead of to stop.rhw.",
 )
+@click.option(
+    "--independent",
+    type=click.IntRange(min=0, max=2**63 - 1),
+    metavar="N",
+    help="Repeat it with other random numbers throughout: sets seed and pool.seed. With another seed alone the pool is "
+    "the same.",
+)
 @junit_option
 @verbose_option
 @av_option
@@ -103,6 +110,7 @@ def run(
     executor: str | None,
     resume: bool,
     accept: str | None,
+    independent: int | None,
     junit: Path | None,
     verbose: bool,
     av: str | None,
@@ -123,7 +131,8 @@ def run(
     """
     limit = [] if accept is None else accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
-    campaign = harness.load_campaign(campaign_file, [*overrides, *limit, *where], av=av)
+    seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
+    campaign = harness.load_campaign(campaign_file, [*seeds, *overrides, *limit, *where], av=av)
     chosen, folder = folder is None, folder or _run_folder(campaign.name, resume=resume)
     from harness.processes import imports_ahead, worker_modules  # noqa: PLC0415 - keeps --help fast
 
@@ -133,10 +142,10 @@ def run(
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
     content = in_folder(result.estimates, folder)
     if junit is not None:
-        from harness.report.junit import statement_cases, write_junit  # noqa: PLC0415 - keeps --help fast
+        from harness.report.junit import statement_case, write_junit  # noqa: PLC0415 - keeps --help fast
 
-        cases = statement_cases(content, campaign.testing.shells.statement, result.exit_code)
-        write_junit(junit, campaign.name, cases, [result.report])
+        case = statement_case(content, campaign.testing.shells.statement, result.exit_code)
+        write_junit(junit, campaign.name, [case], [result.report])
     if as_json:
         print_json(content)
     else:

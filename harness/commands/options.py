@@ -83,7 +83,7 @@ junit_option = click.option(
     "--junit",
     type=FILE,
     callback=written_file(".xml"),
-    help="Write the result as JUnit XML, too: a test case for each statement.",
+    help="Write the result as JUnit XML, too: a test case of what was asked.",
 )
 
 verbose_option = click.option("--verbose", "-v", is_flag=True, help="Say more, in sentences.")

@@ -36,6 +36,8 @@ WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
 CUT_OFF_SHARE = 0.2
 """Weight, relative to the rate, from which tests that were cut off are warned of, if the interval leaves them out."""
+ANY_SHARE = 0.95
+"""Width of the interval of a share from which on it says nothing [assumed]."""
 CARRIES = 0.05
 """Share of a rate from which on there is an upper limit alone, where nothing was seen of it [assumed]."""
 _BRAKES_HARDEST = "brakes-8"
@@ -220,11 +222,11 @@ def _whence(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | No
 
 
 def _share_within(value: float, limits: tuple[float, float] | None, of: str) -> str:
-    """A share with its interval in whole per cent, where there is one; nothing where that may be any."""
+    """A share with its interval in whole per cent, where there is one; nothing where that may be nearly any."""
     if limits is None:
         return share(value) + of
-    low, high = (f"{100.0 * each:.0f}" for each in limits)
-    return "" if (low, high) == ("0", "100") else f"{share(value)} ({low}–{high} %){of}"
+    low, high = limits
+    return "" if high - low > ANY_SHARE else f"{share(value)} ({100.0 * low:.0f}–{100.0 * high:.0f} %){of}"
 
 
 def _decided(decision: Mapping[str, Any]) -> Row:

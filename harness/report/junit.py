@@ -1,4 +1,4 @@
-"""Results as JUnit XML, which every CI system shows: a test case for each statement."""
+"""Results as JUnit XML, which every CI system shows: a test case for what was asked."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
 from harness.records.folder import write_text
 from harness.strata import ASSUMPTION_FREE
 
-Outcome = Literal["passed", "failure", "error", "skipped"]
+Outcome = Literal["passed", "failure", "error"]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A statement: its name, what it says, and what that means for a gate.
+    """A statement: its name, what it says, what that means for a gate, and what was seen besides.
 
     An ``error`` is a question left open, as by a spent budget.
     """
@@ -25,6 +25,7 @@ class Case:
     name: str
     message: str
     outcome: Outcome
+    besides: tuple[str, ...] = ()
 
 
 def outcome_of(exit_code: int) -> Outcome:
@@ -34,20 +35,19 @@ def outcome_of(exit_code: int) -> Outcome:
     return "error" if exit_code == EXIT_BUDGET_SPENT else "failure"
 
 
-def statement_cases(content: dict[str, Any], asked: str, exit_code: int) -> list[Case]:
-    """Cases of ``estimates.json``: the statement that was asked about decides, the others are shown.
+def statement_case(content: dict[str, Any], asked: str, exit_code: int) -> Case:
+    """Case of ``estimates.json``: the statement that was asked about decides, and fails where a test has refuted it.
 
-    Where there is no such statement, as under other methods than shells, the answer itself decides: a gate in which
-    nothing does would let everything pass.
+    What is stated besides was not asked, and is no test that was skipped. Where there is no such statement, as under
+    other methods than shells, the answer itself decides: a gate in which nothing does would let everything pass.
     """
-    decision = content["decision"]
+    decision, details = content["decision"], content["estimates"][content["headline"]].get("details", {})
     found = {ASSUMPTION_FREE: content["statement"], **content["boundary_statements"]}
     asked = asked if asked in found else ASSUMPTION_FREE
-    ends = "" if decision is None else decision["sentence"] + " "
-    return [
-        Case(name, ends + sentence, outcome_of(exit_code)) if name == asked else Case(name, sentence, "skipped")
-        for name, sentence in found.items()
-    ]
+    refuted = any(each["refuted"] for each in details.get("statements", ()) if each["name"] == asked)
+    message = found.pop(asked) if decision is None else f"{decision['sentence']} {found.pop(asked)}"
+    besides = tuple(f"{name}: {sentence}" for name, sentence in found.items())
+    return Case(asked, message, "failure" if refuted else outcome_of(exit_code), besides)
 
 
 def write_junit(path: Path, suite: str, cases: Sequence[Case], attachments: Sequence[Path]) -> None:
@@ -55,14 +55,14 @@ def write_junit(path: Path, suite: str, cases: Sequence[Case], attachments: Sequ
     kinds: list[str] = [case.outcome for case in cases]
     root = ET.Element("testsuites")
     of_suite = ET.SubElement(root, "testsuite", name=suite, tests=str(len(cases)))
-    for kind, key in (("failure", "failures"), ("error", "errors"), ("skipped", "skipped")):
+    for kind, key in (("failure", "failures"), ("error", "errors")):
         of_suite.set(key, str(kinds.count(kind)))
     for case in cases:
         element = ET.SubElement(of_suite, "testcase", classname=suite, name=case.name)
         if case.outcome != "passed":
             ET.SubElement(element, case.outcome, message=case.message)
-        attached = "\n".join(f"[[ATTACHMENT|{each.resolve()}]]" for each in attachments)
-        told = f"{case.message}\n" if case.outcome == "passed" else ""  # else it is in the element of the outcome
-        ET.SubElement(element, "system-out").text = f"{told}{attached}\n"
+        attached = [f"[[ATTACHMENT|{each.resolve()}]]" for each in attachments]
+        told = [case.message] * (case.outcome == "passed")  # else it is in the element of the outcome
+        ET.SubElement(element, "system-out").text = "\n".join([*told, *case.besides, *attached, ""])
     ET.indent(root)
     write_text(path, printable(ET.tostring(root, encoding="unicode", xml_declaration=True)) + "\n")

@@ -253,10 +253,10 @@ class Run:
         if decision is not None:
             code = EXIT_OF[decision.verdict]
             decided["decision"] = decision.to_json()
-        decided["remedy"] = pool_remedy(rule, self.campaign, stopped_by) or None
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
-        manifest.write("done", stopped_by=stopped_by, ending=said, expected=expected, **decided)
+        decided |= {"expected": expected, "remedy": pool_remedy(rule, self.campaign, stopped_by) or None}
+        manifest.write("done", stopped_by=stopped_by, ending=said, **decided)
         self._progress.stage("writing estimates and report", None)
         estimates = estimate_run(self.out)
         write_sealed(self.out / ESTIMATES, estimates)

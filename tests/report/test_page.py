@@ -13,7 +13,7 @@ from junitparser import JUnitXml
 
 from harness.errors import RunFolderError
 from harness.records.folder import write_sealed
-from harness.report.junit import statement_cases, write_junit
+from harness.report.junit import statement_case, write_junit
 from harness.report.page import run_notes, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
@@ -172,21 +172,22 @@ def test_what_no_run_has_written_is_named(run_folder, file, damage, said):
 CONTENT = {
     "decision": {"sentence": "REJECTED: <above> & beyond\x1b[31m."},
     "statement": "The crash rate is 1e-07 per test.",
-    "boundary_statements": {"library": "If it crashes only where …"},
+    "boundary_statements": {"library": "It is NOT so that …"},
+    "headline": "shells",
+    "estimates": {"shells": {"details": {"statements": [{"name": "library", "refuted": True}]}}},
 }
 
 
 @pytest.mark.parametrize(("code", "kind"), [(0, None), (4, "Error"), (5, "Failure"), (3, "Failure")])
 def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     file, report = tmp_path / "gate.xml", tmp_path / "report.html"
-    write_junit(file, "smoke", statement_cases(CONTENT, "assumption_free", code), [report])
+    write_junit(file, "smoke", [statement_case(CONTENT, "assumption_free", code)], [report])
     (suite,) = JUnitXml.fromfile(str(file))
-    assert (suite.name, suite.tests, suite.skipped) == ("smoke", 2, 1)
+    assert (suite.name, suite.tests, suite.skipped) == ("smoke", 1, 0)
     assert (suite.failures, suite.errors) == (int(kind == "Failure"), int(kind == "Error"))
-    asked, other = suite
-    assert (asked.name, other.name) == ("assumption_free", "library")
+    (asked,) = suite
+    assert (asked.name, "library: It is NOT so that …" in asked.system_out) == ("assumption_free", True)
     assert [type(each).__name__ for each in asked.result] == ([] if kind is None else [kind])
-    assert [type(each).__name__ for each in other.result] == ["Skipped"]
     message = f"REJECTED: <above> & beyond\\u001b[31m. {CONTENT['statement']}"
     assert all(each.message == message for each in asked.result)
     assert f"[[ATTACHMENT|{report}]]" in asked.system_out
@@ -195,5 +196,15 @@ def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
 
 def test_a_gate_never_passes_because_nothing_was_asked():
     """A method without shells may still carry a statement's name in its settings."""
-    cases = statement_cases({**CONTENT, "decision": None, "boundary_statements": {}}, "library", 4)
-    assert [(case.name, case.outcome) for case in cases] == [("assumption_free", "error")]
+    case = statement_case({**CONTENT, "decision": None, "boundary_statements": {}}, "library", 4)
+    assert (case.name, case.outcome) == ("assumption_free", "error")
+
+
+@pytest.mark.parametrize("code", [0, 4])
+def test_an_assumption_that_was_asked_about_and_refuted_fails(code):
+    case = statement_case(CONTENT, "library", code)
+    assert (case.name, case.outcome, case.message) == (
+        "library",
+        "failure",
+        "REJECTED: <above> & beyond\x1b[31m. It is NOT so that …",
+    )
