@@ -92,10 +92,10 @@ def _require_version() -> None:
         installed, version = None, "unknown"
     if installed is None or place.resolve() != installed.resolve():
         version = _version_of_libsumo(place)
-        sys.stderr.write(f"note: libsumo is that of {place}.\n")
+        sys.stderr.write(f"note: libsumo {version} is that of {place}.\n")
     if version != SUMO_VERSION:
         mend = f"Take its folder off PYTHONPATH, or {_REINSTALL}."
-        raise HarnessError("libsumo", f"version {version} in {place}", f"version {SUMO_VERSION}", mend)
+        raise HarnessError(f"libsumo in {place}", f"version {version}", f"version {SUMO_VERSION}", mend)
 
 
 def _version_of_libsumo(place: Path) -> str:

@@ -13,6 +13,8 @@ import pytest
 
 from harness.processes import Child, ForkServer
 from harness.progress import Progress
+from harness.resolved import resolve
+from harness.runner import workers
 from tests.golden.campaigns import BASE, IN_BOTH_WORLDS
 from tests.in_process import run_here, run_with_workers, workers_alive
 from tests.runner import bad_workers
@@ -216,3 +218,15 @@ def wait_until_gone(state: Path) -> None:
             return
         time.sleep(POLL_S)
     raise AssertionError(f"{state} is still there")
+
+
+@pytest.mark.parametrize(
+    ("asked", "n_workers", "said"), [(None, 3, ""), (3, 3, ""), (64, 64, "64 workers share the 3")]
+)
+def test_workers_are_as_many_as_there_are_cpus_for_them_or_that_is_said(monkeypatch, capsys, asked, n_workers, said):
+    monkeypatch.setattr(workers, "usable_cpus", lambda: 3)
+    local = workers.LocalWorkers(resolve(golden("nde-twin")), asked)
+    local.close()
+    assert local.n_workers == n_workers
+    assert bool(said) == bool(err := capsys.readouterr().err)
+    assert said in err

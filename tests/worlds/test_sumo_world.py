@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,9 @@ from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreemen
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.vocabulary import CRASH, LV, VEHICLES
+from harness.worlds import sumo
 from harness.worlds.shim import Shim, open_shim, shim_library
+from harness.worlds.sumo import committed_file
 from harness.worlds.twin import TwinWorld
 from tests.worlds.running import smoke
 
@@ -190,3 +193,10 @@ def test_vehicles_that_are_gone_are_an_error_and_those_of_another_simulation_are
     world.place(np.arange(2), X[:2], V[:2])
     drive(world, steps=3)
     assert world.x[0, 0] == libsumo.vehicle.getLanePosition("LV0") > 300.0
+
+
+def test_sumo_reads_its_files_from_an_installation_in_a_folder_of_any_name(driving, tmp_path, monkeypatch):
+    folder = tmp_path / "a,b ${HOME}"
+    shutil.copytree(committed_file("vehicles.add.xml").parent, folder)
+    monkeypatch.setattr(sumo, "committed_file", lambda name: folder / name)
+    drive(driving(2))

@@ -112,6 +112,35 @@ def test_a_libsumo_that_does_not_load_for_another_reason_is_told_too(monkeypatch
         system_libraries.require_libsumo()
 
 
+@pytest.mark.parametrize(
+    ("code", "where", "said"),
+    [
+        ("def getVersion():\n    return 21, 'SUMO 1.20.0'", "libsumo in ", "found:    version 1.20.0"),
+        ("", "libsumo\n", "no attribute 'getVersion'; it is that of "),
+        ("raise ImportError('no libproj.so')", "libsumo\n", "no libproj.so; it is that of "),
+    ],
+)
+def test_a_libsumo_of_another_place_is_named_and_must_be_of_the_version_that_is_pinned(
+    tmp_path, monkeypatch, capsys, code, where, said
+):
+    (tmp_path / "libsumo.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "libsumo", raising=False)
+    assert main(["run", SMOKE, "--out", str(tmp_path / "run")]) == EXIT_BAD_INPUT
+    err = capsys.readouterr().err
+    assert f"error: {where}" in err
+    assert said in err
+    assert str(tmp_path / "libsumo.py") in err
+
+
+def test_a_libsumo_of_the_right_version_is_taken_from_another_place_and_that_is_said(tmp_path, monkeypatch, capsys):
+    (tmp_path / "libsumo.py").write_text(f"def getVersion():\n    return 22, 'SUMO {system_libraries.SUMO_VERSION}'")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "libsumo", raising=False)
+    system_libraries.require_libraries()
+    assert str(tmp_path) in capsys.readouterr().err
+
+
 def test_setup_does_nothing_where_nothing_is_missing(programs, capsys):
     for name in ("sudo", *MANAGERS):
         programs(name)
