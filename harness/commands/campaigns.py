@@ -23,14 +23,11 @@ from harness.commands.options import (
     junit_option,
     progress_bar,
     set_option,
-    verbose_option,
     workers_option,
 )
 from harness.commands.printing import (
-    in_folder,
     print_answer,
     print_json,
-    print_statements,
     print_table,
     say,
 )
@@ -99,7 +96,6 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     "such as r157-cc, instead of to stop.rhw.",
 )
 @junit_option
-@verbose_option
 @av_option
 @set_option
 @json_option
@@ -114,7 +110,6 @@ def run(
     resume: bool,
     accept: str | None,
     junit: Path | None,
-    verbose: bool,
     av: str | None,
     overrides: Sequence[str],
     as_json: bool,
@@ -147,19 +142,15 @@ def run(
         from harness.runner.run import run_campaign  # noqa: PLC0415 - slow to import: the bar is there meanwhile
 
         result = run_campaign(campaign, folder, workers=workers, resume=resume, progress=bar)
-    content = in_folder(result.estimates, folder)
     if junit is not None:
         from harness.report.junit import statement_cases, write_junit  # noqa: PLC0415 - keeps --help fast
 
-        cases = statement_cases(content, campaign.testing.shells.statement, result.exit_code)
+        cases = statement_cases(result.estimates, campaign.testing.shells.statement, result.exit_code)
         write_junit(junit, campaign.name, cases, [result.report])
     if as_json:
-        print_json(content)
+        print_json(result.estimates)
     else:
-        if verbose:
-            print_statements(content)
-            say(result.ending, result.folder / "estimates.json", "")
-        print_answer(content, folder, result.report)
+        print_answer(result.estimates, folder, result.report)
     ctx.exit(result.exit_code)
 
 
@@ -253,7 +244,6 @@ def av_check(
 )
 @workers_option
 @junit_option
-@verbose_option
 @av_option
 @set_option
 @json_option
@@ -269,7 +259,6 @@ def compare(
     margin: float | None,
     workers: int | None,
     junit: Path | None,
-    verbose: bool,
     av: str | None,
     overrides: Sequence[str],
     as_json: bool,
@@ -319,8 +308,6 @@ def compare(
     if as_json:
         print_json(found.content)
     else:
-        if verbose:
-            say(*(f"note: {remark}" for remark in found.content["warnings"]), folder / "compare.json", "")
         say(*told)
     ctx.exit(found.exit_code)
 

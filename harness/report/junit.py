@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
+from harness.estimators.short_answer import lines, within
 from harness.records.folder import write_text
 from harness.strata import ASSUMPTION_FREE
 
@@ -38,16 +39,15 @@ def statement_cases(content: dict[str, Any], asked: str, exit_code: int) -> list
     """Cases of ``estimates.json``: the statement that was asked about decides, the others are shown.
 
     Where there is no such statement, as under other methods than shells, the answer itself decides: a gate in which
-    nothing does would let everything pass.
+    nothing does would let everything pass. One that tests have refuted fails, whatever was decided.
     """
-    decision = content["decision"]
-    found = {ASSUMPTION_FREE: content["statement"], **content["boundary_statements"]}
-    asked = asked if asked in found else ASSUMPTION_FREE
-    ends = "" if decision is None else decision["sentence"] + " "
-    return [
-        Case(name, ends + sentence, outcome_of(exit_code)) if name == asked else Case(name, sentence, "skipped")
-        for name, sentence in found.items()
-    ]
+    statements = content["estimates"][content["headline"]]["details"].get("statements", ())
+    answer, of = "\n".join(lines(content["answer"], None)), {each["name"]: each for each in statements}
+    asked = asked if asked in of else ASSUMPTION_FREE
+    outcome = "failure" if asked in of and of[asked]["refuted"] else outcome_of(exit_code)
+    told = {ASSUMPTION_FREE: answer, **{name: " ".join(filter(None, within(each).texts)) for name, each in of.items()}}
+    told[asked] = answer
+    return [Case(name, text, outcome if name == asked else "skipped") for name, text in told.items()]
 
 
 def write_junit(path: Path, suite: str, cases: Sequence[Case], attachments: Sequence[Path]) -> None:
