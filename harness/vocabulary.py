@@ -115,8 +115,6 @@ SAMPLING: dict[Method, Sampling] = {
     "shells": Sampling(("shells",), baseline_runs=True, strata=True),
 }
 
-RUN_FOLDER = "FOLDER"
-"""Stands for the run's folder in sentences of ``estimates.json``, which may be moved; what shows them names it."""
 COMPARISON = "compare.json"
 """By this file a folder is that of a comparison, and not of a run."""
 

@@ -156,7 +156,7 @@ def test_the_answer_is_that_of_the_reference(tmp_path):
     assert "--seed 777" in REFERENCE["command"]
     combined = math.hypot(found["std_error"], REFERENCE["std_error"])
     assert abs(found["crash_rate"] - REFERENCE["crash_rate"]) < 2.0 * combined
-    assert "as often as a careful and competent driver (r157-cc) would" in estimates["statement"]
+    assert "ratio" in [row["key"] for row in estimates["answer"]["rows"]]
     statements = found["details"]["statements"]
     assert not any(each["refuted"] or each["n_ahead"] or each["rhw"] >= 0.03 for each in statements)
     assert found["warnings"] == []

@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from harness.campaign.files import load_campaign
 from harness.cli import cli, main
 from harness.commands.campaigns import _run_folder
-from harness.commands.printing import in_folder, say
+from harness.commands.printing import say
 from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.estimators.short_answer import lines
 from harness.numbers import interval, words
@@ -60,26 +60,11 @@ def test_check_prints_a_campaign_file(capsys, tmp_path):
 
 
 def test_run_prints_the_answer_and_where_more_is(folder, capsys):
-    """Also as JSON, with commands that name the folder as it was typed."""
     command = ["run", *CAMPAIGN, "--out", str(folder), "--workers", "1", "--resume"]
-    assert main([*command, "-v"]) == 0
-    out, content = capsys.readouterr().out, in_folder(estimates(folder), folder)
-    said = [f"Statement {name}: {sentence}" for name, sentence in content["boundary_statements"].items()]
-    assert f"(harness replay '{folder}'" in said[0]
-    short = lines(content["answer"], manifest(folder)["wall_time_s"], folder / "report.html")
-    assert out.splitlines() == [
-        content["statement"],
-        *said,
-        *content["reference_statements"][1:],
-        content["scope"],
-        "Stopped after 240 tests: stop.episodes was all that was asked for.",
-        str(folder / "estimates.json"),
-        "",
-        *short,
-    ]
     assert main(command) == 0
-    shorter = capsys.readouterr().out.splitlines()
-    assert (shorter[1:], len(shorter)) == (short[1:], 8)  # the first has the time that it took
+    out, content = capsys.readouterr().out.splitlines(), estimates(folder)
+    short = lines(content["answer"], manifest(folder)["wall_time_s"], folder / "report.html")
+    assert (out, len(out)) == (short, 8)
     assert main([*command, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == content
 
@@ -230,10 +215,9 @@ def test_estimate_prints_a_table_and_closes_with_what_was_asked(stored_run, caps
     shown = words(found["crash_rate"], 4), interval(found["ci_low"], found["ci_high"])
     assert [text for text in shown if text not in row] == []
     assert [text for text in (f"mixture_cv: {found['warnings'][0]}", f"nde: {reason}") if text not in out] == []
-    assert out.splitlines()[-1] == content["scope"]
     assert main(command) == EXIT_BAD_INPUT  # these records do not allow it
     out = capsys.readouterr().out
-    assert out.splitlines()[-1] == f"nde: {content['statements']['nde']}"
+    assert out.splitlines()[-1] == f"nde: {reason}"
     assert "mixture_cv" not in out
     assert out.count(reason) == 1
     assert sorted(folder.iterdir()) == before
@@ -241,7 +225,7 @@ def test_estimate_prints_a_table_and_closes_with_what_was_asked(stored_run, caps
 
 def test_estimate_writes_only_when_asked(folder, capsys):
     assert main(["estimate", str(folder), "--confidence", "0.5", "--write", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == in_folder(estimates(folder), folder)
+    assert json.loads(capsys.readouterr().out) == estimates(folder)
     assert estimates(folder)["confidence"] == 0.5
 
 

@@ -23,14 +23,11 @@ from harness.commands.options import (
     junit_option,
     progress_bar,
     set_option,
-    verbose_option,
     workers_option,
 )
 from harness.commands.printing import (
-    in_folder,
     print_answer,
     print_json,
-    print_statements,
     print_table,
     say,
 )
@@ -96,7 +93,6 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     "the same.",
 )
 @junit_option
-@verbose_option
 @av_option
 @set_option
 @json_option
@@ -112,7 +108,6 @@ def run(
     accept: str | None,
     independent: int | None,
     junit: Path | None,
-    verbose: bool,
     av: str | None,
     overrides: Sequence[str],
     as_json: bool,
@@ -140,19 +135,15 @@ def run(
     ahead = imports_ahead(*worker_modules(campaign.world.engine)) if is_local else nullcontext()
     with named_if_written(folder, chosen=chosen), ahead, progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
-    content = in_folder(result.estimates, folder)
     if junit is not None:
         from harness.report.junit import statement_case, write_junit  # noqa: PLC0415 - keeps --help fast
 
-        case = statement_case(content, campaign.testing.shells.statement, result.exit_code)
+        case = statement_case(result.estimates, campaign.testing.shells.statement, result.exit_code)
         write_junit(junit, campaign.name, [case], [result.report])
     if as_json:
-        print_json(content)
+        print_json(result.estimates)
     else:
-        if verbose:
-            print_statements(content)
-            say(result.ending, result.folder / "estimates.json", "")
-        print_answer(content, folder, result.report)
+        print_answer(result.estimates, folder, result.report)
     ctx.exit(result.exit_code)
 
 
@@ -246,7 +237,6 @@ def av_check(
 )
 @workers_option
 @junit_option
-@verbose_option
 @av_option
 @set_option
 @json_option
@@ -262,7 +252,6 @@ def compare(
     margin: float | None,
     workers: int | None,
     junit: Path | None,
-    verbose: bool,
     av: str | None,
     overrides: Sequence[str],
     as_json: bool,
@@ -311,8 +300,6 @@ def compare(
     if as_json:
         print_json(found.content)
     else:
-        if verbose:
-            say(*(f"note: {remark}" for remark in found.content["warnings"]), folder / "compare.json", "")
         say(*told)
     ctx.exit(found.exit_code)
 

@@ -86,7 +86,6 @@ junit_option = click.option(
     help="Write the result as JUnit XML, too: a test case of what was asked.",
 )
 
-verbose_option = click.option("--verbose", "-v", is_flag=True, help="Say more, in sentences.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on stdout instead of text.")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -16,7 +15,6 @@ import click
 
 from harness.errors import HarnessError, printable
 from harness.numbers import half_width, interval, share, words
-from harness.vocabulary import RUN_FOLDER
 
 _WIDTH_OF_FILES = 140
 _PARTS = "found", "expected", "mend"
@@ -91,13 +89,6 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
     return HarnessError(context.command_path, error.format_message().rstrip("."), f"a call of the form: {usage}", mend)
 
 
-def in_folder(content: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """``estimates.json``, with commands in its sentences that name the run folder as it was typed."""
-    typed = shlex.quote(str(folder))
-    sentences = {name: text.replace(RUN_FOLDER, typed) for name, text in content["boundary_statements"].items()}
-    return {**content, "boundary_statements": sentences}
-
-
 def print_json(content: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
     say(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
@@ -120,12 +111,9 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     console.print(table)
 
 
-def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
-    """Print ``estimates.json`` as a table, with warnings and reasons below and the answer in a sentence last.
-
-    ``asked`` are the estimators to show, all by default. What is said in the end is about them.
-    """
-    shown = {name: entry for name, entry in content["estimates"].items() if not asked or name in asked}
+def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
+    """Print the estimators of ``estimates.json`` that are asked for as a table, with warnings and reasons below."""
+    shown = {name: entry for name, entry in content["estimates"].items() if name in asked}
     rows = [
         {
             "estimator": name + (" *" if name == content["headline"] else ""),
@@ -138,21 +126,12 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str] = ()) -> None:
         for name, entry in shown.items()
     ]
     print_table(f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests", rows)
-    answered = content["headline"] in shown
     for name, entry in shown.items():
-        # Without the campaign's own estimator the reason is the answer, and comes last.
-        for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason") if answered else None])]:
+        for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason")])]:
             say(f"{name}: {remark}")
     if shells := shown.get("shells", {}).get("details", {}).get("shells"):
         names = ("shell", "inside", "p", "n_episodes", "n_crashes", "contribution")
         print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])
-    if answered:
-        print_statements(content)
-        return
-    for name in shown:
-        say(f"{name}: {content['statements'][name]}")
-    if any(entry["crash_rate"] is not None for entry in shown.values()):
-        say(content["scope"])
 
 
 def print_answer(content: dict[str, Any], folder: Path, report: Path | None = None) -> None:
@@ -161,10 +140,3 @@ def print_answer(content: dict[str, Any], folder: Path, report: Path | None = No
     from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
 
     say(*lines(content["answer"], read_manifest(folder).get("wall_time_s"), report))
-
-
-def print_statements(content: dict[str, Any]) -> None:
-    """Print the answer in a sentence, what else is stated under which assumption, and what all this is about."""
-    decided = [decision["sentence"]] if (decision := content.get("decision")) else []
-    within = (f"Statement {name}: {sentence}" for name, sentence in content["boundary_statements"].items())
-    say(*decided, content["statement"], *within, *content.get("reference_statements", [])[1:], content["scope"])

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import harness
-from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar, verbose_option
-from harness.commands.printing import in_folder, print_answer, print_estimates, print_json, print_table, say
+from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar
+from harness.commands.printing import print_answer, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share
 from harness.vocabulary import COMPARISON, ESTIMATORS
@@ -47,7 +47,6 @@ LATERAL = ("lead_steps", "onset_step", "onset_r2_m", "onset_ttc_s", "overlap_ttc
     metavar="NAME|FILE",
     help="Answer for other traffic from the same tests (testing.method shells): a shipped environment, or a file.",
 )
-@verbose_option
 @json_option
 @click.pass_context
 def estimate(
@@ -58,13 +57,12 @@ def estimate(
     confidence: float | None,
     write: bool,
     environment: str | None,
-    verbose: bool,
     as_json: bool,
 ) -> None:
     """Estimate the crash rate again from the records in DIR, with any estimator.
 
-    Nothing is simulated in SUMO. Estimators that are asked for, and with -v all, are shown in a table; one that the
-    records do not allow with the reason. The exit code is 2 if they allow none of those asked for.
+    Nothing is simulated in SUMO. Estimators that are asked for are shown in a table; one that the records do not allow
+    with the reason. The exit code is 2 if they allow none of those asked for.
 
     With --environment the shells' probabilities in other traffic are found in the twin (half a minute), and crash
     shares within shells are taken to be the same there. Traffic in which they cannot be is refused. Replicates of
@@ -91,9 +89,9 @@ def estimate(
 
         write_sealed(folder / "estimates.json", content)
     if as_json:
-        print_json(in_folder(content, folder))
-    elif verbose or estimators:
-        print_estimates(in_folder(content, folder), estimators)
+        print_json(content)
+    elif estimators:
+        print_estimates(content, estimators)
     else:
         page = folder / "report.html"  # of the run's own traffic
         print_answer(content, folder, page if environment is None and page.is_file() else None)
@@ -110,7 +108,9 @@ def _compared_elsewhere(folder: Path, environment: str, confidence: float | None
     if as_json:
         print_json(content)
     else:
-        say(*content["sentences"])
+        traffic = content["traffic"]
+        told = [{key: row[key] for key in ("what", "value", "interval", "remark")} for row in content["rows"]]
+        print_table(f"A by {traffic['n_replicates']} replicates of {traffic['environment']}", told)
 
 
 def _ranges(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:

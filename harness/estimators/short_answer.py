@@ -63,6 +63,11 @@ class Row:
     interval: str = ""
     remark: str = ""
 
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """What is shown of it."""
+        return self.what, self.value, self.interval, self.remark
+
 
 @dataclass(frozen=True)
 class ShortAnswer:
@@ -180,7 +185,7 @@ def _rows(
     statements = best.details.get("statements", ())
     chosen = [each for each in statements if each["name"] == asked] or statements
     for each in chosen[:1]:
-        yield _within(each)
+        yield within(each)
 
 
 def assumed_times(best: Estimate, manifest: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -261,7 +266,8 @@ def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: boo
     return Row("ratio", "× competent driver", f"{ratio(found['ratio'])} ({apart})", ends, who)
 
 
-def _within(found: Mapping[str, Any]) -> Row:
+def within(found: Mapping[str, Any]) -> Row:
+    """What holds if the vehicle crashes only within a statement's boundary, and whether it does."""
     name, n, outside = found["name"], found["n_crashes_outside"], count(found["n_episodes_outside"])
     what = f"keeping to {name}"
     if found["refuted"]:

@@ -29,7 +29,6 @@ from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts, PairDecision, PairVerdict
 from harness.estimators.shells import Shells
-from harness.numbers import number, plain, ratio
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import SAMPLING, EstimatorName, Method
 
@@ -69,11 +68,6 @@ def decision_level(expected: float, confidence: float) -> Level:
     return Level(threshold, math.sqrt(2.0 * threshold))
 
 
-def limit_words(limit: float, driver: str | None) -> str:
-    """``3 × 10⁻⁷ per test``, or ``1 times that of r157-cc``."""
-    return f"{plain(limit)} times that of {driver}" if driver else f"{plain(limit)} per test"
-
-
 @dataclass(frozen=True)
 class Decision:
     """What is known about a limit of the crash rate, by an interval that allows for every look.
@@ -107,30 +101,10 @@ class Decision:
         """Whether further tests would change nothing."""
         return self.verdict != "undecided" or self.high < self.limit
 
-    @property
-    def sentence(self) -> str:
-        """The verdict in words."""
-        given = "" if self.statement == ASSUMPTION_FREE else f", given statement {self.statement},"
-        limit, shown = limit_words(self.limit, self.driver), ratio if self.driver else number
-        side = f"below {limit} (upper limit {shown(self.high)})"
-        if self.verdict == "rejected":
-            side = f"above {limit} (lower limit {shown(self.low)})"
-        text = f"{self.verdict.upper()}: with confidence {plain(self.confidence)} the crash rate{given} is {side}."
-        if self.verdict == "undecided" and self.contradicted:
-            text = (
-                f"UNDECIDED: whether the crash rate is below {limit} is not known: the vehicle does not do what "
-                f"statement {self.statement} assumes. Ask for testing.shells.statement: {ASSUMPTION_FREE}, and use a "
-                "new folder."
-            )
-        elif self.verdict == "undecided":
-            between = f"it may be {shown(self.low)} as well as {shown(self.high)}"
-            text = f"UNDECIDED: whether the crash rate{given} is below {limit} is not known; {between}."
-        return text
-
     def to_json(self) -> dict[str, Any]:
         """All of it; a limit per test also by its key in the campaign."""
         of_rate = {} if self.driver else {"crash_rate_below": self.limit}
-        return {"verdict": self.verdict, **of_rate, **asdict(self), "sentence": self.sentence}
+        return {"verdict": self.verdict, **of_rate, **asdict(self)}
 
 
 @dataclass(frozen=True)

@@ -163,36 +163,6 @@ def times(of: Uncertain) -> str:
     return f"at most × {high}" if math.isfinite(of.times[1]) else "no limit"
 
 
-def sentences(found: TrafficError, of: str = "the vehicle") -> Iterator[str]:
-    """The same in words, for estimates.json and the page."""
-    n, level, both = found.n_replicates, share(found.confidence), _ends(found)
-    if is_open(found):
-        yield (
-            f"{found.n_refused} of {n} replicates of {found.environment} are unlike what was tested, so that these "
-            f"tests do not limit by how much the traffic moves the rate of {of}: run the campaign in that environment."
-        )
-        return
-    yield (
-        f"The traffic, as far as {found.environment} is known, moves the rate of {of} by {times(found.rate)} ({level} "
-        f"of {n} replicates{because(found)}); with the sampling error it is {both} per test."
-    )
-    for name, each in found.ratios.items():
-        yield f"The ratio to {name} moves by {times(each)}; with the sampling error it is {_of_ratio(each)}."
-    if found.ratios:
-        yield f"Of a ratio {share(ONE_LAW)} either way are for one law being fitted to drivers who differ."
-    yield (
-        f"In each replicate the rate may be as wrong as that of a reference driver, which is known ({share(found.off)} "
-        f"in the mean); {found.n_refused} cannot be answered, and count as whatever makes an interval wider."
-    )
-
-
-def because(found: TrafficError) -> str:
-    """Why there is an upper limit alone."""
-    if (unseen := found.unseen) is None:
-        return "" if found.rate.times[0] > 0.0 else ", since other cut-ins of its shells may be those that crash"
-    return f", since no lane change was seen at {unseen.where}, where {share(unseen.share)} of the rate arises"
-
-
 @dataclass(frozen=True)
 class Bar:
     """A number, or a block, by how it is ``known``, and the factors of rate and ratio at the two ends of it.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
+from harness.estimators.short_answer import lines, within
 from harness.records.folder import write_text
 from harness.strata import ASSUMPTION_FREE
 
@@ -38,16 +39,17 @@ def outcome_of(exit_code: int) -> Outcome:
 def statement_case(content: dict[str, Any], asked: str, exit_code: int) -> Case:
     """Case of ``estimates.json``: the statement that was asked about decides, and fails where a test has refuted it.
 
-    What is stated besides was not asked, and is no test that was skipped. Where there is no such statement, as under
-    other methods than shells, the answer itself decides: a gate in which nothing does would let everything pass.
+    Where there is no such statement, as under other methods than shells, the answer itself decides: a gate in which
+    nothing does would let everything pass. What is stated besides was not asked, and is no test that was skipped.
     """
-    decision, details = content["decision"], content["estimates"][content["headline"]].get("details", {})
-    found = {ASSUMPTION_FREE: content["statement"], **content["boundary_statements"]}
-    asked = asked if asked in found else ASSUMPTION_FREE
-    refuted = any(each["refuted"] for each in details.get("statements", ()) if each["name"] == asked)
-    message = found.pop(asked) if decision is None else f"{decision['sentence']} {found.pop(asked)}"
-    besides = tuple(f"{name}: {sentence}" for name, sentence in found.items())
-    return Case(asked, message, "failure" if refuted else outcome_of(exit_code), besides)
+    statements = content["estimates"][content["headline"]].get("details", {}).get("statements", ())
+    of = {each["name"]: each for each in statements}
+    refuted = asked in of and of[asked]["refuted"]
+    besides = tuple(" ".join(filter(None, within(each).texts)) for name, each in of.items() if name != asked)
+    message = "\n".join(lines(content["answer"], None))
+    return Case(
+        asked if asked in of else ASSUMPTION_FREE, message, "failure" if refuted else outcome_of(exit_code), besides
+    )
 
 
 def write_junit(path: Path, suite: str, cases: Sequence[Case], attachments: Sequence[Path]) -> None:

@@ -13,7 +13,7 @@ from harness.campaign.files import dump_campaign
 from harness.errors import printable
 from harness.estimators.shells import Within
 from harness.estimators.traffic import Sensitivity
-from harness.numbers import count, leaves
+from harness.numbers import count, leaves, number
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.records.reader import table_sizes, traffic_of
 from harness.report.crashes import crash_gallery
@@ -22,7 +22,7 @@ from harness.report.player import templates
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
 from harness.traffic.laws import Environment
-from harness.vocabulary import OUTCOMES, RUN_FOLDER
+from harness.vocabulary import OUTCOMES
 
 PLOT_NAMES = re.compile(
     r"(severity|where|shells|sensitivity|convergence|weights|answer|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
@@ -58,11 +58,11 @@ def write_report(folder: str | Path) -> Path:
         tabled=traffic is not None and traffic.accepted.size > 0,
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         outcomes=outcome_rows(summary),
-        notes=run_notes(run, summary),
+        beside=what_if_rows(run),
+        warnings=[*run.estimates.answer.warnings, *uncovered(run, summary)],
         diagnostics=diagnostics(run),
         settings=dump_campaign(run.campaign),
         folder=run.typed,
-        run_folder=RUN_FOLDER,
     )
     _write_plots(folder / "plots", plots)
     write_bytes(folder / "report.html", printable(page).encode("utf-8"))
@@ -100,16 +100,13 @@ def _write_plots(folder: Path, plots: list[Plot]) -> None:
             old.unlink()
 
 
-def run_notes(run: RunFolder, summary: RunSummary) -> list[str]:
-    """What else the reader should know about this run as a whole, beside the answer's own warnings."""
-    notes = list(run.headline.warnings)
+def uncovered(run: RunFolder, summary: RunSummary) -> list[str]:
+    """A warning of estimates that are not of these records."""
     n_tests, n_estimated = summary.n_episodes, run.estimates.n_episodes
-    if n_estimated not in (n_tests, n_tests - summary.n_failed):
-        notes.append(
-            f"The estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}: run "
-            f"harness estimate {run.typed} --write."
-        )
-    return notes
+    if n_estimated in (n_tests, n_tests - summary.n_failed):
+        return []
+    found = f"the estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}"
+    return [f"{found}: run harness estimate {run.typed} --write"]
 
 
 def verdict(found: Within) -> str:
@@ -134,6 +131,20 @@ def outcome_rows(summary: RunSummary) -> list[tuple[str, float, float, float]]:
     n = max(summary.n_episodes, 1)
     counted = zip(OUTCOMES, summary.count.tolist(), summary.weight.tolist(), strict=True)
     return [(name, tests, tests / n, summary.per_test(weight)) for name, tests, weight in counted]
+
+
+def what_if_rows(run: RunFolder) -> list[tuple[str, str]]:
+    """What is to be known of tests that count otherwise than they might: failed, cut off, or run a second time."""
+    details, severity, found = run.headline.details, run.estimates.severity, []
+    if details["n_failed"]:
+        found.append(("Crash rate, had all failed tests crashed", number(details["crash_rate_if_failed_had_crashed"])))
+    if severity is not None and severity.cut_off:
+        worst = run.headline.crash_rate + severity.cut_off
+        found.append(("Crash rate, had all tests crashed whose time was up while it closed in", number(worst)))
+    if repeated := run.manifest.get("repeated"):
+        told = f"{count(repeated['n_episodes'])}, {count(len(repeated['differing']))} of them otherwise"
+        found.append(("Tests that were run a second time", told))
+    return found
 
 
 def diagnostics(run: RunFolder) -> list[tuple[str, Any]]:

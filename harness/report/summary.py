@@ -24,7 +24,7 @@ from harness.errors import RunFolderError
 from harness.estimators.answer import Estimates
 from harness.estimators.block import outcome_places
 from harness.estimators.estimate import Estimate, Unavailable
-from harness.estimators.shells import ShellDetails, Within
+from harness.estimators.shells import ShellDetails
 from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_shards, stored_columns
 from harness.strata import ASSUMPTION_FREE
@@ -45,11 +45,6 @@ class ShownShells(ShellDetails):
     """What the headline estimate of a shells run says about them."""
 
     rate: float
-
-    @property
-    def widest(self) -> Within:
-        """The statement with the widest boundary."""
-        return self.statements[-1]
 
     @property
     def pool_half_width(self) -> float:

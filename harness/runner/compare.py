@@ -24,7 +24,7 @@ from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.files import campaign_of
 from harness.campaign.sections import MOST_CUT_INS
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
-from harness.estimators.answer import conclusion
+from harness.estimators.answer import ended_by
 from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
 from harness.estimators.short_answer import unseen_words
 from harness.estimators.stopping import PairRule
@@ -121,7 +121,7 @@ def compare_campaigns(
         "decision": {**asdict(rule.decision), "words": rule.decision.words},
         "to_decide": _to_decide(sides[0].campaign, rounds, pairs),
         "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
-        "ended": conclusion(a, rule, found["n_pairs"])[0],
+        "ended": ended_by(a, rule, found["n_pairs"]),
     }
     code = EXIT_DONE if rule.ended else EXIT_BUDGET_SPENT
     if margin is not None:

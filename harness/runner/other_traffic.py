@@ -23,7 +23,7 @@ from harness.estimators.answer import estimate_blocks
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
 from harness.estimators.short_answer import CARRIES
-from harness.estimators.traffic import ONE_LAW, TrafficError, Unseen, is_open, rows, sentences, too_few, uncertain
+from harness.estimators.traffic import ONE_LAW, TrafficError, Unseen, is_open, rows, too_few, uncertain
 from harness.numbers import number, share
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.moved import FewPaths
@@ -97,14 +97,12 @@ def estimate_in_other_traffic(
         told["assumed"] = assumed(there, tested.pool, tested.design, progress)
     asked: list[EstimatorName] | None = None if moved.is_same else ["shells"]
     content = estimate_blocks(blocks, there.campaign, told, estimators=asked, confidence=confidence)
-    answer, scope = content["answer"], content["scope"]
     if not moved.is_same:
         drivers = " and ".join(each.name for each in tested.design.references)
         known = f" (off by {share(moved.reference_error(), least=0.001)} for {drivers})" if drivers else ""
         was, now = (Path(each).stem for each in (campaign.environment.parameters, environment))
         words = f"tests of {was}, answered for {now}: holds if as large a share of each shell crashes as there{known}"
-        answer, scope = {**answer, "scope": words}, f"{scope} {words[:1].upper()}{words[1:]}."
-    content |= {"answer": answer, "scope": scope}
+        content["answer"] |= {"scope": words}
     if (found := traffic_error(tested, there, moved, content, progress)) is not None:
         content |= told_traffic(found, content)
     return content
@@ -146,7 +144,8 @@ def compare_in_other_traffic(
     """What the stored tests of a comparison say of both vehicles in other traffic, and its replicates of their ratio.
 
     Keys are ``traffic``, a `TrafficError` of A with its ratio to B unless B has not crashed, ``b``, the rate of B, and
-    ``sentences``. Raises `HarnessError` as `estimate_in_other_traffic` does, and where there are no replicates.
+    ``rows``, what a terminal shows of A. Raises `HarnessError` as `estimate_in_other_traffic` does, and where there
+    are no replicates.
     """
     progress = progress or Progress()
     sides = [StoredShells.of(Path(folder) / side, progress) for side in ("a", "b")]
@@ -176,7 +175,7 @@ def compare_in_other_traffic(
     if told["b"]["n_crashes"]:
         ratios["B"] = uncertain(told["ratio"], _ends(told), times[0] / times[1], off + ONE_LAW, *about[1:])
     error = TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), a, ratios, unseen)
-    return {"traffic": finite_json(error), "b": finite_json(b), "sentences": list(sentences(error, "A"))}
+    return {"traffic": finite_json(error), "b": finite_json(b), "rows": [asdict(row) for row in rows(error)]}
 
 
 def _unseen(tested: StoredShells, there: Resolved, moved: Moved, progress: Progress) -> Unseen | None:
@@ -271,17 +270,15 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
 
 
 def told_traffic(found: TrafficError, content: Mapping[str, Any]) -> dict[str, Any]:
-    """What of ``estimates.json`` tells of it: ``traffic`` itself, lines of the answer below rate and ratio, words."""
+    """What of ``estimates.json`` tells of it: ``traffic`` itself, lines of the answer below rate and ratio."""
     answer = content["answer"]
     old = _limited(answer["rows"], found)
     place = 1 + max((i for i, row in enumerate(old) if row["key"] in ("verdict", "rate", "ratio")), default=-1)
     new = [asdict(row) for row in rows(found)]
-    said = " ".join(sentences(found))
     warnings = [*answer["warnings"], *too_few(found.n_replicates, found.confidence)]
     return {
         "traffic": finite_json(found),
         "answer": {**answer, "rows": [*old[:place], *new, *old[place:]], "warnings": warnings},
-        "scope": f"{said} {content['scope']}",
     }
 
 

@@ -149,7 +149,7 @@ class Manifest:
             write_sealed(self._folder / MANIFEST, self._earlier)
             return
         kept = shards[: request.index]
-        cut = {"status": "interrupted", "stopped_by": None, "ending": None}
+        cut: dict[str, Any] = {"status": "interrupted", "stopped_by": None, "unmet": []}
         n_kept = sum(shard["n_episodes"] for shard in kept)
         self._earlier = {**self._earlier, **cut, "n_episodes": n_kept, "shards": kept}
         write_sealed(self._folder / MANIFEST, self._earlier)
@@ -175,7 +175,8 @@ class Manifest:
         content = {
             **self._content,
             "status": status,
-            **dict.fromkeys(("stopped_by", "ending")),
+            "stopped_by": None,
+            "unmet": [],
             **of_the_end,
             "reproducible": self._campaign.av.reproducible and not (repeated and repeated.differing),
             "repeated": None if repeated is None else asdict(repeated),

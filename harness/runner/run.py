@@ -18,7 +18,7 @@ from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
-from harness.estimators.answer import conclusion, expected_for, pool_remedy
+from harness.estimators.answer import ended_by, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
 from harness.files import remove_unfinished
 from harness.pool.build import campaign_pool
@@ -64,16 +64,15 @@ ESTIMATES = "estimates.json"
 class RunResult:
     """What a finished campaign left in its folder, ``estimates.json`` and the page ``report.html`` among it.
 
-    ``stopped_by`` is explained at `harness.records.folder.StoppedBy`; ``ending`` says in a sentence when it ended and
-    which condition decided. The exit code is 0, or 4 when the budget or the pool was spent before the asked precision
-    or decision, or 5 where the crash rate is above the limit that was to be kept.
+    ``stopped_by`` is explained at `harness.records.folder.StoppedBy`. The exit code is 0, or 4 when the budget or the
+    pool was spent before the asked precision or decision, or 5 where the crash rate is above the limit that was to be
+    kept.
     """
 
     folder: Path
     report: Path
     estimates: dict[str, Any]
     stopped_by: StoppedBy
-    ending: str
     exit_code: int
 
 
@@ -246,7 +245,7 @@ class Run:
         counted = {self.out / file for shard in manifest.shards for file in shard["files"].values()}
         for path in {path for table in TABLES for path in shards_on_disk(self.out, table)} - counted:
             path.unlink()
-        stopped_by, said = conclusion(self.campaign, rule, manifest.n_episodes)
+        stopped_by = ended_by(self.campaign, rule, manifest.n_episodes)
         missed = self.campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference")
         expected = expected_for(rule, self.campaign, manifest.n_episodes) if missed else None
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
@@ -256,13 +255,13 @@ class Run:
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
         decided |= {"expected": expected, "remedy": pool_remedy(rule, self.campaign, stopped_by) or None}
-        manifest.write("done", stopped_by=stopped_by, ending=said, **decided)
+        manifest.write("done", stopped_by=stopped_by, unmet=rule.look.unmet, **decided)
         self._progress.stage("writing estimates and report", None)
         estimates = estimate_run(self.out)
         write_sealed(self.out / ESTIMATES, estimates)
         from harness.report.page import write_report  # noqa: PLC0415
 
-        return RunResult(self.out, write_report(self.out), estimates, stopped_by, said, code)
+        return RunResult(self.out, write_report(self.out), estimates, stopped_by, code)
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:

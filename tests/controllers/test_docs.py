@@ -106,5 +106,5 @@ def test_the_first_vehicle_of_a_new_user_runs(page, tmp_path, monkeypatch):
     code = main([*command.split(), "--workers", "1", "--quiet", *short])
     sys.modules.pop("my_av", None)
     assert code == 0
-    statement = json.loads(Path("runs/my_av-MyAV/estimates.json").read_text("utf-8"))["statement"]
-    assert "times as often as a careful and competent driver" in statement
+    rows = json.loads(Path("runs/my_av-MyAV/estimates.json").read_text("utf-8"))["answer"]["rows"]
+    assert "ratio" in [row["key"] for row in rows]

@@ -33,33 +33,30 @@ def answered(parts, **manifest) -> dict:
 def test_rates_are_per_test_and_per_distance_where_that_is_known():
     unknown, known = (answered(drawn("forced"), distance_per_test_m=of) for of in (None, 400.0))
     assert unknown["crash_rate_per_1e6_km"] is None
-    assert "km" not in unknown["statement"]
+    assert "km" not in unknown["answer"]["rows"][0]["remark"]
     assert known["distance_per_test_km"] == 0.4
     assert known["crash_rate_per_1e6_km"]["rate"] == pytest.approx(known["estimates"]["nade"]["crash_rate"] / 0.4 * 1e6)
-    assert "lane-change level 3 " in known["statement"]
-    assert "per million km" in known["statement"]
-    assert set(known["statements"]) == set(known["estimates"])
-    assert known["estimates"]["nde"]["reason"].rstrip(".") in known["statements"]["nde"]
+    assert "per million km" in known["answer"]["rows"][0]["remark"]
 
 
-def test_unbounded_weights_lead_the_sentence_and_claim_no_precision():
+def test_unbounded_weights_lead_the_warnings_and_claim_no_precision():
     content = answered(drawn("step_mixture"))
-    assert content["statement"].startswith("WARNING: the true rate may lie far above this interval: the weights")
+    assert content["answer"]["warnings"][0].startswith("the true rate may lie far above this interval: the weights")
     for name, n_cautions in (("nade", 1), ("scv", 2)):
         found = content["estimates"][name]
-        assert "half-width" not in content["statements"][name]
         assert (found["rhw"], found["cautions"]) == (None, found["warnings"][:n_cautions])
     assert {point["rhw"] for point in content["convergence"]} == {None}
 
 
 @pytest.mark.parametrize(("n", "doubts"), [(2_000, True), (20_000, False)])
-def test_one_crash_that_could_double_the_rate_leads_the_sentence(n, doubts):
+def test_one_crash_that_could_double_the_rate_leads_the_warnings(n, doubts):
     """Three tests in a hundred crash, with weight 0.001; the largest weight, 0.1, counts as much as 100 of them."""
     some = block([k % 100 < 3 for k in range(n)], [-6.9] * n, method="forced", log_p_cut_in=np.full(n, np.log(0.1)))
-    said = answered([some])["statement"]
-    assert said.startswith("WARNING: the true rate may lie far above this interval: one more crash") == doubts
-    assert ("might add 1.65 times it." in said) == doubts
-    assert ("relative half-width" in said) != doubts
+    content = answered([some])
+    said = content["answer"]["warnings"][0]
+    assert said.startswith("the true rate may lie far above this interval: one more crash") == doubts
+    assert ("might add 1.65 times it" in said) == doubts
+    assert (content["estimates"]["nade"]["rhw"] is None) == doubts
 
 
 SHORT = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)

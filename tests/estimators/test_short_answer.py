@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.estimators.answer import estimate_blocks, reference_statements, statement
+from harness.estimators.answer import estimate_blocks
 from harness.estimators.short_answer import (
     LINES,
     WIDTH,
@@ -212,9 +212,6 @@ def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, va
     best = replace(best, **rate, n_crashes=2 * (seen > 0.0), details=details)
     rows = short_answer(golden("shells-lateral-twin", "stop.rhw=0.3"), best, None, {}, None, {}).rows
     assert (rows[0].key, rows[0].value, rows[0].interval) == (first, value, ends)
-    [told, *_] = reference_statements(best)
-    assert ("this vehicle crashes less than 0.20 times as often as" in told) == (high < 1.0)
-    assert statement(best, 1.0, None).count("is below 3.00 × 10⁻⁸") == (seen > 0.0)
 
 
 @pytest.mark.parametrize(("verdict", "untested"), [("rejected", False), ("rejected", True), ("accepted", True)])
@@ -238,7 +235,6 @@ def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     assert found["ratio"] == ("> 2.00 (crashes more)", "3.98 seen")
     assert found["impact"][1] == ""
     assert [row.remark for row in rows if row.key == "impact"] == ["0 % (0–41 %) < 1 m/s"]
-    assert ("is above 1.00 × 10⁻⁷" in statement(best, 1.0, None)) == untested
 
 
 def severe(stored_run, cut_off=0.0, **of_rate):

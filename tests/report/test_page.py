@@ -14,7 +14,7 @@ from junitparser import JUnitXml
 from harness.errors import RunFolderError
 from harness.records.folder import write_sealed
 from harness.report.junit import statement_case, write_junit
-from harness.report.page import run_notes, verdict, write_report
+from harness.report.page import uncovered, verdict, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
 from tests.stored_runs import truncate
@@ -25,8 +25,8 @@ SEEN = {
     "nde": ({"severity"}, []),
     "failed": ({"severity"}, ["9 of 300 tests FAILED", "step: returned nan, expected"]),
     "shells": ({"severity", "shells"}, ["not even 8 m/s² avoids it"]),
-    "shells_refuted": ({"severity", "shells"}, ["Statement library: refuted by these tests", "outermost no. 1"]),
-    "shells_inside_only": ({"severity", "shells"}, ["Statement library: not put to the test", "is above "]),
+    "shells_refuted": ({"severity", "shells"}, ["refuted by these tests; by episode", "outermost no. 1"]),
+    "shells_inside_only": ({"severity", "shells"}, ["not put to the test"]),
 }
 """Plots, and words that no other kind of run has."""
 
@@ -68,7 +68,7 @@ def test_the_page_is_self_contained_with_plots_and_words_that_make_sense(reports
 def test_notes_say_what_is_stale(run_folder):
     edit(run_folder / "estimates.json", n_episodes=2_000)
     run = read_run_folder(run_folder)
-    assert "cover 2,000 tests but the records hold 3,000" in "\n".join(run_notes(run, summarise(run)))
+    assert "cover 2,000 tests but the records hold 3,000" in "".join(uncovered(run, summarise(run)))
 
 
 def test_a_ratio_that_leads_says_of_what_it_is(reports, tmp_path):
@@ -82,7 +82,7 @@ def test_a_ratio_that_leads_says_of_what_it_is(reports, tmp_path):
 
 
 def test_a_statement_that_a_vehicle_does_not_keep_to_is_said_so_and_sooner_that_it_is_refuted(runs):
-    ahead = replace(runs["shells"].shells.widest, n_checked=9, n_ahead=1)
+    ahead = replace(runs["shells"].shells.statements[-1], n_checked=9, n_ahead=1)
     assert verdict(ahead) == "no longer justified: this vehicle does not keep to it"
     assert verdict(replace(ahead, refuted=True)) == "refuted by these tests"
 
@@ -94,7 +94,7 @@ def test_hostile_texts_are_escaped_and_no_formula(folders, tmp_path):
     described = text.replace('\ndescription: ""', f"\ndescription: {json.dumps(hostile + chr(27) + '[31m')}")
     (folder / "campaign.yaml").write_text(described)
     path = folder / "estimates.json"
-    estimates = edit(path, campaign=hostile, statement=hostile, headline=hostile)["estimates"]
+    estimates = edit(path, campaign=hostile, headline=hostile)["estimates"]
     edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": [hostile]}})
     write_report(folder)
     page = Page(folder)
@@ -169,42 +169,39 @@ def test_what_no_run_has_written_is_named(run_folder, file, damage, said):
 # -- JUnit XML as a CI system reads it --
 
 
-CONTENT = {
-    "decision": {"sentence": "REJECTED: <above> & beyond\x1b[31m."},
-    "statement": "The crash rate is 1e-07 per test.",
-    "boundary_statements": {"library": "It is NOT so that …"},
-    "headline": "shells",
-    "estimates": {"shells": {"details": {"statements": [{"name": "library", "refuted": True}]}}},
-}
+def content(**within):
+    keys = "crash_rate", "ci_low", "ci_high", "n_crashes", "n_ahead", "n_checked", "n_crashes_outside"
+    library = {"name": "library", "refuted": False, **dict.fromkeys(keys, 0), "n_episodes_outside": 9, **within}
+    rows = [{"what": "REJECTED", "value": "<above> & beyond\x1b[31m", "interval": "", "remark": ""}]
+    answer = {"vehicle": "idm", "tests": "9 tests", "parameters": [], "rows": rows, "warnings": [], "scope": "all"}
+    return {"answer": answer, "headline": "shells", "estimates": {"shells": {"details": {"statements": [library]}}}}
 
 
 @pytest.mark.parametrize(("code", "kind"), [(0, None), (4, "Error"), (5, "Failure"), (3, "Failure")])
 def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     file, report = tmp_path / "gate.xml", tmp_path / "report.html"
-    write_junit(file, "smoke", [statement_case(CONTENT, "assumption_free", code)], [report])
+    write_junit(file, "smoke", [statement_case(content(), "assumption_free", code)], [report])
     (suite,) = JUnitXml.fromfile(str(file))
     assert (suite.name, suite.tests, suite.skipped) == ("smoke", 1, 0)
     assert (suite.failures, suite.errors) == (int(kind == "Failure"), int(kind == "Error"))
     (asked,) = suite
-    assert (asked.name, "library: It is NOT so that …" in asked.system_out) == ("assumption_free", True)
+    assert (asked.name, "no crash in 9 beyond it" in asked.system_out) == ("assumption_free", True)
     assert [type(each).__name__ for each in asked.result] == ([] if kind is None else [kind])
-    message = f"REJECTED: <above> & beyond\\u001b[31m. {CONTENT['statement']}"
-    assert all(each.message == message for each in asked.result)
+    assert all("REJECTED  <above> & beyond\\u001b[31m" in each.message for each in asked.result)
     assert f"[[ATTACHMENT|{report}]]" in asked.system_out
     assert file.read_text().count("REJECTED") == 1
 
 
+@pytest.mark.parametrize(
+    ("refuted", "code", "outcome"), [(False, 0, "passed"), (True, 0, "failure"), (True, 4, "failure")]
+)
+def test_a_refuted_assumption_that_was_asked_about_fails(refuted, code, outcome):
+    case = statement_case(content(refuted=refuted), "library", code)
+    assert (case.name, case.outcome) == ("library", outcome)
+
+
 def test_a_gate_never_passes_because_nothing_was_asked():
     """A method without shells may still carry a statement's name in its settings."""
-    case = statement_case({**CONTENT, "decision": None, "boundary_statements": {}}, "library", 4)
+    none = {**content(), "estimates": {"shells": {"details": {}}}}
+    case = statement_case(none, "library", 4)
     assert (case.name, case.outcome) == ("assumption_free", "error")
-
-
-@pytest.mark.parametrize("code", [0, 4])
-def test_an_assumption_that_was_asked_about_and_refuted_fails(code):
-    case = statement_case(CONTENT, "library", code)
-    assert (case.name, case.outcome, case.message) == (
-        "library",
-        "failure",
-        "REJECTED: <above> & beyond\x1b[31m. It is NOT so that …",
-    )

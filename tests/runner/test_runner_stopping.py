@@ -95,12 +95,13 @@ def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, 
     decided = run_here(campaign(*SHELLS, "world.engine=twin", *changes), tmp_path / "run")
     found = decided.estimates["decision"]
     assert (decided.exit_code, found["verdict"]) == (code, verdict)
-    assert ("accept.times_reference" if "r157-cc" in changes[0] else "accept.crash_rate_below") in decided.ending
-    assert (found["driver"] == "r157-cc") == ("r157-cc" in found["sentence"]) == ("r157-cc" in changes[0])
+    row, key = decided.estimates["answer"]["rows"][0], "times_reference" if "r157-cc" in changes[0] else "crash_rate"
+    assert decided.estimates["unmet"][0].startswith(f"accept.{key}")
+    assert (found["driver"] == "r157-cc") == ("r157-cc" in row["value"]) == ("r157-cc" in changes[0])
     assert (decided.stopped_by == "accept") == (code != 4)
     assert estimate(decided.folder)["decision"] == found
     if code == 5:
-        assert found["sentence"] in write_report(decided.folder).read_text(encoding="utf-8")
+        assert row["value"] in write_report(decided.folder).read_text(encoding="utf-8")
     assert found["statement"] == ("library" if "library" in changes[0] else "assumption_free")
     n_outside = decided.estimates["estimates"]["shells"]["details"]["statements"][0]["n_episodes_outside"]
     assert n_outside == 0 or "library" not in changes[0]
@@ -111,8 +112,7 @@ def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(campaign, run_h
     asked = partial(campaign, *SHELLS, "world.engine=twin", "stop.rhw=0.01", "stop.episodes=2000")
     far = run_here(asked("stop.below_reference=2"), tmp_path / "far")
     assert (far.exit_code, far.stopped_by, far.estimates["decision"]) == (0, "below_reference", None)
-    said = "with confidence 0.95 the crash rate is below 2 times that of r157-cc (stop.below_reference)"
-    assert said in far.ending
+    assert far.estimates["unmet"] == ["stop.below_reference (2)"]
     assert far.estimates["answer"]["scope"].endswith("ended by: far enough below the competent driver")
     n = far.estimates["n_episodes"]
     others = run_here(asked("stop.below_reference=0.3"), tmp_path / "other")
@@ -131,8 +131,8 @@ def test_nothing_is_accepted_given_what_the_vehicle_does_not_do(campaign, run_he
     )
     found = run_here(campaign(*SHELLS, "world.engine=twin", *changes), tmp_path / "run")
     assert (found.exit_code, found.stopped_by) == (4, "contradicted")
-    assert found.estimates["decision"]["sentence"].startswith("UNDECIDED")
-    assert "ask for testing.shells.statement: assumption_free" in found.ending
+    assert found.estimates["answer"]["rows"][0]["what"] == "UNDECIDED"
+    assert any("assumes: ask without it" in text for text in found.estimates["answer"]["warnings"])
 
 
 @pytest.mark.parametrize(

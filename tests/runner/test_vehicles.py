@@ -9,7 +9,7 @@ import pytest
 
 from examples.idm import IDM
 from examples.what_crashes_share import what_crashes_share
-from harness import estimate, replay
+from harness import replay
 from harness.campaign.drivers import NeedBasedParameters
 from harness.vehicles.kinematics import CONTACT_M, VEHICLE_LENGTH_M
 from tests.runner.conftest import SHELLS
@@ -52,7 +52,7 @@ def test_the_interval_holds_what_may_have_happened(method, campaign, run_here, t
     assert found["ci_low"] <= truth <= found["ci_high"]
     assert truth <= found["upper_bound"]
     assert found["details"]["crash_rate_if_failed_had_crashed"] > 0.6 * truth
-    assert "FAILED: they count as no crash in the rate and as crashes in the upper limit" in content["statement"]
+    assert any("tests FAILED; had they all crashed" in text for text in content["answer"]["warnings"])
     if found["rhw"] is not None:
         assert found["rhw"] == pytest.approx((found["ci_high"] - found["ci_low"]) / 2.0 / found["crash_rate"])
 
@@ -117,7 +117,6 @@ def test_the_statement_says_so_where_it_matters(faster):
     assert 0 < (was_ahead & crashed).sum() < ahead.sum() < was_ahead.sum()
     assert (need["n_checked"], need["n_ahead"]) == (400, ahead.sum())
     assert need["ahead_in"] == np.flatnonzero(ahead)[:10].tolist()
-    assert estimate(faster.folder)["boundary_statements"] == faster.estimates["boundary_statements"]
     first = need["ahead_in"][0]
     assert (
         replay(faster.folder, first).row["ahead_step"]
