@@ -20,6 +20,7 @@ from harness.estimators.traffic import TrafficError
 from harness.importance.functions import importance_names
 from harness.numbers import interval, number, plain, ratio, share, two_digits_up
 from harness.records.folder import StoppedBy
+from harness.strata import LIBRARY_STATEMENT
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ESTIMATORS, RUN_FOLDER, EstimatorName
 
@@ -250,9 +251,10 @@ def _beside(found: Mapping[str, Any], level: str, *, wide: bool) -> str:
 
 
 def boundary_statements(estimate: Estimate) -> dict[str, str]:
-    """What holds for vehicles that crash only within a boundary, by statement; none unless drawn from shells."""
+    """What holds for vehicles that crash only within the boundary; none unless drawn from shells."""
     details, level = estimate.details, share(estimate.confidence)
-    return {found["name"]: _within(found, len(details["shells"]), level) for found in details.get("statements", ())}
+    found = details.get("within")
+    return {} if found is None else {LIBRARY_STATEMENT: _within(found, len(details["shells"]), level)}
 
 
 def _within(found: Mapping[str, Any], n_shells: int, level: str) -> str:
@@ -269,7 +271,7 @@ def _within(found: Mapping[str, Any], n_shells: int, level: str) -> str:
         f"({level} interval {interval(found['ci_low'], found['ci_high'])}), estimated from "
         f"{found['n_episodes']:,} tests ({found['n_crashes']:,} sampled crashes).{failed_statement(found)}"
     )
-    return f"{text} {_outside(found, n_shells, level)}{_ahead(found)}"
+    return f"{text} {_outside(found, n_shells, level)}"
 
 
 def _outside(found: Mapping[str, Any], n_shells: int, level: str) -> str:
@@ -282,22 +284,6 @@ def _outside(found: Mapping[str, Any], n_shells: int, level: str) -> str:
     return (
         f"There was no crash in {found['n_episodes_outside']:,} tests outside{counted}: with {level} confidence "
         f"fewer than {number(found['upper_bound_outside'])} crashes per test lie there."
-    )
-
-
-def _ahead(found: Mapping[str, Any]) -> str:
-    """What each test says about the assumption, where it was asked."""
-    if not found["n_checked"]:
-        return ""
-    if not found["n_ahead"]:
-        return (
-            f" In none of {found['n_checked']:,} tests was it ahead of such a vehicle and less than {DANGER_TTC_S:g} s "
-            "from a collision: each keeps to the assumption."
-        )
-    return (
-        f" In {found['n_ahead']:,} of {found['n_checked']:,} tests it was AHEAD of such a vehicle and less than "
-        f"{DANGER_TTC_S:g} s from a collision, first in {_replayed(found['ahead_in'])}: it does not do what is "
-        "assumed, and nothing but the lack of crashes outside speaks for the statement."
     )
 
 

@@ -27,7 +27,7 @@ from harness.errors import HarnessError
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.cut_ins import Pool
 from harness.pool.learned import Learned, learned_crashes
-from harness.pool.shells import CANDIDATES, conservative_first, shells_of, widest
+from harness.pool.shells import CANDIDATES, conservative_first, shells_of
 from harness.pool.walk import PILOT_PATHS, BaselineRuns, EnumeratedPaths, contributions, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
@@ -163,7 +163,7 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, l
     if learned is not None:
         asked = (crashes != 0) & (mass > 0.0)
         given = paths.seed, paths.index, paths.state, environment, runs, asked, followers.counts_above_mps
-        place = widest([list(library.surrogates)[d] for d in order], library) + 1
+        place = order.tolist().index(list(library.surrogates).index(library.boundary)) + 1
         beyond = shells_of(crashes, order) >= place
         own = learned_crashes(learned, *given)
         if mass[own & beyond].sum() > LEAST_LEARNED * mass[own].sum():

@@ -24,7 +24,7 @@ from harness.errors import RunFolderError
 from harness.estimators.answer import Estimates
 from harness.estimators.block import outcome_places
 from harness.estimators.estimate import Estimate, Unavailable
-from harness.estimators.shells import ShellDetails, Within
+from harness.estimators.shells import ShellDetails
 from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_shards, stored_columns
 from harness.strata import ASSUMPTION_FREE
@@ -47,18 +47,9 @@ class ShownShells(ShellDetails):
     rate: float
 
     @property
-    def widest(self) -> Within:
-        """The statement with the widest boundary."""
-        return self.statements[-1]
-
-    @property
     def pool_half_width(self) -> float:
         """What the pool's own error leaves open of the rate."""
         return self.rhw_from_pool * self.rate
-
-    def narrowest(self, place: int) -> str:
-        """Which boundary a shell is inside of, the narrowest one."""
-        return next((f"inside {each.name}" for each in self.statements if place < each.n_shells), "outside")
 
     def share_of_uncertainty(self, half_width: float) -> float:
         """Share in the sum of squared half-widths, which is what makes the interval of the rate."""
@@ -89,7 +80,7 @@ class RunFolder:
 
     @property
     def asked_statement(self) -> str | None:
-        """The statement about a boundary that should reach ``stop.rhw``; None for the assumption-free one."""
+        """The statement `library` where that should reach ``stop.rhw``; None for the assumption-free one."""
         asked = ASSUMPTION_FREE if self.shells is None else self.campaign.testing.shells.statement
         return None if asked == ASSUMPTION_FREE else asked
 
