@@ -155,8 +155,9 @@ def test_the_answer_is_that_of_the_reference(tmp_path):
     combined = math.hypot(found["std_error"], REFERENCE["std_error"])
     assert abs(found["crash_rate"] - REFERENCE["crash_rate"]) < 2.0 * combined
     assert "as often as a careful and competent driver (r157-cc) would" in estimates["statement"]
-    statements = found["details"]["statements"]
-    assert not any(each["refuted"] or each["n_ahead"] or each["rhw"] >= 0.03 for each in statements)
+    within = found["details"]["within"]
+    assert not within["refuted"]
+    assert within["rhw"] < 0.03
     assert found["warnings"] == []
     assert "Read this before using the number" not in (folder / "report.html").read_text(encoding="utf-8")
     rows = [pq.read_table(path, columns=["outcome"]) for path in (folder / "episodes").glob("*.parquet")]
