@@ -40,7 +40,7 @@ from harness.vocabulary import FloatArray, IntArray, RecordArray
 EVENLY = 0.1
 """Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
 LEAST_LEARNED = 0.05
-"""Share of the learned surrogate's crash rate beyond the boundaries from which on it has a shell there [assumed]."""
+"""Share of the learned surrogate's crash rate beyond the boundary from which on it has a shell there [assumed]."""
 CHOICE_DRAW = 2
 """Draw of a baseline run within the diagnostic stream."""
 
@@ -143,7 +143,7 @@ def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None
 def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, learned: Learned | None = None) -> Pool:
     """Pool of the vehicle that was driven along the paths.
 
-    A surrogate that was ``learned`` from it has a shell beyond the boundaries, if a share of its crashes lies there.
+    A surrogate that was ``learned`` from it has a shell beyond the boundary, if a share of its crashes lies there.
 
     Raises `HarnessError`: no cut-in was found on which even the envelope crashes.
     """

@@ -469,7 +469,7 @@ class Division:
     ) -> None:
         """Leave out the equals of vehicles that crash on these masses of cut-ins, (m,) each.
 
-        The driver ``learned`` has a shell beyond the boundaries, as in the pool of a vehicle.
+        The driver ``learned`` has a shell beyond the boundary, as in the pool of a vehicle.
         """
         bit = {name: driver for driver, name in enumerate(library.surrogates)}
         rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}

@@ -40,6 +40,7 @@ SAID = {
         "138 (crashes more)",
         "ended by: all tests done",
     ],
+    "shells-inside": ["keeping to library ", "nothing tested beyond it"],
     "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc, same approach"],
     "forced-inattentive": ["fvdm (reaction.delay_s 0.2, "],
     "forced-krauss": ["SUMO’s Krauss · 240 tests in SUMO"],
@@ -136,7 +137,7 @@ def test_vehicles_are_named_with_what_is_not_a_default():
         assert vehicle_words(campaign.av) == (name, parameters)
 
 
-@pytest.mark.parametrize(("name", "untested"), [("shells-need-based", True), ("shells-twin", False)])
+@pytest.mark.parametrize(("name", "untested"), [("shells-inside", True), ("shells-twin", False)])
 def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, untested, stored_run):
     content = estimates(stored_run(name))
     (rate,) = [row for row in content["answer"]["rows"] if row["key"] == "rate"]

@@ -193,4 +193,4 @@ def test_a_round_is_divided_into_shards_without_gap():
 def test_a_run_that_stops_at_a_wide_interval_says_what_that_does(stored_run):
     wide = manifest(stored_run("shells-stops"))["ending"]
     assert wide.endswith("Ask for a smaller stop.rhw.")
-    assert "by chance" not in manifest(stored_run("shells-accepted"))["ending"]
+    assert "by chance" not in manifest(stored_run("shells-inside"))["ending"]
