@@ -29,7 +29,6 @@ REFERENCES = {
     "r157-cc-1mps": {"model": "r157-cc", "parameters": {"lateral_speed_mps": 1.0}},
     "r157-fsm": {"model": "r157-fsm"},
     "r157-fsm-at-once": {"model": "r157-fsm", "parameters": {"evaluated_at_m": 1.6}},
-    "need-based": {"model": "need-based"},
 }
 ENVELOPE = {"full-throttle-2": {"model": "constant", "parameters": {"acceleration_mps2": 2.0}}}
 
@@ -37,13 +36,13 @@ ENVELOPE = {"full-throttle-2": {"model": "constant", "parameters": {"acceleratio
 def main() -> None:
     """Print the rows."""
     drivers = {**TESTED, **REFERENCES, **ENVELOPE}
-    described = {"format": "surrogate-library", "version": 1, "boundary": "need-based", "surrogates": drivers}
+    described = {"format": "surrogate-library", "version": 1, "boundary": "late-1s", "surrogates": drivers}
     library = Library.model_validate({**described, "envelope": "full-throttle-2"})
     environment, names = load_environment(load_campaign("scenarios/overtaking_shells.yaml").environment), list(drivers)
     pilot = Enumerator(environment, library.followers(environment.lateral.present), SEED)
     rates = pilot.run(0, PILOT_PATHS, Progress()).rates(len(names))
     # Aimed at the careful ones: the others, and the cut-in itself, are known well enough anyway.
-    share = [0.2 if name in ("need-based", "full-throttle-2") else 1.0 for name in names]
+    share = [0.2 if name == "full-throttle-2" else 1.0 for name in names]
     paths = pilot.aimed(rates, np.array([*share, 0.0])).run(PILOT_PATHS, PATHS, Progress())
     crash = {name: ((paths.crashes >> d) & 1).astype(np.bool_) for d, name in enumerate(names)}
     print(f"{'driver':18}{'crashes per test':>22}" + "".join(f"{'avoids of ' + name:>24}" for name in TESTED))

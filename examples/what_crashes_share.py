@@ -53,5 +53,5 @@ def what_crashes_share(folder: str | Path) -> pd.DataFrame:
 
 if __name__ == "__main__":
     found = what_crashes_share(sys.argv[1])
-    none = "No crash to look at: of shells only those beyond the library's widest boundary are compared."
+    none = "No crash to look at: of shells only those beyond the library's boundary are compared."
     print(found.to_string(index=False) if found["share of crashes"].any() else none)  # noqa: T201 - it is the answer

@@ -62,9 +62,9 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
         require_private(campaign.av.traci)
     resolved = resolve(campaign, command, controller_sha256=controller_sha256)
     if campaign.sampling.strata:
-        resolved.library.require_statement(campaign.testing.shells.statement)
-        if campaign.accept is not None and (beside := campaign.accept.times_reference) is not None:
-            resolved.library.require_reference(beside.driver)
+        library, accept = resolved.library, campaign.accept  # the file is read, and refused if it is wrong
+        if accept is not None and accept.times_reference is not None:
+            library.require_reference(accept.times_reference.driver)
     return resolved
 
 

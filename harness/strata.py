@@ -17,7 +17,7 @@ from harness.vocabulary import BoolArray, FloatArray
 OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
 ASSUMPTION_FREE, LIBRARY_STATEMENT = "assumption_free", "library"
-"""Names of the statement that has no boundary, and of the one whose boundary is the library's own."""
+"""What is asked about: the rate without an assumption, or that of a vehicle that crashes only inside the boundary."""
 LEARNED = "learned"
 """Name of the stratum outside on which a surrogate that was learned from the vehicle crashes."""
 FAILED_BASELINE = "failed shadow runs"
@@ -31,21 +31,6 @@ Numbers = Annotated[
     PlainSerializer(lambda array: array.tolist()),
 ]
 """An array that a JSON file holds as a list of numbers."""
-
-
-@dataclass(frozen=True)
-class Statement:
-    """What is said about vehicles that crash only inside a boundary, the most aggressive surrogate there.
-
-    ``assumes`` is the end of a sentence that begins with "If this vehicle"; ``n_inside`` strata lie inside; ``checked``
-    says whether each test shows that the assumption holds in it: that the vehicle is never ahead of the boundary.
-    """
-
-    name: str
-    boundary: str
-    assumes: str
-    n_inside: int
-    checked: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,8 +64,11 @@ class ShellDesign:
     references : tuple of Reference, length R
     reference_rate, reference_square : ndarray, shape (R,)
         Crash rate of each reference in the pool, and the mean square of a path's probability that it crashes.
-    statements : tuple of Statement
-        From the narrowest boundary to the widest; strata up to the widest are shells.
+    boundary, assumes : str
+        The most aggressive surrogate inside the library's boundary, and what is assumed of a vehicle that crashes only
+        there: the end of a sentence that begins with "If this vehicle".
+    n_inside : int
+        Strata up to the boundary, which are shells.
     p_cut_in, p_unreachable : float
         Probability of a cut-in, and the part of it on which no vehicle within the envelope's acceleration can crash,
         and which is not tested.
@@ -99,7 +87,9 @@ class ShellDesign:
     cell_stratum: tuple[int, ...]
     cell_p: Numbers
     n_paths: int
-    statements: tuple[Statement, ...]
+    boundary: str
+    assumes: str
+    n_inside: int
     p_cut_in: float
     p_unreachable: float
     cell_references: tuple[int, ...] = ()
@@ -117,8 +107,8 @@ class ShellDesign:
         return np.asarray(np.bincount(self.cell_stratum, self.cell_p, minlength=len(self.strata)), np.float64)
 
     def n_within(self, statement: str) -> int:
-        """Strata up to the boundary of a statement; all where it has none."""
-        return next((each.n_inside for each in self.statements if each.name == statement), len(self.strata))
+        """Strata that are asked about: those inside the boundary, or all."""
+        return self.n_inside if statement == LIBRARY_STATEMENT else len(self.strata)
 
     def crashes_too(self, r: int) -> BoolArray:
         """In which cells a reference crashes, shape (C,)."""
@@ -135,26 +125,11 @@ class ShellDesign:
         """Paths that would err as the pool's do; fewer where they were chosen from a finite number, which errs too."""
         return self.n_paths / (1.0 + self.n_paths / self.candidates) if self.candidates else self.n_paths
 
-    @property
-    def n_inside(self) -> int:
-        """Strata up to the widest boundary."""
-        return self.statements[-1].n_inside
-
-    @property
-    def library(self) -> Statement:
-        """The statement whose boundary is the library's own; the narrowest one if there is none of that name."""
-        return next((each for each in self.statements if each.name == LIBRARY_STATEMENT), self.statements[0])
-
     def without_references(self) -> ShellDesign:
         """The same strata, each one cell."""
         n, none = len(self.strata), np.zeros(0)
         one_each = replace(self, cell_stratum=tuple(range(n)), cell_references=(0,) * n, cell_p=self.p)
         return replace(one_each, references=(), reference_rate=none, reference_square=none)
-
-    @property
-    def checked(self) -> Statement | None:
-        """The statement whose assumption is checked in each test, if there is one."""
-        return next((each for each in self.statements if each.checked), None)
 
     @cached_property
     def joined(self) -> FloatArray:
@@ -166,8 +141,10 @@ def _of_one_size(design: ShellDesign) -> ShellDesign:
     n, r, strata = len(design.cell_stratum), len(design.references), set(range(len(design.strata)))
     if not design.cell_p.size == len(design.cell_references) == n or set(design.cell_stratum) != strata:
         raise ValueError("cells need a stratum, a probability and references each, and strata a cell")
-    if not design.reference_rate.size == design.reference_square.size == r or not design.statements:
-        raise ValueError("references need a rate and a mean square each, and there is a statement")
+    if not design.reference_rate.size == design.reference_square.size == r:
+        raise ValueError("references need a rate and a mean square each")
+    if not 0 <= design.n_inside <= len(design.strata):
+        raise ValueError("the boundary lies among the strata")
     return design
 
 

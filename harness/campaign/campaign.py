@@ -34,7 +34,6 @@ from harness.campaign.sections import (
     listed,
 )
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import SAMPLING, Sampling
 
 
@@ -142,7 +141,6 @@ class Combination(NamedTuple):
     mend: str
 
 
-_COMPARED = ASSUMPTION_FREE, LIBRARY_STATEMENT
 _TAKES_TIME = "where cut-ins take time (`lateral` of the environment)"
 
 REFUSED = (
@@ -232,13 +230,6 @@ REFUSED = (
         "controller: a vehicle that acts before the cut-in has cut-ins of its own",
         "hold_speed in A and B: pairs need the same cut-ins",
         "Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",
-    ),
-    Combination(
-        "testing.shells.statement",
-        lambda c, use: use.command == "compare" and c.testing.shells.statement not in _COMPARED,
-        "{testing.shells.statement}",
-        f"{' or '.join(_COMPARED)}: a comparison has these two",
-        "Choose one of them.",
     ),
 )
 """All that is refused, in the order in which it is told."""

@@ -142,35 +142,10 @@ class FuzzySafetyParameters(Reference):
         return self
 
 
-class NeedBasedParameters(Section):
-    """Accelerates until it needs to brake, and a delay later brakes with what it needs."""
-
-    acceleration_mps2: Strength = Field(1.0, description="until it needs to brake [assumed]")
-    deceleration_mps2: Strength = Field(3.0, description="hardest braking [assumed]")
-    reaction_time_s: Delay = Field(0.5, description="from the first need to the brakes [assumed]")
-    needed_mps2: Strength = Field(1.0, description="braking that must be needed to prevent a collision [assumed]")
-    standstill_gap_m: Gap = Field(2.0, description="gap that is to remain [assumed]")
-
-    @property
-    def min_acceleration_mps2(self) -> float:
-        """Its braking (m/s²)."""
-        return -self.deceleration_mps2
-
-    @property
-    def max_acceleration_mps2(self) -> float:
-        """Its acceleration (m/s²)."""
-        return self.acceleration_mps2
-
-
 BuiltInParameters = (
-    IDMParameters
-    | FVDMParameters
-    | ConstantParameters
-    | CarefulCompetentParameters
-    | FuzzySafetyParameters
-    | NeedBasedParameters
+    IDMParameters | FVDMParameters | ConstantParameters | CarefulCompetentParameters | FuzzySafetyParameters
 )
-ModelName = Literal["idm", "fvdm", "constant", "r157-cc", "r157-fsm", "need-based"]
+ModelName = Literal["idm", "fvdm", "constant", "r157-cc", "r157-fsm"]
 PARAMETERS: dict[str, type[BuiltInParameters]] = dict(
     zip(get_args(ModelName), get_args(BuiltInParameters), strict=True)
 )

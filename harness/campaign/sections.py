@@ -19,7 +19,6 @@ from pydantic import (
 )
 
 from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, in_words
-from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import Method
 
 LARGEST_EXACT_WHOLE_FLOAT = 2.0**53
@@ -111,9 +110,10 @@ class CrashSettings(Section):
 class ShellSettings(Section):
     """How tests are spread over the shells of the pool, and what is said about vehicles that keep to some of them."""
 
-    statement: str = Field(
-        ASSUMPTION_FREE,
-        description="which statement stop.rhw or accept is about; outside of it nothing is tested",
+    statement: Literal["assumption_free", "library"] = Field(
+        "assumption_free",
+        description="what stop.rhw or accept is about; library: if the vehicle crashes only inside the library's "
+        "boundary, outside of which nothing is tested then",
     )
     first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
         None, description="tests of each shell before any is preferred; none: by its probability"

@@ -5,7 +5,7 @@ It is written for one family of scenarios, a cut-in by BV while LV drives ahead 
 - `cells`: what is remembered of a running episode, and the columns of its record;
 - `path`: how the traffic moves before and after its decision, and who runs into it;
 - `decide`: what is drawn in a step, and where an importance function is asked (`harness.importance`);
-- `drive`: what the AV sees and follows, and the boundary driver behind BV;
+- `drive`: what the AV sees and follows;
 - `judge`: how an episode ends, and what stays of it;
 - `likelihood_ratio`: the hazard of the one decision, in `forced_ratio` and `record_lane`; its mixtures hold for any;
 - `harness.traffic.laws`: initial states, accelerations, and the hazard of the decision; `harness.pool.walk` sums it.

@@ -58,17 +58,12 @@ CELL_DTYPE = np.dtype(
         ("took_over_step", _i8),  # first step in which it did what it asked for; -1: none yet
         ("asked_to_speed_up", _i8),  # whether it asked for that while it was held
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration
-        ("boundary_x", _f8),  # of the boundary beside the AV: position, speed, and what it remembers
-        ("boundary_v", _f8),
-        ("boundary_acceleration", _f8),
-        ("boundary_danger", _f8),
-        ("ahead_step", _i8),  # first step after which the AV was ahead of it, -1: never
     ]
 )
 
 _STEPS = (
     *("n_steps", "cut_in_step", "lead_steps", "onset_step", "took_over_step", "n_control_steps"),
-    *("n_lv", "n_bv", "ahead_step"),
+    *("n_lv", "n_bv"),
 )
 _AT_CUT_IN = ("cut_in_r2_m", "cut_in_r2dot_mps", "onset_r2_m", "onset_r2dot_mps")
 _AT_END = ("crash_time_s", "impact_speed_mps", "min_ttc_s", "av_distance_m", "log_weight", "log_p_cut_in")
@@ -242,8 +237,7 @@ class KernelState(NamedTuple):
     is the R2 at which the AV has passed. ``asks_controller`` says whether one outside of the kernels decides for the
     AV: ``observation`` is what it sees, ``acts_before_cut_in`` whether from the start; else from the step after the
     onset. ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or BV is on its lane.
-    ``boundary`` is (1,) where the AV is compared with a driver beside it, else (0,). What may be so or not is 0
-    or 1.
+    What may be so or not is 0 or 1.
     """
 
     seed: int
@@ -264,4 +258,3 @@ class KernelState(NamedTuple):
     observation: BatchObservation
     acts_before_cut_in: int
     av_cruises: int
-    boundary: RecordArray

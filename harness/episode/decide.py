@@ -184,7 +184,6 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     cell.min_ttc = cell.danger = math.inf
     cell.cut_r2 = cell.cut_r2dot = cell.onset_r2 = cell.onset_r2dot = math.nan
     cell.av_start = kernel.x[k, AV]
-    cell.ahead_step = -1
     cells.acceleration[k, AV] = 0.0
     cells.log_ratio[k, :] = 0.0
     cells.martingale[k, :] = 0.0

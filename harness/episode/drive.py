@@ -1,10 +1,4 @@
-"""What AVs do in the coming step, or see if a controller is to say it; the speeds commanded; and the boundary driver.
-
-That is the one that a statement says the AV is never ahead of, driven beside it from its cut-in on.
-It starts with the AV: same place, same speed, one step after the onset of the cut-in, when neither could act yet. As
-long as the AV is not ahead of it, the AV runs into nothing that it does not run into. Where it has run into BV itself,
-or passed it before the overlap, there is nothing left to be compared.
-"""
+"""What AVs do in the coming step, or see if a controller is to say it; and the speeds commanded."""
 
 from __future__ import annotations
 
@@ -17,7 +11,7 @@ from harness.compiled import compiled, compiled_inline
 from harness.controllers.protocol import BatchObservation
 from harness.episode.cells import KernelState
 from harness.traffic.lateral import lateral_position, perceived_in
-from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, next_position, next_speed
+from harness.vehicles.kinematics import STEP_S, gap, next_speed
 from harness.vehicles.references import Memory, react, reaction_steps, still_cruises
 from harness.vocabulary import AV, BV, LV, FloatArray, IntArray, read_only
 
@@ -135,9 +129,7 @@ def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
 
 @compiled
 def command(kernel: KernelState) -> None:
-    """Turn accelerations into the speeds at the end of the step; idle cells stand still. Drive the boundary, too."""
-    if kernel.boundary.size > 0:
-        boundary_driver(kernel)
+    """Turn accelerations into the speeds at the end of the step; idle cells stand still."""
     x, v, cells = kernel.x, kernel.v, kernel.cells
     for k in range(cells.cell.size):
         running = cells.cell[k].row >= 0
@@ -147,41 +139,3 @@ def command(kernel: KernelState) -> None:
             if kernel.keep_traces and running:
                 here = cells.trace[k, cells.cell[k].step, vehicle]
                 here[0], here[1], here[2] = x[k, vehicle], v[k, vehicle], a
-
-
-AHEAD_M = 1e-6
-"""What counts as ahead: more than a rounding of positions."""
-
-
-@compiled_inline
-def boundary_driver(kernel: KernelState) -> None:
-    """Before a step: the boundary's position at its end, infinite once it has run into BV."""
-    x, v, driver = kernel.x, kernel.v, kernel.boundary[0]
-    for k in range(kernel.cells.cell.size):
-        cell = kernel.cells.cell[k]
-        since = cell.step - cell.onset_step - 1
-        if cell.row < 0 or cell.onset_step < 0 or since < 0:
-            continue
-        if since == 0:
-            cell.boundary_x, cell.boundary_v = x[k, AV], v[k, AV]
-            cell.boundary_acceleration, cell.boundary_danger = 0.0, math.inf
-        ahead = gap(x[k, BV], cell.boundary_x)
-        if ahead < CONTACT_M and cell.step > cell.planned:
-            cell.boundary_x = math.inf
-        if cell.boundary_x == math.inf:
-            continue
-        if since >= driver.delay_steps:
-            memory = Memory(cell.boundary_acceleration, cell.boundary_danger, driver.used_up_steps)
-            memory = react(driver, memory, since - driver.delay_steps, cell.boundary_v, v[k, BV], ahead)
-            cell.boundary_acceleration, cell.boundary_danger = memory.acceleration, memory.danger
-        after = next_speed(cell.boundary_v, cell.boundary_acceleration)
-        cell.boundary_x, cell.boundary_v = next_position(cell.boundary_x, cell.boundary_v, after), after
-
-
-@compiled_inline
-def note_if_ahead(k: int, kernel: KernelState) -> None:
-    """After a step: whether it was the first at whose end the AV is ahead of the boundary."""
-    cell = kernel.cells.cell[k]
-    followed = 0 <= cell.onset_step < cell.step - 1
-    if followed and cell.ahead_step < 0 and kernel.x[k, AV] > cell.boundary_x + AHEAD_M:
-        cell.ahead_step = cell.step

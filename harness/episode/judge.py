@@ -8,7 +8,6 @@ import numpy as np
 
 from harness.compiled import compiled, compiled_inline
 from harness.episode.cells import KernelState
-from harness.episode.drive import note_if_ahead
 from harness.episode.likelihood_ratio import log_weight
 from harness.episode.path import state_of
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, overlaps
@@ -49,8 +48,6 @@ def judge(kernel: KernelState, contact: BoolArray) -> int:
         state = state_of(kernel.x[k], kernel.v[k])
         if cell.cut_step >= 0 and state.r2dot_mps < 0.0 and state.r2_m >= 0.0:
             cell.min_ttc = min(cell.min_ttc, state.r2_m / -state.r2dot_mps)
-        if kernel.boundary.size > 0:
-            note_if_ahead(k, kernel)
         outcome = outcome_of(k, state, kernel)
         if contact[k] != (outcome in (CRASH, BV_LV_CONTACT)):
             return -1 - k
@@ -117,7 +114,6 @@ def end_episode(k: int, outcome: int, n: int, kernel: KernelState) -> None:
     row.log_weight = log_weight(kernel.importance, cells.log_ratio[k], cell.log_sampled)
     row.log_p_cut_in = cell.log_p_cut_in
     row.n_lv, row.n_bv = cell.n_lv, cell.n_path
-    row.ahead_step = cell.ahead_step
     row.took_over_step, row.asked_to_speed_up = cell.took_over_step, cell.asked_to_speed_up
     copy_row(cells.log_ratio[k], results.log_q[cell.row])
     copy_row(cells.martingale[k], results.martingale[cell.row])

@@ -29,12 +29,10 @@ from harness.errors import WorldDisagreementError
 from harness.importance.functions import Importance
 from harness.traffic.lateral import LateralMotion, constant_lead
 from harness.traffic.laws import Environment
-from harness.vehicles.drivers import driver_records
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds import AVLostError, World
 
-NOBODY = driver_records([])
 MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}
 STRAYED = (
     "the vehicle did something else than in its baseline run, given the same traffic and the same random stream: it "
@@ -46,13 +44,12 @@ CONTROL_STEPS = 16
 
 
 class Drawing(NamedTuple):
-    """What decides the motion of LV, BV and AV; ``boundary`` is (1,) if the AV is compared with a driver, else (0,)."""
+    """What decides the motion of LV, BV and AV."""
 
     seed: int
     environment: Environment
     importance: Importance
     driver: RecordArray
-    boundary: RecordArray = NOBODY
 
 
 class RecordPolicy(NamedTuple):
@@ -203,7 +200,6 @@ class EpisodeLoop:
                 observation=self._observation,
                 acts_before_cut_in=int(early),
                 av_cruises=int(cruises and not early),
-                boundary=policy.boundary,
             )
         )
 

@@ -17,7 +17,7 @@ from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.traffic import laws
 from harness.traffic.lateral import onset_of, perceived_in
 from harness.traffic.laws import Environment, acceleration
-from harness.vehicles.drivers import MOST_FOLLOWERS, NEED_BASED_KIND, Followers
+from harness.vehicles.drivers import MOST_FOLLOWERS, Followers
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
 from harness.vehicles.references import Memory, react, still_cruises
 from harness.vocabulary import (
@@ -279,7 +279,7 @@ def never_reaches(driver: Record, speed: float, ahead: float, slowest: float, st
 def who_crashes(followers: Followers, cut: int, lead: int, environment: Environment, path: Trajectory) -> int:
     """One bit for each attentive driver that runs into BV hard enough to count; see `follow`.
 
-    Of those that enclose others every crash counts: who stays behind them may be the harder for crashing later.
+    Of the envelope every crash counts: who stays behind it may be the harder for crashing later.
     """
     drivers, envelope, until = followers.drivers, followers.envelope, environment.numbers.max_steps
     found = n = 0
@@ -292,16 +292,14 @@ def who_crashes(followers: Followers, cut: int, lead: int, environment: Environm
         found = 1 << envelope
     for d in range(drivers.size):
         if d != envelope:
-            late, encloses = drivers[d].delay_steps, drivers[d].kind == NEED_BASED_KIND
-            take_over(n, d, drivers, late, encloses, cut, lead, environment, path)
+            take_over(n, d, drivers, drivers[d].delay_steps, False, cut, lead, environment, path)
             n += 1
     follow(n, drivers, cut, lead, until, path)
     for i in range(n):
         one = path.follower[i]
-        if one.end >= 0:
-            counts = followers.counts_above_mps == 0.0 or one.encloses
-            if counts or one.v - path.v_after[one.end] > followers.counts_above_mps:
-                found |= 1 << one.driver
+        above = followers.counts_above_mps
+        if one.end >= 0 and (above == 0.0 or one.v - path.v_after[one.end] > above):
+            found |= 1 << one.driver
     return found
 
 

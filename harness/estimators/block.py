@@ -40,15 +40,14 @@ EPISODE_COLUMNS = (
     "episode", "outcome", "cut_in_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_cut_in", "log_q",
     "n_steps", "min_ttc_s", "took_over_step", "asked_to_speed_up",
 )  # fmt: skip
-SHELL_COLUMNS = ("component", "cell", "cell_mass", "ahead_step")
+SHELL_COLUMNS = ("component", "cell", "cell_mass")
 BASELINE_COLUMNS = ("shadow", "cut_in_mass")
 """Of vehicles that act before the cut-in, where `ShellDesign.candidates` says that they are on record."""
 DANGER_TTC_S = 4.0
-"""A test in which the vehicle was ahead of a boundary counts where it also came closer to a collision than this (s).
+"""A test whose time was up counts as cut off where it came closer to a collision than this (s).
 
-No crash slips through: each has such a moment. And a driver who is put in the vehicle's place with more time left, and
-brakes with 3 m/s² after half a second, as of the statement ``need-based``, stays clear at closing speeds up to 21 m/s;
-the fastest cut-ins of `ndd-overtaking-1` close with 16.
+A driver who brakes with 3 m/s² after half a second stays clear from there at closing speeds up to 21 m/s; the fastest
+cut-ins of `ndd-overtaking-1` close with 16.
 """
 CUT_OFF_STEPS = 40
 """A test whose time was up so soon after a cut-in, and closer to a collision than `DANGER_TTC_S`, was cut off."""
@@ -108,8 +107,7 @@ class Block:
     ``first_ratios`` (n, 9, J): q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one.
     ``log_p_cut_in`` (n,): log P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode
     alone. Of shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C): its path's probability of a cut-in of each
-    cell; ``ahead`` (n,) bool: whether the vehicle was ever ahead of the boundary that a statement checks; and
-    `BASELINE_COLUMNS`, with ``step`` (n,) of the cut-in, below 0 where a failed test has come to none.
+    cell; and `BASELINE_COLUMNS`, with ``step`` (n,) of the cut-in, below 0 where a failed test has come to none.
     """
 
     first_episode: int
@@ -264,10 +262,6 @@ def block_from_tables(
             columns |= {name: episodes.column(name).to_numpy() for name in BASELINE_COLUMNS}
             step = pc.fill_null(episodes.column("cut_in_step"), -1).to_numpy()
             columns["step"] = np.where(columns["cut_in"], step, -1 - index).astype(np.int64)
-        if shells.checked is not None:
-            # Comparing with a null, of a vehicle that never closed in, is false.
-            danger = pc.fill_null(pc.less(episodes.column("min_ttc_s"), DANGER_TTC_S), fill_value=False).to_numpy()
-            columns["ahead"] = _known(episodes, "ahead_step") & (danger | (outcome == CRASH) | failed)
     cap = None if SAMPLING[method].controlled else 1.0
     drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), cap, shells, counts_above_mps, epsilon)
     block = Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)

@@ -102,8 +102,8 @@ class PairCounts:
         return np.asarray(self.ends.sum((1, 2)))
 
     def inside(self, n: int | None = None) -> PairCounts:
-        """Only the first ``n`` strata, by default those within the boundary of the statement `library`."""
-        within = slice(0, self.design.library.n_inside if n is None else n)
+        """Only the first ``n`` strata, by default those within the boundary."""
+        within = slice(0, self.design.n_inside if n is None else n)
         return PairCounts(self.design, self.ends[within], self.mass[within, :, :, within])
 
     def outcomes(self, *, failed_a: bool = False, failed_b: bool = False) -> Counts:
@@ -286,7 +286,7 @@ def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
     shells = [
         {
             "shell": design.strata[s],
-            "inside": s < design.library.n_inside,
+            "inside": s < design.n_inside,
             "p": float(design.p[s]),
             "n_pairs": int(pairs.tests[s]),
             **dict(zip(counts, row.tolist(), strict=True)),
@@ -296,9 +296,9 @@ def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
     ]
     conditional = {
         **contrast(inside, level),
-        "boundary": design.library.boundary,
+        "boundary": design.boundary,
         "n_pairs_outside": int(pairs.tests.sum() - inside.tests.sum()),
-        "refuted": any(tally.crashes[design.library.n_inside :].any() for tally in tallies),
+        "refuted": any(tally.crashes[design.n_inside :].any() for tally in tallies),
     }
     more = {"confidence": confidence, "conditional": conditional, "shells": shells, "warnings": warnings}
     return finite_json({"a": each[0].shown, "b": each[1].shown, **contrast(pairs, level), **more})

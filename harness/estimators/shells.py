@@ -1,4 +1,4 @@
-"""`shells`: crashes counted within shells of known probability p_s, and the statements (docs/shells.md) they allow.
+"""`shells`: crashes counted within shells of known probability p_s (docs/shells.md).
 
 The rate is Σ p_s c_s, c_s being the share of a stratum's tests that crash. Its limits are those of the likelihood
 ratio, with the error of the p_s in the same root, and failed tests as crashes in the upper one alone
@@ -49,7 +49,7 @@ from harness.vocabulary import BoolArray, FloatArray
 GROWTH, MOST_TIMES = 1.1, 1e6
 """Of numbers of tests that are looked at, and where there is no more looking."""
 MOST_NAMED = 10
-"""Tests that are named of those that refute a statement, or show that its reason fails."""
+"""Tests that are named of those that crashed outside."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,11 @@ class Shell:
 
 @dataclass(frozen=True)
 class Within:
-    """A row of the table of statements: the rate given that there are no crashes outside, and what is known of those.
+    """The rate given that there are no crashes outside the library's boundary, and what is known of those.
 
-    ``refuted_by`` are the first few tests (episodes) that crashed outside, and ``ahead_in`` those in which the vehicle
-    was ahead of the boundary and came within `DANGER_TTC_S` of a collision, of the ``n_checked`` that were asked;
-    ``n_ahead`` is their number.
+    ``refuted_by`` are the first few tests (episodes) that crashed outside.
     """
 
-    name: str
     boundary: str
     assumes: str
     n_shells: int
@@ -112,10 +109,6 @@ class Within:
     refuted: bool
     refuted_by: tuple[int, ...]
     upper_bound_outside: float
-    checked: bool
-    n_checked: int
-    n_ahead: int
-    ahead_in: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -139,7 +132,7 @@ class ShellDetails:
     p_unreachable: float
     learned: str
     references: tuple[BesideReference, ...]
-    statements: tuple[Within, ...]
+    within: Within
     shells: tuple[Shell, ...]
 
 
@@ -156,8 +149,6 @@ class Shells:
         self._known: dict[tuple[int, Level], RateLimits] = {}  # of so many first strata
         self._on_runs: list[CrashedTests] = []
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
-        self._n_checked = self._n_ahead = 0
-        self._ahead_in: list[int] = []
 
     @classmethod
     def of(cls, design: ShellDesign, tally: Tally) -> Shells:
@@ -202,15 +193,13 @@ class Shells:
             place = cell[rows] + design.cell_p.size * block.failed[rows]
             self._on_runs.append(CrashedTests(block.shadow[rows], block.step[rows], block.cut_in_mass[rows], place))
         for s in np.unique(stratum[crash]).tolist():
-            _name(self._crashed.setdefault(s, []), block, crash & (stratum == s))
-        if design.checked is not None and "ahead" in block.columns:
-            self._n_checked += len(block)
-            self._n_ahead += int(block.ahead.sum())
-            _name(self._ahead_in, block, block.ahead)
+            named = self._crashed.setdefault(s, [])
+            episodes = block.first_episode + np.flatnonzero(crash & (stratum == s))
+            named += episodes[: MOST_NAMED - len(named)].tolist()
         self._join()
 
     def result(self, confidence: float) -> Estimate:
-        """Assumption-free estimate; the other statements are among its details."""
+        """Assumption-free estimate; that within the boundary is among its details."""
         tally, design = self.tally, self._design
         n, n_crashes, _ = tally.totals
         cautions = tuple(self._cautions())
@@ -240,7 +229,7 @@ class Shells:
                     design.p_unreachable,
                     design.learned,
                     references=() if cautions else compared(design, self._cells, Level.two_sided(confidence)),
-                    statements=tuple(self.within(each.name, confidence) for each in design.statements),
+                    within=self.within(confidence),
                     shells=self._shells(tally, (1.0 - confidence) / 2.0),
                 )
             ),
@@ -340,10 +329,8 @@ class Shells:
         return max(float(np.max(self.tally.tests[kept > 0] * times / kept[kept > 0], initial=1.0)), 1.0)
 
     def contradicts(self, statement: str) -> bool:
-        """Whether a test crashed beyond the boundary of a statement, or was ahead of it where that is checked."""
-        beyond = self.tally.crashes[self._design.n_within(statement) :]
-        checked = any(each.checked and each.name == statement for each in self._design.statements)
-        return bool(beyond.any()) or (checked and self._n_ahead > 0)
+        """Whether a test crashed beyond the strata that are asked about."""
+        return bool(self.tally.crashes[self._design.n_within(statement) :].any())
 
     def _limits(self, n_strata: int, level: Level) -> RateLimits:
         """Of the first strata; anything is possible where crashes lie on too few paths."""
@@ -369,21 +356,19 @@ class Shells:
             f"{two_digits_up(self._design.n_paths * FEWEST_PATHS / max(n, 1.0)):,} or more, and run into a new folder"
         ]
 
-    def within(self, statement: str, confidence: float) -> Within:
-        """One of the design's statements."""
+    def within(self, confidence: float) -> Within:
+        """What holds of a vehicle that crashes only inside the boundary."""
         design, tally = self._design, self.tally
-        given = next(each for each in design.statements if each.name == statement)
-        n, level = given.n_inside, Level.two_sided(confidence)
+        n, level = design.n_inside, Level.two_sided(confidence)
         inside, outside = tally.part(slice(0, n)), tally.part(slice(n, None))
         limits, (n_outside, n_crashes_outside, _) = self._limits(n, level), outside.totals
         bound = combined(design.p[n:], outside, design.n_independent, Level.of_bound(confidence, n_outside)).high
         crashed = sorted(episode for s, episodes in self._crashed.items() if s >= n for episode in episodes)
-        who = given.name, given.boundary, given.assumes, n
+        who = design.boundary, design.assumes, n
         rate = limits.rate, limits.low, limits.high, limits.rhw, *limits.from_pool_relative()
         if_failed = float(design.p[:n] @ inside.failed_as_crashes().share)
         beyond = n_crashes_outside > 0, tuple(crashed[:MOST_NAMED]), bound
-        ahead = (self._n_checked, self._n_ahead, tuple(self._ahead_in)) if given.checked else (0, 0, ())
-        return Within(*who, *rate, *inside.totals, if_failed, *outside.totals, *beyond, given.checked, *ahead)
+        return Within(*who, *rate, *inside.totals, if_failed, *outside.totals, *beyond)
 
     def _shells(self, tally: Tally, tail: float) -> tuple[Shell, ...]:
         p, inside = self._design.p, np.arange(self._design.p.size) < self._design.n_inside
@@ -405,22 +390,11 @@ class Shells:
             )
         if used_up := ", ".join(name for name, n, available in kept if n >= available > 0):
             found.append(f"all cut-ins that the pool has kept of {used_up} were tested")
-        found += [
-            f"{crashes:,} crashes beyond {each.boundary}: the statement {each.name} does not hold for this vehicle"
-            for each in design.statements
-            if (crashes := int(tally.crashes[each.n_inside :].sum()))
-        ]
-        if design.checked is not None and self._n_ahead:
+        if crashes := int(tally.crashes[design.n_inside :].sum()):
             found.append(
-                f"the vehicle was ahead of {design.checked.boundary} in {self._n_ahead:,} of {self._n_checked:,} "
-                f"tests: nothing but the lack of a crash outside speaks for the statement {design.checked.name}"
+                f"{crashes:,} crashes beyond {design.boundary}: statement library does not hold for this vehicle"
             )
         return found
-
-
-def _name(episodes: list[int], block: Block, rows: BoolArray) -> None:
-    """Note the first few of some tests of a block."""
-    episodes += (block.first_episode + np.flatnonzero(rows)[: MOST_NAMED - len(episodes)]).tolist()
 
 
 @dataclass(frozen=True)

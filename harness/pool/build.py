@@ -43,7 +43,6 @@ _MADE_BY = ("build.py", "cut_ins.py", "shells.py")
 def campaign_pool_key(resolved: Resolved, order: Sequence[str] = ()) -> str:
     """Hash of all that a pool depends on: environment, lane changing, library, settings, code, and a given order."""
     library = resolved.library
-    boundaries = library.boundary, *(statement.boundary for statement in library.statements.values())
     content = [
         FORMAT,
         source_hash(WORLD_SOURCES),
@@ -51,7 +50,7 @@ def campaign_pool_key(resolved: Resolved, order: Sequence[str] = ()) -> str:
         environment_hash(resolved.environment),
         {name: model.model_dump() for name, model in library.surrogates.items()},
         [(name, model.model_dump()) for name, model in library.references.items()],
-        [sorted(boundaries), library.boundary, library.envelope],
+        [library.boundary, library.envelope],
         resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths", "pilot_tests"}),
         resolved.campaign.crash.counts_above_mps,
         *order,
@@ -80,7 +79,7 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
 def cached_pool(resolved: Resolved, order: Sequence[str] = ()) -> Pool | None:
     """The pool of a campaign; None if none has been built on this machine, or its file is damaged."""
     content = cache.read(pool_name(campaign_pool_key(resolved, order)))
-    # The key does not hold the words of statements: they are those of today.
+    # The key does not hold what the boundary assumes in words: that is said as of today.
     return None if content is None else replace(pool_from(content), library=resolved.library)
 
 

@@ -11,7 +11,6 @@ even the full-throttle envelope crashes is left out, with crash probability 0, i
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,8 +20,7 @@ from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
-from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign, Statement
-from harness.vehicles.library import Library
+from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 
 CANDIDATES = 32_768
@@ -77,7 +75,7 @@ def acceleration_limit(av: AutomatedVehicle) -> float:
 
 def shells_in_strata(pool: Pool, limit_mps2: float) -> list[list[int]]:
     """Which shells of the pool make up each stratum, for a vehicle that accelerates so hard; empty ones none."""
-    boundary = outermost(pool)
+    boundary = boundary_shell(pool)
     present = [s for s in range(pool.shell_p.size) if pool.shell_p[s] > 0.0]
     tested = present if limit_mps2 > pool.library.envelope_mps2 else [s for s in present if s < len(pool.names)]
     inside = [[s] for s in tested if s <= boundary]
@@ -88,24 +86,19 @@ def shells_in_strata(pool: Pool, limit_mps2: float) -> list[list[int]]:
 
 def _name(pool: Pool, shell: int) -> str:
     """Of the stratum that begins with a shell."""
-    beyond = shell > outermost(pool)
+    beyond = shell > boundary_shell(pool)
     return pool.names[shell] if not beyond or LEARNED in pool.names[shell : shell + 1] else OUTSIDE
 
 
-def outermost(pool: Pool) -> int:
-    """Index of the shell up to which strata are shells: the widest boundary of the library's statements."""
-    return widest(pool.names, pool.library)
-
-
-def widest(names: Sequence[str], library: Library) -> int:
-    """Place of the widest boundary among surrogates in their order."""
-    return max(names.index(each.boundary) for each in library.all_statements.values())
+def boundary_shell(pool: Pool) -> int:
+    """Index of the shell up to which strata are shells: that of the library's boundary."""
+    return pool.names.index(pool.library.boundary)
 
 
 def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
     """Strata of a campaign whose vehicle accelerates at most so hard (`acceleration_limit`)."""
     groups = shells_in_strata(pool, limit_mps2)
-    statements = _statements(pool, groups)
+    boundary = pool.library.boundary
     cells, stratum, references = cells_in_strata(pool, groups)
     takes_time = bool(pool.cut_ins.lead.any())
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
@@ -124,7 +117,9 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         reference_rate=pool.reference_rate,
         reference_square=pool.reference_square,
         n_paths=pool.n_paths,
-        statements=statements,
+        boundary=boundary,
+        assumes=pool.library.assumes or f"crashes only where the surrogate {boundary} or a more careful one crashes",
+        n_inside=sum(group[-1] <= boundary_shell(pool) for group in groups),
         p_cut_in=pool.p_cut_in,
         p_unreachable=pool.p_cut_in - float(p.sum()),
         shadow_runs=(acts := pool.cut_ins.motion.size > 0),
@@ -139,16 +134,6 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         cell_p=np.append(design.cell_p, pool.p_after_failure),
         cell_references=(*design.cell_references, 0),
     )
-
-
-def _statements(pool: Pool, groups: list[list[int]]) -> tuple[Statement, ...]:
-    """The library's statements, the narrowest boundary first."""
-    found = []
-    for name, each in pool.library.all_statements.items():
-        n_inside = sum(group[-1] <= pool.names.index(each.boundary) for group in groups)
-        assumes = each.assumes or f"crashes only where the surrogate {each.boundary} or a more careful one crashes"
-        found.append(Statement(name, each.boundary, assumes, n_inside, each.checked))
-    return tuple(sorted(found, key=lambda each: pool.names.index(each.boundary)))
 
 
 def cells_in_strata(pool: Pool, groups: list[list[int]]) -> tuple[IntArray, IntArray, IntArray]:
@@ -184,7 +169,7 @@ class PrescribedEpisodes:
         limit = acceleration_limit(campaign.av)
         design, groups = design_shells(pool, limit), shells_in_strata(pool, limit)
         self._cut_ins, self._shell, self._shell_p = pool.cut_ins, pool.shell, pool.shell_p
-        self._n_inside = outermost(pool) + 1
+        self._n_inside = boundary_shell(pool) + 1
         self._cells = cells_in_strata(pool, groups)[0]
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
         self._order += [np.zeros(0, np.int64)] * (len(design.strata) - len(groups))
@@ -196,7 +181,7 @@ class PrescribedEpisodes:
         return np.array(self.design.available, np.int64)
 
     def pilot(self, n: int, seed: int) -> tuple[RecordArray, PrescribedTraffic]:
-        """Some n cut-ins to learn the vehicle from: half of them inside the boundaries, half evenly of shells beyond.
+        """Some n cut-ins to learn the vehicle from: half of them inside the boundary, half evenly of shells beyond.
 
         Inside they are drawn by probability.
         """

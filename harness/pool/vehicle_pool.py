@@ -27,7 +27,7 @@ from harness.errors import HarnessError
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.cut_ins import Pool
 from harness.pool.learned import Learned, learned_crashes
-from harness.pool.shells import CANDIDATES, conservative_first, shells_of, widest
+from harness.pool.shells import CANDIDATES, conservative_first, shells_of
 from harness.pool.walk import PILOT_PATHS, BaselineRuns, EnumeratedPaths, contributions, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
@@ -40,7 +40,7 @@ from harness.vocabulary import FloatArray, IntArray, RecordArray
 EVENLY = 0.1
 """Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
 LEAST_LEARNED = 0.05
-"""Share of the learned surrogate's crash rate beyond the boundaries from which on it has a shell there [assumed]."""
+"""Share of the learned surrogate's crash rate beyond the boundary from which on it has a shell there [assumed]."""
 CHOICE_DRAW = 2
 """Draw of a baseline run within the diagnostic stream."""
 
@@ -143,7 +143,7 @@ def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None
 def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, learned: Learned | None = None) -> Pool:
     """Pool of the vehicle that was driven along the paths.
 
-    A surrogate that was ``learned`` from it has a shell beyond the boundaries, if a share of its crashes lies there.
+    A surrogate that was ``learned`` from it has a shell beyond the boundary, if a share of its crashes lies there.
 
     Raises `HarnessError`: no cut-in was found on which even the envelope crashes.
     """
@@ -163,7 +163,7 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, l
     if learned is not None:
         asked = (crashes != 0) & (mass > 0.0)
         given = paths.seed, paths.index, paths.state, environment, runs, asked, followers.counts_above_mps
-        place = widest([list(library.surrogates)[d] for d in order], library) + 1
+        place = order.tolist().index(list(library.surrogates).index(library.boundary)) + 1
         beyond = shells_of(crashes, order) >= place
         own = learned_crashes(learned, *given)
         if mass[own & beyond].sum() > LEAST_LEARNED * mass[own].sum():

@@ -74,12 +74,6 @@ def episodes_schema(
     """
     of_shells = [
         _field("cell", _I2, "1", "cell of shells.json: shell, and which references crash (method shells alone)"),
-        _or_null(
-            "ahead_step",
-            _I2,
-            "0.1 s",
-            "step after which the AV was first ahead of the boundary that is checked, null: never, or not asked",
-        ),
         _field("cell_mass", _per(n_cells), "1", "P of a cut-in of each cell on the same path (method shells alone)"),
     ]
     return pa.schema(

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
 from harness.estimators.short_answer import lines, within
 from harness.records.folder import write_text
-from harness.strata import ASSUMPTION_FREE
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
 Outcome = Literal["passed", "failure", "error"]
 
@@ -42,14 +42,12 @@ def statement_case(content: dict[str, Any], asked: str, exit_code: int) -> Case:
     Where there is no such statement, as under other methods than shells, the answer itself decides: a gate in which
     nothing does would let everything pass. What is stated besides was not asked, and is no test that was skipped.
     """
-    statements = content["estimates"][content["headline"]].get("details", {}).get("statements", ())
-    of = {each["name"]: each for each in statements}
-    refuted = asked in of and of[asked]["refuted"]
-    besides = tuple(" ".join(filter(None, within(each).texts)) for name, each in of.items() if name != asked)
-    message = "\n".join(lines(content["answer"], None))
-    return Case(
-        asked if asked in of else ASSUMPTION_FREE, message, "failure" if refuted else outcome_of(exit_code), besides
-    )
+    found = content["estimates"][content["headline"]].get("details", {}).get("within")
+    asks = found is not None and asked == LIBRARY_STATEMENT
+    besides = () if found is None or asks else (" ".join(filter(None, within(found).texts)),)
+    outcome = "failure" if asks and found["refuted"] else outcome_of(exit_code)
+    name, message = asked if asks else ASSUMPTION_FREE, "\n".join(lines(content["answer"], None))
+    return Case(name, message, outcome, besides)
 
 
 def write_junit(path: Path, suite: str, cases: Sequence[Case], attachments: Sequence[Path]) -> None:

@@ -26,7 +26,7 @@ WEIGHTED = (
     "with a large weight, and many late jumps mean that the interval cannot be trusted yet."
 )
 IN_ROUNDS = (
-    "Tests come in rounds, first inside the narrowest boundary. A shell without tests counts as free of crashes in the "
+    "Tests come in rounds, first inside the boundary. A shell without tests counts as free of crashes in the "
     "line and as anything in the band, which begins wide and one-sided. RHW falls faster than the dotted line while "
     "what remains is to see no crash outside."
 )
@@ -147,18 +147,17 @@ def shells_plot(found: ShownShells) -> Plot:
     for row, width in enumerate(half_widths.tolist()):
         text = share(found.share_of_uncertainty(width), least=0.001)
         right.add("text", "muted", min(width, widest / 1.3), row, label=text)
-    for each in found.statements:
-        if (boundary := each.n_shells - 0.5) < len(shells) - 0.5:
-            label = f"outside {each.name} ↓"  # its boundary is the row above
-            for panel, end in ((left, limit * max(left.room_before(label), 0.0)), (right, right.x.high)):
-                panel.add("line", "muted", [0.0, end], [boundary] * 2, dash=DASHED, width=1.0)
-            left.add("text", "muted", limit, boundary, label=label)
+    if (boundary := found.within.n_shells - 0.5) < len(shells) - 0.5:
+        label = "outside ↓"  # the boundary is the row above
+        for panel, end in ((left, limit * max(left.room_before(label), 0.0)), (right, right.x.high)):
+            panel.add("line", "muted", [0.0, end], [boundary] * 2, dash=DASHED, width=1.0)
+        left.add("text", "muted", limit, boundary, label=label)
     source, open_question = _source(found), _open_question(found, names, half_widths.tolist())
     alt = (
         f"Bars per shell from {shells[0].shell} to {shells[-1].shell}: contribution to the crash rate with limits, and "
         f"half-width. {source} {open_question}"
     )
-    orange = " (orange outside every boundary)" if (rate[~inside] > 0.0).any() else ""
+    orange = " (orange outside the boundary)" if (rate[~inside] > 0.0).any() else ""
     caption = (
         f"From careful (top) to careless. The rate: what each shell adds, with its limits{orange}. {source} The "
         "uncertainty: probability × half-width of the crash share, and its share of the sum of squares, which makes "

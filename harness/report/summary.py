@@ -51,10 +51,6 @@ class ShownShells(ShellDetails):
         """What the pool's own error leaves open of the rate."""
         return self.rhw_from_pool * self.rate
 
-    def narrowest(self, place: int) -> str:
-        """Which boundary a shell is inside of, the narrowest one."""
-        return next((f"inside {each.name}" for each in self.statements if place < each.n_shells), "outside")
-
     def share_of_uncertainty(self, half_width: float) -> float:
         """Share in the sum of squared half-widths, which is what makes the interval of the rate."""
         squares = math.fsum(shell.half_width**2 for shell in self.shells) + self.pool_half_width**2
@@ -84,7 +80,7 @@ class RunFolder:
 
     @property
     def asked_statement(self) -> str | None:
-        """The statement about a boundary that should reach ``stop.rhw``; None for the assumption-free one."""
+        """The statement `library` where that should reach ``stop.rhw``; None for the assumption-free one."""
         asked = ASSUMPTION_FREE if self.shells is None else self.campaign.testing.shells.statement
         return None if asked == ASSUMPTION_FREE else asked
 

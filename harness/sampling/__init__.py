@@ -73,7 +73,7 @@ def compile_kernels(resolved: Resolved) -> None:
     campaign, environment = resolved.campaign, resolved.environment
     naturalistic = campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"method": "nde"})})
     importance = build_importance(naturalistic, None)
-    policy = Drawing(campaign.seed, environment, importance, resolved.av, boundary=resolved.surrogates[:1])
+    policy = Drawing(campaign.seed, environment, importance, resolved.av)
     states = InitialStates(environment.numbers).draw(0, 0, 1)
     EpisodeLoop(TwinWorld(1), policy, RecordPolicy(0, "none", 0.0)).run(0, states)
     distance_per_test_m(environment)

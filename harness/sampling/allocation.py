@@ -18,12 +18,12 @@ from harness.vocabulary import IntArray
 GROWTH = 1.1
 """Tests after a round over tests before it; also the distance of the looks at the result."""
 INNER_RHW = 0.3
-"""Relative half-width of a statement at which testing turns to what lies outside its boundary."""
+"""Relative half-width inside the boundary at which testing turns to what lies outside."""
 CONFIDENCE = 0.9
 """Level at which widths are compared, whatever the campaign reports."""
 _TAIL, _LEVEL = (1.0 - CONFIDENCE) / 2.0, Level.two_sided(CONFIDENCE)
 FIRST_TESTS = 36
-"""First tests of all strata within the narrowest boundary together, each its share of the probability there."""
+"""First tests of all strata within the boundary together, each its share of the probability there."""
 LEAST_FIRST_TESTS, MOST_FIRST_TESTS = 3, 12
 """Of one stratum."""
 MOST_INNER_TESTS = 8
@@ -44,7 +44,7 @@ def first_tests(design: ShellDesign, asked: int | None = None) -> IntArray:
     """
     if asked is not None:
         return np.full(design.p.size, asked, np.int64)
-    within = design.p[: design.statements[0].n_inside].sum()
+    within = design.p[: design.n_inside].sum()
     share = np.ceil(FIRST_TESTS * design.p / within) if within > 0.0 else np.full(design.p.size, np.inf)
     return np.asarray(np.clip(share, LEAST_FIRST_TESTS, MOST_FIRST_TESTS).astype(np.int64))
 
@@ -54,7 +54,7 @@ class Allocation:
     """How many tests each shell gets next.
 
     A stratum gets ``first_tests`` before anything is decided about it, and at most those ``available``, shape (S,).
-    With a ``statement`` of the design what lies outside its boundary is never tested. A round has at least
+    With the ``statement`` `library` what lies outside the boundary is never tested. A round has at least
     ``smallest_round`` tests, where there are as many.
     """
 
@@ -123,9 +123,9 @@ class Allocation:
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
     def _n_begun(self, tests: IntArray, inner_rhw: Callable[[int], float]) -> int:
-        """Of how many strata it is time: of those inside the narrowest boundary that leaves much open."""
-        boundaries = (each.n_inside for each in self.design.statements if each.n_inside < self.n_asked)
-        return next((n for n in boundaries if not self._enough_inside(n, tests, inner_rhw)), self.n_asked)
+        """Of how many strata it is time: of those inside the boundary while they leave much open."""
+        n = min(self.design.n_inside, self.n_asked)
+        return self.n_asked if n == self.n_asked or self._enough_inside(n, tests, inner_rhw) else n
 
     def _enough_inside(self, n: int, tests: IntArray, inner_rhw: Callable[[int], float]) -> bool:
         """Whether it is time to test more than the first ``n`` strata."""

@@ -19,7 +19,7 @@ from harness.campaign.campaign import Campaign
 from harness.controllers.find import build_host
 from harness.controllers.hosts import Death
 from harness.episode.cells import PrescribedTraffic
-from harness.episode.loop import MOMENT_LIMITS, NOBODY, Drawing, EpisodeLoop, RecordPolicy, Shard
+from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import Rule, StopRule
@@ -108,7 +108,7 @@ class Source:
             challenge = self.campaign.testing.challenge
             self.tables = build_tables(resolved.environment, drivers, challenge, progress.advance)
         importance = build_importance(self.campaign, self.tables)
-        self.policy = Drawing(self.campaign.seed, resolved.environment, importance, resolved.av, NOBODY)
+        self.policy = Drawing(self.campaign.seed, resolved.environment, importance, resolved.av)
         self.initial_states = InitialStates(resolved.environment.numbers)
         self.design: ShellDesign | None = None
         self.baseline_paths: BaselinePaths | None = None

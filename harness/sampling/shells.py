@@ -2,8 +2,8 @@
 
 A round is run to its end before the next begins, whatever the number of workers, and the result is looked at. Rounds
 grow geometrically, to where they narrow the interval most (`harness.sampling.allocation`). That depends on counts
-alone, not on the stop rule or on time: a run can be continued to a smaller RHW. First the strata inside the narrowest
-boundary are tested until what is stated about them is roughly known; then those of the next one, and at last all.
+alone, not on the stop rule or on time: a run can be continued to a smaller RHW. First the strata inside the
+boundary are tested until their rate is roughly known; then all.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ from harness.resolved import Resolved
 from harness.sampling.allocation import CONFIDENCE, Allocation
 from harness.sampling.protocol import Rounds, ShardRequest, Source
 from harness.strata import ASSUMPTION_FREE, LEARNED, ShellDesign, StoredDesign
-from harness.vehicles.library import library_records
 from harness.vocabulary import IntArray, RecordArray
 
 MOST_SHARDS_PER_ROUND = 16
@@ -65,10 +64,6 @@ class Shells(Source):
     def _draw_from(self, pool: Pool) -> None:
         self.prescribed = PrescribedEpisodes(self.campaign, pool)
         self.design = self.prescribed.design
-        surrogates, checked = self.resolved.library.surrogates, self.design.checked  # beside whom each test is driven
-        models = [] if checked is None else [surrogates[checked.boundary]]
-        boundary = library_records(models, self.resolved.environment.lateral.present)
-        self.policy = self.policy._replace(boundary=boundary)
 
     @classmethod
     def cached_files(cls, resolved: Resolved) -> list[str]:

@@ -24,7 +24,7 @@ from harness.compiled import compiled_inline
 from harness.vocabulary import Record, RecordArray
 
 IDM_KIND, FVDM_KIND, CONSTANT_KIND = 0, 1, 2
-CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND = -1, -2, -3
+CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND = -1, -2
 """Below zero: those that remember a danger."""
 SMALLEST_GAP_M = 0.1
 """Gap below which the models see this gap: they divide by it."""
@@ -62,7 +62,7 @@ def driver_records(
     ``see_onset`` says that cut-ins take time: reference drivers then perceive and evaluate them, and none of their
     delay has been used up before.
     """
-    remembering = CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND, NEED_BASED_KIND
+    remembering = CAREFUL_COMPETENT_KIND, FUZZY_SAFETY_KIND
     kinds = dict(zip(get_args(BuiltInParameters), (IDM_KIND, FVDM_KIND, CONSTANT_KIND, *remembering), strict=True))
     records: RecordArray = np.zeros(len(drivers), driver_dtype())
     for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):

@@ -13,7 +13,6 @@ from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.problems import broken_rule, did_you_mean
 from harness.campaign.sections import Section, SurrogateName, listed
 from harness.errors import CampaignError
-from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import RecordArray
 
@@ -37,16 +36,6 @@ class LibraryDriver(Driver):
         return self.parameters.delay_after_cut_in_s + self.reaction.delay_s
 
 
-class StatementSettings(Section):
-    """A statement about vehicles that crash only inside a boundary."""
-
-    boundary: SurrogateName = Field(description="the most careless surrogate inside")
-    assumes: str = Field("", description='what it assumes, as the end of a sentence that begins with "If this vehicle"')
-    checked: bool = Field(
-        False, description="whether each test has to show that the vehicle is never ahead of that surrogate"
-    )
-
-
 def library_records(models: Sequence[LibraryDriver], see_onset: bool) -> RecordArray:
     """Drivers of a library as kernels read them, shape (D,); ``see_onset`` says that cut-ins take time."""
     parameters, reactions = [model.parameters for model in models], [model.reaction for model in models]
@@ -64,13 +53,10 @@ class Library(Section):
     description: str = ""
     boundary: SurrogateName = Field(
         description="the most careless driver that the vehicle under test is assumed to be more careful than, "
-        "in the statement library"
+        "where a campaign asks for testing.shells.statement: library"
     )
     assumes: str = Field(
-        "", description='what that statement assumes, as the end of a sentence that begins with "If this vehicle"'
-    )
-    statements: dict[SurrogateName, StatementSettings] = Field(
-        default_factory=dict, description="further statements by name"
+        "", description='what that assumes, as the end of a sentence that begins with "If this vehicle"'
     )
     envelope: SurrogateName = Field(
         description="a driver at constant full throttle: it crashes wherever any vehicle within its acceleration does"
@@ -103,18 +89,6 @@ class Library(Section):
         """Acceleration of the envelope (m/s²)."""
         return self.surrogates[self.envelope].parameters.max_acceleration_mps2
 
-    @property
-    def all_statements(self) -> dict[str, StatementSettings]:
-        """The statement `library`, with the library's own boundary, and the further ones."""
-        return {LIBRARY_STATEMENT: StatementSettings(boundary=self.boundary, assumes=self.assumes), **self.statements}
-
-    def require_statement(self, asked: str) -> None:
-        """Refuse (`CampaignError`) a statement that a campaign asks for where there is none of that name."""
-        if asked not in (known := (ASSUMPTION_FREE, *self.all_statements)):
-            expected = f"one of {', '.join(known)}"
-            mend = did_you_mean(asked, known) or "Name one of them, or add it to a library of your own (pool.library)."
-            raise CampaignError("testing.shells.statement", f"'{asked}'", expected, mend)
-
     def require_reference(self, asked: str) -> None:
         """Refuse (`CampaignError`) a limit beside a reference driver that is not there."""
         if asked not in self.references:
@@ -124,8 +98,7 @@ class Library(Section):
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
-        places = {f"statements.{name}.boundary": each.boundary for name, each in self.statements.items()}
-        for key, name in {"boundary": self.boundary, "envelope": self.envelope, **places}.items():
+        for key, name in {"boundary": self.boundary, "envelope": self.envelope}.items():
             if name not in self.surrogates:
                 expected = f"one of the surrogates: {', '.join(self.surrogates)}"
                 mend = did_you_mean(name, list(self.surrogates)) or "Add it to surrogates, or name another."
@@ -134,14 +107,6 @@ class Library(Section):
                 expected = "a driver that reacts: the envelope crashes nearly always, which says nothing"
                 mend = "Name the most careless driver that the vehicle can be expected to outdo."
                 raise broken_rule(key, f"'{name}', which is the envelope", expected, mend)
-        if taken := {ASSUMPTION_FREE, LIBRARY_STATEMENT} & set(self.statements):
-            expected = f"another name: {ASSUMPTION_FREE} and {LIBRARY_STATEMENT} are there always"
-            mend = "Rename it; the boundary of the statement library is the key boundary."
-            raise broken_rule("statements", f"a statement named {min(taken)}", expected, mend)
-        if len(checked := [name for name, each in self.statements.items() if each.checked]) > 1:
-            found = f"{len(checked)} statements that are checked in each test: {listed(checked)}"
-            mend = "Leave checked out of the others: a crash beyond their boundary refutes them."
-            raise broken_rule("statements", found, "one at most", mend)
         if (n := self.n_drivers) > MOST_SURROGATES:
             mend = "Every shell costs tests: keep those that differ in crash rate by a quarter or more."
             raise broken_rule("surrogates", f"{n} of them, with the references", f"at most {MOST_SURROGATES}", mend)

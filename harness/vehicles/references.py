@@ -1,4 +1,4 @@
-"""Drivers that remember a danger: the reference drivers of UN Regulation No. 157, and one that brakes when it needs to.
+"""Drivers that remember a danger: the reference drivers of UN Regulation No. 157.
 
 The careful and competent human (`r157-cc`) and the fuzzy safety model (`r157-fsm`) are written from the definitions
 that their authors publish with them: K. Mattas et al., JRC-FSM (github.com/ec-jrc/JRC-FSM, commit 01b05c2), where the
@@ -21,7 +21,6 @@ from harness.compiled import compiled_inline
 from harness.random_stream import AV_DRAWS, uniform
 from harness.vehicles.drivers import (
     CAREFUL_COMPETENT_KIND,
-    FUZZY_SAFETY_KIND,
     SMALLEST_GAP_M,
     driver_acceleration,
     idm_acceleration,
@@ -169,28 +168,6 @@ def fuzzy_safety(
 
 
 @compiled_inline
-def need_based(
-    driver: Record, memory: Memory, step: int, speed: float, lead_speed: float, gap: float
-) -> tuple[float, float]:
-    """Acceleration (m/s²) of a vehicle that brakes when it needs to, and the step since when it has.
-
-    It needs to brake where the deceleration that prevents a collision, dv²/(2 (gap − standstill gap)), is no less than
-    a threshold; then it brakes with that, as hard as it can at most. It waits once: whoever has braked watches the
-    vehicle ahead.
-    """
-    danger, closing = memory.danger, speed - lead_speed
-    room = 2.0 * (gap - driver.standstill_gap_m)
-    needs = closing > 0.0 and closing * closing >= driver.needed_mps2 * room
-    if danger == math.inf and needs:
-        danger = float(step)
-    if not needs:
-        return driver.acceleration_mps2, danger
-    hardest = driver.min_acceleration_mps2
-    wanted = hardest if room <= 0.0 else max(-(closing * closing) / room, hardest)
-    return changing(part_after(step, danger, driver.reaction_steps), driver.acceleration_mps2, wanted), danger
-
-
-@compiled_inline
 def still_cruises(cruises: bool, bv_overlaps: bool, asked: float) -> bool:
     """Whether a vehicle that cruises still does: until it first asks to brake (m/s²), or BV is on its lane.
 
@@ -219,9 +196,7 @@ def react(driver: Record, memory: Memory, step: int, speed: float, lead_speed: f
         wanted = driver_acceleration(driver, speed, lead_speed, gap)
     elif driver.kind == CAREFUL_COMPETENT_KIND:
         wanted, danger = careful_competent(driver, memory, step, speed, lead_speed, gap)
-    elif driver.kind == FUZZY_SAFETY_KIND:
-        wanted, danger = fuzzy_safety(driver, memory, step, speed, lead_speed, gap)
     else:
-        wanted, danger = need_based(driver, memory, step, speed, lead_speed, gap)
+        wanted, danger = fuzzy_safety(driver, memory, step, speed, lead_speed, gap)
     change = driver.max_jerk_mps3 * STEP_S
     return Memory(min(max(wanted, memory.acceleration - change), memory.acceleration + change), danger, memory.used_up)

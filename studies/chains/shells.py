@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from harness.pool.shells import shells_of
-from harness.strata import LIBRARY_STATEMENT, OUTSIDE, ShellDesign, Statement
+from harness.strata import OUTSIDE, ShellDesign
 from harness.vocabulary import FloatArray
 from studies.chains.chain import Chain
 from studies.chains.sampler import approach_paths
@@ -64,7 +64,9 @@ class ChainShells:
             cell_stratum=tuple(range(p.size)),
             cell_p=p,
             n_paths=len(path),
-            statements=(Statement(LIBRARY_STATEMENT, names[-2], "crashes only inside", chain.n_surrogates),),
+            boundary=names[-2],
+            assumes="crashes only inside",
+            n_inside=chain.n_surrogates,
             p_cut_in=float(p.sum()),
             p_unreachable=0.0,
         )

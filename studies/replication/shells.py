@@ -28,7 +28,7 @@ from harness.estimators.shells import Shells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import CrashedTests, Tally, combined
 from harness.pool.cut_ins import CutIns, Pool
-from harness.pool.shells import cells_in_strata, design_shells, outermost, shells_in_strata, shells_of, widest
+from harness.pool.shells import boundary_shell, cells_in_strata, design_shells, shells_in_strata, shells_of
 from harness.pool.vehicle_pool import LEAST_LEARNED
 from harness.sampling.allocation import Allocation
 from harness.sampling.shells import PairRounds, ShellRounds
@@ -237,7 +237,7 @@ class _Drawn:
 class ShellCampaign(_Drawn):
     """A shells campaign to replicate; its stop rule, statement and first tests are used.
 
-    Judged are all statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
+    Judged are both statements and the comparisons with reference drivers. With ``limits``, by their multiple of the
     crash rate, all of these are decided instead, as by ``accept``, and judged within each of the ``budgets``; what is
     tested next depends on neither. They may be multiples of the rate of a reference driver, ``beside``; with
     ``estimated`` intervals are judged besides. ``siblings`` see `FORMER`; and intervals of vehicles that act before the
@@ -295,18 +295,15 @@ class ShellCampaign(_Drawn):
 
     def _estimate(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
         design = drawn.design
-        names = [each.name for each in design.statements]
-        rules = {name: RoundRule(self.campaign.replaced(_STATEMENT, name)) for name in names}
-        known: dict[str, Row] = {}
+        rule, within = RoundRule(self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT)), None
         for _, planner, enough in looks(self.campaign, drawn, rng):
-            for name, rule in rules.items():
-                pending = name not in known and planner.seen.tally.tests.size
-                if pending and rule.observe(planner.seen) and rule.look.stopped:
-                    known[name] = self._statement_row(planner.seen, name, replication, reached=True)
+            pending = within is None and planner.seen.tally.tests.size
+            if pending and rule.observe(planner.seen) and rule.look.stopped:
+                within = self._statement_row(planner.seen, replication, reached=True)
             if enough:
                 break
         estimate, reached = planner.seen.result(self.campaign.stop.confidence), planner.rule.look.stopped
-        outside = int(estimate.details["statements"][0]["n_crashes_outside"])
+        outside = int(estimate.details["within"]["n_crashes_outside"])
         row = estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
         yield row
         for level in self.levels:
@@ -316,27 +313,27 @@ class ShellCampaign(_Drawn):
             without = tally._replace(runs=runs._replace(own=np.zeros_like(runs.own)))
             limits = combined(design.p, without, design.n_independent, Level.two_sided(estimate.confidence))
             yield replace(row, result=PAIRS_ALONE, ci_low=limits.low, ci_high=limits.high, refused=False)
-        bounds = [(BOUND, 0, estimate.crash_rate, row.std_error, estimate.upper_bound)]
-        for found in estimate.details["statements"]:
-            rate = estimate.crash_rate - found["crash_rate"]  # whose error nobody claims to know
-            bounds.append((bound_outside(found["name"]), found["n_shells"], rate, 0.0, found["upper_bound_outside"]))
-        for name, first, rate, error, bound in bounds:
+        found = estimate.details["within"]
+        beyond_it = estimate.crash_rate - found["crash_rate"]  # whose error nobody claims to know
+        for name, first, rate, error, bound in (
+            (BOUND, 0, estimate.crash_rate, row.std_error, estimate.upper_bound),
+            (bound_outside(LIBRARY_STATEMENT), found["n_shells"], beyond_it, 0.0, found["upper_bound_outside"]),
+        ):
             beyond = replace(row, result=name, crash_rate=rate, std_error=error, ci_low=0.0, ci_high=bound)
             yield beyond
             if self.siblings:
                 part = planner.tally.part(slice(first, None))
                 former = former_bound(design.p[first:], part, self.campaign.stop.confidence)
                 yield replace(beyond, result=name + FORMER, ci_high=former)
-        for name in names:
-            yield known.get(name) or self._statement_row(planner.seen, name, replication, reached=False)
+        yield within or self._statement_row(planner.seen, replication, reached=False)
         for reference in design.references:
             yield from _reference_rows(estimate, reference.name, replication, reached=reached)
 
-    def _statement_row(self, seen: Shells, name: str, replication: int, *, reached: bool) -> Row:
-        found = seen.within(name, self.campaign.stop.confidence)
+    def _statement_row(self, seen: Shells, replication: int, *, reached: bool) -> Row:
+        found = seen.within(self.campaign.stop.confidence)
         error, refused = seen.std_error(found.n_shells), math.isinf(found.rhw_from_pool)
         numbers = found.n_episodes, found.n_crashes, found.crash_rate, error, found.ci_low, found.ci_high
-        return Row(result_of(name), replication, *numbers, reached, found.n_crashes_outside, refused)
+        return Row(result_of(LIBRARY_STATEMENT), replication, *numbers, reached, found.n_crashes_outside, refused)
 
 
 def _reference_rows(estimate: Estimate, reference: str, replication: int, *, reached: bool) -> Iterator[Row]:
@@ -373,7 +370,7 @@ class PairedCampaign(_Drawn):
 
     def _row(self, result: str, replication: int, pairs: PairCounts, *, reached: bool) -> Row:
         level = Level.two_sided(self.campaign.stop.confidence)
-        found, beyond = pairs.difference(level), pairs.ends[pairs.design.library.n_inside :]
+        found, beyond = pairs.difference(level), pairs.ends[pairs.design.n_inside :]
         counts = int(pairs.tests.sum()), sum(pairs.n_alone)
         numbers = found.value, found.half_width / level.z, found.ci_low, found.ci_high
         outside = int(beyond.sum() - beyond[:, NO_CRASH, NO_CRASH].sum())
@@ -424,11 +421,10 @@ class OvertakingShells:
         return float(self.mass[:, crashes].sum()) / len(self.mass)
 
     def crashes_outside(self, crashing: FloatArray) -> dict[str, float]:
-        """Share of a crash mass by cell (n, C) that lies beyond the boundary of each statement; 0 of no crash."""
-        by_cell, names = crashing.sum(0), self.template.names
-        total, statements = by_cell.sum() or 1.0, self.template.library.all_statements
-        places = {name: names.index(each.boundary) for name, each in statements.items()}
-        return {name: float(by_cell[self.template.cell_shell > place].sum() / total) for name, place in places.items()}
+        """Share of a crash mass by cell (n, C) that lies beyond the boundary, by statement; 0 of no crash."""
+        by_cell = crashing.sum(0)
+        beyond = by_cell[self.template.cell_shell > boundary_shell(self.template)].sum()
+        return {LIBRARY_STATEMENT: float(beyond / (by_cell.sum() or 1.0))}
 
     def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
         """A new pool: its design, and what vehicles do on its paths by the design's cells; see `Draw`."""
@@ -473,7 +469,7 @@ class Division:
     ) -> None:
         """Leave out the equals of vehicles that crash on these masses of cut-ins, (m,) each.
 
-        The driver ``learned`` has a shell beyond the boundaries, as in the pool of a vehicle.
+        The driver ``learned`` has a shell beyond the boundary, as in the pool of a vehicle.
         """
         bit = {name: driver for driver, name in enumerate(library.surrogates)}
         rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}
@@ -484,7 +480,7 @@ class Division:
         self._population = population
         order = np.array([bit[name] for name in names])
         if learned is not None:
-            place, own = widest(names, reduced) + 1, population.mass * population.crashes(learned)
+            place, own = names.index(reduced.boundary) + 1, population.mass * population.crashes(learned)
             if own[shells_of(population.bits, order) >= place].sum() > LEAST_LEARNED * own.sum():
                 names, order = (*names[:place], LEARNED, *names[place:]), np.insert(order, place, learned)
         self._shell = shells_of(population.bits, order).astype(np.int64)
@@ -541,7 +537,7 @@ class Division:
     def as_adversary(self, made: Adversary, crashing: FloatArray) -> FloatArray:
         """The mass of crashes (m,) of an adversary made of a vehicle."""
         template, population = self._shells.template, self._population
-        inside: BoolArray = self._shell <= outermost(template)
+        inside: BoolArray = self._shell <= boundary_shell(template)
         if made.crashes != "everywhere":
             weight = population.by_path(crashing * inside)
             order = np.argsort(-weight if made.crashes == "on_heaviest_paths" else weight, kind="stable")
@@ -581,5 +577,4 @@ def leave_out(library: Library, names: set[str], conservative_first: tuple[str, 
             raise CampaignError("campaign.pool.library", found, "one that can be the boundary", mend)
         library = library.model_copy(update={"boundary": boundary})
     kept = {name: model for name, model in library.surrogates.items() if name not in names}
-    statements = {name: each for name, each in library.statements.items() if each.boundary not in names}
-    return Library.model_validate({**dict(library), "surrogates": kept, "statements": statements})
+    return Library.model_validate({**dict(library), "surrogates": kept})

@@ -80,7 +80,6 @@ VEHICLES = {
     "brakes-8": "av.parameters.min_acceleration_mps2=-8",
     "late": "av.reaction.delay_s=0.6",
     "fvdm": "av={model: fvdm}",
-    "need-based": "av.model=need-based",
     "touches": "av.reaction.delay_s=0.6",
 }
 ABOVE_MPS = (0.0, 1.0, 3.0, 5.0, 10.0)
@@ -134,17 +133,17 @@ def harder():
 
 
 def test_drivers_of_the_pool_are_judged_by_the_speed_that_counts(harder, source):
-    """But those that enclose others: of them every crash counts."""
+    """But the envelope: of it every crash counts."""
     crashed, impact = driven(harder, "brakes-8")
     counts = crashed & (impact > 5.0)
     resolved = resolve(golden("shells-twin", "crash.counts_above_mps=5"))
     pool, before = campaign_pool(resolved), campaign_pool(resolve(golden("shells-twin")))
-    place = {name: pool.names.index(name) for name in ("brakes-8", "brakes-3-when-needed")}
+    place = {name: pool.names.index(name) for name in ("brakes-8", "full-throttle-2")}
     assert 0 < counts.sum() < crashed.sum()
     assert np.array_equal(pool.cut_ins.crashes[:, place["brakes-8"]], counts)
     mu = {name: (pool.mu[of], before.mu[before.names.index(name)]) for name, of in place.items()}
     assert mu["brakes-8"][0] < 0.7 * mu["brakes-8"][1]
-    assert mu["brakes-3-when-needed"][0] == pytest.approx(mu["brakes-3-when-needed"][1], rel=0.2)
+    assert mu["full-throttle-2"][0] == pytest.approx(mu["full-throttle-2"][1], rel=0.2)
     assert np.all(pool.reference_rate < 0.8 * before.reference_rate)
 
 

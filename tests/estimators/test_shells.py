@@ -25,7 +25,7 @@ from harness.estimators.tally import (
     paths_that_count,
     pool_variance,
 )
-from harness.strata import Reference, Statement
+from harness.strata import Reference
 from tests.estimators.small_blocks import EXACT, SHELLS, in_shells, tally
 
 P, LEVEL = SHELLS.p, Level.two_sided(0.9)
@@ -41,9 +41,8 @@ def shells_estimate(*rows: tuple[int, int, int, int], shells=SHELLS, **columns) 
 
 
 def within(estimate: Estimate) -> dict:
-    """Details of the only statement."""
-    (found,) = estimate.details["statements"]
-    return found
+    """What is said of the inside of the boundary."""
+    return estimate.details["within"]
 
 
 def test_limits_are_those_of_the_likelihood_ratio_and_wider_where_the_pool_errs():
@@ -141,7 +140,7 @@ def test_a_crash_outside_refutes_the_assumption():
 
 def test_shares_of_the_crashes_have_the_limits_of_a_binomial_share():
     """In one stratum, of a pool without error: Σ n KL(seen, limit) is a level's threshold."""
-    one = replace(SHELLS, strata=("a",), cell_stratum=(0,), cell_references=(0,), cell_p=P[:1], statements=())
+    one = replace(SHELLS, strata=("a",), cell_stratum=(0,), cell_references=(0,), cell_p=P[:1], n_inside=1)
     every, some = (Shells.of(one, tally(0.0 * P[:1], (crashes,), (500,))) for crashes in (40, 10))
     low, high = every.share_of_crashes(some, LEVEL, of_the_others=False)
     for limit in (low, high):
@@ -154,30 +153,25 @@ def test_shares_of_the_crashes_have_the_limits_of_a_binomial_share():
     assert uncertain.share_of_crashes(Shells.of(one, tally(P[:1], (10,), (500,))), LEVEL, of_the_others=False)[0] < low
 
 
-TWO = (Statement("library", "careful", "keeps to careful", 1), Statement("need", "careless", "brakes", 2, checked=True))
-
-
-@pytest.mark.parametrize("ahead_in", [(), (7, 250)])
-def test_each_statement_has_its_own_inside_and_its_own_refutation(ahead_in):
-    """One set of tests: a crash beyond the narrow boundary alone leaves the wide statement as it is."""
-    ahead, rows = np.isin(np.arange(430), ahead_in), ((0, 8, 0, 2), (1, 3, 0, 17), (2, 0, 0, 400))
-    estimate = shells_estimate(*rows, shells=replace(SHELLS, statements=TWO), ahead=ahead)
+def test_it_has_its_own_inside_and_its_own_refutation():
+    """One set of tests: a crash beyond a narrow boundary leaves what is said of a wide one as it is."""
+    rows = (0, 8, 0, 2), (1, 3, 0, 17), (2, 0, 0, 400)
+    narrow = within(shells_estimate(*rows, shells=replace(SHELLS, boundary="careful", n_inside=1)))
+    estimate = shells_estimate(*rows)
+    wide = within(estimate)
     assert estimate.crash_rate == pytest.approx(0.8e-4 + 0.15 * 3e-4)
     assert sum(shell["contribution"] for shell in estimate.details["shells"]) == pytest.approx(estimate.crash_rate)
     json.dumps(finite_json(estimate.shown), allow_nan=False)
-    library, need = estimate.details["statements"]
-    assert (library["n_episodes"], library["n_episodes_outside"], library["refuted"]) == (10, 420, True)
-    assert library["refuted_by"] == (10, 11, 12)
-    assert (need["n_episodes"], need["n_episodes_outside"], need["refuted"]) == (30, 400, False)
-    assert (need["n_checked"], need["n_ahead"], need["ahead_in"]) == (430, len(ahead_in), ahead_in)
-    assert library["crash_rate"] == pytest.approx(0.8e-4)
-    assert need["crash_rate"] == pytest.approx(estimate.crash_rate)
+    assert (narrow["n_episodes"], narrow["n_episodes_outside"], narrow["refuted"]) == (10, 420, True)
+    assert narrow["refuted_by"] == (10, 11, 12)
+    assert (wide["n_episodes"], wide["n_episodes_outside"], wide["refuted"]) == (30, 400, False)
+    assert narrow["crash_rate"] == pytest.approx(0.8e-4)
+    assert wide["crash_rate"] == pytest.approx(estimate.crash_rate)
     alone = combined(P[:2], tally(P, (8, 3, 0), (10, 20, 400)).part(slice(0, 2)), SHELLS.n_paths, LEVEL)
-    assert (need["ci_low"], need["ci_high"]) == pytest.approx((alone.low, alone.high), rel=1e-9)
-    assert need["ci_high"] < estimate.ci_high
+    assert (wide["ci_low"], wide["ci_high"]) == pytest.approx((alone.low, alone.high), rel=1e-9)
+    assert wide["ci_high"] < estimate.ci_high
     bound = 2e-2 * -np.expm1(-Level.of_bound(0.9, 400).threshold / 400)
-    assert need["upper_bound_outside"] == pytest.approx(bound)
-    assert any("was ahead of careless in 2 of 430" in warning for warning in estimate.warnings) == bool(ahead_in)
+    assert wide["upper_bound_outside"] == pytest.approx(bound)
 
 
 def test_plain_means_do_not_know_what_to_do_with_shells():
@@ -274,9 +268,7 @@ def test_few_paths_end_nothing_while_another_stratum_is_to_be_tested(untested, a
     two = counted([1, 2] * 30, range(60), 1e-4, [0] * 60)._replace(tests=np.array([1000, untested]), runs=None)
     place = CrashedTests(np.array([1, 2] * 30), np.arange(60), np.full(60, 1e-4), np.zeros(60, np.int64))
     design = replace(SHELLS, strata=("careful", "outside"), cell_stratum=(0, 1), cell_references=(0, 0), n_paths=100)
-    design = replace(
-        design, cell_p=P[:2], available=(9_000, available), statements=(replace(SHELLS.library, n_inside=1),)
-    )
+    design = replace(design, cell_p=P[:2], available=(9_000, available), n_inside=1)
     seen = Shells()
     seen.count(design, two, place)
     limits = seen.limits_of("assumption_free", LEVEL)

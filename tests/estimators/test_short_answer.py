@@ -34,16 +34,13 @@ SAID = {
         "× competent driver  ",
         "r157-cc of UN R157",
         "not even 8 m/s² avoids it",
-        "keeping to library ",
     ],
     "shells-accepted": ["ACCEPTED ", "below 4 × 10⁻⁷ per test", "confidence 0.95", "ended by: decision reached"],
     "shells-refuted": [
         "138 (crashes more)",
-        "does NOT keep to it",
-        "103 crashes in 120 beyond it",
         "ended by: all tests done",
     ],
-    "shells-need-based": ["need-based · ", "keeping to need-based "],
+    "shells-inside": ["keeping to library ", "nothing tested beyond it"],
     "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc, same approach"],
     "forced-inattentive": ["fvdm (reaction.delay_s 0.2, "],
     "forced-krauss": ["SUMO’s Krauss · 240 tests in SUMO"],
@@ -94,7 +91,7 @@ def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     blocks = [block.harder_than(50.0) for block in stored_blocks(folder, moments=False)]
     content = estimate_blocks(blocks, campaign, read_manifest(folder))
     rows = {row["key"]: row for row in content["answer"]["rows"]}
-    assert set(rows) == {"rate", "ratio", "within"}
+    assert set(rows) == {"rate", "ratio"}
     assert (rows["rate"]["what"], rows["rate"]["interval"]) == ("crash rate > 50 m/s", "no crash seen")
     assert rows["rate"]["value"].startswith("< ")
     assert rows["rate"]["remark"].startswith("< ")
@@ -140,7 +137,7 @@ def test_vehicles_are_named_with_what_is_not_a_default():
         assert vehicle_words(campaign.av) == (name, parameters)
 
 
-@pytest.mark.parametrize(("name", "untested"), [("shells-need-based", True), ("shells-twin", False)])
+@pytest.mark.parametrize(("name", "untested"), [("shells-inside", True), ("shells-twin", False)])
 def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, untested, stored_run):
     content = estimates(stored_run(name))
     (rate,) = [row for row in content["answer"]["rows"] if row["key"] == "rate"]

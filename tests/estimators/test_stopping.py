@@ -19,7 +19,7 @@ from harness.estimators.pairs import CRASH, NO_CRASH, no_pairs
 from harness.estimators.shells import Shells
 from harness.estimators.stopping import LOOK_RATIO, Decision, RoundRule, StopRule, look_grid
 from harness.estimators.tally import Tally
-from harness.strata import ASSUMPTION_FREE, Reference, Statement
+from harness.strata import ASSUMPTION_FREE, Reference
 from tests.estimators.small_blocks import SHELLS, block
 
 SHARD = 200
@@ -108,7 +108,7 @@ def test_a_verdict_says_that_the_whole_interval_is_on_one_side(limit, one, other
 P, SHARE = np.array([2e-6, 1e-5, 2e-5]), np.array([0.9, 0.5, 0.15])
 """A vehicle that crashes about 1e-5 times per test, on a share of each shell: the hardest that was measured."""
 DESIGN = replace(
-    SHELLS.without_references(), cell_p=P, n_paths=10**12, statements=(Statement("library", "outermost", "does", 2),)
+    SHELLS.without_references(), cell_p=P, n_paths=10**12, boundary="outermost", assumes="does", n_inside=2
 )
 LEVEL = Level.two_sided(0.9)
 BUDGET = 3_000
@@ -228,7 +228,7 @@ def test_a_vehicle_that_always_crashes_may_have_a_rate_above_that_of_this_pool()
         pairs.ends[:, CRASH, NO_CRASH], pairs.mass[:, CRASH, NO_CRASH] = tests, drawn
         free, alone = found.limits_of(ASSUMPTION_FREE, LEVEL), pairs.alone(0, LEVEL)
         low = np.array([free.low, 0.0, alone.ci_low])
-        high = np.array([free.high, found.within("library", 0.9).upper_bound_outside, alone.ci_high])
+        high = np.array([free.high, found.within(0.9).upper_bound_outside, alone.ci_high])
         true = np.array([truth.sum(), truth[2], truth.sum()])
         covered += (low <= true) & (true <= high)
         cut += true <= np.minimum(high, [design.p.sum(), design.p[2], design.p.sum()])

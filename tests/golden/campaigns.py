@@ -39,7 +39,7 @@ IN_THE_TWIN = {
     "forced-batch": (FORCED, "av.controller=examples.idm_batch:IDM"),
     "forced-reference": (FORCED, LATERAL, "av.model=r157-fsm"),
     "shells-accepted": (*SHELLS, "accept.crash_rate_below=4e-7", "stop.episodes=1500"),
-    "shells-need-based": (*SHELLS, "testing.shells.statement=need-based", "av.model=need-based", "stop.rhw=0.5"),
+    "shells-inside": (*SHELLS, "testing.shells.statement=library", "stop.rhw=0.5"),
     "shells-refuted": (*SHELLS, "av={model: constant, parameters: {acceleration_mps2: 0}}"),
     "shells-stops": (*SHELLS, "stop.rhw=0.6", "stop.episodes=3000", "av.reaction.delay_s=0.6"),
 }

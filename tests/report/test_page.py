@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,7 +13,7 @@ from junitparser import JUnitXml
 from harness.errors import RunFolderError
 from harness.records.folder import write_sealed
 from harness.report.junit import statement_case, write_junit
-from harness.report.page import uncovered, verdict, write_report
+from harness.report.page import uncovered, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
 from tests.stored_runs import truncate
@@ -79,12 +78,6 @@ def test_a_ratio_that_leads_says_of_what_it_is(reports, tmp_path):
     edit(folder / "estimates.json", answer=answer | {"rows": [row, *answer["rows"]]})
     write_report(folder)
     assert "Crash rate < 0.25 × a competent driver's crashes less, no crash seen" in Page(folder).words
-
-
-def test_a_statement_that_a_vehicle_does_not_keep_to_is_said_so_and_sooner_that_it_is_refuted(runs):
-    ahead = replace(runs["shells"].shells.statements[-1], n_checked=9, n_ahead=1)
-    assert verdict(ahead) == "no longer justified: this vehicle does not keep to it"
-    assert verdict(replace(ahead, refuted=True)) == "refuted by these tests"
 
 
 def test_hostile_texts_are_escaped_and_no_formula(folders, tmp_path):
@@ -174,7 +167,7 @@ def content(**within):
     library = {"name": "library", "refuted": False, **dict.fromkeys(keys, 0), "n_episodes_outside": 9, **within}
     rows = [{"what": "REJECTED", "value": "<above> & beyond\x1b[31m", "interval": "", "remark": ""}]
     answer = {"vehicle": "idm", "tests": "9 tests", "parameters": [], "rows": rows, "warnings": [], "scope": "all"}
-    return {"answer": answer, "headline": "shells", "estimates": {"shells": {"details": {"statements": [library]}}}}
+    return {"answer": answer, "headline": "shells", "estimates": {"shells": {"details": {"within": library}}}}
 
 
 @pytest.mark.parametrize(("code", "kind"), [(0, None), (4, "Error"), (5, "Failure"), (3, "Failure")])

@@ -132,8 +132,7 @@ def test_no_line_runs_through_a_label_and_no_tick_through_the_legend(runs):
 def test_a_long_name_of_a_driver_is_not_cut(runs):
     found, name = runs["shells"].shells, "blind-brakes-2-late-1s"
     shells = [replace(found.shells[0], shell=name), *found.shells[1:]]
-    statements = [replace(each, boundary=name) for each in found.statements]
-    rates = shells_plot(replace(found, shells=shells, statements=statements)).panels[0]
+    rates = shells_plot(replace(found, shells=shells)).panels[0]
     labels = [mark.label for mark in rates.marks if mark.label.startswith("outside")]
     assert labels
     assert min(map(rates.room_before, labels)) > 0.0

@@ -152,7 +152,6 @@ def test_a_margin_that_the_budget_leaves_open(campaign, tmp_path):
             r"--set av\.limits\.max_acceleration_mps2=2.*default",
         ),
         ((*SHELLS, "world.engine=sumo"), "av={sumo: {carFollowModel: ACC}}", "Nothing in the harness limits"),
-        ((*SHELLS, "testing.shells.statement=need-based"), HARDER, "assumption_free or library"),
         ((*SHELLS, "accept.crash_rate_below=1e-7"), HARDER, "a limit of one crash rate"),
         (SHELLS, "av={controller: 'tests.controllers.early:Speeds', before_cut_in: controller}", "cut-ins of its own"),
         (SHELLS, "seed=5", "^seed"),

@@ -120,7 +120,7 @@ def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp
     assert (lost["shell"], lost["n_episodes"], lost["inside"]) == ("failed shadow runs", 0, False)
     assert lost["p"] > 1e-9
     assert shells["ci_high"] > shells["crash_rate"] + lost["p"]
-    assert shells["details"]["statements"][-1]["upper_bound_outside"] > lost["p"]
+    assert shells["details"]["within"]["upper_bound_outside"] > lost["p"]
     assert any("no test in failed shadow runs" in warning for warning in shells["warnings"])
 
 
@@ -176,7 +176,7 @@ def test_a_page_is_written_where_so_few_paths_crashed_that_the_pool_s_error_is_n
     folder = copy_of(stored_run(ACTS), tmp_path / "run")
     content = estimates(folder)["estimates"]
     details = content["shells"]["details"]
-    for part in (details, *details["statements"]):
+    for part in (details, details["within"]):
         part.update(rhw_from_pool=None, rhw_from_pool_at_least=None)
     edit(folder, "estimates.json", estimates=content)
     page = write_report(folder).read_text()

@@ -14,7 +14,6 @@ from harness.errors import RunFolderError
 from harness.runner.resume import Manifest
 from harness.sampling.allocation import GROWTH, Allocation, first_tests
 from harness.sampling.shells import round_requests
-from harness.strata import Statement
 from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import tally as counted
 from tests.in_process import run_here as run_golden
@@ -97,7 +96,7 @@ def test_shells_of_another_pool_or_that_are_none_are_refused(stored_run, tmp_pat
     for act in (lambda: replay(folder, 3), lambda: run_golden(golden("shells-twin"), folder, resume=True)):
         with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
             act()
-    for key, wrong in (("cell_p", [0.1]), ("statements", []), ("strata", {})):
+    for key, wrong in (("cell_p", [0.1]), ("n_inside", 9), ("strata", {})):
         kept = json.loads((folder / "shells.json").read_text())[key]
         edit(folder, "shells.json", **{key: wrong})
         with pytest.raises(RunFolderError, match=r"shells\.json"):
@@ -114,25 +113,22 @@ MANY, NONE, TWELVE = np.full(3, 10_000), np.zeros(3, int), np.full(3, 12)
 
 
 def test_first_tests_go_in_proportion_to_the_probability():
-    """Within limits: at least a few, and no more beyond the narrowest boundary than a start."""
+    """Within limits: at least a few, and no more beyond the boundary than a start."""
     p = np.array([1e-9, 1e-7, 2e-7, 5e-7, 3e-5])
-    statements = Statement("library", "c", "keeps to c", 3), Statement("need", "d", "brakes", 4)
     strata = ("a", "b", "c", "d", "outside")
-    design = replace(DESIGN, strata=strata, cell_stratum=tuple(range(5)), cell_p=p, statements=statements)
+    design = replace(DESIGN, strata=strata, cell_stratum=tuple(range(5)), cell_p=p, boundary="c", n_inside=3)
     assert first_tests(design).tolist() == [3, 12, 12, 12, 12]
-    many = replace(design, cell_p=p * [1, 1, 0.5, 1, 1], statements=statements[1:])
+    many = replace(design, cell_p=p * [1, 1, 0.5, 1, 1], boundary="d", n_inside=4)
     assert first_tests(many).tolist() == [3, 6, 6, 12, 12]
     assert first_tests(design, 40).tolist() == [40] * 5
 
 
-def test_each_boundary_is_passed_when_what_lies_within_is_known():
-    statements = Statement("narrow", "a", "keeps to a", 1), Statement("wide", "b", "keeps to b", 2)
-    rule = Allocation(replace(DESIGN, statements=statements), TWELVE, MANY)
-    assert rule.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [12, 0, 0]
-    assert rule.next_round(tally(np.array([12, 0, 0]), np.array([12, 0, 0]), NONE), 10**6).tolist() == [0, 12, 0]
+def test_the_boundary_is_passed_when_what_lies_within_is_known():
+    rule = Allocation(replace(DESIGN, n_inside=2), TWELVE, MANY)
+    assert rule.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [12, 12, 0]
     tests, crashes = np.array([400, 400, 0]), np.array([400, 200, 0])
     assert rule.next_round(tally(tests, crashes, NONE), 10**6).tolist() == [0, 0, 12]
-    inside = Allocation(rule.design, TWELVE, MANY, "wide")
+    inside = Allocation(rule.design, TWELVE, MANY, "library")
     assert inside.next_round(tally(tests, crashes, NONE), 10**6)[2] == 0
     hopeless = Allocation(DESIGN, TWELVE, MANY).next_round(tally(np.array([96, 96, 0]), NONE, NONE), 10**6)
     assert hopeless.tolist() == [0, 0, 12]

@@ -178,7 +178,7 @@ def test_floating_car_data_hold_the_episodes_motion(engine, request, tmp_path):
 
 
 RETRACED = (
-    *("nde-sumo", "forced-sumo", "step-recursive-sumo", "shells-lateral-sumo", "shells-refuted", "shells-need-based"),
+    *("nde-sumo", "forced-sumo", "step-recursive-sumo", "shells-lateral-sumo", "shells-refuted"),
     *("forced-inattentive", "forced-reference", "nde-lateral", "shells-stops", "shells-controller-sumo"),
 )
 

@@ -177,9 +177,9 @@ def test_counted_tests_say_what_their_records_would(with_references, shadow_runs
 def as_tree(estimate: Estimate) -> dict[str, object]:
     """What it says, but for which tests refuted a statement: those have no numbers where they are counted alone."""
     found = asdict(estimate)
-    for rows in ("statements", "references", "shells"):
-        named = enumerate(found["details"][rows])
-        found["details"][rows] = {k: {key: row[key] for key in row if key != "refuted_by"} for k, row in named}
+    del found["details"]["within"]["refuted_by"]
+    for rows in ("references", "shells"):
+        found["details"][rows] = dict(enumerate(found["details"][rows]))
     return found
 
 

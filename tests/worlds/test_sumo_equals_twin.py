@@ -146,7 +146,6 @@ AVS = {
     "careful_competent": "{model: r157-cc}",
     "fuzzy_safety": "{model: r157-fsm, parameters: {lateral_speed_mps: 1}, reaction: {inattention_probability: 0.5,"
     " inattention_delay_s: 0.9}}",
-    "need_based": "{model: need-based, reaction: {max_jerk_mps3: 12}}",
 }
 LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
 OUTRUNS = "av={model: constant, parameters: {acceleration_mps2: 5}, reaction: {perceives_lateral_m: 0}}"
