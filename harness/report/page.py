@@ -23,9 +23,7 @@ from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_ru
 from harness.traffic.laws import Environment
 from harness.vocabulary import OUTCOMES, RUN_FOLDER
 
-PLOT_NAMES = re.compile(
-    r"(severity|where|shells|sensitivity|convergence|weights|answer|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
-)
+PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")
 
 
 def write_report(folder: str | Path) -> Path:
