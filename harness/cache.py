@@ -7,7 +7,6 @@ that a folder that may only be read is a cache, too, and a user without a home h
 
 from __future__ import annotations
 
-import mmap
 import os
 import stat
 import sys
@@ -20,13 +19,14 @@ from pathlib import Path
 import platformdirs
 
 from harness.errors import OF_THE_DISK, HarnessError
-from harness.files import write_atomically
+from harness.files import checksum, write_atomically
 
 FOLDER = "HARNESS_CACHE_DIR"
 """Environment variable that names the cache; the default is the user's own, if there is a home to have it in."""
 SAID = "HARNESS_CACHE_SAID"
 """Environment variable that keeps a process from saying what another of the same command has said, or will say."""
-_SEAL_BYTES = 4
+_SEAL_BYTES, _SEALED = 4, 0x2144DF1C
+"""The CRC-32 of whatever ends with its own is always this."""
 
 
 def own_folder() -> Path | None:
@@ -73,12 +73,27 @@ def has(name: str) -> bool:
 
 def find(name: str) -> Path | None:
     """A sound file of a name, with its checksum at the end; None if there is none."""
-    return next((path for path in places(name) if _is_sound(path, name)), None)
+    for path in places(name):
+        with suppress(OSError):
+            if checksum(path, zlib.crc32(name.encode())) == _SEALED:
+                return path
+    return None
 
 
 def read(name: str) -> bytes | None:
     """What is kept under a name; None if nothing is, or it is damaged."""
     return None if (path := find(name)) is None else path.read_bytes()[:-_SEAL_BYTES]
+
+
+def keep(name: str, content: bytes | memoryview) -> Path:
+    """Keep a file under a name; returns where."""
+
+    def write(path: Path) -> None:
+        with path.open("wb") as file:
+            file.write(content)
+            file.write(zlib.crc32(content, zlib.crc32(name.encode())).to_bytes(_SEAL_BYTES, "little"))
+
+    return put(name, lambda path: write_atomically(path, write))
 
 
 def put(name: str, write: Callable[[Path], object]) -> Path:
@@ -101,32 +116,3 @@ def put(name: str, write: Callable[[Path], object]) -> Path:
         os.environ[SAID] = "1"
         sys.stderr.write(f"note: what is compiled or built is kept in {spare}, as {why}. Set {FOLDER}.\n")
     return spare / name
-
-
-def keep(name: str, write: Callable[[Path], object]) -> Path:
-    """Let ``write`` fill a file, and keep it under a name; returns where."""
-
-    def sealed(path: Path) -> None:
-        write(path)
-        with path.open("rb+") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            file.seek(0, os.SEEK_END)
-            file.write(zlib.crc32(content, zlib.crc32(name.encode())).to_bytes(_SEAL_BYTES))
-
-    return put(name, lambda path: write_atomically(path, sealed))
-
-
-def keep_bytes(name: str, content: bytes) -> None:
-    """Keep some bytes under a name."""
-    keep(name, lambda path: path.write_bytes(content))
-
-
-def _is_sound(path: Path, name: str) -> bool:
-    with (
-        suppress(OSError, ValueError),  # none, or an empty one
-        path.open("rb") as file,
-        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-        memoryview(content) as view,
-    ):
-        seal = zlib.crc32(view[:-_SEAL_BYTES], zlib.crc32(name.encode()))
-        return seal == int.from_bytes(view[-_SEAL_BYTES:])
-    return False

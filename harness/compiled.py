@@ -100,7 +100,7 @@ class _KernelCache(caching.NullCache):
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep what has been compiled, unless it holds addresses."""
         if not data.library.has_dynamic_globals:
-            cache.keep_bytes(self._name_for(sig, data.codegen), serialize.dumps(data._reduce()))  # type: ignore[no-untyped-call]
+            cache.keep(self._name_for(sig, data.codegen), serialize.dumps(data._reduce()))  # type: ignore[no-untyped-call]
 
     @property
     def is_filled(self) -> bool:

@@ -6,6 +6,7 @@ import fcntl
 import os
 import time
 import uuid
+import zlib
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,7 @@ from harness.errors import writing
 
 _UNFINISHED = ".harness-{}.part"
 """A file that is being written; nobody else's temporary files have such names."""
+_BLOCK_BYTES = 1 << 20
 _ABOUT_TO_BE_S = 60.0
 """Age from which an empty one is no longer about to be locked."""
 
@@ -21,6 +23,14 @@ _ABOUT_TO_BE_S = 60.0
 def real_path(path: Path | str) -> Path:
     """The path without links; of links that lead in a circle as far as it goes, for whoever opens it to complain."""
     return Path(os.path.realpath(path))
+
+
+def checksum(path: Path, crc: int = 0) -> int:
+    """CRC-32 of a file's bytes, and of what had ``crc`` before them."""
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK_BYTES):
+            crc = zlib.crc32(block, crc)
+    return crc
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:

@@ -34,7 +34,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import recv_handle, send_handle
 from pathlib import Path
-from tempfile import NamedTemporaryFile, TemporaryFile
+from tempfile import TemporaryFile
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from weakref import finalize
@@ -137,13 +137,11 @@ class SharedFile:
     """A file without a name, which ends with this object or process, however that ends; children open its ``path``."""
 
     def __init__(self, content: bytes = b"") -> None:
-        # Where there is no /proc it has a name, and is left behind by a process that is killed.
-        has_proc = Path("/proc/self/fd").exists()
-        self._file = TemporaryFile() if has_proc else NamedTemporaryFile(prefix="harness-")  # noqa: SIM115
+        self._file = TemporaryFile()  # noqa: SIM115
         self._file.write(content)
         self._file.flush()
         finalize(self, self._file.close)
-        self.path = Path(f"/proc/{os.getpid()}/fd/{self._file.fileno()}" if has_proc else str(self._file.name))
+        self.path = Path(f"/proc/{os.getpid()}/fd/{self._file.fileno()}")
 
 
 class Printed:
@@ -615,8 +613,7 @@ _CONTROL_GROUPS, _OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 @cache
 def usable_cpus() -> int:
     """CPUs that this process may use: its affinity allows so many, and the quota of its control groups, rounded up."""
-    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.ceil(min([allowed, *_quotas()])))
+    return max(1, math.ceil(min([len(os.sched_getaffinity(0)), *_quotas()])))
 
 
 def _quotas() -> Iterator[float]:

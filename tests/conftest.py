@@ -45,7 +45,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     command = [sys.executable, "-m", "tests.golden.record", "--digits", "1e-9", "--only"]
     compiling = [subprocess.Popen([*command, *names]) for names in TO_COMPILE]
     if not any([process.wait() for process in compiling]):  # noqa: C419 - wait for all
-        cache.keep_bytes(mark, b"done")
+        cache.keep(mark, b"done")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from harness import cache
-from harness.errors import HarnessError
+from harness.errors import HarnessError, writing
 
 NAME, OTHER, CONTENT = "pools/one", "pools/other", bytes(range(256))
 
@@ -50,12 +50,12 @@ def flipped(bit: int):
 )
 def test_a_damaged_file_or_anothers_is_as_good_as_none(folder, damage):
     for name in (NAME, OTHER):
-        cache.keep_bytes(name, CONTENT)
+        cache.keep(name, CONTENT)
     assert cache.read(NAME) == CONTENT
     damage(folder / NAME)
     assert cache.read(NAME) is None
     if (folder / NAME).is_file():
-        cache.keep_bytes(NAME, CONTENT)
+        cache.keep(NAME, CONTENT)
         assert cache.read(NAME) == CONTENT
 
 
@@ -82,7 +82,7 @@ def test_what_cannot_be_kept_in_its_place_is_kept_for_this_user_alone_and_that_i
     assert cache.read(NAME) is None
     assert not spare.exists()
     for name in (NAME, OTHER):
-        assert cache.keep(name, lambda path: path.write_bytes(CONTENT)) == spare / name
+        assert cache.keep(name, CONTENT) == spare / name
     assert (cache.read(NAME), cache.has(OTHER)) == (CONTENT, True)
     assert spare.stat().st_mode & 0o777 == 0o700
     (note,) = capsys.readouterr().err.splitlines()
@@ -91,7 +91,7 @@ def test_what_cannot_be_kept_in_its_place_is_kept_for_this_user_alone_and_that_i
 
 
 def test_a_cache_that_may_only_be_read_is_read_and_what_it_lacks_goes_elsewhere(folder, spare, monkeypatch):
-    cache.keep_bytes(NAME, CONTENT)
+    cache.keep(NAME, CONTENT)
     write = cache.write_atomically
 
     def read_only(path, fill):
@@ -100,17 +100,17 @@ def test_a_cache_that_may_only_be_read_is_read_and_what_it_lacks_goes_elsewhere(
         write(path, fill)
 
     monkeypatch.setattr(cache, "write_atomically", read_only)
-    cache.keep_bytes(OTHER, CONTENT)
+    cache.keep(OTHER, CONTENT)
     assert (cache.read(NAME), cache.find(OTHER)) == (CONTENT, spare / OTHER)
     flipped(100)(folder / NAME)
-    cache.keep_bytes(NAME, CONTENT)
+    cache.keep(NAME, CONTENT)
     assert cache.find(NAME) == spare / NAME
 
 
 @pytest.mark.parametrize("kind", ["link", "open", "file", "foreign"])
 def test_a_folder_that_others_can_write_to_is_neither_read_nor_written(folder, spare, monkeypatch, kind):
     nowhere_writable(folder, monkeypatch)
-    cache.keep_bytes(NAME, CONTENT)
+    cache.keep(NAME, CONTENT)
     if kind == "link":
         spare.rename(spare.with_name("elsewhere"))
         spare.symlink_to("elsewhere")
@@ -125,14 +125,15 @@ def test_a_folder_that_others_can_write_to_is_neither_read_nor_written(folder, s
         spare.rename(spare.with_name(f"harness-{stranger}"))
     assert cache.read(NAME) is None
     with pytest.raises(HarnessError, match="not this user's alone"):
-        cache.keep_bytes(NAME, CONTENT)
+        cache.keep(NAME, CONTENT)
 
 
 def test_a_full_disk_is_no_reason_to_go_elsewhere(spare):
-    def fail(_path):
-        raise OSError(28, "No space left on device")
+    def fail(path):
+        with writing(path):
+            raise OSError(28, "No space left on device")
 
     with pytest.raises(OSError, match="No space left") as raised:
-        cache.keep(NAME, fail)
+        cache.put(NAME, fail)
     assert raised.value.filename.endswith(NAME)
     assert not spare.exists()

@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -61,11 +62,11 @@ def _load(path: Path) -> Tables:
     return Tables(*(stored[name][0] for name in Tables._fields))
 
 
-def _save(path: Path, tables: Tables) -> None:
-    """Write the tables as the fields of one record: one file, in which each lies in one piece."""
+def _content(tables: Tables) -> memoryview:
+    """The tables as the fields of one record: one file, in which each lies in one piece."""
     dtype = [(name, table.dtype, table.shape) for name, table in zip(Tables._fields, tables, strict=True)]
-    with path.open("wb") as file:
-        np.save(file, np.array([tuple(tables)], dtype))
+    np.save(file := BytesIO(), np.array([tuple(tables)], dtype))
+    return file.getbuffer()
 
 
 def build_one(environment: Environment, driver: RecordArray, challenge: str) -> Tables:
@@ -98,4 +99,4 @@ def build_tables(
     with ThreadPoolExecutor(usable_cpus()) as threads:
         parts = list(threads.map(one, range(drivers.size)))
     tables = Tables(*(np.stack(arrays) for arrays in zip(*parts, strict=True)))
-    return _load(cache.keep(name, lambda path: _save(path, tables)))
+    return _load(cache.keep(name, _content(tables)))

@@ -72,7 +72,7 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
     if (cached := cached_pool(resolved, order)) is not None:
         return cached
     pool = build_pool(resolved.environment, resolved.library, resolved.campaign.pool, key, progress, order)
-    cache.keep_bytes(pool_name(key), pool_content(pool))
+    cache.keep(pool_name(key), pool_content(pool))
     return pool
 
 

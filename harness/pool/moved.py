@@ -27,7 +27,6 @@ from harness.vocabulary import STATE_COLUMNS, FloatArray
 N_PATHS = 4096
 FORMAT = 2
 """Raise it when the meaning of what is kept changes."""
-KEPT_EVERY = 20
 MARGIN = 0.05
 """Of the range of a sample of cut-ins, by which another may lie beyond it [assumed]."""
 
@@ -60,8 +59,7 @@ class Moved:
 class FewPaths:
     """Walks the same few paths, aimed by the traffic ``resolved``, in one traffic after the other.
 
-    Strata are those of a ``design`` that was made of the ``pool``. What was found is kept in the cache, and every
-    `KEPT_EVERY` environments while it is being found.
+    Strata are those of a ``design`` that was made of the ``pool``. What was found is kept in the cache.
     """
 
     def __init__(
@@ -83,18 +81,20 @@ class FewPaths:
         self._name = f"moved/{key}"
         kept: dict[str, list[float]] = json.loads(cache.read(self._name) or "{}")
         self._seen = {key: Moved.of(np.array(row), self._n_strata) for key, row in kept.items()}
-        self._n_kept = len(self._seen)
 
     def of(self, environments: Sequence[Environment]) -> Iterator[Moved]:
         """What is found in each."""
-        for environment in environments:
-            if (key := environment_hash(environment)) not in self._seen:
-                self._seen[key] = self._walk(environment)
-                if len(self._seen) - self._n_kept == KEPT_EVERY:
-                    self._keep()
-            yield self._seen[key]
-            self._progress.advance(1)
-        self._keep()
+        n_kept = len(self._seen)
+        try:
+            for environment in environments:
+                if (key := environment_hash(environment)) not in self._seen:
+                    self._seen[key] = self._walk(environment)
+                yield self._seen[key]
+                self._progress.advance(1)
+        finally:
+            if len(self._seen) > n_kept:
+                content = {key: each.numbers.tolist() for key, each in self._seen.items()}
+                cache.keep(self._name, json.dumps(content).encode())
 
     def _walk(self, environment: Environment) -> Moved:
         if self._aimed is None:
@@ -114,12 +114,6 @@ class FewPaths:
         unknown[-1] = False  # no vehicle within the envelope crashes there
         beyond = (by_path * outside).sum(0) @ in_stratum
         return Moved(of_shell @ in_stratum, np.array(rate), beyond, float(of_shell[unknown].sum()))
-
-    def _keep(self) -> None:
-        if len(self._seen) > self._n_kept:
-            content = json.dumps({key: each.numbers.tolist() for key, each in self._seen.items()})
-            cache.keep_bytes(self._name, content.encode())
-            self._n_kept = len(self._seen)
 
 
 def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:

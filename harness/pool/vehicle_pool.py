@@ -79,10 +79,10 @@ class Candidates(BaselinePaths):
         arrays = (values[chosen] for values in (self.index, self.state, self.weight))
         return BaselinePaths(self.key, self.seed, self.order, *arrays)
 
-    def save(self, path: Path) -> None:
-        """Write all of them."""
-        with path.open("wb") as file:
-            np.savez(file, **vars(self))
+    def content(self) -> memoryview:
+        """All of them as a file."""
+        np.savez(file := BytesIO(), **vars(self))
+        return file.getbuffer()
 
 
 def walk_candidates(
@@ -136,7 +136,7 @@ def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None
             candidates = Candidates(key, int(stored["seed"]), **columns)
     else:
         candidates = walk_candidates(resolved.environment, resolved.library, settings, key, progress)
-        cache.keep(name, candidates.save)
+        cache.keep(name, candidates.content())
     return candidates.draw(settings.shadow_paths)
 
 

@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened
-from harness.files import write_atomically
+from harness.files import checksum, write_atomically
 from harness.records.schemas import ShardTables
 
 T = TypeVar("T")
@@ -41,7 +41,6 @@ MEND_SHARD = (
 """All files, because a missing traces file alone is not made again: whether traces are kept may change on --resume."""
 SEAL = "crc32"
 """Key of a JSON file's checksum."""
-_BLOCK_BYTES = 1 << 20
 ROWS_FOR_THREADS = 10_000
 """Of a file below this, handing columns to threads costs more than decoding them (measured: 1.8 against 1.4 ms)."""
 NO_RUN = "Give a folder that `harness run` has written."
@@ -144,15 +143,6 @@ def write_sealed(path: Path, content: Mapping[str, Any]) -> None:
 
 def _seal(values: Mapping[str, Any]) -> int:
     return zlib.crc32(json.dumps(values, ensure_ascii=False).encode())
-
-
-def checksum(path: Path) -> int:
-    """CRC-32 of a file's bytes."""
-    crc = 0
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            crc = zlib.crc32(block, crc)
-    return crc
 
 
 def require_unchanged(path: Path, crc32: int | None, mend: str) -> None:

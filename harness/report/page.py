@@ -24,9 +24,7 @@ from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_ru
 from harness.traffic.laws import Environment
 from harness.vocabulary import OUTCOMES
 
-PLOT_NAMES = re.compile(
-    r"(severity|where|shells|sensitivity|convergence|weights|answer|strata|cut_ins|impact_speed|crash_time|crash-\d+)\.(png|svg)"
-)
+PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")
 
 
 @checked("harness.write_report")

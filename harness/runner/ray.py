@@ -114,7 +114,7 @@ class OnMachine:
 def _fill_cache(files: Files) -> None:
     for name, content in files.items():
         if cache.find(name) is None:
-            cache.keep_bytes(name, ray.get(content).tobytes())
+            cache.keep(name, ray.get(content).data)
 
 
 # -- where the run is --

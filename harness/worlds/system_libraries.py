@@ -14,9 +14,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
-from pathlib import Path
 from typing import NamedTuple
 
 from harness.errors import HarnessError
@@ -77,35 +77,22 @@ def require_libraries() -> None:
 
 
 def _require_version() -> None:
-    """Refuse another version; one that has the right version, but is not the installed package's, is named.
-
-    Python looks for it wherever PYTHONPATH says, and what the installed package's version is says nothing of that.
-    """
-    spec = find_spec("libsumo")
-    if spec is None:
-        raise not_importable("there is none")
-    place = Path(next(iter(spec.submodule_search_locations or [spec.origin or "?"])))
-    try:
+    """Refuse another version, wherever PYTHONPATH finds it; one that is not the installed package's is named."""
+    place = getattr(find_spec("libsumo"), "origin", None)
+    with suppress(PackageNotFoundError):
         package = distribution("libsumo")
-        installed, version = Path(str(package.locate_file("libsumo"))), package.version
-    except PackageNotFoundError:
-        installed, version = None, "unknown"
-    if installed is None or place.resolve() != installed.resolve():
-        version = _version_of_libsumo(place)
-        sys.stderr.write(f"note: libsumo {version} is that of {place}.\n")
-    if version != SUMO_VERSION:
-        mend = f"Take its folder off PYTHONPATH, or {_REINSTALL}."
-        raise HarnessError(f"libsumo in {place}", f"version {version}", f"version {SUMO_VERSION}", mend)
-
-
-def _version_of_libsumo(place: Path) -> str:
-    """As the compiled library tells it."""
+        if (str(package.locate_file("libsumo/__init__.py")), package.version) == (place, SUMO_VERSION):
+            return
     try:
         import libsumo  # noqa: PLC0415 - takes half a second
 
-        return str(libsumo.getVersion()[1]).removeprefix("SUMO ")
+        version = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
     except (ImportError, AttributeError) as error:
         raise not_importable(f"{error}; it is that of {place}") from error
+    if version != SUMO_VERSION:
+        mend = f"Take its folder off PYTHONPATH, or {_REINSTALL}."
+        raise HarnessError(f"libsumo in {place}", f"version {version}", f"version {SUMO_VERSION}", mend)
+    sys.stderr.write(f"note: libsumo {version} is that of {place}.\n")
 
 
 def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:

@@ -38,7 +38,7 @@ def few(monkeypatch):
     """Paths enough for these tests, kept where no other test does; returns what is kept."""
     kept: dict[str, bytes] = {}
     monkeypatch.setattr(moved, "N_PATHS", 512)
-    monkeypatch.setattr(moved, "cache", SimpleNamespace(read=kept.get, keep_bytes=kept.__setitem__))
+    monkeypatch.setattr(moved, "cache", SimpleNamespace(read=kept.get, keep=kept.__setitem__))
     return kept
 
 
@@ -79,7 +79,7 @@ def test_what_was_found_once_is_not_looked_for_again(stored_run, tmp_path, monke
     folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.005, 0.02]})
     first = estimate_in_other_traffic(folder, mine)
     monkeypatch.setattr(moved.FewPaths, "_walk", None)
-    monkeypatch.setattr(moved.cache, "keep_bytes", None)  # a cache may be there to be read alone
+    monkeypatch.setattr(moved.cache, "keep", None)  # a cache may be there to be read alone
     assert estimate_in_other_traffic(folder, mine) == first
 
 

@@ -27,7 +27,7 @@ def few(monkeypatch):
     """Paths enough for these tests, kept where no other test does; returns what is kept."""
     kept: dict[str, bytes] = {}
     monkeypatch.setattr(moved, "N_PATHS", 512)
-    monkeypatch.setattr(moved, "cache", SimpleNamespace(read=kept.get, keep_bytes=kept.__setitem__))
+    monkeypatch.setattr(moved, "cache", SimpleNamespace(read=kept.get, keep=kept.__setitem__))
     return kept
 
 
