@@ -19,12 +19,12 @@ from typing import Any
 
 from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
+from harness.files import checksum
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
     SHELLS,
     Repeated,
-    checksum,
     listed_crc32,
     read_as,
     read_manifest,

@@ -20,7 +20,7 @@ from harness.campaign.files import campaign_of
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import ended_by, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
-from harness.files import remove_unfinished
+from harness.files import checksum, remove_unfinished
 from harness.pool.build import campaign_pool
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
@@ -28,7 +28,6 @@ from harness.records.folder import (
     SHELLS,
     TABLES,
     StoppedBy,
-    checksum,
     parquet,
     shards_on_disk,
     sole_use,
