@@ -29,8 +29,6 @@ SCOPE = "The interval is about sampling error in this environment, not about how
 MENDS: dict[str, str] = {
     "episodes": "stop.episodes was spent; raise it and go on with --resume",
     "pool": "all cut-ins that the pool keeps of a shell were tested",
-    "contradicted": "the vehicle does not do what the statement assumes; ask for testing.shells.statement: "
-    "assumption_free and use a new folder",
     "pool_error": "the pool's own error alone is wider",
 }
 """Why a campaign ended before its precision, and the mend; of a pool it is `pool_remedy`."""
@@ -299,8 +297,6 @@ def conclusion(campaign: Campaign, rule: Rule, n_episodes: int) -> tuple[Stopped
     if look.stopped:
         stopped_by = "accept" if look.decision is not None else "rhw" if look.below is None else "below_reference"
         stopped_by = getattr(rule, "ended", None) or stopped_by
-    elif look.decision is not None and look.decision.is_final:
-        stopped_by = "contradicted"
     elif look.pool_error_above_target:  # whatever else is spent: more of it would not help
         stopped_by = "pool_error"
     elif n_episodes >= budget:

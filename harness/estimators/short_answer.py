@@ -45,7 +45,6 @@ ENDED = {
     "accept": "decision reached",
     "episodes": "budget spent",
     "pool": "every cut-in of the pool was tested",
-    "contradicted": "vehicle does not do what the statement assumes",
     "pool_error": "the pool’s own error is too wide",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
@@ -257,11 +256,7 @@ def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: boo
 
 
 def _within(found: Mapping[str, Any]) -> Row:
-    n, outside = found["n_crashes_outside"], count(found["n_episodes_outside"])
-    what = f"keeping to {LIBRARY_STATEMENT}"
-    if found["refuted"]:
-        return Row("within", what, "does NOT keep to it", "", f"{count(n)} crashes in {outside} beyond it")
-    beyond = f"no crash in {outside} beyond it" if found["n_episodes_outside"] else "nothing tested beyond it"
+    what, beyond = f"keeping to {LIBRARY_STATEMENT}", "nothing tested beyond it"
     if not found["n_crashes"]:
         return Row("within", what, f"< {number(found['ci_high'])}", "", beyond)
     return Row("within", what, number(found["crash_rate"]), interval(found["ci_low"], found["ci_high"]), beyond)
@@ -284,8 +279,6 @@ def _warnings(
     if "where" in given and "times" not in given:
         yield unseen_words(given["where"])
     decision = manifest.get("decision")
-    if decision is not None and decision["contradicted"]:
-        yield f"the vehicle does not do what statement {decision['statement']} assumes: ask without it"
     if decision is not None and not decision.get("driver") and (unseen := no_lower_limit(best, manifest)):
         yield f"no lane change was seen at {unseen[0]}: a limit on the rate rests on that; ask --accept r157-cc"
     worst = best.crash_rate + (0.0 if severity is None else severity.cut_off)

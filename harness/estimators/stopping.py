@@ -82,8 +82,6 @@ class Decision:
     which the rate lies after ``n_episodes`` tests. ``statement`` is the one that decides. ``confidence`` is that the
     crash rate lies on the side which is said, whatever the budget: a campaign is wrong in at most 1 - ``confidence`` of
     cases even where the limit is the rate itself.
-    ``contradicted`` says whether a test has shown that the vehicle does not do what the statement assumes: its upper
-    limit then says nothing, while what crashed, crashed.
     """
 
     limit: float
@@ -91,7 +89,6 @@ class Decision:
     confidence: float
     low: float
     high: float
-    contradicted: bool = False
     n_episodes: int = 0
     driver: str | None = None
 
@@ -100,12 +97,7 @@ class Decision:
         """On which side of the limit the interval lies, if that can be said."""
         if self.low > self.limit:
             return "rejected"
-        return "accepted" if self.high < self.limit and not self.contradicted else "undecided"
-
-    @property
-    def is_final(self) -> bool:
-        """Whether further tests would change nothing."""
-        return self.verdict != "undecided" or self.high < self.limit
+        return "accepted" if self.high < self.limit else "undecided"
 
     @property
     def sentence(self) -> str:
@@ -116,13 +108,7 @@ class Decision:
         if self.verdict == "rejected":
             side = f"above {limit} (lower limit {shown(self.low)})"
         text = f"{self.verdict.upper()}: with confidence {plain(self.confidence)} the crash rate{given} is {side}."
-        if self.verdict == "undecided" and self.contradicted:
-            text = (
-                f"UNDECIDED: whether the crash rate is below {limit} is not known: the vehicle does not do what "
-                f"statement {self.statement} assumes. Ask for testing.shells.statement: {ASSUMPTION_FREE}, and use a "
-                "new folder."
-            )
-        elif self.verdict == "undecided":
+        if self.verdict == "undecided":
             between = f"it may be {shown(self.low)} as well as {shown(self.high)}"
             text = f"UNDECIDED: whether the crash rate{given} is below {limit} is not known; {between}."
         return text
@@ -311,18 +297,17 @@ class RoundRule(Rule):
         n, statement = int(seen.tally.tests.sum()), self._statement
         level = self.level_at(seen.expected(limit, driver, statement), self._confidence)
         ends = seen.limits_of(statement, level)[1:3] if driver is None else seen.beside(driver, statement, level)
-        confidence, contradicted = (1.0 + self._confidence) / 2.0, seen.contradicts(statement)
-        return Decision(limit, statement, confidence, *ends, contradicted, n, driver=driver)
+        return Decision(limit, statement, (1.0 + self._confidence) / 2.0, *ends, n, driver=driver)
 
     def _decided(self, seen: Shells, accept: Accept) -> bool:
         """Look at a limit until it is decided; that answer stays, also while the folder holds further tests."""
         n, found = int(seen.tally.tests.sum()), self.look.decision
-        if found is None or not found.is_final:
+        if found is None or found.verdict == "undecided":
             key, limit, driver = accept.asked
             found, unmet = self._beside(seen, limit, driver), (f"accept.{key} ({limit:g})",)
             rhw = seen.limits_of(self._statement, Level.two_sided(self._confidence)).rhw
             self.look = Look(rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
-        return found.is_final and n >= self._held
+        return found.verdict != "undecided" and n >= self._held
 
 
 class PairRule(Rule):
