@@ -112,8 +112,6 @@ def ended_by(campaign: Campaign, rule: Rule, n_episodes: int) -> StoppedBy:
     if look.stopped:
         reached: StoppedBy = "rhw" if look.below is None else "below_reference"
         return getattr(rule, "ended", None) or ("accept" if look.decision is not None else reached)
-    if look.decision is not None and look.decision.is_final:
-        return "contradicted"
     if look.pool_error_above_target:  # whatever else is spent: more of it would not help
         return "pool_error"
     return "episodes" if n_episodes >= campaign.stop.episodes else "pool"

@@ -328,10 +328,6 @@ class Shells:
         kept = np.array(self._design.available or [math.inf])
         return max(float(np.max(self.tally.tests[kept > 0] * times / kept[kept > 0], initial=1.0)), 1.0)
 
-    def contradicts(self, statement: str) -> bool:
-        """Whether a test crashed beyond the strata that are asked about."""
-        return bool(self.tally.crashes[self._design.n_within(statement) :].any())
-
     def _limits(self, n_strata: int, level: Level) -> RateLimits:
         """Of the first strata; anything is possible where crashes lie on too few paths."""
         if (n_strata, level) not in self._known:

@@ -47,7 +47,6 @@ ENDED = {
     "accept": "decision reached",
     "episodes": "budget spent",
     "pool": "every cut-in of the pool was tested",
-    "contradicted": "vehicle does not do what the statement assumes",
     "pool_error": "the pool’s own error is too wide",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
@@ -292,8 +291,6 @@ def _warnings(
     if "where" in given and "times" not in given:
         yield unseen_words(given["where"])
     decision = manifest.get("decision")
-    if decision is not None and decision["contradicted"]:
-        yield f"the vehicle does not do what statement {decision['statement']} assumes: ask without it"
     if decision is not None and not decision.get("driver") and (unseen := no_lower_limit(best, manifest)):
         yield f"no lane change was seen at {unseen[0]}: a limit on the rate rests on that; ask --accept r157-cc"
     worst = best.crash_rate + (0.0 if severity is None else severity.cut_off)

@@ -76,8 +76,6 @@ class Decision:
     which the rate lies after ``n_episodes`` tests. ``statement`` is the one that decides. ``confidence`` is that the
     crash rate lies on the side which is said, whatever the budget: a campaign is wrong in at most 1 - ``confidence`` of
     cases even where the limit is the rate itself.
-    ``contradicted`` says whether a test has shown that the vehicle does not do what the statement assumes: its upper
-    limit then says nothing, while what crashed, crashed.
     """
 
     limit: float
@@ -85,7 +83,6 @@ class Decision:
     confidence: float
     low: float
     high: float
-    contradicted: bool = False
     n_episodes: int = 0
     driver: str | None = None
 
@@ -94,12 +91,7 @@ class Decision:
         """On which side of the limit the interval lies, if that can be said."""
         if self.low > self.limit:
             return "rejected"
-        return "accepted" if self.high < self.limit and not self.contradicted else "undecided"
-
-    @property
-    def is_final(self) -> bool:
-        """Whether further tests would change nothing."""
-        return self.verdict != "undecided" or self.high < self.limit
+        return "accepted" if self.high < self.limit else "undecided"
 
     def to_json(self) -> dict[str, Any]:
         """All of it; a limit per test also by its key in the campaign."""
@@ -285,18 +277,17 @@ class RoundRule(Rule):
         n, statement = int(seen.tally.tests.sum()), self._statement
         level = self.level_at(seen.expected(limit, driver, statement), self._confidence)
         ends = seen.limits_of(statement, level)[1:3] if driver is None else seen.beside(driver, statement, level)
-        confidence, contradicted = (1.0 + self._confidence) / 2.0, seen.contradicts(statement)
-        return Decision(limit, statement, confidence, *ends, contradicted, n, driver=driver)
+        return Decision(limit, statement, (1.0 + self._confidence) / 2.0, *ends, n, driver=driver)
 
     def _decided(self, seen: Shells, accept: Accept) -> bool:
         """Look at a limit until it is decided; that answer stays, also while the folder holds further tests."""
         n, found = int(seen.tally.tests.sum()), self.look.decision
-        if found is None or not found.is_final:
+        if found is None or found.verdict == "undecided":
             key, limit, driver = accept.asked
             found, unmet = self._beside(seen, limit, driver), (f"accept.{key} ({limit:g})",)
             rhw = seen.limits_of(self._statement, Level.two_sided(self._confidence)).rhw
             self.look = Look(rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
-        return found.is_final and n >= self._held
+        return found.verdict != "undecided" and n >= self._held
 
 
 class PairRule(Rule):

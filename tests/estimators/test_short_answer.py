@@ -79,7 +79,7 @@ def test_a_vehicle_that_is_not_reproducible_and_a_precision_that_was_not_reached
 def test_a_limit_that_is_rejected_or_open(stored_run):
     decision = json.loads(json.dumps(read_manifest(stored_run("shells-accepted"))["decision"]))
     for verdict, value in (("rejected", "above 4 × 10⁻⁷ per test"), ("undecided", "limit 4 × 10⁻⁷ per test")):
-        asked = {**decision, "verdict": verdict, "contradicted": True}
+        asked = {**decision, "verdict": verdict}
         answer = answered(stored_run, decision=asked)
         assert (answer["rows"][0]["what"], answer["rows"][0]["value"]) == (verdict.upper(), value)
         assert len([line for line in lines(answer, 1.0) if not line.startswith("    ")]) <= LINES

@@ -92,14 +92,12 @@ def test_two_looks_in_turn_must_pass_and_what_was_missing_is_remembered(looks, r
 RATES = st.floats(1e-9, 1e-3)
 
 
-@given(limit=RATES, one=RATES, other=RATES, contradicted=st.booleans())
-def test_a_verdict_says_that_the_whole_interval_is_on_one_side(limit, one, other, contradicted):
-    """A statement that tests contradict accepts nothing and still rejects."""
+@given(limit=RATES, one=RATES, other=RATES)
+def test_a_verdict_says_that_the_whole_interval_is_on_one_side(limit, one, other):
     low, high = sorted((one, other))
-    found = Decision(limit, "library", 0.95, low, high, contradicted=contradicted)
+    found = Decision(limit, "library", 0.95, low, high)
     assert (found.verdict == "rejected") == (low > limit)
-    assert (found.verdict == "accepted") == (high < limit and not contradicted)
-    assert found.is_final == (not low <= limit <= high)
+    assert (found.verdict == "accepted") == (high < limit)
 
 
 # -- decisions about a limit that is the truth, where an error rate is defined: both verdicts are wrong there --

@@ -18,7 +18,6 @@ from harness.campaign.drivers import (
     FuzzySafetyParameters,
     FVDMParameters,
     IDMParameters,
-    NeedBasedParameters,
     Reaction,
     Reflexes,
 )
@@ -93,7 +92,6 @@ drivers = st.one_of(
 with_memory = st.one_of(
     st.builds(CarefulCompetentParameters, lateral_speed_mps=st.floats(0.3, 3.0), min_acceleration_mps2=any_braking),
     st.builds(FuzzySafetyParameters, lateral_speed_mps=st.floats(0.3, 3.0), min_acceleration_mps2=any_braking),
-    st.builds(NeedBasedParameters, deceleration_mps2=st.floats(0.5, 9.0), reaction_time_s=st.floats(0.0, 2.0)),
 )
 any_driver = drivers | with_memory
 delays = st.integers(0, 100).map(lambda steps: steps / 10.0)
