@@ -21,13 +21,13 @@ from harness.campaign.files import dump_campaign
 from harness.campaign.sections import Accept
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.estimators.stopping import limit_words
+from harness.files import checksum
 from harness.pool.replay import Retracing
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
     SHELLS,
     Repeated,
-    checksum,
     listed_crc32,
     read_as,
     read_manifest,

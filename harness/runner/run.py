@@ -18,7 +18,7 @@ from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import conclusion, expected_for
 from harness.estimators.stopping import Rule, Verdict
-from harness.files import remove_unfinished
+from harness.files import checksum, remove_unfinished
 from harness.pool.build import campaign_pool
 from harness.pool.replay import Retracing
 from harness.pool.vehicle_pool import BaselinePaths
@@ -27,7 +27,6 @@ from harness.records.folder import (
     SHELLS,
     TABLES,
     StoppedBy,
-    checksum,
     parquet,
     shards_on_disk,
     sole_use,
