@@ -378,7 +378,7 @@ def test_an_fmu_lies_beside_the_panel(load, panel, tmp_path):
     [
         ("  a: {model: idm, parameters: {min_acceleration: -3}}", "avs.a.parameters.min_acceleration", "Did you mean"),
         ("  a: {model: idm}\n  b: {model: fvdm, reaction: {delay_s: 0.25}}", "avs.b.reaction.delay_s", "0.1 s step"),
-        ("  {}", "avs", "at least 1 item"),
+        ("  {}", "avs", "expected one at least"),
     ],
 )
 def test_a_mistake_in_a_panel_names_its_place(panel, entries, where, words):

@@ -141,27 +141,27 @@ def test_damaged_text_loads_or_is_a_clear_error(load, text, draw):
 
 
 SHIPPED = {
-    "overtaking_forced": "b657668f11d62fd0",
-    "overtaking_mixture": "42558e5a3a675239",
-    "overtaking_nade": "b226c47fdc95c0f4",
-    "overtaking_nade_epsilon_0.1": "b1fae5c08f1c001f",
-    "overtaking_nde": "79dc26aa52d82b03",
-    "overtaking_recursive": "7ee985d5fe57ad6f",
-    "overtaking_shells": "933ee8aa23a65ff4",
-    "smoke": "898809eafc50c892",
+    "overtaking_forced": "d9b477868a5a1fc6",
+    "overtaking_mixture": "c2eb6e427cca3adc",
+    "overtaking_nade": "0e703f4f5d31042f",
+    "overtaking_nade_epsilon_0.1": "accc0ed8c78ae519",
+    "overtaking_nde": "fc3545d6478cee32",
+    "overtaking_recursive": "0987054c7065eccf",
+    "overtaking_shells": "13a26e5ad92a97bb",
+    "smoke": "83c743f424310ab6",
 }
-PANEL = "c39c18b777533bf2"
+PANEL = "3d9016982bad7952"
 CHANGED = [
-    (["crash.counts_above_mps=5"], "c56ac63a61b912ed"),
-    (["environment.cut_in_lead_s=0.5"], "28e559244a520b20"),
-    (["testing.shells.smallest_round=8"], "7e99329bdabc7973"),
+    (["crash.counts_above_mps=5"], "b9a0793296b4e085"),
+    (["environment.cut_in_lead_s=0.5"], "ff63b7f56962ec48"),
+    (["testing.shells.smallest_round=8"], "282dae74ee9ed7e6"),
     (["av={controller: 'a:B', parameters: {x: 1}, before_cut_in: controller}"], "4d26ac0bd2021c01"),
-    (["av={controller: 'a:B', warm_up_s: 0}"], "1b092567e1b013d3"),
-    (["av={traci: {command: x}}"], "1b82238e47ccff97"),
-    (["av={sumo: {tau: 1}}"], "d9349d4c947a2cf2"),
-    (["surrogates={}", "accept.crash_rate_below=1e-7"], "3993cb902f1f5bb5"),
-    (["testing.method=forced"], "6491a6656ccb6639"),
-    (["run.shard_size=7", "records.moments=all", "pool.library=ladder-1"], "f7523fbaa7dbb30c"),
+    (["av={controller: 'a:B', warm_up_s: 0}"], "d8aab23f8f6ac5d0"),
+    (["av={traci: {command: x}}"], "f85e9160fd0e259a"),
+    (["av={sumo: {tau: 1}}"], "30bb4389775c6076"),
+    (["surrogates={}", "accept.crash_rate_below=1e-7"], "fc804d9a60e48a02"),
+    (["testing.method=forced"], "6305dd2dfba9fe91"),
+    (["run.shard_size=7", "records.moments=all", "pool.library=ladder-1"], "6becec20ca8471c1"),
 ]
 
 

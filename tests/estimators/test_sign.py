@@ -99,9 +99,9 @@ SAFE = population({"a": 1.0}, {"b": 0.1}, {})
         ("assumption_free", APART[:, [0, 2, 1, 3]], (), {}, "accept", "refuted"),
         ("library", ALIKE, (), {}, "rhw", "open"),
         ("library", ALIKE, (0.0,), {}, "accept", "proven"),
-        ("assumption_free", SAFE, (), {"below_reference": 0.3}, "below_reference", "open"),
-        ("assumption_free", SAFE, (), {"below_reference": 0.3, "episodes": 2_000}, None, "open"),
-        ("library", APART, (None, 0.05), {"below_reference": 3.0}, "rhw", "proven"),
+        ("assumption_free", SAFE, (), {"rhw": 0.3, "below_reference": 0.3}, "below_reference", "open"),
+        ("assumption_free", SAFE, (), {"rhw": 0.3, "below_reference": 0.3, "episodes": 2_000}, None, "open"),
+        ("library", APART, (None, 0.05), {"rhw": 0.3, "below_reference": 3.0}, "rhw", "proven"),
     ],
 )
 def test_what_ends_a_comparison(statement, shares, args, stop, ended, verdict):
