@@ -204,7 +204,7 @@ def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, c
 def test_what_is_loaded_is_loaded_once_a_process_and_shared(tmp_path):
     av = forced(f"av={_of('Learned', note=str(tmp_path / 'note'), braking=[1.0])}").av
     host = build_host(av, n_cells=3, seed=1)
-    assert host.start(*3 * (np.arange(3),)) == {}
+    assert host.start(*3 * (np.arange(3),), np.zeros(3)) == {}
     made = Learned.made[-3:]
     assert (tmp_path / "note").read_text() == "loaded 3\n"
     assert len({id(each.loaded) for each in made}) == 1
