@@ -123,7 +123,7 @@ def test_the_road_is_in_scale(opened, replayed):
     i = step - scene["first"]
     assert place["BV"][0] - place["AV"][0] == pytest.approx((bv["x"][i] - av["x"][i]) * pixels, abs=0.02)
     assert place["LV"][0] - place["AV"][0] == pytest.approx((lv["x"][i] - av["x"][i]) * pixels, abs=0.02)
-    assert place["BV"][1] == place["AV"][1]
+    assert place["BV"][1] - place["LV"][1] == pytest.approx(scene["over"][i] * 3.6 * pixels, abs=0.02)
     assert place["AV"][1] - place["LV"][1] == pytest.approx(3.6 * pixels, abs=0.02)
 
 

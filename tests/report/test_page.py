@@ -104,7 +104,7 @@ def test_a_report_made_again_has_the_same_bytes(reports, tmp_path):
     """Plots of an earlier report go, other files stay."""
     folder = shutil.copytree(reports["weighted"], tmp_path / "run")
     before = contents(folder)
-    for name in ("crash-999999999.svg", "my-notes.svg"):
+    for name in ("shells.svg", "my-notes.svg"):
         (folder / "plots" / name).write_text("left over")
     assert write_report(folder) == folder / "report.html"
     assert contents(folder) == before | {"plots/my-notes.svg": b"left over"}

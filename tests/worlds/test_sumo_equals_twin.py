@@ -148,7 +148,9 @@ AVS = {
     " inattention_delay_s: 0.9}}",
 }
 LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
-OUTRUNS = "av={model: constant, parameters: {acceleration_mps2: 5}, reaction: {perceives_lateral_m: 0}}"
+OUTRUNS = (
+    "av={model: constant, parameters: {acceleration_mps2: 5}, reaction: {perceives_lateral_m: 0}, takes_over: onset}"
+)
 EPISODES = 150
 """Of each driver."""
 HOPELESS = np.array(
