@@ -282,8 +282,8 @@ def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_afte
     assert one["repeated"] == two["repeated"]
     assert len(one["repeated"]["differing"]) == one["repeated"]["n_episodes"] == 10
     assert (one["reproducible"], two["reproducible"]) == (False, False)
-    (told, *_) = json.loads((folders[0] / "estimates.json").read_text())["answer"]["warnings"]
-    assert told.startswith("NOT REPRODUCIBLE: 10 of 10 tests")
+    warnings = json.loads((folders[0] / "estimates.json").read_text())["answer"]["warnings"]
+    assert any(told.startswith("NOT REPRODUCIBLE: 10 of 10 tests") for told in warnings)
     with pytest.raises(CampaignError, match="10 of 10 tests that it repeated itself came out otherwise"):
         replay_episode(folders[0], 3)
     copied = copy_of(folders[0], tmp_path / "copy")
