@@ -195,7 +195,7 @@ class RayWorkers(Workers):
         self._cached = (
             {}
             if address == LOCAL
-            else {name: ray.put(np.frombuffer(cache.read(name) or b"", np.uint8)) for name in names}
+            else {name: ray.put(np.frombuffer(kept, np.uint8)) for name in names if (kept := cache.read(name))}
         )
         self._actor_class = ray.remote(OnMachine).options(
             num_cpus=settings.resources.cpus / n_runs,
