@@ -48,7 +48,7 @@ def flipped(bit: int):
         lambda path: (path.unlink(), path.mkdir()),
     ],
 )
-def test_a_damaged_file_or_anothers_is_as_good_as_none(folder, damage):
+def test_a_damaged_file_or_that_of_another_is_as_good_as_none(folder, damage):
     for name in (NAME, OTHER):
         cache.keep(name, CONTENT)
     assert cache.read(NAME) == CONTENT

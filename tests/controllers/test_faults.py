@@ -167,7 +167,7 @@ REFUSED = [
     (_of("OnlyStepp"), "av.controller", "Did you mean 'OnlyStep'?"),
     (_of("Misbehaving", badd="x"), "av.parameters", "Did you mean 'bad'?"),
     (_of("only_a_function"), "av.parameters", "min_acceleration_mps2"),
-    (_of("Learned", nott="x"), "av.parameters", "Did you mean 'note'?"),
+    (_of("Learned", notes="x"), "av.parameters", "Did you mean 'note'?"),
     (_of("RaisesInClose", pth="x"), "av.parameters", "pth"),
     *(
         (_of("Always", SHORT_MADE, where="constructor", how=how), "av.controller", words)
