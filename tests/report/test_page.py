@@ -163,7 +163,7 @@ def test_what_no_run_has_written_is_named(run_folder, file, damage, said):
 
 
 def content(**within):
-    keys = "crash_rate", "ci_low", "ci_high", "n_crashes", "n_ahead", "n_checked", "n_crashes_outside"
+    keys = "crash_rate", "ci_low", "ci_high", "n_crashes", "n_crashes_outside"
     library = {"name": "library", "refuted": False, **dict.fromkeys(keys, 0), "n_episodes_outside": 9, **within}
     rows = [{"what": "REJECTED", "value": "<above> & beyond\x1b[31m", "interval": "", "remark": ""}]
     answer = {"vehicle": "idm", "tests": "9 tests", "parameters": [], "rows": rows, "warnings": [], "scope": "all"}
