@@ -19,7 +19,7 @@ from scipy.special import ndtr
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.block import Block, block_from_tables
-from harness.importance.functions import mixture_weights
+from harness.families.cut_in.nade.functions import mixture_weights
 from harness.pool.build import campaign_pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve

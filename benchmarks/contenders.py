@@ -19,8 +19,8 @@ import numpy as np
 from benchmarks.one_at_a_time import OverTraci, in_libsumo
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
-from harness.episode import loop
-from harness.episode.loop import Shard
+from harness.loop import loop
+from harness.loop.loop import Shard
 from harness.records.folder import encoded, write_shard
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve

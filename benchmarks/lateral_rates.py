@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from harness.campaign.sections import EnvironmentSettings, PoolSettings
+from harness.families.cut_in.loading import load_environment
 from harness.pool.build import take_aim
 from harness.pool.walk import PILOT_PATHS
 from harness.progress import Progress
-from harness.traffic.loading import load_environment
 from harness.vehicles.library import load_library
 
 LIBRARY = Path(__file__).parent / "lateral_rows.yaml"

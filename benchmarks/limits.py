@@ -22,8 +22,8 @@ from scipy import special
 
 import harness
 from harness.campaign.files import load_campaign
-from harness.traffic.laws import InitialStates
-from harness.traffic.loading import load_environment
+from harness.families.cut_in.laws import InitialStates
+from harness.families.cut_in.loading import load_environment
 
 FAST_MPS = 40.0
 """144 km/h: the end of the speeds that the traffic was fitted to."""

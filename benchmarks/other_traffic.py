@@ -25,6 +25,7 @@ import yaml
 
 from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
+from harness.families.cut_in.loading import load_parameters
 from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths
 from harness.pool.shells import design_shells
@@ -34,7 +35,6 @@ from harness.runner.other_traffic import estimate_in_other_traffic, read_replica
 from harness.runner.run import run_campaign
 from harness.runner.stored_shells import MOST_OFF, Moved, environment_with
 from harness.strata import ShellDesign
-from harness.traffic.loading import load_parameters
 from harness.vehicles.library import SHIPPED_FOLDER as LIBRARIES
 from harness.vocabulary import FloatArray
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 import time
 
 from harness import load_campaign
+from harness.families.cut_in.loading import load_environment
 from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
-from harness.traffic.loading import load_environment
 from harness.vehicles.library import load_library
 
 PATHS = 8192

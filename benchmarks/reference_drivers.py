@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from harness import load_campaign
+from harness.families.cut_in.loading import load_environment
 from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator
 from harness.progress import Progress
-from harness.traffic.loading import load_environment
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray
 

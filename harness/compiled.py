@@ -31,11 +31,10 @@ WORLD_SOURCES = (
     "compiled.py",
     "random_stream.py",
     "vocabulary.py",
-    "traffic/*.py",
     "vehicles/*.py",
     "controllers/protocol.py",
-    "importance/*.py",
-    "episode/*.py",
+    "families/**/*.py",
+    "loop/*.py",
     "pool/walk.py",
     "worlds/twin.py",
 )

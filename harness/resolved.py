@@ -11,8 +11,8 @@ from functools import cached_property
 from harness.campaign.campaign import Campaign, Command, Use, refusal
 from harness.controllers.find import require_controller
 from harness.errors import CampaignError
-from harness.traffic.laws import Environment
-from harness.traffic.loading import load_environment, load_parameters
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.vehicles.drivers import av_records, driver_records
 from harness.vehicles.library import OF_TRAFFIC, Library, load_library
 from harness.vocabulary import RecordArray

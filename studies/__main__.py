@@ -245,7 +245,7 @@ def trajectories(environment: str, file: Path, *, hours: float, seed: int, level
     makes lane changes of the shipped environments about as frequent as on motorways.
     """
     from harness.campaign.sections import EnvironmentSettings  # noqa: PLC0415 - keeps --help fast
-    from harness.traffic.loading import load_environment  # noqa: PLC0415
+    from harness.families.cut_in.loading import load_environment  # noqa: PLC0415
     from studies.trajectories import ALIKE, Differences, simulate, write  # noqa: PLC0415
 
     settings = EnvironmentSettings(parameters=environment, lane_change_level=level)
@@ -341,11 +341,11 @@ def motorway(folder: Path, *, environments: Sequence[str]) -> None:
     `harness fit --mirror`.
     """
     from harness.campaign.sections import EnvironmentSettings  # noqa: PLC0415 - keeps --help fast
+    from harness.families.cut_in.loading import load_environment  # noqa: PLC0415
     from harness.fitting.laws import Traffic  # noqa: PLC0415
     from harness.fitting.observations import Tally, observations  # noqa: PLC0415
     from harness.fitting.table import load_mapping  # noqa: PLC0415
     from harness.records.folder import write_bytes  # noqa: PLC0415
-    from harness.traffic.loading import load_environment  # noqa: PLC0415
     from studies.motorway import figures, installed_rows, page, trajectories_of  # noqa: PLC0415
     from studies.trajectories import write  # noqa: PLC0415
 

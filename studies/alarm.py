@@ -28,11 +28,12 @@ from scipy.special import logsumexp
 
 from harness.campaign.files import load_campaign
 from harness.compiled import compiled_inline, compiled_threads, unboxed
-from harness.episode.path import Trajectory, empty_trajectory, end_in, walk, who_crashes
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, Drawn, block_from_tables
 from harness.estimators.estimate import finite_json
-from harness.importance.functions import mixture_weights
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.nade.functions import mixture_weights
+from harness.families.cut_in.path import Trajectory, empty_trajectory, end_in, walk, who_crashes
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
 from harness.pool.replay import LEAD, PATH_COLUMNS, StoredPaths, leave_stored, recall, stored_paths
@@ -41,7 +42,6 @@ from harness.progress import Progress
 from harness.records.folder import MEND_SHARD, read_manifest
 from harness.records.reader import read_shard
 from harness.resolved import Resolved, resolve
-from harness.traffic.laws import Environment
 from harness.vehicles.drivers import Followers
 from harness.vocabulary import BV_LV_CONTACT, FAILED, PASSED, RUNNING, BoolArray, FloatArray, IntArray
 

@@ -29,6 +29,8 @@ from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import TrajectoryError
 from harness.estimators.traffic import ONE_LAW
+from harness.families.cut_in.loading import evaluate_laws, load_environment, load_parameters
+from harness.families.cut_in.parameters import FIXED, REPLACED, EnvironmentParameters
 from harness.files import write_atomically
 from harness.fitting.fit import fit_traffic
 from harness.fitting.laws import KINDS, TTC_EDGES_S, Traffic
@@ -39,8 +41,6 @@ from harness.pool.build import take_aim
 from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
 from harness.resolved import resolve
-from harness.traffic.loading import evaluate_laws, load_environment, load_parameters
-from harness.traffic.parameters import FIXED, REPLACED, EnvironmentParameters
 from harness.vocabulary import BoolArray, FloatArray, RecordArray
 from studies.trajectories import RECORDING_H, Differences, simulate, write
 

@@ -18,9 +18,9 @@ from scipy.optimize import brentq
 from harness.campaign.files import read_model
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import EnvironmentSettings, Section
+from harness.families.cut_in.laws import Environment, InitialStates
+from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.pool.walk import write_script
-from harness.traffic.laws import Environment, InitialStates
-from harness.traffic.loading import evaluate_laws, load_environment
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, BV, LV, FloatArray
 

@@ -22,11 +22,11 @@ import pandas as pd
 from scipy.ndimage import gaussian_filter1d
 
 from harness.compiled import compiled_threads, unboxed
+from harness.families.cut_in import laws
+from harness.families.cut_in.lateral import draw_lead
+from harness.families.cut_in.laws import AccelerationLaw, Environment, InitialStates
 from harness.files import write_atomically
 from harness.random_stream import BV_DRAWS, CUT_IN, LV_DRAWS, uniform
-from harness.traffic import laws
-from harness.traffic.lateral import draw_lead
-from harness.traffic.laws import AccelerationLaw, Environment, InitialStates
 from harness.vehicles.kinematics import STEP_S, next_position, next_speed
 from harness.vocabulary import FloatArray, IntArray, RecordArray, State
 

@@ -31,7 +31,7 @@ from harness.files import real_path
 
 Model = TypeVar("Model", bound=BaseModel)
 
-SHIPPED_PARAMETERS = Path(__file__).parents[1] / "traffic"
+SHIPPED_PARAMETERS = Path(__file__).parents[1] / "families" / "cut_in"
 
 
 SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"

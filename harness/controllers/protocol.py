@@ -39,7 +39,7 @@ class EpisodeStart:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a per-vehicle controller sees before a step; filled by `harness.episode.drive.observe`.
+    """What a per-vehicle controller sees before a step; filled by `harness.loop.drive.observe`.
 
     Attributes
     ----------

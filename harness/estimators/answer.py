@@ -17,7 +17,7 @@ from harness.estimators.severity import Severity
 from harness.estimators.short_answer import ShortAnswer, assumed_times, short_answer
 from harness.estimators.stopping import RoundRule, Rule
 from harness.estimators.traffic import TrafficError
-from harness.importance.functions import importance_names
+from harness.families.cut_in.nade.functions import importance_names
 from harness.numbers import two_digits_up
 from harness.records.folder import StoppedBy
 from harness.vocabulary import ESTIMATORS, EstimatorName

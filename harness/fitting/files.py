@@ -15,6 +15,7 @@ import yaml
 from harness.campaign.files import read_model
 from harness.campaign.yaml_text import yaml_text
 from harness.errors import HarnessError, printable
+from harness.families.cut_in.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
 from harness.fitting.fit import Fit, fit_traffic
 from harness.fitting.laws import Traffic
 from harness.fitting.observations import Observations, Tally, observations, require_distinct, require_enough
@@ -25,7 +26,6 @@ from harness.fitting.tracks import FitRange
 from harness.fitting.uncertainty import REPLICATES, replicates
 from harness.progress import Progress
 from harness.records.folder import parquet, require_place, write_together
-from harness.traffic.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
 
 OF_YAML, OF_PAGE = b"Traffic fitted by harness", b"Traffic fitted to trajectories"
 """What marks files that a fit has written."""

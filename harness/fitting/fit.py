@@ -11,6 +11,8 @@ import numpy as np
 from harness.campaign.files import Places, validated
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
+from harness.families.cut_in.loading import load_environment, require_sound_laws
+from harness.families.cut_in.parameters import REPLACED, EnvironmentParameters
 from harness.fitting.laws import (
     FREE_TTC_S,
     TTC_EDGES_S,
@@ -29,8 +31,6 @@ from harness.fitting.laws import (
     hazard_design,
 )
 from harness.progress import Progress
-from harness.traffic.loading import load_environment, require_sound_laws
-from harness.traffic.parameters import REPLACED, EnvironmentParameters
 from harness.vocabulary import FloatArray
 
 HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)

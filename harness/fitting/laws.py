@@ -19,9 +19,9 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, sparse, special
 
+from harness.families.cut_in.parameters import SMALLEST_SHARE
 from harness.fitting.maximum import Maximum, Prior, maximise
 from harness.fitting.observations import AT_RISK, FOLLOWING, FREE, INITIAL, LEADS, Observations
-from harness.traffic.parameters import SMALLEST_SHARE
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, BoolArray, FloatArray, IntArray, RecordArray
 
@@ -340,7 +340,7 @@ def follows(rows: RecordArray, base: Base) -> tuple[RecordArray, FloatArray, Flo
 
 
 def guard_caps(r1: FloatArray, r1dot: FloatArray, base: Base) -> IntArray:
-    """Index of the largest acceleration that the guard allows (`harness.traffic.laws.guard_cap`)."""
+    """Index of the largest acceleration that the guard allows (`harness.families.cut_in.laws.guard_cap`)."""
     h, own = base["guard__horizon_s"], base["guard__own_braking_mps2"]
     cap = np.full(r1.size, -1)
     for acceleration in ACCELERATIONS_MPS2:
@@ -403,7 +403,7 @@ def fit_hazard(traffic: Traffic) -> tuple[FittedLaw, Knots] | None:
     knots = first, second, third
 
     def log_likelihood(rows: RecordArray, eta: FloatArray) -> FloatArray:
-        # Decided once a second (`harness.traffic.laws`); beyond a chance of 1/2 straight on, as a bend has no maximum.
+        # Decided once a second (`cut_in.laws`); beyond a chance of 1/2 straight on, as a bend has no maximum.
         rate = -np.log1p(-np.minimum(np.exp(eta), 0.5)) + np.maximum(eta + math.log(2.0), 0.0)
         return np.asarray(np.where(rows["changes"], np.log(rate), 0.0) - rate * rows["duration_s"])
 

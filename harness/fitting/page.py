@@ -15,15 +15,15 @@ from harness.campaign.files import read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import printable
 from harness.estimators.limits import garwood
+from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
+from harness.families.cut_in.loading import evaluate_laws, load_environment
+from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.fitting.fit import Fit
 from harness.fitting.laws import HAZARD_OF, TTC_EDGES_S, bins
 from harness.fitting.observations import Tally
 from harness.numbers import number
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.player import templates
-from harness.traffic.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
-from harness.traffic.loading import evaluate_laws, load_environment
-from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, IntArray, RecordArray
 
 CONFIDENCE = 0.9

@@ -12,10 +12,10 @@ import numpy as np
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
+from harness.families.cut_in.loading import load_environment, require_sound_laws
 from harness.fitting.fit import Fit
 from harness.fitting.laws import TTC_EDGES_S
 from harness.progress import Progress
-from harness.traffic.loading import load_environment, require_sound_laws
 from harness.vocabulary import FloatArray
 
 REPLICATES = 200

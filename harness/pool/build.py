@@ -13,13 +13,13 @@ import numpy as np
 from harness import cache
 from harness.campaign.sections import PoolSettings
 from harness.compiled import WORLD_SOURCES, source_hash
+from harness.families.cut_in.laws import Environment
 from harness.pool.cut_ins import FORMAT, CutIns, Pool, environment_hash, pool_content, pool_from
 from harness.pool.shells import cells_of, conservative_first, shells_of
 from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator, write_script
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.resolved import Resolved
-from harness.traffic.laws import Environment
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 

@@ -15,10 +15,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from harness.families.cut_in.laws import Environment
 from harness.pool.walk import PILOT_PATHS
 from harness.records.folder import parquet
 from harness.records.schemas import prefixes, rows
-from harness.traffic.laws import Environment
 from harness.vehicles.library import Library
 from harness.vocabulary import (
     STATE_COLUMNS,

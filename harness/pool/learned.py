@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads, unboxed
-from harness.episode.path import SAFE_M, Trajectory, empty_trajectory, leave, walk
+from harness.families.cut_in.lateral import draw_lead, onset_of
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.path import SAFE_M, Trajectory, empty_trajectory, leave, walk
 from harness.pool.walk import FREE_DRAWS_PER_CUT_IN, BaselineRuns
-from harness.traffic.lateral import draw_lead, onset_of
-from harness.traffic.laws import Environment
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, next_position, next_speed, overlaps
 from harness.vocabulary import BV, BoolArray, FloatArray, IntArray, RecordArray
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from harness import cache
+from harness.families.cut_in.laws import Environment
 from harness.pool.build import take_aim
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.shells import shells_in_strata, shells_of
@@ -21,7 +22,6 @@ from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
 from harness.resolved import Resolved
 from harness.strata import ShellDesign
-from harness.traffic.laws import Environment
 from harness.vocabulary import STATE_COLUMNS, FloatArray
 
 N_PATHS = 4096

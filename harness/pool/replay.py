@@ -13,7 +13,9 @@ import numpy as np
 import pyarrow as pa
 
 from harness.compiled import compiled_inline, compiled_threads
-from harness.episode.path import (
+from harness.families.cut_in.lateral import onset_of
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.path import (
     NO_CRASH,
     Trajectory,
     follow,
@@ -23,8 +25,6 @@ from harness.episode.path import (
 )
 from harness.pool.cut_ins import padded
 from harness.pool.walk import Script
-from harness.traffic.lateral import onset_of
-from harness.traffic.laws import Environment
 from harness.vocabulary import (
     AV,
     CUT_IN,

@@ -18,7 +18,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.episode.cells import PrescribedCutIns, PrescribedTraffic
+from harness.loop.cells import PrescribedCutIns, PrescribedTraffic
 from harness.pool.cut_ins import Pool
 from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign
 from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray

@@ -22,8 +22,9 @@ import numpy as np
 
 from harness import cache
 from harness.campaign.sections import PoolSettings
-from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
+from harness.families.cut_in.laws import Environment
+from harness.loop.judge import motion_hashes
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.cut_ins import Pool
 from harness.pool.learned import Learned, learned_crashes
@@ -33,7 +34,6 @@ from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.resolved import Resolved
 from harness.strata import LEARNED
-from harness.traffic.laws import Environment
 from harness.vehicles.library import Library
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 

@@ -25,13 +25,13 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads, unboxed
-from harness.episode.path import Trajectory, empty_trajectory, leave, state_of, walk, weigh_cut_ins, who_crashes
+from harness.families.cut_in import laws
+from harness.families.cut_in.lateral import draw_lead
+from harness.families.cut_in.laws import Environment, InitialStates
+from harness.families.cut_in.path import Trajectory, empty_trajectory, leave, state_of, walk, weigh_cut_ins, who_crashes
 from harness.processes import made_ahead
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, INITIAL, LV_DRAWS, uniform, uniforms
-from harness.traffic import laws
-from harness.traffic.lateral import draw_lead
-from harness.traffic.laws import Environment, InitialStates
 from harness.vehicles.drivers import Followers
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
 from harness.vocabulary import AV, CUT_IN, LV, STATE_COLUMNS, BoolArray, FloatArray, Int8Array, IntArray, RecordArray

@@ -21,6 +21,8 @@ from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.processes import made_ahead
 from harness.records.folder import (
     CAMPAIGN,
@@ -36,8 +38,6 @@ from harness.records.folder import (
     read_manifest,
     require_unchanged,
 )
-from harness.traffic.laws import Environment
-from harness.traffic.loading import load_environment, load_parameters
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """The tables that a run leaves: Arrow schemas with units and meanings in the field metadata, and a shard's rows.
 
 Importance functions are in the order of `importance_names`: for the episode mixture the defensive ``forced`` cut-in
-first, then the surrogates; for the others the surrogates alone. Values are from `harness.episode.judge.end_episode`.
+first, then the surrogates; for the others the surrogates alone. Values are from `harness.loop.judge.end_episode`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.episode.loop import Shard
+from harness.loop.loop import Shard
 from harness.vocabulary import (
     AV,
     BV,

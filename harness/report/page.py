@@ -13,6 +13,7 @@ from harness.campaign.files import dump_campaign
 from harness.errors import printable
 from harness.estimators.shells import Within
 from harness.estimators.traffic import Sensitivity
+from harness.families.cut_in.laws import Environment
 from harness.numbers import count, leaves, number
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.records.reader import table_sizes, traffic_of
@@ -21,7 +22,6 @@ from harness.report.drawing import Plot
 from harness.report.player import templates
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
-from harness.traffic.laws import Environment
 from harness.vocabulary import OUTCOMES
 
 PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")

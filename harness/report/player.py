@@ -21,14 +21,14 @@ from markupsafe import Markup
 
 from harness.campaign.campaign import Campaign
 from harness.compiled import unboxed
-from harness.episode.path import Trajectory, empty_trajectory
 from harness.errors import printable
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.path import Trajectory, empty_trajectory
 from harness.numbers import tenths
 from harness.pool.cut_ins import onset_steps
 from harness.pool.replay import drive_others, stored_paths
 from harness.records.folder import write_bytes
 from harness.report.summary import floats
-from harness.traffic.laws import Environment
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import LibraryDriver, library_records
 from harness.vocabulary import VEHICLES, FloatArray, IntArray

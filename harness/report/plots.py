@@ -7,16 +7,16 @@ import math
 import numpy as np
 
 from harness.compiled import unboxed
-from harness.episode.path import empty_trajectory
 from harness.estimators.answer import Estimates
 from harness.estimators.traffic import Sensitivity
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.path import empty_trajectory
 from harness.numbers import count, number, plain, share
 from harness.pool.replay import StoredPaths, drive_others
 from harness.pool.walk import Script
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.player import OTHERS
 from harness.report.summary import RunSummary, ShownShells
-from harness.traffic.laws import Environment
 from harness.vehicles.library import library_records
 from harness.vocabulary import CRASH, CUT_IN, FAILED, FloatArray, IntArray, states_from
 

@@ -18,9 +18,9 @@ import numpy as np
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.clock import Clock
 from harness.controllers.find import build_host, has_foreign_code, run_apart
-from harness.episode.cells import PrescribedTraffic
-from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy, Shard, hash_of_index
 from harness.errors import HarnessError
+from harness.loop.cells import PrescribedTraffic
+from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy, Shard, hash_of_index
 from harness.records.folder import Repeated
 from harness.sampling.protocol import Source
 from harness.vocabulary import FAILED, RecordArray

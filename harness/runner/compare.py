@@ -28,6 +28,7 @@ from harness.estimators.answer import ended_by
 from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
 from harness.estimators.short_answer import unseen_words
 from harness.estimators.stopping import PairRule
+from harness.families.cut_in.loading import load_parameters
 from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
@@ -40,7 +41,6 @@ from harness.runner.run import Run
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import PairRounds, Shells, round_requests
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
-from harness.traffic.loading import load_parameters
 from harness.vocabulary import COMPARISON
 
 SIDES = ("a", "b")

@@ -21,10 +21,10 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.find import build_host, has_foreign_code, run_apart
 from harness.controllers.hosts import ControllerHost, Failures
 from harness.controllers.protocol import BatchObservation
-from harness.episode.cells import drawn_traffic
-from harness.episode.loop import EpisodeLoop, Shard
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
+from harness.loop.cells import drawn_traffic
+from harness.loop.loop import EpisodeLoop, Shard
 from harness.resolved import require_world, resolve
 from harness.runner.again import Bits, Tests, bits_of, run_elsewhere
 from harness.sampling import prepare

@@ -24,6 +24,15 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
 from harness.estimators.short_answer import CARRIES
 from harness.estimators.traffic import ONE_LAW, TrafficError, Unseen, is_open, rows, too_few, uncertain
+from harness.families.cut_in.loading import load_parameters
+from harness.families.cut_in.parameters import (
+    OF_REPLICATES,
+    SHIPPED_FOLDER,
+    SMALLEST_SHARE,
+    AcceptanceSteps,
+    EnvironmentParameters,
+    content_hash,
+)
 from harness.numbers import number, share
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.moved import FewPaths
@@ -45,15 +54,6 @@ from harness.runner.stored_shells import (
 )
 from harness.sampling import distance_per_test_m
 from harness.strata import ShellDesign
-from harness.traffic.loading import load_parameters
-from harness.traffic.parameters import (
-    OF_REPLICATES,
-    SHIPPED_FOLDER,
-    SMALLEST_SHARE,
-    AcceptanceSteps,
-    EnvironmentParameters,
-    content_hash,
-)
 from harness.vocabulary import EstimatorName, FloatArray
 
 NOT_LOOKING = "cut_in__ignore_share"

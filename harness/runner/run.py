@@ -20,6 +20,7 @@ from harness.campaign.files import campaign_of
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import ended_by, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
+from harness.families.cut_in.loading import load_parameters
 from harness.files import checksum, remove_unfinished
 from harness.pool.build import campaign_pool
 from harness.pool.vehicle_pool import BaselinePaths
@@ -53,7 +54,6 @@ from harness.sampling import distance_per_test_m, prepare
 from harness.sampling.baseline import IN_MANIFEST, baseline_file, begin, stored_baseline
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
-from harness.traffic.loading import load_parameters
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
 ESTIMATES = "estimates.json"

@@ -21,12 +21,12 @@ from harness.arguments import checked
 from harness.errors import CampaignError
 from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
+from harness.families.cut_in.loading import load_parameters
+from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
 from harness.runner.other_traffic import as_if_unseen, read_replicates
 from harness.runner.stored_shells import Moved, Nearby, StoredShells, environment_with, nearby, require_shares
-from harness.traffic.loading import load_parameters
-from harness.traffic.parameters import EnvironmentParameters
 
 BLOCKS = {
     "initial state": ("initial_state",),

@@ -19,6 +19,7 @@ from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block
 from harness.estimators.one_pass import SPACING
+from harness.families.cut_in.laws import Environment
 from harness.processes import made_ahead
 from harness.records.folder import CAMPAIGN, concatenated, no_episodes, read_kept, read_manifest
 from harness.records.origin import require_trust
@@ -29,7 +30,6 @@ from harness.runner.resume import cpu_name, require_same_pool, versions
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
 from harness.sampling.protocol import block_of
-from harness.traffic.laws import Environment
 from harness.vocabulary import ESTIMATORS, EstimatorName
 from harness.worlds import build_world
 from harness.worlds.system_libraries import require_libraries

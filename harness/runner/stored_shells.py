@@ -23,6 +23,9 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.shells import Shells as SeenShells
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.loading import load_environment, require_sound_laws
+from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.numbers import share
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool, environment_hash
@@ -35,9 +38,6 @@ from harness.resolved import Resolved, resolve
 from harness.runner.stored import stored_blocks
 from harness.sampling.shells import Shells
 from harness.strata import ShellDesign
-from harness.traffic.laws import Environment
-from harness.traffic.loading import load_environment, require_sound_laws
-from harness.traffic.parameters import EnvironmentParameters
 from harness.vocabulary import FloatArray
 
 MOST_BEYOND = 0.01

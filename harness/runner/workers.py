@@ -23,9 +23,9 @@ import pyarrow as pa
 from scipy.special import bdtrc
 
 from harness.controllers.hosts import Death, death_cause
-from harness.episode.loop import EpisodeLoop
 from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
+from harness.loop.loop import EpisodeLoop
 from harness.processes import (
     CLOSED_PIPE_EXIT_CODE,
     OF_EPISODE,

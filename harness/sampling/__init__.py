@@ -2,8 +2,8 @@
 
 Where the cut-in of a test is drawn, and its weight made:
 
-- `nde`, `forced` and the mixtures: step by step in the loop, by `harness.episode.decide` (forced: its step, before the
-  test), the weight by `harness.episode.likelihood_ratio`; of vehicles that act before the cut-in by `forced`;
+- `nde`, `forced` and the mixtures: step by step in the loop, by `decide` of `harness.families.cut_in.nade` (forced: its
+  step, before the test), the weight by its `likelihood_ratio`; of vehicles that act before the cut-in by `forced`;
 - `shells`: from the pool, by `harness.pool.shells.PrescribedEpisodes`, which also has the weight, log p_s; how many
   from which shell says `allocation`.
 
@@ -19,16 +19,16 @@ from concurrent.futures import ThreadPoolExecutor
 
 from harness.campaign.campaign import Campaign
 from harness.compiled import is_cached, unboxed
-from harness.episode.judge import judge
-from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
-from harness.episode.path import empty_trajectory, mean_test_distance
-from harness.importance.functions import build_importance
+from harness.families.cut_in.laws import Environment, InitialStates
+from harness.families.cut_in.nade.functions import build_importance
+from harness.families.cut_in.path import empty_trajectory, mean_test_distance
+from harness.loop.judge import judge
+from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.progress import Progress
 from harness.resolved import Resolved
 from harness.sampling.forced import Forced
 from harness.sampling.protocol import Source
 from harness.sampling.shells import Shells
-from harness.traffic.laws import Environment, InitialStates
 from harness.vocabulary import Method
 
 _SOURCES: Mapping[Method, type[Source]] = {"forced": Forced, "shells": Shells}

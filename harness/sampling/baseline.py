@@ -19,9 +19,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from harness.episode.cells import PrescribedTraffic, drawn_traffic
-from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import RunFolderError
+from harness.families.cut_in.laws import Environment
+from harness.loop.cells import PrescribedTraffic, drawn_traffic
+from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.pool.cut_ins import padded
 from harness.pool.learned import Following, Learned, learn
 from harness.pool.vehicle_pool import BaselinePaths
@@ -29,7 +30,6 @@ from harness.pool.walk import BaselineRuns, write_script
 from harness.records.folder import parquet, read_table
 from harness.records.schemas import baseline_table, pilot_table
 from harness.sampling.protocol import ShardRequest, Source
-from harness.traffic.laws import Environment
 from harness.vocabulary import AV, FAILED, IntArray, RecordArray
 
 SHADOW = "shadow"

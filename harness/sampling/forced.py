@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.episode.cells import PrescribedTraffic
-from harness.episode.decide import CUT_IN_DRAW
-from harness.episode.judge import motion_hashes
-from harness.episode.loop import EpisodeLoop, Shard
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.nade.decide import CUT_IN_DRAW
+from harness.loop.cells import PrescribedTraffic
+from harness.loop.judge import motion_hashes
+from harness.loop.loop import EpisodeLoop, Shard
 from harness.pool.cut_ins import onset_steps
 from harness.pool.walk import enumerate_cut_ins, write_script
 from harness.random_stream import CUT_IN, uniforms
 from harness.sampling.baseline import recorded, without_cut_in
 from harness.sampling.protocol import ShardRequest, Source
-from harness.traffic.laws import Environment
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import RecordArray
 

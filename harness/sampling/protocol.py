@@ -18,13 +18,14 @@ import pyarrow as pa
 from harness.campaign.campaign import Campaign
 from harness.controllers.find import build_host
 from harness.controllers.hosts import Death
-from harness.episode.cells import PrescribedTraffic
-from harness.episode.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import Rule, StopRule
-from harness.importance.functions import build_importance, mixture_weights
-from harness.importance.tables import Tables, build_tables, tables_name
+from harness.families.cut_in.laws import InitialStates
+from harness.families.cut_in.nade.functions import build_importance, mixture_weights
+from harness.families.cut_in.nade.tables import Tables, build_tables, tables_name
+from harness.loop.cells import PrescribedTraffic
+from harness.loop.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.pool.learned import Learned
 from harness.pool.shells import Draw
 from harness.pool.vehicle_pool import BaselinePaths
@@ -32,7 +33,6 @@ from harness.pool.walk import BaselineRuns
 from harness.progress import Progress
 from harness.resolved import Resolved
 from harness.strata import ShellDesign
-from harness.traffic.laws import InitialStates
 from harness.vocabulary import RecordArray
 from harness.worlds import World
 

@@ -18,14 +18,14 @@ import numpy as np
 import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
-from harness.episode.cells import PrescribedTraffic
-from harness.episode.loop import EpisodeLoop, Shard
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts
 from harness.estimators.shells import Shells as SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
+from harness.loop.cells import PrescribedTraffic
+from harness.loop.loop import EpisodeLoop, Shard
 from harness.numbers import plain
 from harness.pool.build import campaign_pool, campaign_pool_key, pool_name
 from harness.pool.cut_ins import Pool

@@ -24,10 +24,10 @@ from harness.campaign.drivers import default_surrogates
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.block import MAX_CONTROL_STEPS, Block, Drawn
-from harness.importance.challenge import roll_out
-from harness.importance.grid import GridPoints
-from harness.traffic.laws import Environment
-from harness.traffic.loading import evaluate_laws, load_environment
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.loading import evaluate_laws, load_environment
+from harness.families.cut_in.nade.challenge import roll_out
+from harness.families.cut_in.nade.grid import GridPoints
 from harness.vehicles.drivers import av_records, driver_records
 from harness.vehicles.kinematics import CONTACT_M, STEP_S
 from harness.vocabulary import (
@@ -170,7 +170,7 @@ def small_world(level: float, *, nodes: int = NODES) -> SmallWorld:
 
 
 def _cut_in(speed: FloatArray, r1: FloatArray, r2: FloatArray, environment: Environment) -> FloatArray:
-    """Probability to cut in within the step, as `harness.traffic.laws.cut_in_hazard` gives it."""
+    """Probability to cut in within the step, as `harness.families.cut_in.laws.cut_in_hazard` gives it."""
     n = environment.numbers
     _, chance, accepted = _laws(speed, r1, np.column_stack([r2, speed - AV_MPS]), environment)
     p_1s = np.minimum(chance * accepted, float(n["cut_in__max_probability_1s"]))

@@ -15,7 +15,7 @@ from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import Positive, Section, Whole
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError
-from harness.traffic.loading import load_environment
+from harness.families.cut_in.loading import load_environment
 from harness.vehicles.library import OF_TRAFFIC
 from harness.vocabulary import SAMPLING, EstimatorName
 from studies.chains.chain import CHAINS

@@ -25,11 +25,12 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.find import build_host
-from harness.episode.cells import PrescribedTraffic
-from harness.episode.judge import motion_hashes
-from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.errors import CampaignError, HarnessError
-from harness.importance.functions import build_importance
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.nade.functions import build_importance
+from harness.loop.cells import PrescribedTraffic
+from harness.loop.judge import motion_hashes
+from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.pool.cut_ins import onset_steps
 from harness.pool.learned import Learned, learned_crashes
 from harness.pool.shells import CANDIDATES, PrescribedEpisodes, acceleration_limit
@@ -39,7 +40,6 @@ from harness.progress import Progress
 from harness.records.schemas import pilot_table
 from harness.resolved import Resolved, resolve
 from harness.sampling.baseline import ALL_MOTION, learned_from, recorded, without_cut_in
-from harness.traffic.laws import Environment
 from harness.vehicles.drivers import Followers, av_records
 from harness.vehicles.library import Library
 from harness.vocabulary import CRASH, BoolArray, FloatArray, IntArray, RecordArray

@@ -10,10 +10,10 @@ from itertools import product
 from typing import Any
 
 from harness.campaign.campaign import Campaign
+from harness.families.cut_in.loading import load_environment
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.strata import LIBRARY_STATEMENT
-from harness.traffic.loading import load_environment
 from harness.vehicles.library import Library, load_library
 from studies.chains.chain import CHAINS, Chain
 from studies.chains.shells import ChainShells

@@ -10,10 +10,10 @@ from itertools import pairwise, product
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.episode.loop import EpisodeLoop
 from harness.estimators.block import Block
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import StopRule
+from harness.loop.loop import EpisodeLoop
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
 from harness.sampling import prepare

@@ -24,7 +24,7 @@ from harness.campaign.files import (
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT, CampaignError
-from harness.traffic.parameters import EnvironmentParameters
+from harness.families.cut_in.parameters import EnvironmentParameters
 
 
 @pytest.fixture

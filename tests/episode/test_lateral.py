@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from harness.episode.cells import drawn_traffic
-from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
-from harness.importance.functions import build_importance
+from harness.families.cut_in.nade.functions import build_importance
+from harness.loop.cells import drawn_traffic
+from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.vocabulary import AV, CRASH, CUT_IN, PASSED, STATE_DTYPE

@@ -9,7 +9,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import FVDMParameters, IDMParameters, Reaction, Surrogate
 from harness.campaign.sections import EnvironmentSettings, Records, Testing
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.episode.loop import Shard
+from harness.loop.loop import Shard
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.sampling.protocol import Source

@@ -6,7 +6,7 @@ import pytest
 
 from harness.errors import RunFolderError
 from harness.estimators.block import block_from_tables
-from harness.importance.functions import mixture_weights
+from harness.families.cut_in.nade.functions import mixture_weights
 from harness.vocabulary import OUTCOMES
 from tests.stored_runs import golden, stored_table
 

@@ -10,11 +10,11 @@ import pytest
 
 import harness
 from harness.compiled import unboxed
-from harness.episode.path import empty_trajectory
 from harness.estimators.block import Block, Drawn, joined
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import SPEEDS_MPS, Impacts
 from harness.estimators.shells import Shells as SeenShells
+from harness.families.cut_in.path import empty_trajectory
 from harness.pool.build import campaign_pool
 from harness.pool.replay import StoredPaths
 from harness.pool.walk import Script

@@ -11,12 +11,12 @@ import pytest
 from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.errors import HarnessError, TrajectoryError
+from harness.families.cut_in.loading import load_parameters
 from harness.fitting import fit
 from harness.fitting.files import fit_files
 from harness.fitting.laws import FREE_TTC_S, FittedLaw
 from harness.fitting.maximum import Maximum
 from harness.runner.other_traffic import read_replicates
-from harness.traffic.loading import load_parameters
 from tests.fitting.trajectories import overtaking
 
 

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from harness.importance.functions import as_challenge, harmless_cells
-from harness.importance.grid import interpolate_maneuvers
-from harness.importance.tables import Tables
+from harness.families.cut_in.nade.functions import as_challenge, harmless_cells
+from harness.families.cut_in.nade.grid import interpolate_maneuvers
+from harness.families.cut_in.nade.tables import Tables
 from harness.vehicles.kinematics import CONTACT_M
 from harness.vocabulary import CUT_IN, STATE_COLUMNS, STAY
 from tests.episode.twin_runs import prepared, run

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from harness.campaign.drivers import IDMParameters
-from harness.importance import tables as cache
-from harness.importance.tables import MODEL_FIELDS, Tables, build_tables, tables_hash, tables_name
+from harness.families.cut_in.nade import tables as cache
+from harness.families.cut_in.nade.tables import MODEL_FIELDS, Tables, build_tables, tables_hash, tables_name
 from harness.vehicles.drivers import driver_records
 from tests.kernels import environment
 

@@ -5,12 +5,12 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.families.cut_in.laws import Environment, InitialStates
+from harness.families.cut_in.loading import load_environment
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
 from harness.pool.walk import enumerate_cut_ins
 from harness.resolved import resolve
-from harness.traffic.laws import Environment, InitialStates
-from harness.traffic.loading import load_environment
 from harness.vehicles.drivers import Followers
 from tests.chains.seed import SEED
 from tests.stored_runs import MIXTURE_FILE

@@ -7,13 +7,13 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.campaign.sections import PoolSettings
+from harness.families.cut_in.loading import load_environment, load_parameters
+from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_name
 from harness.pool.cut_ins import environment_hash
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
 from harness.pool.walk import NATURALISTIC_SHARE, STRIDE, Enumerator, aimed_points, fit_proposal
 from harness.resolved import resolve
-from harness.traffic.loading import load_environment, load_parameters
-from harness.traffic.parameters import EnvironmentParameters
 from harness.vehicles.library import load_library
 from tests.chains.seed import SEED
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL, enumerated

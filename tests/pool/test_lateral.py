@@ -5,15 +5,15 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.controllers.find import build_host
-from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy
-from harness.importance.functions import build_importance
+from harness.families.cut_in.loading import load_environment
+from harness.families.cut_in.nade.functions import build_importance
+from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import pool_content, pool_from
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
 from harness.sampling.baseline import recorded, without_cut_in
-from harness.traffic.loading import load_environment
 from harness.vehicles.library import load_library
 from harness.vocabulary import CRASH, PASSED
 from harness.worlds.twin import TwinWorld

@@ -7,9 +7,9 @@ import pyarrow as pa
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.episode.judge import motion_hashes
 from harness.errors import HarnessError
 from harness.estimators.tally import CrashedTests, OnRuns, Tally
+from harness.loop.judge import motion_hashes
 from harness.pool.shells import CANDIDATES
 from harness.pool.vehicle_pool import EVENLY, chances, vehicle_pool
 from harness.pool.walk import BaselineRuns, enumerate_cut_ins

@@ -9,8 +9,8 @@ import pyarrow as pa
 import pytest
 
 import harness
-from harness.episode.loop import traced_by_index
 from harness.errors import RunFolderError
+from harness.loop.loop import traced_by_index
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
 from harness.vocabulary import AV
 from tests.in_process import run_here

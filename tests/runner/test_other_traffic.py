@@ -10,12 +10,12 @@ import pytest
 
 from harness.cli import main
 from harness.errors import CampaignError
+from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.pool.moved import Moved as Few
 from harness.progress import Progress
 from harness.runner import stored_shells
 from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.runner.stored_shells import Moved, StoredShells, nearby
-from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.stored_runs import copy_of, estimates
 
 SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()

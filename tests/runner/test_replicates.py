@@ -15,6 +15,7 @@ from harness.cli import main
 from harness.errors import HarnessError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.traffic import ONE_LAW, too_few, uncertain
+from harness.families.cut_in.loading import load_parameters
 from harness.pool import moved
 from harness.progress import Progress
 from harness.resolved import resolve
@@ -23,7 +24,6 @@ from harness.runner.compare import compare_campaigns
 from harness.runner.other_traffic import assumed, estimate_in_other_traffic
 from harness.runner.run import run_campaign
 from harness.runner.stored_shells import Moved, StoredShells, environment_with, nearby
-from harness.traffic.loading import load_parameters
 from tests.golden.campaigns import COMPARED
 from tests.in_process import one_process, without_page
 from tests.stored_runs import copy_of, estimates, golden

@@ -11,11 +11,11 @@ import pytest
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
+from harness.families.cut_in.loading import load_parameters
+from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.pool import moved
 from harness.runner.sensitivity import Move, bar_of, moves, sensitivity
 from harness.runner.stored_shells import Nearby
-from harness.traffic.loading import load_parameters
-from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.stored_runs import copy_of, edit, manifest
 from tests.traffic.tables import TEXT, fitted
 

@@ -19,7 +19,7 @@ from scipy.stats import binom, norm
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.estimators.block import Block, block_from_tables
-from harness.importance.functions import mixture_weights
+from harness.families.cut_in.nade.functions import mixture_weights
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
 from harness.records.schemas import episodes_table

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from harness.campaign.sections import EnvironmentSettings
-from harness.traffic.loading import load_environment
-from harness.traffic.parameters import SHIPPED_FOLDER
+from harness.families.cut_in.loading import load_environment
+from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from studies.__main__ import main
 from studies.motorway import trajectories_of
 from studies.trajectories import Differences, simulate

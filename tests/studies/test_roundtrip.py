@@ -7,12 +7,12 @@ import pandas as pd
 import pytest
 from scipy.stats import gamma
 
+from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.fitting.fit import HEAVIEST_TAILS, fit_traffic
 from harness.fitting.laws import Acceptance, Traffic
 from harness.fitting.observations import observations
 from harness.fitting.table import load_mapping
 from harness.progress import Progress
-from harness.traffic.loading import load_environment, load_parameters
 from harness.vocabulary import FloatArray
 from studies.roundtrip import (
     ESTIMATE,

@@ -12,11 +12,11 @@ from harness.estimators.block import Block, Drawn
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
 from harness.estimators.tally import combined
+from harness.families.cut_in.loading import load_environment
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.sampling.shells import ShellRounds
 from harness.strata import ASSUMPTION_FREE
-from harness.traffic.loading import load_environment
 from harness.vehicles.library import load_library
 from harness.vocabulary import CRASH, FAILED, TIMEOUT
 from studies.replication.experiment import Adversary

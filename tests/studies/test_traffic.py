@@ -10,7 +10,7 @@ import pytest
 import yaml
 from scipy import stats
 
-from harness.traffic.parameters import SHIPPED_FOLDER
+from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from studies.__main__ import main
 from studies.traffic import beside_published
 

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from harness.campaign.sections import EnvironmentSettings
-from harness.traffic.laws import Environment
-from harness.traffic.loading import evaluate_laws, load_environment
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.vocabulary import ACCELERATIONS_MPS2
 from studies.__main__ import main
 from studies.trajectories import ALIKE, CLOSEST_M, Differences, simulate

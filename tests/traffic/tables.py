@@ -10,7 +10,13 @@ import pyarrow.parquet as pq
 
 from harness.campaign.files import read_model
 from harness.campaign.yaml_text import read_yaml
-from harness.traffic.parameters import OF_REPLICATES, REPLACED, SHIPPED_FOLDER, EnvironmentParameters, content_hash
+from harness.families.cut_in.parameters import (
+    OF_REPLICATES,
+    REPLACED,
+    SHIPPED_FOLDER,
+    EnvironmentParameters,
+    content_hash,
+)
 
 SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
 DATA, _ = read_yaml(SHIPPED)

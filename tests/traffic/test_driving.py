@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import special, stats
 
-from harness.traffic.laws import InitialStates, t_table
+from harness.families.cut_in.laws import InitialStates, t_table
 from tests.chains.seed import SEED
 from tests.kernels import bv_accelerations, cut_in_terms, environment, t_distribution
 

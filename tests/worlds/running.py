@@ -10,7 +10,7 @@ from pathlib import Path
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.campaign.vehicle import AutomatedVehicle, Limits, TraciProcess
-from harness.episode.loop import Shard
+from harness.loop.loop import Shard
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.worlds import World, build_world

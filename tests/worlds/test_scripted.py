@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from harness.compiled import unboxed
-from harness.episode.cells import PrescribedTraffic, drawn_traffic
-from harness.episode.loop import Drawing, EpisodeLoop, RecordPolicy, Shard
-from harness.episode.path import empty_trajectory
-from harness.importance.functions import build_importance
+from harness.families.cut_in.loading import load_environment
+from harness.families.cut_in.nade.functions import build_importance
+from harness.families.cut_in.path import empty_trajectory
+from harness.loop.cells import PrescribedTraffic, drawn_traffic
+from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy, Shard
 from harness.pool.replay import stored_paths
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.traffic.loading import load_environment
 from harness.vehicles.drivers import Followers
 from harness.vehicles.library import load_library
 from harness.vocabulary import BV_LV_CONTACT, CRASH, CUT_IN, STATE_DTYPE, TIMEOUT

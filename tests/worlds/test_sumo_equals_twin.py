@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from harness.campaign.yaml_text import yaml_text
-from harness.episode.loop import Shard
+from harness.loop.loop import Shard
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.vehicles.kinematics import STEP_S, next_position

@@ -12,8 +12,8 @@ import libsumo
 import numpy as np
 import pytest
 
-from harness.episode.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
+from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.vocabulary import CRASH, LV, VEHICLES

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.controllers.protocol import BatchObservation
-from harness.episode.path import Trajectory, empty_trajectory, lengths
-from harness.importance.functions import Importance
-from harness.traffic.laws import Environment
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.nade.functions import Importance
+from harness.families.cut_in.path import Trajectory, empty_trajectory, lengths
 from harness.vocabulary import (
     N_ACCELERATIONS,
     STATE_COLUMNS,

@@ -5,7 +5,7 @@
 A moment is critical if any V_j exceeds the threshold. Before the cut-in the maneuvers are {stay, cut_in}; after it, at
 redraw times, the 31 accelerations.
 
-What a test that is sampled with them is worth: `harness.episode.likelihood_ratio`.
+What a test that is sampled with them is worth: `harness.families.cut_in.nade.likelihood_ratio`.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.compiled import compiled_inline
-from harness.importance.challenge import level_of, level_steps
-from harness.importance.grid import AFTER, BEFORE, interpolate, interpolate_maneuvers, locate
-from harness.importance.tables import Tables
-from harness.traffic.laws import Environment, acceptance
+from harness.families.cut_in.laws import Environment, acceptance
+from harness.families.cut_in.nade.challenge import level_of, level_steps
+from harness.families.cut_in.nade.grid import AFTER, BEFORE, interpolate, interpolate_maneuvers, locate
+from harness.families.cut_in.nade.tables import Tables
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from harness.vocabulary import N_ACCELERATIONS, BoolArray, Float32Array, FloatArray, State, read_only
 
@@ -33,7 +33,7 @@ class Importance(NamedTuple):
     nobody is asked; ``n_forced`` is 1 where the forced cut-in is importance function 0: surrogates follow after it.
     ``steps_per_level`` lie between two levels of ``value``.
     ``alpha`` (M,) are the mixture weights. ``value`` (J, levels + 1, v, R2, R2dot), ``maneuvers`` (J, v, R2, R2dot, 31)
-    and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `harness.importance.tables`).
+    and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `tables`).
     ``harmless`` (J, levels + 1, v - 1, R2 - 1, R2dot - 1) marks the grid cells after the cut-in in which no
     acceleration challenges a surrogate within a remaining time: most of what is driven lies there, and nothing needs
     to be interpolated.

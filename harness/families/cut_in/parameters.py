@@ -18,9 +18,9 @@ from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule, describe_found
 from harness.campaign.sections import Section
 from harness.campaign.yaml_text import read_yaml
+from harness.families.cut_in.lateral import LateralMotion, constant_lead, log_normal_speed
+from harness.families.cut_in.laws import Wish
 from harness.numbers import plain
-from harness.traffic.lateral import LateralMotion, constant_lead, log_normal_speed
-from harness.traffic.laws import Wish
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import ACCELERATIONS_MPS2, FloatArray, Record
 
@@ -68,7 +68,7 @@ def _within(low: float, high: float) -> AfterValidator:
     return AfterValidator(checked)
 
 
-# Wide limits: what a law makes of its numbers is judged by `harness.traffic.loading`.
+# Wide limits: what a law makes of its numbers is judged by `harness.families.cut_in.loading`.
 Coefficient = Annotated[Number, _within(-1000.0, 1000.0)]
 LogScale = Annotated[Number, _within(-50.0, 50.0)]
 Scale = Annotated[Number, _within(0.001, 1000.0)]

@@ -14,8 +14,8 @@ once a second with probability p_1s; a step of 0.1 s has p = 1 - (1 - p_1s)^0.1,
 - p_1s). A cut-in time is drawn by one exponential clock: it happens in the first step whose accumulated hazard
 exceeds -ln(1 - U). Given that no cut-in has happened before, this is the Bernoulli(p) draw of the step, and the same
 clock runs unchanged under importance functions and under the forced cut-in. Those that draw a path beforehand sum its
-hazards (`harness.episode.path.weigh_cut_ins`), pools of shells too (`harness.pool.walk`); all others go step by step
-(`harness.episode.decide.choose_lane`).
+hazards (`weigh_cut_ins` in `path`), pools of shells too (`harness.pool.walk`); all others go step by step
+(`choose_lane` in `nade.decide`).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ import numpy as np
 from scipy import special
 
 from harness.compiled import compiled_inline
+from harness.families.cut_in.lateral import LateralMotion
 from harness.random_stream import INITIAL, uniforms
-from harness.traffic.lateral import LateralMotion
 from harness.vocabulary import (
     ACCELERATIONS_MPS2,
     N_ACCELERATIONS,

@@ -17,10 +17,10 @@ import numpy as np
 
 from harness import cache
 from harness.campaign.drivers import FVDMParameters, IDMParameters
-from harness.importance.challenge import LEVELS, build_after_cut_in, build_before_cut_in, build_immediate
-from harness.importance.grid import AFTER, BEFORE
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.nade.challenge import LEVELS, build_after_cut_in, build_before_cut_in, build_immediate
+from harness.families.cut_in.nade.grid import AFTER, BEFORE
 from harness.processes import usable_cpus
-from harness.traffic.laws import Environment
 from harness.vocabulary import Float32Array, RecordArray
 
 _FORMAT = 4

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from harness.compiled import compiled, compiled_inline
-from harness.episode.cells import KernelState
-from harness.episode.likelihood_ratio import log_weight
-from harness.episode.path import state_of
+from harness.families.cut_in.nade.likelihood_ratio import log_weight
+from harness.families.cut_in.path import state_of
+from harness.loop.cells import KernelState
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, overlaps
 from harness.vocabulary import (
     AV,

@@ -8,9 +8,9 @@ shared history*, is the mixture Σ_j w_j q_j with
 * episode mixture: the posterior weights w_j ∝ α_j exp(L_j). The drawn component itself is not part of the history.
 
 Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Forced cut-ins
-and shells know it at the beginning of the episode (`harness.episode.decide`): -log P(cut-in | path), and -log p_s.
+and shells know it at the beginning of the episode (`decide`): -log P(cut-in | path), and -log p_s.
 Each control step adds its ratios (`record_lane`, `record_acceleration`), and where the episode is over
-(`harness.episode.judge`) `log_weight` is what its record says.
+(`harness.loop.judge`) `log_weight` is what its record says.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from __future__ import annotations
 import math
 
 from harness.compiled import compiled_inline
-from harness.episode.cells import KernelState
-from harness.importance.functions import Importance
+from harness.families.cut_in.nade.functions import Importance
+from harness.loop.cells import KernelState
 from harness.vocabulary import CUT_IN, STAY, FloatArray, State
 
 

@@ -17,10 +17,10 @@ from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads, unboxed
 from harness.errors import CampaignError
-from harness.traffic import laws
-from harness.traffic.lateral import constant_lead
-from harness.traffic.laws import Environment, InitialStates, build_environment
-from harness.traffic.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
+from harness.families.cut_in import laws
+from harness.families.cut_in.lateral import constant_lead
+from harness.families.cut_in.laws import Environment, InitialStates, build_environment
+from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
 from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray, State
 
 PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])

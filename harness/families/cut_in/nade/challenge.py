@@ -33,10 +33,19 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads, unboxed
-from harness.importance.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of, state_at
+from harness.families.cut_in import laws
+from harness.families.cut_in.laws import Environment, InitialStates, acceleration
+from harness.families.cut_in.nade.grid import (
+    AFTER,
+    BEFORE,
+    GridPoints,
+    interpolate,
+    locate,
+    points_of,
+    shape_of,
+    state_at,
+)
 from harness.processes import usable_cpus
-from harness.traffic import laws
-from harness.traffic.laws import Environment, InitialStates, acceleration
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from harness.vocabulary import N_ACCELERATIONS, Float32Array, FloatArray, Record, RecordArray

@@ -1,7 +1,7 @@
 """What LV and BV do: where a test begins, what is drawn for it, and their maneuvers in every step.
 
 Accelerations are drawn at hold clocks, the cut-in in every step, by importance functions where a moment is critical;
-where the traffic is prescribed they repeat it. What that is worth: `harness.episode.likelihood_ratio`.
+where the traffic is prescribed they repeat it. What that is worth: `harness.families.cut_in.nade.likelihood_ratio`.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 import math
 
 from harness.compiled import compiled, compiled_inline
-from harness.episode.cells import KernelState
-from harness.episode.drive import command, drive_av
-from harness.episode.likelihood_ratio import record_acceleration, record_lane
-from harness.episode.path import place, state_of, walk, weigh_cut_ins
-from harness.importance.challenge import remaining_level
-from harness.importance.functions import challenges_nobody, look_ahead, propose_acceleration, propose_cut_in
+from harness.families.cut_in import laws
+from harness.families.cut_in.lateral import draw_lead, onset_of
+from harness.families.cut_in.laws import acceleration, draw_acceleration
+from harness.families.cut_in.nade.challenge import remaining_level
+from harness.families.cut_in.nade.functions import challenges_nobody, look_ahead, propose_acceleration, propose_cut_in
+from harness.families.cut_in.nade.likelihood_ratio import record_acceleration, record_lane
+from harness.families.cut_in.path import place, state_of, walk, weigh_cut_ins
+from harness.loop.cells import KernelState
+from harness.loop.drive import command, drive_av
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.random_stream import CUT_IN as CUT_IN_STREAM
-from harness.traffic import laws
-from harness.traffic.lateral import draw_lead, onset_of
-from harness.traffic.laws import acceleration, draw_acceleration
 from harness.vocabulary import AV, BV, CUT_IN, LV, N_ACCELERATIONS, FloatArray, State
 
 

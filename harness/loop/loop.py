@@ -11,7 +11,12 @@ import numpy as np
 from harness.compiled import unboxed
 from harness.controllers.hosts import ControllerHost
 from harness.controllers.protocol import BatchObservation
-from harness.episode.cells import (
+from harness.errors import WorldDisagreementError
+from harness.families.cut_in.lateral import LateralMotion, constant_lead
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.nade.decide import decide
+from harness.families.cut_in.nade.functions import Importance
+from harness.loop.cells import (
     KernelState,
     PrescribedCutIns,
     PrescribedTraffic,
@@ -22,13 +27,8 @@ from harness.episode.cells import (
     idle_cells,
     with_more_room,
 )
-from harness.episode.decide import decide
-from harness.episode.drive import Past, command, empty_observation, first, hold_cruising, observe
-from harness.episode.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
-from harness.errors import WorldDisagreementError
-from harness.importance.functions import Importance
-from harness.traffic.lateral import LateralMotion, constant_lead
-from harness.traffic.laws import Environment
+from harness.loop.drive import Past, command, empty_observation, first, hold_cruising, observe
+from harness.loop.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import AV, CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds import AVLostError, World

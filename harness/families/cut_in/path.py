@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads
+from harness.families.cut_in import laws
+from harness.families.cut_in.lateral import onset_of, perceived_in
+from harness.families.cut_in.laws import Environment, acceleration
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
-from harness.traffic import laws
-from harness.traffic.lateral import onset_of, perceived_in
-from harness.traffic.laws import Environment, acceleration
 from harness.vehicles.drivers import MOST_FOLLOWERS, Followers
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
 from harness.vehicles.references import Memory, react, still_cruises

@@ -9,8 +9,8 @@ import numpy as np
 
 from harness.compiled import compiled, compiled_inline
 from harness.controllers.protocol import BatchObservation
-from harness.episode.cells import KernelState
-from harness.traffic.lateral import lateral_position, perceived_in
+from harness.families.cut_in.lateral import lateral_position, perceived_in
+from harness.loop.cells import KernelState
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
 from harness.vehicles.references import Memory, react, reaction_steps, still_cruises
 from harness.vocabulary import AV, BV, LV, FloatArray, IntArray, read_only
