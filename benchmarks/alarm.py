@@ -19,7 +19,6 @@ from scipy.special import ndtr
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.block import Block, block_from_tables
-from harness.families.cut_in.nade.functions import mixture_weights
 from harness.pool.build import campaign_pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
@@ -63,8 +62,8 @@ def asked(method: Method, n: int) -> Asked:
     content = {"environment": {"parameters": "ndd-overtaking-1"}, "testing": {"method": method}}
     campaign = Campaign.model_validate({"name": "alarm", "seed": SEED, **content})
     ready, pool = prepare(resolve(campaign)), campaign_pool(resolve(campaign))
-    table = episodes_table(ready.loop(TwinWorld(256)).run(0, ready.states(0, n)), SEED)
-    block = block_from_tables(table, None, method=method, alpha=mixture_weights(campaign))
+    table = episodes_table(ready.loop(TwinWorld(256)).run(0, ready.tests(0, n)), SEED)
+    block = block_from_tables(table, None, method=method, alpha=campaign.mixture_weights)
     return Asked(block, surrogates_crash(table, resolve(campaign), pool), KnownRates.of(pool))
 
 

@@ -85,16 +85,16 @@ class Recorded(Contender):
         self.folder = Path(tempfile.mkdtemp(prefix="harness-benchmark-"))
 
     def run(self, first: int, n: int) -> Work:
-        shard = self.loop.run(first, self.prepared.states(first, n))
+        shard = self.loop.run(first, self.prepared.tests(first, n))
         self.write(shard)
         written = sum(path.stat().st_size for path in self.folder.rglob("*.parquet"))
-        return Work(n, int(shard.results.episode["n_steps"].sum()), written)
+        return Work(n, int(shard.episode["n_steps"].sum()), written)
 
     def write(self, shard: Shard) -> None:
         write_shard(self.folder, 0, encoded(shard_tables(shard, self.prepared.campaign.seed, keep_traces=False)))
 
     def rows(self, n: int) -> bytes:
-        episode = self.loop.run(0, self.prepared.states(0, n)).results.episode
+        episode = self.loop.run(0, self.prepared.tests(0, n)).episode
         return b"".join(episode[name].tobytes() for name in ("outcome", "n_steps", "cut_in_step", "log_weight"))
 
     def close(self) -> None:
@@ -144,6 +144,9 @@ def _timed(function: Callable[..., object], part: str, seconds: dict[str, float]
     return call
 
 
+LANES = np.array([[1, 1, 0]], np.int8)
+
+
 class Floor(Contender):
     """SUMO's simulationStep alone: K cells whose vehicles keep an equal speed, nothing told, nothing read."""
 
@@ -158,8 +161,8 @@ class Floor(Contender):
         wall_s = cpu_s = 0.0
         for i in range(rounds):
             world.x[:] = [250.0, 200.0, 100.0]
-            world.v[:] = self._prepared.states(first + i * cells, cells)["v_bv_mps"][:, None]
-            world.place(np.arange(cells), world.x, world.v)
+            world.v[:] = self._prepared.paths(first + i * cells, cells).start["v_bv_mps"][:, None]
+            world.place(np.arange(cells), world.x, world.v, np.tile(LANES, (cells, 1)))
             wall, cpu = time.perf_counter(), time.process_time()
             for _ in range(FLOOR_STEPS):
                 world._api.simulationStep()
@@ -180,12 +183,12 @@ class BareOneAtATime(Contender):
 
     def run(self, first: int, n: int) -> Work:
         """Full-length episodes at constant speed."""
-        cell, nobody = np.zeros(1, np.int64), np.zeros(1, np.int8)
-        for state in self._prepared.states(first, n):
+        cell = np.zeros(1, np.int64)
+        for state in self._prepared.paths(first, n).start:
             x, v = np.array([[250.0, 200.0, 100.0]]), np.full((1, 3), state["v_bv_mps"])
-            self._world.place(cell, x, v)
+            self._world.place(cell, x, v, LANES)
             for _ in range(FLOOR_STEPS):
-                self._world.step(v, nobody)
+                self._world.step(v, LANES)
         return Work(n, n * FLOOR_STEPS)
 
     def close(self) -> None:
@@ -200,8 +203,8 @@ class TwinAlone(Contender):
         self._loop = self._prepared.loop(TwinWorld(TWIN_CELLS))
 
     def run(self, first: int, n: int) -> Work:
-        shard = self._loop.run(first, self._prepared.states(first, n))
-        return Work(n, int(shard.results.episode["n_steps"].sum()))
+        shard = self._loop.run(first, self._prepared.tests(first, n))
+        return Work(n, int(shard.episode["n_steps"].sum()))
 
 
 class Workers(Contender):

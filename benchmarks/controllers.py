@@ -52,14 +52,14 @@ def external_process(n_episodes: int) -> float:
     prepared, world = prepare(resolve(campaign)), build_world(campaign)
     loop = prepared.loop(world, traces="none")
     try:
-        loop.run(0, prepared.states(0, CELLS))
+        loop.run(0, prepared.tests(0, CELLS))
         began = time.perf_counter()
-        shard = loop.run(0, prepared.states(0, n_episodes))
+        shard = loop.run(0, prepared.tests(0, n_episodes))
         elapsed_s = time.perf_counter() - began
     finally:
         loop.close()
         world.close()
-    return float(shard.results.episode["n_steps"].sum()) / FULL_LENGTH_STEPS / elapsed_s
+    return float(shard.episode["n_steps"].sum()) / FULL_LENGTH_STEPS / elapsed_s
 
 
 def main() -> None:
@@ -78,12 +78,12 @@ def main() -> None:
                 resolve(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", [f"av={av}", "av.warm_up_s=0"]))
             )
             loops[name] = prepared.loop(world, traces="none", black_box=Path(folder) / "black-box")
-            loops[name].run(0, prepared.states(0, 96))
-        states = prepared.states(0, given.episodes)
+            loops[name].run(0, prepared.tests(0, 96))
+        tests = prepared.tests(0, given.episodes)
         for _ in range(given.rounds):
             for name, loop in loops.items():
                 began = time.process_time()
-                shard = loop.run(0, states)
+                shard = loop.run(0, tests)
                 best[name] = min(best[name], time.process_time() - began)
                 assert not shard.failures
         world.close()

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import libsumo
+import numpy as np
 import traci
 from sumolib.miscutils import getFreeSocketPort
 
-from harness.vocabulary import AV, BV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
+from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import World
 from harness.worlds.sumo import EXACT_OPTIONS, as_shared, committed_file, network_file
 
@@ -40,7 +41,13 @@ class OneAtATime(World):
         self._names: list[str] = []
         api.route.add("cell0", ["cell0"])
 
-    def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:  # noqa: ARG002 - there is one cell
+    def place(
+        self,
+        cells: IntArray,  # noqa: ARG002 - there is one
+        x: FloatArray,
+        v: FloatArray,
+        lane: Int8Array,
+    ) -> None:
         """Remove the vehicles of the last episode, add new ones."""
         vehicle = self._api.vehicle
         for name in self._names:
@@ -52,15 +59,17 @@ class OneAtATime(World):
             vehicle.add(name, "cell0", typeID="vanilla")
             vehicle.setSpeedMode(name, 0)
             vehicle.setLaneChangeMode(name, 0)
-            vehicle.moveTo(name, f"cell0_{RIGHT if i == AV else LEFT}", float(x[0, i]))
+            vehicle.moveTo(name, f"cell0_{lane[0, i]}", float(x[0, i]))
             vehicle.setPreviousSpeed(name, float(v[0, i]))
+        self.lane[0] = lane[0]
         self._begin_reading()
 
-    def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
+    def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
         """Tell three speeds, step, read everything."""
         vehicle = self._api.vehicle
-        if cut_in[0]:
-            vehicle.changeLane(self._names[BV], RIGHT, 0.0)
+        for i in np.flatnonzero(lane[0] != self.lane[0]).tolist():
+            vehicle.changeLane(self._names[i], int(lane[0, i]), 0.0)
+        self.lane[0] = lane[0]
         for name, wanted in zip(self._names, speed[0].tolist(), strict=True):
             vehicle.setSpeed(name, wanted)
         self._api.simulationStep()

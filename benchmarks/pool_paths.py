@@ -16,8 +16,8 @@ import numpy as np
 
 from harness import load_campaign
 from harness.campaign.sections import PoolSettings
+from harness.pool.aim import PILOT_PATHS
 from harness.pool.build import AGGRESSIVE_ERROR, ROUND_PATHS, Aim, planned_number, take_aim
-from harness.pool.walk import PILOT_PATHS
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.vocabulary import FloatArray
@@ -42,7 +42,7 @@ def stopped(sums: FloatArray, squares: FloatArray, aim: Aim, error: float, rng: 
 def main() -> None:
     """Print the lines."""
     resolved = resolve(load_campaign("scenarios/overtaking_shells.yaml", ["pool.seed=101"]))
-    aim = take_aim(resolved.environment, resolved.library, resolved.campaign.pool, Progress())
+    aim = take_aim(resolved.family, resolved.environment, resolved.library, resolved.campaign.pool, Progress())
     n_rounds, n_surrogates = int(sys.argv[1]) // ROUND_PATHS if sys.argv[1:] else 1024, len(resolved.library.surrogates)
     firsts = range(PILOT_PATHS, PILOT_PATHS + n_rounds * ROUND_PATHS, ROUND_PATHS)
     rates = (aim.enumerator.run(first, ROUND_PATHS, Progress()).rates(n_surrogates) for first in firsts)

@@ -12,8 +12,9 @@ from __future__ import annotations
 import time
 
 from harness import load_campaign
+from harness.families import family_named
 from harness.families.cut_in.loading import load_environment
-from harness.pool.walk import PILOT_PATHS, Enumerator
+from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.progress import Progress
 from harness.vehicles.library import load_library
 
@@ -29,12 +30,12 @@ def main() -> None:
     names = list(library.surrogates)
     before = names[: names.index(library.boundary) + 1]
     followers = library.followers(environment.lateral.present)
-    pilot = Enumerator(environment, followers, SEED)
+    pilot = Enumerator(family_named("cut_in"), environment, followers, SEED)
     pilot_rates = pilot.run(0, PILOT_PATHS, Progress()).rates(len(names))[:, : len(before)]
     print("stride  ms/path  cost  " + "  ".join(before))
     first = 0.0
     for stride in STRIDES:
-        enumerator = Enumerator(environment, followers, SEED, stride=stride).aimed(pilot_rates)
+        enumerator = Enumerator(family_named("cut_in"), environment, followers, SEED, stride=stride).aimed(pilot_rates)
         begin = time.process_time()
         paths = enumerator.run(PILOT_PATHS, PATHS, Progress())
         milliseconds = (time.process_time() - begin) / PATHS * 1e3

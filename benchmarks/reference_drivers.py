@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from harness import load_campaign
+from harness.families import family_named
 from harness.families.cut_in.loading import load_environment
-from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator
+from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, Enumerator
 from harness.progress import Progress
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray
@@ -39,7 +40,7 @@ def main() -> None:
     described = {"format": "surrogate-library", "version": 1, "boundary": "late-1s", "surrogates": drivers}
     library = Library.model_validate({**described, "envelope": "full-throttle-2"})
     environment, names = load_environment(load_campaign("scenarios/overtaking_shells.yaml").environment), list(drivers)
-    pilot = Enumerator(environment, library.followers(environment.lateral.present), SEED)
+    pilot = Enumerator(family_named("cut_in"), environment, library.followers(environment.lateral.present), SEED)
     rates = pilot.run(0, PILOT_PATHS, Progress()).rates(len(names))
     # Aimed at the careful ones: the others, and the cut-in itself, are known well enough anyway.
     share = [0.2 if name == "full-throttle-2" else 1.0 for name in names]

@@ -26,7 +26,7 @@ from harness.campaign.files import load_campaign
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.sampling.protocol import Source
-from harness.vocabulary import BV_LV_CONTACT, CRASH
+from harness.vocabulary import CONTACT, CRASH
 from harness.worlds.twin import TwinWorld
 
 CELLS = 1024
@@ -46,11 +46,11 @@ def sums_of(task: tuple[str, tuple[str, ...], int, int]) -> np.ndarray:
     """(n, crashes, ΣY, ΣY², ΣW·1{cut-in}, ΣW·1{contact}) of a range of episodes."""
     path, overrides, first, n = task
     prepared = _prepared(path, overrides)
-    rows = prepared.loop(TwinWorld(CELLS)).run(first, prepared.states(first, n)).results.episode
+    rows = prepared.loop(TwinWorld(CELLS)).run(first, prepared.tests(first, n)).episode
     weight = np.exp(rows["log_weight"])
     crash = rows["outcome"] == CRASH
     y = np.where(crash, weight, 0.0)
-    cut_in, contact = rows["cut_in_step"] >= 0, rows["outcome"] == BV_LV_CONTACT
+    cut_in, contact = rows["event_step"] >= 0, rows["outcome"] == CONTACT
     return np.array([n, crash.sum(), y.sum(), (y * y).sum(), weight[cut_in].sum(), weight[contact].sum()])
 
 

@@ -26,16 +26,17 @@ from pydantic.fields import FieldInfo
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import PARAMETERS
+from harness.families.cut_in.family import CUT_IN, STATE_FACTS
 from harness.records.schemas import baseline_schema, episodes_schema, moments_schema, pilot_schema, traces_schema
 
 FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 SCHEMAS = {
-    "episodes": episodes_schema(4, 3, 2, acts=True, takes_time=True),
-    "moments": moments_schema(3),
+    "episodes": episodes_schema(CUT_IN.columns, 4, 3, 2, acts=True, takes_time=True),
+    "moments": moments_schema(STATE_FACTS, 3),
     "traces": traces_schema(takes_time=True),
-    "shadow": baseline_schema(),
+    "shadow": baseline_schema(CUT_IN.columns),
     "pilot": pilot_schema(),
 }
 RESULTS = {

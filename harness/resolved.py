@@ -11,8 +11,11 @@ from functools import cached_property
 from harness.campaign.campaign import Campaign, Command, Use, refusal
 from harness.controllers.find import require_controller
 from harness.errors import CampaignError
+from harness.families import family_named
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.loading import load_environment, load_parameters
+from harness.families.protocol import Family
+from harness.loop.loop import Scenario
 from harness.vehicles.drivers import av_records, driver_records
 from harness.vehicles.library import OF_TRAFFIC, Library, load_library
 from harness.vocabulary import RecordArray
@@ -35,6 +38,19 @@ class Resolved:
     surrogates: RecordArray
     content_hash: str
     controller_sha256: str | None = None
+
+    @property
+    def family(self) -> Family:
+        """What kind of events the campaign tests."""
+        return family_named("cut_in")
+
+    @property
+    def scenario(self) -> Scenario:
+        """What its tests have in common."""
+        family, environment = self.family, self.environment
+        places = family.vehicles, family.principal, family.ahead
+        sizes = family.max_steps(environment), family.sideways_m(environment), family.shows(environment)
+        return Scenario(self.campaign.seed, *places, *sizes, self.av, family.columns)
 
     @cached_property
     def library(self) -> Library:

@@ -119,7 +119,7 @@ COMPARISON = "compare.json"
 """By this file a folder is that of a comparison, and not of a run."""
 
 OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")
-CRASH, PASSED, TIMEOUT, BV_LV_CONTACT, FAILED = range(len(OUTCOMES))
+CRASH, PASSED, TIMEOUT, CONTACT, FAILED = range(len(OUTCOMES))
 RUNNING = -1
 
 VEHICLES = ("LV", "BV", "AV")

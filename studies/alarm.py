@@ -32,18 +32,17 @@ from harness.errors import HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, Drawn, block_from_tables
 from harness.estimators.estimate import finite_json
 from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.nade.functions import mixture_weights
 from harness.families.cut_in.path import Trajectory, empty_trajectory, end_in, walk, who_crashes
+from harness.families.cut_in.replay import LEAD, PATH_COLUMNS, StoredPaths, leave_stored, recall, stored_paths
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
-from harness.pool.replay import LEAD, PATH_COLUMNS, StoredPaths, leave_stored, recall, stored_paths
 from harness.processes import made_ahead
 from harness.progress import Progress
 from harness.records.folder import MEND_SHARD, read_manifest
 from harness.records.reader import read_shard
 from harness.resolved import Resolved, resolve
 from harness.vehicles.drivers import Followers
-from harness.vocabulary import BV_LV_CONTACT, FAILED, PASSED, RUNNING, BoolArray, FloatArray, IntArray
+from harness.vocabulary import CONTACT, FAILED, PASSED, RUNNING, BoolArray, FloatArray, IntArray
 
 
 @compiled_inline
@@ -85,7 +84,7 @@ def replay_surrogates(
         if cut < 0:
             continue
         decided, step = approach_cut_in(i, stored, environment, path)
-        if decided == BV_LV_CONTACT and step == cut + 1:
+        if decided == CONTACT and step == cut + 1:
             continue
         if decided != RUNNING or not leave_stored(i, max_steps, stored, environment, path):
             return i
@@ -232,7 +231,7 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
         mend = "Choose another run; SUMO's positions are held against the twin's in each step."
         raise HarnessError(str(folder), found, expected, mend)
     pool = campaign_pool(resolved, progress)
-    alarm, alpha = Alarm(KnownRates.of(pool)), mixture_weights(campaign)
+    alarm, alpha = Alarm(KnownRates.of(pool)), campaign.mixture_weights
     lead = [LEAD] if resolved.environment.lateral.present else []
     columns = [*dict.fromkeys([*EPISODE_COLUMNS, *PATH_COLUMNS, *lead])]
 

@@ -37,8 +37,8 @@ from harness.fitting.laws import KINDS, TTC_EDGES_S, Traffic
 from harness.fitting.observations import observations, require_enough
 from harness.fitting.table import load_mapping
 from harness.fitting.uncertainty import replicates
+from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import take_aim
-from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.vocabulary import BoolArray, FloatArray, RecordArray
@@ -129,7 +129,7 @@ class Drivers:
         names = [*library.surrogates, *library.references]
         self._bits = [names.index(driver) for driver in DRIVERS]
         here = load_environment(TRAFFIC, truth())
-        self._paths: Enumerator = take_aim(here, library, resolved.campaign.pool, nobody).enumerator
+        self._paths: Enumerator = take_aim(resolved.family, here, library, resolved.campaign.pool, nobody).enumerator
         self.true = self._of(here)
 
     def rates(self, parameters: EnvironmentParameters) -> FloatArray:

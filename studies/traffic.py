@@ -18,9 +18,10 @@ from scipy.optimize import brentq
 from harness.campaign.files import read_model
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import EnvironmentSettings, Section
+from harness.families.cut_in.events import write_maneuvers
 from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws, load_environment
-from harness.pool.walk import write_script
+from harness.families.protocol import Paths
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, BV, LV, FloatArray
 
@@ -160,7 +161,7 @@ def _scenario(environment: Environment, approach: Approach) -> dict[str, float]:
     """Cut-ins of naturalistic paths whose AV keeps its speed, and lane changes per km where nobody is behind."""
     index = np.arange(N_PATHS)
     start = InitialStates(environment.numbers).draw(SEED, 0, N_PATHS)
-    script = write_script(SEED, index, np.full(N_PATHS, -1), start, environment)
+    script = write_maneuvers(SEED, Paths(index, start), np.full(N_PATHS, -1), environment)
     hold, n_steps = int(environment.numbers["hold_steps"]), int(environment.numbers["max_steps"])
     initial = {LV: np.maximum(start["v_bv_mps"] + start["r1dot_mps"], 0.0), BV: start["v_bv_mps"]}
     x, v = {}, {}

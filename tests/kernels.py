@@ -15,11 +15,10 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads
 from harness.families.cut_in import laws
 from harness.families.cut_in.loading import load_environment
-from harness.families.cut_in.nade import functions
+from harness.families.cut_in.nade import functions, likelihood_ratio
 from harness.families.cut_in.nade.challenge import remaining_level
 from harness.families.cut_in.nade.decide import draw_from
 from harness.families.cut_in.nade.grid import AFTER, interpolate, locate
-from harness.loop import likelihood_ratio
 from harness.vehicles import drivers, kinematics, references
 from harness.vocabulary import State
 

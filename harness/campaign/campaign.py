@@ -93,6 +93,21 @@ class Campaign(Section):
             return tuple(1.0 / len(self.surrogates) for _ in self.surrogates)
         return tuple(self.testing.alpha[name] for name in self.surrogates)
 
+    @property
+    def importance_names(self) -> tuple[str, ...]:
+        """Names of the importance functions, in the order of ``log_q``."""
+        defensive = ("forced",) if self.sampling.forces else ()
+        return defensive + (tuple(self.surrogates) if self.sampling.mixes else ())
+
+    @property
+    def mixture_weights(self) -> tuple[float, ...]:
+        """Weights α of the importance functions, in the order of `importance_names`."""
+        alpha = self.alpha() if self.sampling.mixes else ()
+        if not self.sampling.forces:
+            return alpha
+        share = self.testing.defensive_share if alpha else 1.0
+        return (share, *((1.0 - share) * weight for weight in alpha))
+
     def content_hash(self, environment_parameters: str) -> str:
         """Hash of everything that changes an episode's bits, that of the environment's parameters included.
 

@@ -17,7 +17,6 @@ from harness.estimators.severity import Severity
 from harness.estimators.short_answer import ShortAnswer, assumed_times, short_answer
 from harness.estimators.stopping import RoundRule, Rule
 from harness.estimators.traffic import TrafficError
-from harness.families.cut_in.nade.functions import importance_names
 from harness.numbers import two_digits_up
 from harness.records.folder import StoppedBy
 from harness.vocabulary import ESTIMATORS, EstimatorName
@@ -88,7 +87,7 @@ def estimate_blocks(
             distance_per_test_km=distance_km,
             crash_rate_per_1e6_km=None if distance_km is None else per_distance(best, distance_km),
             estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in estimates.items()},
-            diagnostics=done.diagnostics.result(importance_names(campaign)),
+            diagnostics=done.diagnostics.result(campaign.importance_names),
             convergence=tuple(done.convergence),
             answer=short_answer(campaign, best, done.severity, manifest, distance_km, done.diagnostics.counts),
             severity=done.severity,

@@ -37,7 +37,7 @@ from harness.vocabulary import (
 MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
 EPISODE_COLUMNS = (
-    "episode", "outcome", "cut_in_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_cut_in", "log_q",
+    "episode", "outcome", "cut_in_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_cut_in",
     "n_steps", "min_ttc_s", "took_over_step", "asked_to_speed_up",
 )  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass")
@@ -237,9 +237,10 @@ def block_from_tables(
     failed, n_control_steps = outcome == FAILED, _integers(episodes, "n_control_steps")
     columns: dict[str, Column] = {
         "cut_in": _known(episodes, "cut_in_step"),
-        "log_q": _nested(episodes, "log_q", len(alpha)),
         "n_control_steps": n_control_steps,
     }
+    if SAMPLING[method].mixes:
+        columns["log_q"] = _nested(episodes, "log_q", len(alpha))
     if "impact_speed_mps" in episodes.column_names:
         columns["impact_mps"] = np.asarray(episodes.column("impact_speed_mps").to_numpy(), dtype=np.float64)
     if "n_steps" in episodes.column_names:

@@ -17,7 +17,7 @@ from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.severity import Impacts, Severity
 from harness.estimators.shells import Shells
 from harness.estimators.weighted import Moments, Nade, Nde
-from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, EstimatorName, Sampling
+from harness.vocabulary import CONTACT, ESTIMATORS, EstimatorName, Sampling
 
 ACCUMULATORS: dict[EstimatorName, Callable[[], Accumulator]] = {
     "nde": Nde,
@@ -52,7 +52,7 @@ class Diagnostics:
 
     def add(self, block: Block) -> None:
         """Add one block."""
-        weights, contact = block.weights(), block.outcome == BV_LV_CONTACT
+        weights, contact = block.weights(), block.outcome == CONTACT
         self._sampling = block.drawn.sampling
         self.n += len(block)
         counted = {"n_cut_ins": block.cut_in, "n_bv_lv_contacts": contact, "n_failed": block.failed}

@@ -1,4 +1,4 @@
-"""State of the K episodes that run side by side, and the buffers that a shard's results are written to.
+"""State of the K tests that run side by side, and the buffers that a shard's results are written to.
 
 Scalars of a cell are fields of one record, so that a kernel touches one cache line; what has a length is an array with
 the cell as first axis. Results are written to row ``episode − first`` of the shard: finishing order leaves no trace.
@@ -6,23 +6,13 @@ the cell as first axis. Results are written to row ``episode − first`` of the 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from harness.controllers.protocol import BatchObservation
-from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.nade.functions import Importance
-from harness.families.cut_in.path import Trajectory, empty_trajectory, lengths
-from harness.vocabulary import (
-    N_ACCELERATIONS,
-    STATE_COLUMNS,
-    FloatArray,
-    Int8Array,
-    IntArray,
-    RecordArray,
-    UInt64Array,
-)
+from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 
 _f8, _i8 = np.float64, np.int64
 
@@ -33,26 +23,16 @@ CELL_DTYPE = np.dtype(
         ("announced_index", _i8),  # index that the AV is told, and that its random stream follows from
         ("motion_hash", np.uint64),  # hash of the AV's motion, through the step of the onset
         ("step", _i8),  # t, in steps
-        ("cut_step", _i8),  # -1 before the cut-in
-        ("planned", _i8),  # step in which BV will cut in, if that is known before; else -1
-        ("lead", _i8),  # steps from the onset of its lateral motion to overlap
+        ("event_step", _i8),  # step of the event, -1 before it
+        ("planned", _i8),  # step in which it will be, if that is known before; else -1
+        ("lead", _i8),  # steps from its onset to it
         ("onset_step", _i8),  # from the step after it on the AV may act; -1: nobody knows of an onset yet
-        ("component", _i8),  # episode mixture: importance function drawn; shells: the shell; else -1
-        ("lv_maneuver", _i8),
-        ("bv_maneuver", _i8),
-        ("n_lv", _i8),  # draws so far
-        ("n_bv", _i8),  # car-following draws so far
-        ("n_bv_free", _i8),  # free-driving draws so far
-        ("n_path", _i8),  # entries of BV's path, the cut-in included
+        ("component", _i8),  # what the test was drawn from: stratum, or importance function; -1: nothing of the kind
         ("n_control", _i8),
-        ("clock", _f8),  # hazard accumulated by the sampler
-        ("target", _f8),  # hazard at which BV cuts in
-        ("hazard", _f8),  # hazard accumulated under p
-        ("hazard_total", _f8),  # hazard of the whole path without cut-in (methods that draw the path ahead)
-        ("log_p_cut_in", _f8),
-        ("log_sampled", _f8),  # log q_sampled/p so far, of all but the episode mixture: see likelihood_ratio
+        ("log_weight", _f8),
+        ("log_p_event", _f8),
         ("min_ttc", _f8),
-        *((name, _f8) for name in ("cut_r2", "cut_r2dot", "onset_r2", "onset_r2dot", "av_start")),
+        *((name, _f8) for name in ("event_gap", "event_rate", "onset_gap", "onset_rate", "av_start")),
         ("cruises", _i8),  # whether the AV still keeps its speed, whatever it asks for but to brake
         ("set_speed", _f8),  # at which the AV cruises
         ("took_over_step", _i8),  # first step in which it did what it asked for; -1: none yet
@@ -61,131 +41,93 @@ CELL_DTYPE = np.dtype(
     ]
 )
 
-_STEPS = (
-    *("n_steps", "cut_in_step", "lead_steps", "onset_step", "took_over_step", "n_control_steps"),
-    *("n_lv", "n_bv"),
-)
-_AT_CUT_IN = ("cut_in_r2_m", "cut_in_r2dot_mps", "onset_r2_m", "onset_r2dot_mps")
-_AT_END = ("crash_time_s", "impact_speed_mps", "min_ttc_s", "av_distance_m", "log_weight", "log_p_cut_in")
+_STEPS = "n_steps", "event_step", "lead_steps", "onset_step", "took_over_step", "n_control_steps"
+_AT_EVENT = "event_gap_m", "event_rate_mps", "onset_gap_m", "onset_rate_mps"
+_AT_END = "crash_time_s", "impact_speed_mps", "min_ttc_s", "av_distance_m", "log_weight", "log_p_event"
 EPISODE_DTYPE = np.dtype(
     [(name, np.int8) for name in ("outcome", "component", "asked_to_speed_up")]
     + [(name, np.int16) for name in _STEPS]
-    + [(name, _f8) for name in (*_AT_CUT_IN, *_AT_END)]
+    + [(name, _f8) for name in (*_AT_EVENT, *_AT_END)]
 )
 
-MOMENT_DTYPE = np.dtype(
-    [("row", _i8), ("step", np.int16), ("maneuver", np.int8)]
-    + [(name, _f8) for name in (*STATE_COLUMNS, "p", "q_sampled")]
-)
+
+class Script(NamedTuple):
+    """What is prescribed of tests (n,) with V vehicles each, the AV last, and O others.
+
+    ``x``, ``v``, ``lane`` (n, V) are positions (m), speeds (m/s) and lanes (0 right, 1 left) at the beginning.
+    ``speed`` (n, steps, O) are the very speeds that the world is told of the others at the end of each step, and
+    ``lanes`` (n, steps, O) on which lanes they then are; no steps if they are driven in the loop. The event is in step
+    ``at`` (n,), -1 for none, and shows itself ``lead`` (n,) steps earlier. ``stratum`` (n,) is what a test was drawn
+    from, ``log_weight`` (n,) its log weight, ``log_p_event`` (n,) the log probability of an event on its path, NaN
+    where nobody has asked. ``announced_index`` (n,) are the indices that AVs are told, ``motion_hash`` (n,) of what
+    they must have done when the step of the onset is over: those of their baseline runs; empty where an AV keeps its
+    speed until then.
+    """
+
+    x: FloatArray
+    v: FloatArray
+    lane: Int8Array
+    speed: FloatArray
+    lanes: Int8Array
+    at: IntArray
+    lead: IntArray
+    stratum: IntArray
+    log_weight: FloatArray
+    log_p_event: FloatArray
+    announced_index: IntArray
+    motion_hash: UInt64Array
+
+    def rows(self, rows: slice) -> Script:
+        """Those of some tests."""
+        return Script._make(np.ascontiguousarray(column[rows]) for column in self)
+
+
+def natural_script(
+    x: FloatArray, v: FloatArray, lane: Int8Array, speed: FloatArray, lanes: Int8Array, at: IntArray, lead: IntArray
+) -> Script:
+    """A script whose tests weigh 1; see `Script`."""
+    n = len(x)
+    natural = np.full(n, -1), np.zeros(n), np.full(n, math.nan)
+    return Script(x, v, lane, speed, lanes, at, lead, *natural, np.zeros(0, np.int64), np.zeros(0, np.uint64))
 
 
 class Cells(NamedTuple):
-    """The K running episodes.
+    """The K running tests, of V vehicles each, the AV last.
 
-    ``cell`` (K,) are `CELL_DTYPE` records. ``log_ratio`` (K, M) is L_j, ``martingale`` (K, J). ``cut_challenge`` and
-    ``stay_challenge`` (K, hold, J) look ahead to the end of the hold period. ``lv_path``, ``bv_path`` (K, draws) hold
-    maneuver indices. ``acceleration`` and ``speed`` (K, 3) are the commands for the coming step, ``cut_in`` (K,) says
-    whose BV changes lanes in it. ``trace`` (K, steps + 1, 3 vehicles, 3: x, v, a) is (K, 1, 3, 3) when not kept.
-    ``placed`` (K,) begins with the cells that have been refilled for the coming step, ``ended`` and ``ended_row`` (K,)
-    with those whose episode has ended, and its row.
+    ``cell`` (K,) are `CELL_DTYPE` records. ``speed`` (K, V) and ``lane`` (K, V) are the commands for the coming step,
+    ``lane_before`` (K, V) the lanes before it, ``acceleration`` (K,) the AV's. ``trace`` (K, steps + 1, V, 3: x, v,
+    lane) is (K, 1, V, 3) when not kept. ``placed`` (K,) begins with the cells that have been refilled for the coming
+    step, ``ended`` and ``ended_row`` (K,) with those whose test has ended, and its row.
     """
 
     cell: RecordArray
-    log_ratio: FloatArray
-    martingale: FloatArray
-    cut_challenge: FloatArray
-    stay_challenge: FloatArray
-    lv_path: Int8Array
-    bv_path: Int8Array
     acceleration: FloatArray
     speed: FloatArray
-    cut_in: Int8Array
+    lane: Int8Array
+    lane_before: Int8Array
     trace: FloatArray
     placed: IntArray
     ended: IntArray
     ended_row: IntArray
 
 
-def idle_cells(n_cells: int, environment: Environment, importance: Importance, *, keep_traces: bool) -> Cells:
-    """K cells without an episode."""
-    max_steps, hold_steps, draws = lengths(environment)
-    cell, n_surrogates = np.zeros(n_cells, CELL_DTYPE), importance.n_surrogates
+def idle_cells(n_cells: int, n_vehicles: int, max_steps: int, *, keep_traces: bool) -> Cells:
+    """K cells without a test."""
+    cell = np.zeros(n_cells, CELL_DTYPE)
     cell["row"] = -1
-    log_ratio, martingale = np.zeros((n_cells, importance.alpha.size)), np.zeros((n_cells, n_surrogates))
-    cutting, staying = np.zeros((2, n_cells, hold_steps, n_surrogates))
-    lv_path, bv_path = np.zeros((2, n_cells, draws), np.int8)
-    acceleration, speed = np.zeros((2, n_cells, 3))
-    trace = np.full((n_cells, max_steps + 1 if keep_traces else 1, 3, 3), np.nan)
+    lane, lane_before = np.zeros((2, n_cells, n_vehicles), np.int8)
+    trace = np.full((n_cells, max_steps + 1 if keep_traces else 1, n_vehicles, 3), math.nan)
     placed, ended, ended_row = np.zeros((3, n_cells), np.int64)
-    drawn = cell, log_ratio, martingale, cutting, staying, lv_path, bv_path
-    return Cells(*drawn, acceleration, speed, np.zeros(n_cells, np.int8), trace, placed, ended, ended_row)
+    speed = np.zeros((n_cells, n_vehicles))
+    return Cells(cell, np.zeros(n_cells), speed, lane, lane_before, trace, placed, ended, ended_row)
 
 
-class Results(NamedTuple):
-    """Rows of a shard: ``episode`` (n,) `EPISODE_DTYPE`, and what has a length beside it.
-
-    ``moment`` (capacity,) `MOMENT_DTYPE` with ``moment_q``, ``moment_v`` (capacity, J); ``moment_count`` (1,) says how
-    many are used and ``moment_limit`` how many are kept of each episode.
-    """
-
-    episode: RecordArray
-    log_q: FloatArray
-    martingale: FloatArray
-    lv_path: Int8Array
-    bv_path: Int8Array
-    moment: RecordArray
-    moment_q: FloatArray
-    moment_v: FloatArray
-    moment_count: IntArray
-    moment_limit: int
-
-
-def empty_results(
-    n_episodes: int, environment: Environment, importance: Importance, *, moment_limit: int, capacity: int
-) -> Results:
-    """Buffers for a shard of ``n_episodes`` with room for ``capacity`` control steps."""
-    draws, n_surrogates = lengths(environment)[2], importance.n_surrogates
-    episode, log_q = np.zeros(n_episodes, EPISODE_DTYPE), np.zeros((n_episodes, importance.alpha.size))
-    lv_path, bv_path = np.zeros((2, n_episodes, draws), np.int8)
-    tests = episode, log_q, np.zeros((n_episodes, n_surrogates)), lv_path, bv_path
-    q, v = np.zeros((2, capacity, n_surrogates))
-    return Results(*tests, np.zeros(capacity, MOMENT_DTYPE), q, v, np.zeros(1, np.int64), moment_limit)
-
-
-def with_more_room(results: Results) -> Results:
-    """The same results with room for twice as many control steps."""
-    old = results.moment, results.moment_q, results.moment_v
-    moment, moment_q, moment_v = (np.concatenate([each, np.zeros_like(each)]) for each in old)
-    return results._replace(moment=moment, moment_q=moment_q, moment_v=moment_v)
-
-
-class PrescribedTraffic(NamedTuple):
-    """Episodes whose traffic is prescribed: what LV and BV do in each row of a shard; no rows if it is drawn.
-
-    ``lv``, ``bv`` (rows, draws) int8 are maneuver indices as an episode records them, 31 in ``bv`` being the cut-in in
-    step ``cut_step`` (rows,), which is -1 for a run without a cut-in, and in which BV begins to move sideways ``lead``
-    (rows,) steps earlier. ``stratum`` (rows,) is a shell, or all that lie outside, and ``log_weight`` (rows,) its log
-    probability. ``announced_index`` (rows,) are the indices that AVs are told, ``motion_hash`` (rows,) of what they
-    must have done when the step of the onset is over: those of their baseline runs. Both are empty where an AV keeps
-    its speed until then.
-    """
-
-    lv: Int8Array
-    bv: Int8Array
-    cut_step: IntArray
-    stratum: IntArray
-    log_weight: FloatArray
-    announced_index: IntArray
-    motion_hash: UInt64Array
-    lead: IntArray
-
-
-class PrescribedCutIns(NamedTuple):
-    """Which cut-ins of a pool tests prescribe, and what the error of the pool is told by.
+class PrescribedEvents(NamedTuple):
+    """Which events of a pool tests prescribe, and what the error of the pool is told by.
 
     ``row`` (n,) is the row in the pool, ``cell`` (n,) the cell of the campaign's design, ``cell_mass`` (n, C) the
-    path's probability of a cut-in of each cell. Of vehicles that act before the cut-in ``shadow`` (n,) is the baseline
-    run, and ``mass`` (n,) the probability of the cut-in itself; else empty.
+    path's probability of an event of each cell. Of vehicles that act before the event ``shadow`` (n,) is the baseline
+    run, and ``mass`` (n,) the probability of the event itself; else empty.
     """
 
     row: IntArray
@@ -195,66 +137,33 @@ class PrescribedCutIns(NamedTuple):
     mass: FloatArray
 
 
-def drawn_traffic() -> PrescribedTraffic:
-    """For episodes that draw their own traffic."""
-    none, no_index = np.zeros((0, 1), np.int8), np.zeros(0, np.int64)
-    return PrescribedTraffic(none, none, no_index, no_index, np.zeros(0), no_index, np.zeros(0, np.uint64), no_index)
-
-
-class Scratch(NamedTuple):
-    """Room for what a kernel works out at one moment of one cell; kernels allocate nothing.
-
-    ``p`` (31,): exposure of the accelerations. ``q`` (J,) and ``q_acceleration`` (J, 31): importance functions;
-    ``challenge`` (J,): V_j. ``ratio`` (M,): q_j/p of the maneuver taken; ``path``: what lies ahead of an episode.
-    """
-
-    p: FloatArray
-    q: FloatArray
-    q_acceleration: FloatArray
-    challenge: FloatArray
-    ratio: FloatArray
-    path: Trajectory
-
-
-def empty_scratch(environment: Environment, importance: Importance) -> Scratch:
-    """Room for M importance functions and J surrogates."""
-    n_importance, n_surrogates = importance.alpha.size, importance.n_surrogates
-    return Scratch(
-        p=np.zeros(N_ACCELERATIONS),
-        q=np.zeros(n_surrogates),
-        q_acceleration=np.zeros((n_surrogates, N_ACCELERATIONS)),
-        challenge=np.zeros(n_surrogates),
-        ratio=np.zeros(n_importance),
-        path=empty_trajectory(environment),
-    )
-
-
 class KernelState(NamedTuple):
-    """All that the episodes of a shard are run with, and written to.
+    """All that the tests of a shard are run with, and written to.
 
-    ``first_episode`` is the campaign index of row 0, ``states`` (rows,) are initial states. ``x``, ``v`` (K, 3) are the
-    world's positions (m) and speeds (m/s) of LV, BV, AV. ``driver`` is (1,) for a built-in AV, else (0,). ``passed_m``
-    is the R2 at which the AV has passed. ``asks_controller`` says whether one outside of the kernels decides for the
-    AV: ``observation`` is what it sees, ``acts_before_cut_in`` whether from the start; else from the step after the
-    onset. ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or BV is on its lane.
-    What may be so or not is 0 or 1.
+    ``first_episode`` is the campaign index of row 0. ``x``, ``v`` (K, V) are the world's positions (m) and speeds
+    (m/s). ``episode`` (n,) are the results, `EPISODE_DTYPE`. ``max_steps`` is the longest test; ``principal`` is the
+    place of the vehicle that the event is about, and ``ahead`` that of the one ahead of it, -1 without one;
+    ``sideways_m`` is the way from its first lateral motion to overlap. ``driver`` is (1,) for a built-in AV, else (0,).
+    ``passed_m`` is the gap to the principal vehicle at which the AV has passed it. ``observation`` is what a controller
+    outside of the kernels sees, ``acts_early`` whether from the start; else from the step after the onset.
+    ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or somebody is ahead on its
+    lane. What may be so or not is 0 or 1.
     """
 
     seed: int
     first_episode: int
-    states: RecordArray
-    traffic: PrescribedTraffic
+    script: Script
     x: FloatArray
     v: FloatArray
     cells: Cells
-    results: Results
-    scratch: Scratch
-    environment: Environment
-    importance: Importance
+    episode: RecordArray
+    max_steps: int
+    principal: int
+    ahead: int
+    sideways_m: float
     driver: RecordArray
     passed_m: float
     keep_traces: int
-    asks_controller: int
     observation: BatchObservation
-    acts_before_cut_in: int
+    acts_early: int
     av_cruises: int

@@ -9,35 +9,37 @@ import numpy as np
 
 from harness.compiled import compiled, compiled_inline
 from harness.controllers.protocol import BatchObservation
-from harness.families.cut_in.lateral import lateral_position, perceived_in
 from harness.loop.cells import KernelState
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
 from harness.vehicles.references import Memory, react, reaction_steps, still_cruises
-from harness.vocabulary import AV, BV, LV, FloatArray, IntArray, read_only
+from harness.vehicles.sideways import lateral_position, perceived_in
+from harness.vocabulary import FloatArray, IntArray, read_only
 
 
-@compiled_inline
-def drive_av(kernel: KernelState) -> None:
-    """Acceleration of a built-in AV wherever it is cut in on; it acts from the step after the onset at most."""
+@compiled
+def drive(kernel: KernelState) -> None:
+    """Acceleration of a built-in AV wherever it meets an event; it acts from the step after the onset at most."""
     x, v, cells, driver = kernel.x, kernel.v, kernel.cells, kernel.driver
-    perceives_m, distance_m = driver[0].perceives_lateral_m, kernel.environment.lateral.distance_m
+    if driver.size == 0:
+        return
+    perceives_m, av, other = driver[0].perceives_lateral_m, x.shape[1] - 1, kernel.principal
     for k in range(cells.cell.size):
         cell = cells.cell[k]
         if cell.row < 0 or cell.onset_step < 0 or cell.step <= cell.onset_step:
             continue
-        first, earlier = perceived_in(perceives_m, cell.planned, cell.lead, distance_m)
+        first, earlier = perceived_in(perceives_m, cell.planned, cell.lead, kernel.sideways_m)
         step = cell.step - first - reaction_steps(driver[0], kernel.seed, cell.episode)
         if step >= 0:
-            memory = Memory(cells.acceleration[k, AV], cell.danger, driver[0].used_up_steps + earlier)
-            memory = react(driver[0], memory, step, v[k, AV], v[k, BV], gap(x[k, BV], x[k, AV]))
-            cells.acceleration[k, AV], cell.danger = held_if_cruising(k, memory.acceleration, kernel), memory.danger
+            memory = Memory(cells.acceleration[k], cell.danger, driver[0].used_up_steps + earlier)
+            memory = react(driver[0], memory, step, v[k, av], v[k, other], gap(x[k, other], x[k, av]))
+            cells.acceleration[k], cell.danger = held_if_cruising(k, memory.acceleration, kernel), memory.danger
 
 
 @compiled_inline
 def held_if_cruising(k: int, asked: float, kernel: KernelState) -> float:
     """Acceleration (m/s²) of an AV that asks for one: none while it cruises."""
     cell = kernel.cells.cell[k]
-    if still_cruises(cell.cruises, 0 <= cell.cut_step < cell.step, asked):
+    if still_cruises(cell.cruises, 0 <= cell.event_step < cell.step, asked):
         cell.asked_to_speed_up |= asked > 0.0
         return 0.0
     if cell.took_over_step < 0:
@@ -50,28 +52,30 @@ def hold_cruising(kernel: KernelState, n: int) -> None:
     """The first ``n`` AVs that were asked do what they ask for, unless they are still to keep their speed."""
     for i in range(n):
         k = kernel.observation.cell[i]
-        kernel.cells.acceleration[k, AV] = held_if_cruising(k, kernel.cells.acceleration[k, AV], kernel)
+        kernel.cells.acceleration[k] = held_if_cruising(k, kernel.cells.acceleration[k], kernel)
 
 
 @compiled
 def observe(kernel: KernelState) -> int:
     """Write what the AVs that are to act see to ``kernel.observation``; returns their number."""
     x, v, cells, out = kernel.x, kernel.v, kernel.cells, kernel.observation
-    distance_m = kernel.environment.lateral.distance_m
+    av, bv, lv, distance_m = x.shape[1] - 1, kernel.principal, kernel.ahead, kernel.sideways_m
     n = 0
     for k in range(cells.cell.size):
         cell = cells.cell[k]
-        followed, comes = 0 <= cell.cut_step < cell.step, 0 <= cell.onset_step < cell.step
-        if cell.row < 0 or not (comes or kernel.acts_before_cut_in):
+        followed, comes = 0 <= cell.event_step < cell.step, 0 <= cell.onset_step < cell.step
+        if cell.row < 0 or not (comes or kernel.acts_early):
             continue
         out.cell[n], out.episode[n], out.time_s[n] = k, cell.announced_index, cell.step * STEP_S
-        out.position_m[n], out.speed_mps[n] = x[k, AV], v[k, AV]
-        out.acceleration_mps2[n] = cells.acceleration[k, AV]
-        out.gap_m[n] = gap(x[k, BV], x[k, AV]) if followed else math.inf
-        out.lead_speed_mps[n] = v[k, BV] if followed else math.nan
-        out.bv_position_m[n], out.bv_speed_mps[n] = x[k, BV], v[k, BV]
+        out.position_m[n], out.speed_mps[n] = x[k, av], v[k, av]
+        out.acceleration_mps2[n] = cells.acceleration[k]
+        out.gap_m[n] = gap(x[k, bv], x[k, av]) if followed else math.inf
+        out.lead_speed_mps[n] = v[k, bv] if followed else math.nan
+        out.bv_position_m[n], out.bv_speed_mps[n] = x[k, bv], v[k, bv]
         out.bv_lane[n] = 0 if followed else 1
-        out.lv_position_m[n], out.lv_speed_mps[n] = x[k, LV], v[k, LV]
+        out.lv_position_m[n], out.lv_speed_mps[n] = math.nan, math.nan
+        if lv >= 0:
+            out.lv_position_m[n], out.lv_speed_mps[n] = x[k, lv], v[k, lv]
         out.bv_lateral_m[n] = lateral_position(cell.step, cell.planned, cell.lead, distance_m) if comes else 0.0
         out.bv_lateral_speed_mps[n] = distance_m / (cell.lead * STEP_S) if comes and not followed else 0.0
         out.bv_overlaps[n], out.set_speed_mps[n] = 1 if followed else 0, cell.set_speed
@@ -92,14 +96,18 @@ def first(observation: BatchObservation, n: int) -> BatchObservation:
 
 
 class Past:
-    """The last states of K cells: what a controller whose AV keeps its speed until the cut-in is shown of them."""
+    """The last states of K cells: what a controller whose AV keeps its speed until the event is shown of them.
 
-    def __init__(self, n_steps: int, n_cells: int) -> None:
-        self._states = np.zeros((n_steps, 2, n_cells, 3))
+    ``principal`` and ``ahead`` are the places of the vehicles that are BV and LV to it; see `KernelState`.
+    """
+
+    def __init__(self, n_steps: int, shape: tuple[int, ...], principal: int, ahead: int) -> None:
+        self._states = np.zeros((n_steps, 2, *shape))
+        self._principal, self._ahead = principal, ahead
         self._n_noted = 0
 
     def note(self, x: FloatArray, v: FloatArray) -> None:
-        """Keep positions and speeds (K, 3) before a step."""
+        """Keep positions and speeds (K, V) before a step."""
         if n_steps := len(self._states):
             self._states[self._n_noted % n_steps] = x, v
             self._n_noted += 1
@@ -114,10 +122,11 @@ class Past:
         known = np.minimum(ago, step)
         x, v = np.moveaxis(self._states[(self._n_noted - known) % n_steps, :, seen.cell], (2, 3), (0, 1))
         x = x - v * ((ago - known) * STEP_S)
-        nobody = np.full(known.shape, math.inf), np.full(known.shape, math.nan)
-        zero = np.zeros(known.shape)
+        zero, absent = np.zeros(known.shape), np.full(known.shape, math.nan)
+        nobody, bv = (np.full(known.shape, math.inf), absent), (x[self._principal], v[self._principal])
+        lv = (x[self._ahead], v[self._ahead]) if self._ahead >= 0 else (absent, absent)
         set_speed = np.broadcast_to(seen.set_speed_mps, known.shape)
-        real = (step - ago) * STEP_S, x[AV], v[AV], zero, *nobody, x[BV], v[BV], x[LV], v[LV], zero, zero, set_speed
+        real = (step - ago) * STEP_S, x[-1], v[-1], zero, *nobody, *bv, *lv, zero, zero, set_speed
         whole = read_only(np.stack((seen.cell, seen.episode, np.ones_like(seen.cell), np.zeros_like(seen.cell))))
         return [_rows(whole, rows) for rows in read_only(np.stack(real, axis=1))]
 
@@ -129,13 +138,15 @@ def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
 
 @compiled
 def command(kernel: KernelState) -> None:
-    """Turn accelerations into the speeds at the end of the step; idle cells stand still."""
-    x, v, cells = kernel.x, kernel.v, kernel.cells
+    """Turn the AVs' accelerations into the speeds at the end of the step; idle cells stand still."""
+    x, v, cells, av = kernel.x, kernel.v, kernel.cells, kernel.x.shape[1] - 1
     for k in range(cells.cell.size):
-        running = cells.cell[k].row >= 0
-        for vehicle in range(3):
-            a = cells.acceleration[k, vehicle]
-            cells.speed[k, vehicle] = next_speed(v[k, vehicle], a) if running else 0.0
-            if kernel.keep_traces and running:
+        if cells.cell[k].row < 0:
+            for vehicle in range(av + 1):
+                cells.speed[k, vehicle], cells.lane[k, vehicle] = 0.0, cells.lane_before[k, vehicle]
+            continue
+        cells.speed[k, av] = next_speed(v[k, av], cells.acceleration[k])
+        if kernel.keep_traces:
+            for vehicle in range(av + 1):
                 here = cells.trace[k, cells.cell[k].step, vehicle]
-                here[0], here[1], here[2] = x[k, vehicle], v[k, vehicle], a
+                here[0], here[1], here[2] = x[k, vehicle], v[k, vehicle], cells.lane_before[k, vehicle]

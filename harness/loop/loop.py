@@ -1,10 +1,10 @@
-"""Run a range of episodes in a world: decide → ask the controller → command → step → judge, until all have ended."""
+"""Run a range of tests in a world: refill → move → drive or ask → command → step → judge, until all have ended."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,50 +12,43 @@ from harness.compiled import unboxed
 from harness.controllers.hosts import ControllerHost
 from harness.controllers.protocol import BatchObservation
 from harness.errors import WorldDisagreementError
-from harness.families.cut_in.lateral import LateralMotion, constant_lead
-from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.nade.decide import decide
-from harness.families.cut_in.nade.functions import Importance
-from harness.loop.cells import (
-    KernelState,
-    PrescribedCutIns,
-    PrescribedTraffic,
-    Results,
-    drawn_traffic,
-    empty_results,
-    empty_scratch,
-    idle_cells,
-    with_more_room,
-)
-from harness.loop.drive import Past, command, empty_observation, first, hold_cruising, observe
+from harness.loop.cells import EPISODE_DTYPE, KernelState, PrescribedEvents, idle_cells
+from harness.loop.drive import Past, command, drive, empty_observation, first, hold_cruising, observe
 from harness.loop.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
-from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import AV, CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
+from harness.loop.repeat import Traffic, refill
+from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds import AVLostError, World
 
-MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}
 STRAYED = (
     "the vehicle did something else than in its baseline run, given the same traffic and the same random stream: it "
     "draws random numbers of its own, remembers earlier episodes, or depends on time"
 )
 """Cause of a test that failed because its weight would have been wrong."""
-CONTROL_STEPS = 16
-"""Of an episode, for which a shard has room at first; more is made where they are more."""
 
 
-class Drawing(NamedTuple):
-    """What decides the motion of LV, BV and AV."""
+class Scenario(NamedTuple):
+    """What tests of a campaign have in common.
+
+    ``vehicles`` are the names of the vehicles of a cell, the AV last; ``principal`` is the place of the one that events
+    are about, ``ahead`` of the one ahead of it (-1: none). ``max_steps`` is the longest test, ``sideways_m`` the way
+    from a first lateral motion to overlap, and ``shows`` whether events can be seen before they happen. ``driver`` (1,)
+    is a built-in AV, else (0,). ``columns`` are the facts of tests that records keep.
+    """
 
     seed: int
-    environment: Environment
-    importance: Importance
+    vehicles: tuple[str, ...]
+    principal: int
+    ahead: int
+    max_steps: int
+    sideways_m: float
+    shows: bool
     driver: RecordArray
+    columns: tuple[Any, ...]
 
 
 class RecordPolicy(NamedTuple):
-    """What is recorded: at most ``moments`` control steps per episode, and the motion of the ``traces`` episodes."""
+    """Of which tests the motion is recorded."""
 
-    moments: int
     traces: str
     trace_share: float
 
@@ -73,21 +66,21 @@ class RecordPolicy(NamedTuple):
 
 @dataclass
 class Shard:
-    """Everything that a range of episodes left behind, row by row; ``states`` (n,) are where they began.
+    """Everything that a range of tests left behind, row by row.
 
-    ``cut_ins`` are those of the pool that were prescribed, if any were; ``lateral`` says how cut-ins show themselves.
-    ``traces`` maps an episode's row to its (steps + 1, 3 vehicles, 3: x, v, a) motion, ``failures`` to the cause.
+    ``episode`` (n,) are their results, `harness.loop.cells.EPISODE_DTYPE`; ``traffic`` is what the others did, and
+    ``events`` are those of the pool that were prescribed, if any were. ``traces`` maps a test's row to its
+    (steps + 1, V, 3: x, v, lane) motion, ``failures`` to the cause.
     """
 
     first_episode: int
-    states: RecordArray
-    results: Results
+    scenario: Scenario
+    traffic: Traffic
+    episode: RecordArray
     traced: BoolArray
-    traffic: PrescribedTraffic = field(default_factory=drawn_traffic)
     traces: dict[int, FloatArray] = field(default_factory=dict)
     failures: dict[int, str] = field(default_factory=dict)
-    cut_ins: PrescribedCutIns | None = None
-    lateral: LateralMotion = field(default_factory=constant_lead)
+    events: PrescribedEvents | None = None
 
 
 def hash_of_index(seed: int, episodes: IntArray) -> FloatArray:
@@ -106,55 +99,50 @@ def traced_by_index(seed: int, episodes: IntArray, share: float) -> BoolArray:
 
 
 class EpisodeLoop:
-    """K idle cells of a world, fed with episodes of one campaign; ``av`` is a controller outside of the kernels."""
+    """K idle cells of a world, fed with tests of one campaign; ``av`` is a controller outside of the kernels."""
 
-    def __init__(self, world: World, policy: Drawing, keep: RecordPolicy, av: ControllerHost | None = None) -> None:
-        environment, importance = policy.environment, policy.importance
-        self._world = world
-        self._policy = policy
-        self._keep = keep
-        self._av = av
-        self._scratch = empty_scratch(environment, importance)
+    def __init__(self, world: World, scenario: Scenario, keep: RecordPolicy, av: ControllerHost | None = None) -> None:
+        self._world, self._scenario, self._keep, self._av = world, scenario, keep, av
         self._observation = empty_observation(world.n_cells)
-        self._past = Past(0 if av is None else av.warm_up_steps, world.n_cells)
-        self._cells = idle_cells(world.n_cells, environment, importance, keep_traces=keep.any_trace)
+        warm_up = 0 if av is None else av.warm_up_steps
+        self._past = Past(warm_up, world.x.shape, scenario.principal, scenario.ahead)
+        self._cells = idle_cells(world.n_cells, len(scenario.vehicles), scenario.max_steps, keep_traces=keep.any_trace)
 
-    def run(self, first_episode: int, states: RecordArray, traffic: PrescribedTraffic | None = None) -> Shard:
-        """Run episodes ``first_episode … first_episode + n − 1`` of the campaign, from initial ``states`` (n,).
-
-        ``traffic`` is what LV and BV do, where it is not drawn.
+    def run(self, first_episode: int, traffic: Traffic) -> Shard:
+        """Run tests ``first_episode … first_episode + n − 1`` of the campaign, in which the others do so.
 
         Raises `WorldDisagreementError`: the world did something else than it was told. Raises `CampaignError`: the
         vehicle has replaced what the harness calls, whatever came of that.
         """
         try:
-            return self._run(first_episode, states, traffic)
+            return self._run(first_episode, traffic)
         finally:
             if self._av is not None:
                 self._av.require_untouched()
 
-    def _run(self, first_episode: int, states: RecordArray, traffic: PrescribedTraffic | None) -> Shard:
-        shard = self._empty_shard(first_episode, states, traffic or drawn_traffic())
-        kernel = self._kernel_state(shard)
-        given = ended = 0
+    def _run(self, first_episode: int, traffic: Traffic) -> Shard:
+        n = len(traffic)
+        traced = traced_by_index(self._scenario.seed, first_episode + np.arange(n), self._keep.trace_share)
+        shard = Shard(first_episode, self._scenario, traffic, np.zeros(n, EPISODE_DTYPE), traced)
+        self._cells.cell["row"] = -1
+        kernel, given, ended = self._kernel_state(shard), 0, 0
+        traffic.begin(self._world.n_cells, first_episode)
         while True:
-            placed = decide(kernel, given)
-            if self._av is not None:
+            placed = refill(kernel, given)
+            traffic.move(kernel, placed)
+            if self._av is None:
+                drive(kernel)
+            else:
                 ended += self._ask(self._av, kernel, shard, placed)
-                command(kernel)
-            if ended == states.size:
+            command(kernel)
+            if ended == n:
                 return shard
             ended += self._step_and_judge(kernel, shard, placed)
             given += placed
-            if shard.results.moment_count[0] > shard.results.moment.size - self._world.n_cells:
-                shard.results = with_more_room(shard.results)
-                kernel = self._kernel_state(shard)
 
-    def beside(
-        self, world: World | None = None, keep: RecordPolicy | None = None, drawing: Drawing | None = None
-    ) -> EpisodeLoop:
-        """Another loop with the same AV, in a world of no more cells, with other records, or another drawing."""
-        return EpisodeLoop(world or self._world, drawing or self._policy, keep or self._keep, self._av)
+    def beside(self, world: World | None = None, keep: RecordPolicy | None = None) -> EpisodeLoop:
+        """Another loop with the same AV, in a world of no more cells, or with other records."""
+        return EpisodeLoop(world or self._world, self._scenario, keep or self._keep, self._av)
 
     @property
     def construction_s(self) -> list[float]:
@@ -166,39 +154,28 @@ class EpisodeLoop:
         if self._av is not None:
             self._av.close()
 
-    def _empty_shard(self, first_episode: int, states: RecordArray, traffic: PrescribedTraffic) -> Shard:
-        policy, keep = self._policy, self._keep
-        self._cells.cell["row"] = -1
-        room = CONTROL_STEPS * states.size + self._world.n_cells
-        results = empty_results(
-            states.size, policy.environment, policy.importance, moment_limit=keep.moments, capacity=room
-        )
-        traced = traced_by_index(policy.seed, first_episode + np.arange(states.size), keep.trace_share)
-        return Shard(first_episode, states, results, traced, traffic, lateral=policy.environment.lateral)
-
     def _kernel_state(self, shard: Shard) -> KernelState:
         """All that kernels need for a shard, in the form that they need it in."""
-        policy, early = self._policy, (self._av or self._world).acts_before_cut_in
-        cruises = policy.driver["cruises"].all() if self._av is None else self._av.cruises
+        scenario, early = self._scenario, (self._av or self._world).acts_before_cut_in
+        cruises = scenario.driver["cruises"].all() if self._av is None else self._av.cruises
         return unboxed(
             KernelState(
-                seed=policy.seed,
+                seed=scenario.seed,
                 first_episode=shard.first_episode,
-                states=shard.states,
-                traffic=shard.traffic,
+                script=shard.traffic.script,
                 x=self._world.x,
                 v=self._world.v,
                 cells=self._cells,
-                results=shard.results,
-                scratch=self._scratch,
-                environment=policy.environment,
-                importance=policy.importance,
-                driver=policy.driver,
+                episode=shard.episode,
+                max_steps=scenario.max_steps,
+                principal=scenario.principal,
+                ahead=scenario.ahead,
+                sideways_m=scenario.sideways_m,
+                driver=scenario.driver,
                 passed_m=PASSED_UNDER_CONTROL_M if early else PASSED_M,
                 keep_traces=int(self._keep.any_trace),
-                asks_controller=int(self._av is not None),
                 observation=self._observation,
-                acts_before_cut_in=int(early),
+                acts_early=int(early),
                 av_cruises=int(cruises and not early),
             )
         )
@@ -214,7 +191,7 @@ class EpisodeLoop:
             seen = first(self._observation, n)
             if av.warm_up_steps:
                 failures = {**self._warm_up(av, seen), **failures}
-            cells.acceleration[seen.cell, AV], failed = av.act(seen)
+            cells.acceleration[seen.cell], failed = av.act(seen)
             hold_cruising(kernel, n)
             failures = {**failed, **failures}
         self._past.note(self._world.x, self._world.v)
@@ -237,16 +214,17 @@ class EpisodeLoop:
                 refilled = cells.placed[:placed]
                 if world.drives_av:
                     world.announce(refilled, cells.cell["announced_index"][refilled])
-                world.place(refilled, world.x, world.v)
-            contact = world.step(cells.speed, cells.cut_in)
+                world.place(refilled, world.x, world.v, cells.lane_before)
+            contact = world.step(cells.speed, cells.lane)
         except AVLostError as lost:
             return self._lose(str(lost), kernel, shard)
         ended = judge(kernel, contact)
         if ended < 0:
             raise _disagreement(cells.cell[-1 - ended], bool(contact[-1 - ended]))
         if ended:
+            shard.traffic.finish(kernel, ended)
             self._keep_traces(ended, shard)
-            outcome = shard.results.episode["outcome"]
+            outcome = shard.episode["outcome"]
             shard.failures.update((row, STRAYED) for _, row in self._ended(ended) if outcome[row] == FAILED)
         return ended
 
@@ -261,6 +239,7 @@ class EpisodeLoop:
         """End episodes whose controller failed (cell → cause), and go on; returns their number."""
         if failures:
             fail(kernel, np.array(sorted(failures), np.int64))
+            shard.traffic.finish(kernel, len(failures))
             for k, row in self._ended(len(failures)):
                 shard.failures[row] = failures[k]
             self._keep_traces(len(failures), shard)
@@ -275,11 +254,9 @@ class EpisodeLoop:
         if not self._keep.any_trace:
             return
         for k, row in self._ended(n):
-            episode = shard.results.episode[row]
+            episode = shard.episode[row]
             if shard.traced[row] or self._keep.wants(int(episode["outcome"]), int(episode["n_control_steps"])):
-                trace = shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
-                if self._world.drives_av:  # nobody commanded what the AV did: its speeds say it
-                    trace[:-1, AV, 2] = np.diff(trace[:, AV, 1]) / STEP_S
+                shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
 
 
 def _disagreement(cell: np.void, contact: bool) -> WorldDisagreementError:

@@ -14,9 +14,10 @@ from harness import cache
 from harness.campaign.sections import PoolSettings
 from harness.compiled import WORLD_SOURCES, source_hash
 from harness.families.cut_in.laws import Environment
+from harness.families.protocol import Family, Paths
+from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, Enumerator
 from harness.pool.cut_ins import FORMAT, CutIns, Pool, environment_hash, pool_content, pool_from
 from harness.pool.shells import cells_of, conservative_first, shells_of
-from harness.pool.walk import PILOT_PATHS, EnumeratedPaths, Enumerator, write_script
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.resolved import Resolved
@@ -36,7 +37,7 @@ POOL_SEED = 0x706F6F6C
 """Keeps a pool's random numbers apart from those of a campaign with the same seed."""
 KEEP_DRAW = 1
 """Draw of a shell within the diagnostic stream."""
-_MADE_BY = ("build.py", "cut_ins.py", "shells.py")
+_MADE_BY = ("aim.py", "build.py", "cut_ins.py", "shells.py")
 """Code that decides what is in a pool, beside the kernels."""
 
 
@@ -71,7 +72,9 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
     key = campaign_pool_key(resolved, order)
     if (cached := cached_pool(resolved, order)) is not None:
         return cached
-    pool = build_pool(resolved.environment, resolved.library, resolved.campaign.pool, key, progress, order)
+    pool = build_pool(
+        resolved.family, resolved.environment, resolved.library, resolved.campaign.pool, key, progress, order
+    )
     cache.keep(pool_name(key), pool_content(pool))
     return pool
 
@@ -84,6 +87,7 @@ def cached_pool(resolved: Resolved, order: Sequence[str] = ()) -> Pool | None:
 
 
 def build_pool(
+    family: Family,
     environment: Environment,
     library: Library,
     settings: PoolSettings,
@@ -93,12 +97,12 @@ def build_pool(
 ) -> Pool:
     """Build a pool in the twin, which will carry the content hash ``key``; for ``order`` see `campaign_pool`."""
     progress = progress or Progress()
-    aim = take_aim(environment, library, settings, progress)
+    aim = take_aim(family, environment, library, settings, progress)
     n = planned_number(aim, settings)
     progress.stage("pool of cut-ins", n)
     paths = aim.enumerator.run(PILOT_PATHS, n, progress)
     places = np.array([list(library.surrogates).index(name) for name in order], np.int64) if order else None
-    return pool_of(paths, settings.seed ^ POOL_SEED, places, environment, library, settings, key)
+    return pool_of(family, paths, settings.seed ^ POOL_SEED, places, environment, library, settings, key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,9 +119,12 @@ class Aim:
         return np.where(self.conservative, 1.0, AGGRESSIVE_SHARE)
 
 
-def take_aim(environment: Environment, library: Library, settings: PoolSettings, progress: Progress) -> Aim:
+def take_aim(
+    family: Family, environment: Environment, library: Library, settings: PoolSettings, progress: Progress
+) -> Aim:
     """Find out by a pilot run of naturalistic paths where surrogates crash."""
-    pilot = Enumerator(environment, library.followers(environment.lateral.present), settings.seed ^ POOL_SEED)
+    followers = library.followers(environment.lateral.present)
+    pilot = Enumerator(family, environment, followers, settings.seed ^ POOL_SEED)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(library.surrogates))
     mean, boundary = rates.mean(0), list(library.surrogates).index(library.boundary)
@@ -145,6 +152,7 @@ def planned_number(aim: Aim, settings: PoolSettings) -> int:
 
 
 def pool_of(
+    family: Family,
     paths: EnumeratedPaths,
     seed: int,
     order: IntArray | None,
@@ -171,11 +179,11 @@ def pool_of(
     cell, cell_shell, cell_references, by_path = cells_of(mass, shell, references, n_references)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
     path, step = _keep(mass, shell, n_surrogates + 1, settings)
-    script = write_script(seed, paths.index[path], step, paths.state[path], environment)
+    chosen = family.choose(environment, seed, Paths(paths.index[path], paths.start[path]), step)
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
-    cell_kept, state, mass_kept = cell[path, step], paths.state[path], by_path[path].astype(np.float32)
-    sample = CutIns(PILOT_PATHS + path, step, cell_kept, state, *script, crashes, mass_kept)
+    mass_kept = by_path[path].astype(np.float32)
+    sample = CutIns(PILOT_PATHS + path, step, cell[path, step], chosen.facts, chosen.lead, crashes, mass_kept)
     return Pool(
         key=key,
         environment=environment_hash(environment),

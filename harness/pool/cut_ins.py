@@ -15,26 +15,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from harness.families import family_named
 from harness.families.cut_in.laws import Environment
-from harness.pool.walk import PILOT_PATHS
+from harness.pool.aim import PILOT_PATHS
 from harness.records.folder import parquet
-from harness.records.schemas import prefixes, rows
+from harness.records.schemas import fact_columns, facts_from, rows
 from harness.vehicles.library import Library
-from harness.vocabulary import (
-    STATE_COLUMNS,
-    BoolArray,
-    Float32Array,
-    FloatArray,
-    Int8Array,
-    IntArray,
-    RecordArray,
-    UInt64Array,
-    states_from,
-)
+from harness.vocabulary import BoolArray, Float32Array, FloatArray, IntArray, RecordArray, UInt64Array
 
-FORMAT = 6
+FORMAT = 7
 """Raise it when the meaning of a pool changes."""
 _METADATA = b"harness_pool"
+COLUMNS = family_named("cut_in").columns
 
 
 def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
@@ -44,11 +36,10 @@ def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class CutIns:
-    """A weighted sample of cut-ins, each with the paths of LV and BV before and after it.
+    """A weighted sample of cut-ins, each with what has to be known to repeat it.
 
     Within a shell all have the same probability. ``path``, ``step``, ``cell`` (n,): which path of the pool, cut-in
-    step, and cell; ``state`` (n,): initial states. ``lv``, ``bv`` (n, draws): maneuver indices as an episode records
-    them, 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,): how many of them are used. ``crashes`` (n, D + R): which
+    step, and cell; ``facts`` (n,) are the family's. ``crashes`` (n, D + R): which
     surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
     a cut-in of each cell. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
     in the pool of a vehicle that acts before it, or of its onset, and ``mass`` (n,) the probability of those
@@ -59,11 +50,7 @@ class CutIns:
     path: IntArray
     step: IntArray
     cell: IntArray
-    state: RecordArray
-    lv: Int8Array
-    bv: Int8Array
-    n_lv: IntArray
-    n_bv: IntArray
+    facts: RecordArray
     lead: IntArray
     crashes: BoolArray
     path_mass: Float32Array
@@ -166,17 +153,16 @@ def _table(pool: Pool) -> pa.Table:
     probability = pool.shell_p / np.maximum(np.bincount(pool.shell, minlength=pool.shell_p.size), 1)
     columns: dict[str, tuple[pa.Array, str]] = {
         "path": (pa.array(c.path), "index of the path in the pool"),
-        **{name: (pa.array(np.ascontiguousarray(c.state[name])), "initial state") for name in STATE_COLUMNS},
         "cut_in_step": (pa.array(c.step.astype(np.int16)), "step (0.1 s) in which BV cuts in"),
         "probability": (pa.array(probability[pool.shell]), "P under the NDE that it stands for"),
         "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
         "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
         "crashes": (rows(c.crashes), "which surrogates crash, as the metadata orders names, and which references"),
         "path_mass": (rows(c.path_mass), "P of a cut-in of each cell on the path, times the path's weight"),
-        "lv_maneuvers": (prefixes(c.lv, c.n_lv), "LV's draws, one per hold period"),
-        "bv_maneuvers": (prefixes(c.bv, c.n_bv), "BV's draws; 31 marks the cut-in"),
         "lead_steps": (pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"),
     }
+    known_of = fact_columns(c.facts, COLUMNS)
+    columns |= {each.name: (known_of[each.name], each.doc) for each in COLUMNS}
     schema = pa.schema(
         [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
     )
@@ -185,16 +171,6 @@ def _table(pool: Pool) -> pa.Table:
     table = pa.table([array for array, _ in columns.values()], schema=schema)
     facts = json.dumps({"library": pool.library.model_dump(), **plain}).encode()
     return table.replace_schema_metadata({_METADATA: facts})
-
-
-def padded(column: pa.ChunkedArray, width: int | None = None) -> tuple[np.ndarray, IntArray]:
-    """Lists (n,) as rows of zeros beyond their lengths, shape (n, width of the longest), and their lengths (n,)."""
-    lists = column.combine_chunks()
-    lengths, flat = np.asarray(lists.value_lengths()).astype(np.int64), np.asarray(lists.flatten())
-    places = np.arange(lengths.max(initial=0) if width is None else width)
-    values = np.zeros((len(lists), places.size), flat.dtype)
-    values[places < lengths[:, None]] = flat
-    return values, lengths
 
 
 def pool_from(content: bytes) -> Pool:
@@ -210,11 +186,9 @@ def pool_from(content: bytes) -> Pool:
         values = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
         return np.asarray(values).reshape(table.num_rows, -1)
 
-    bv, n_bv = padded(table.column("bv_maneuvers"))
-    lv, n_lv = padded(table.column("lv_maneuvers"), bv.shape[1])
-    states = states_from(np.asarray(table.column(name)) for name in STATE_COLUMNS)
     path, step, cell, lead = map(whole, ("path", "cut_in_step", "cell", "lead_steps"))
-    cut_ins = CutIns(path, step, cell, states, lv, bv, n_lv, n_bv, lead, matrix("crashes"), matrix("path_mass"))
+    sample = facts_from(table, COLUMNS), lead, matrix("crashes"), matrix("path_mass")
+    cut_ins = CutIns(path, step, cell, *sample)
     known: dict[str, Any] = {
         name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()
     }

@@ -15,10 +15,10 @@ import numpy as np
 
 from harness import cache
 from harness.families.cut_in.laws import Environment
+from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import take_aim
 from harness.pool.cut_ins import Pool, environment_hash
 from harness.pool.shells import shells_in_strata, shells_of
-from harness.pool.walk import PILOT_PATHS, Enumerator
 from harness.progress import Progress
 from harness.resolved import Resolved
 from harness.strata import ShellDesign
@@ -99,14 +99,15 @@ class FewPaths:
     def _walk(self, environment: Environment) -> Moved:
         if self._aimed is None:
             resolved, nobody = self._resolved, Progress()
-            self._aimed = take_aim(resolved.environment, resolved.library, resolved.campaign.pool, nobody).enumerator
+            asked = resolved.family, resolved.environment, resolved.library, resolved.campaign.pool
+            self._aimed = take_aim(*asked, nobody).enumerator
         paths = replace(self._aimed, environment=environment).run(PILOT_PATHS, N_PATHS, Progress())
         shell, mass, n_shells = shells_of(paths.crashes, self._order), paths.mass / N_PATHS, self._stratum.size
         flat = np.arange(N_PATHS)[:, None] * n_shells + shell
         by_path = np.bincount(flat.ravel(), mass.ravel(), N_PATHS * n_shells).reshape(N_PATHS, n_shells)
         outside = np.zeros((N_PATHS, n_shells), np.bool_)
         for name, (low, high) in self._range.items():
-            state = paths.state[name][:, None]
+            state = paths.start[name][:, None]
             outside |= (state < low) | (state > high)
         rate = [np.where((paths.crashes >> bit) & 1 == 1, mass, 0.0).sum() for bit in self._drivers]
         in_stratum = self._stratum[:, None] == np.arange(self._n_strata)
@@ -126,7 +127,7 @@ def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
     for name in STATE_COLUMNS:
         low, high = np.full(n, -np.inf), np.full(n, np.inf)  # of a shell without cut-ins nothing is known
         for s in np.unique(shell):
-            values = pool.cut_ins.state[name][shell == s]
+            values = pool.cut_ins.facts[name][shell == s]
             low[s], high[s] = values.min(), values.max()
             margin = MARGIN * (high[s] - low[s])
             low[s], high[s] = low[s] - margin, high[s] + margin

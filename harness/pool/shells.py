@@ -15,13 +15,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.loop.cells import PrescribedCutIns, PrescribedTraffic
+from harness.families.protocol import Chosen
+from harness.loop.cells import PrescribedEvents
+from harness.loop.repeat import Traffic
 from harness.pool.cut_ins import Pool
+from harness.resolved import Resolved
 from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign
-from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
+from harness.vocabulary import FloatArray, Int8Array, IntArray
 
 CANDIDATES = 32_768
 """Paths of an AV that holds its speed, of which baseline runs are chosen: they cost milliseconds each, and save two of
@@ -165,7 +167,8 @@ class PrescribedEpisodes:
     shell has no cut-in left.
     """
 
-    def __init__(self, campaign: Campaign, pool: Pool) -> None:
+    def __init__(self, resolved: Resolved, pool: Pool) -> None:
+        campaign, self._resolved = resolved.campaign, resolved
         limit = acceleration_limit(campaign.av)
         design, groups = design_shells(pool, limit), shells_in_strata(pool, limit)
         self._cut_ins, self._shell, self._shell_p = pool.cut_ins, pool.shell, pool.shell_p
@@ -180,7 +183,7 @@ class PrescribedEpisodes:
         """How many draws each stratum allows, shape (S,)."""
         return np.array(self.design.available, np.int64)
 
-    def pilot(self, n: int, seed: int) -> tuple[RecordArray, PrescribedTraffic]:
+    def pilot(self, n: int, seed: int) -> Traffic:
         """Some n cut-ins to learn the vehicle from: half of them inside the boundary, half evenly of shells beyond.
 
         Inside they are drawn by probability.
@@ -202,33 +205,28 @@ class PrescribedEpisodes:
         rows = [self._order[draw.stratum][draw.first : draw.first + draw.n] for draw in draws]
         return np.concatenate(rows), np.repeat([draw.stratum for draw in draws], [draw.n for draw in draws])
 
-    def episodes(self, draws: tuple[Draw, ...]) -> tuple[RecordArray, PrescribedTraffic, PrescribedCutIns]:
-        """Initial states (n,), traffic, and which cut-ins they are."""
+    def tests(self, draws: tuple[Draw, ...]) -> tuple[Traffic, PrescribedEvents]:
+        """Tests (n,), and which cut-ins they are."""
         rows, stratum = self.rows(draws)
-        return (*self.of_rows(rows, stratum), self.cut_ins(rows))
+        return self.of_rows(rows, stratum), self.events(rows)
 
-    def cut_ins(self, rows: IntArray) -> PrescribedCutIns:
+    def events(self, rows: IntArray) -> PrescribedEvents:
         """What records say of given cut-ins of the pool (n,)."""
         joined = np.eye(len(self.design.cell_stratum) + 1)[self._cells, :-1]  # the last row is for what is not tested
         c, mass = self._cut_ins, self._cut_ins.path_mass[rows] @ joined
         acts = slice(None) if self.design.shadow_runs else slice(0)
-        return PrescribedCutIns(rows, self._cells[c.cell[rows]], mass, c.row[rows[acts]], c.mass[rows[acts]])
+        return PrescribedEvents(rows, self._cells[c.cell[rows]], mass, c.row[rows[acts]], c.mass[rows[acts]])
 
-    def of_rows(self, rows: IntArray, stratum: IntArray) -> tuple[RecordArray, PrescribedTraffic]:
-        """Initial states (n,) and traffic of given cut-ins of the pool (n,), tested for given strata (n,)."""
-        c = self._cut_ins
-        acts = c.motion.size > 0
-        traffic = PrescribedTraffic(
-            lv=np.ascontiguousarray(c.lv[rows]),
-            bv=np.ascontiguousarray(c.bv[rows]),
-            cut_step=c.step[rows],
-            stratum=stratum.astype(np.int64),
-            log_weight=np.log(self.design.p[stratum]),
-            announced_index=c.row[rows] if acts else np.zeros(0, np.int64),
-            motion_hash=c.motion[rows] if acts else c.motion,
-            lead=c.lead[rows],
-        )
-        return c.state[rows], traffic
+    def of_rows(self, rows: IntArray, stratum: IntArray) -> Traffic:
+        """Tests of given cut-ins of the pool (n,), for given strata (n,)."""
+        c, resolved = self._cut_ins, self._resolved
+        chosen = Chosen(c.facts[rows], c.step[rows], c.lead[rows])
+        script = resolved.family.script(resolved.environment, chosen)
+        log_weight = np.log(self.design.p[stratum])
+        script = script._replace(stratum=stratum.astype(np.int64), log_weight=log_weight)
+        if c.motion.size > 0:
+            script = script._replace(announced_index=c.row[rows], motion_hash=c.motion[rows])
+        return Traffic(script, chosen.facts)
 
 
 def _order(pool: Pool, group: list[int], seed: int, stratum: int) -> IntArray:

@@ -24,12 +24,13 @@ from harness import cache
 from harness.campaign.sections import PoolSettings
 from harness.errors import HarnessError
 from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.learned import Learned, learned_crashes
+from harness.families.protocol import Family, Paths, Recorded
 from harness.loop.judge import motion_hashes
+from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, contributions
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.cut_ins import Pool
-from harness.pool.learned import Learned, learned_crashes
 from harness.pool.shells import CANDIDATES, conservative_first, shells_of
-from harness.pool.walk import PILOT_PATHS, BaselineRuns, EnumeratedPaths, contributions, enumerate_cut_ins
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.resolved import Resolved
@@ -51,15 +52,20 @@ class BaselinePaths:
 
     ``key`` is the content hash of all that they follow from, ``seed`` that of their random numbers. ``order`` (D,) are
     the surrogates as places in the library, the most conservative behind an AV that holds its speed first. ``index``,
-    ``state``, ``weight`` (n,) are the paths' numbers, initial states, and naturalistic density over that of the draw.
+    ``start``, ``weight`` (n,) are the paths' numbers, how they begin, and naturalistic density over that of the draw.
     """
 
     key: str
     seed: int
     order: IntArray
     index: IntArray
-    state: RecordArray
+    start: RecordArray
     weight: FloatArray
+
+    @property
+    def paths(self) -> Paths:
+        """Without their weights."""
+        return Paths(self.index, self.start)
 
     def __len__(self) -> int:
         return self.index.size
@@ -76,7 +82,7 @@ class Candidates(BaselinePaths):
         u = uniforms(self.seed, 0, n, DIAGNOSTIC, CHOICE_DRAW + 1)[:, CHOICE_DRAW]
         cumulative = np.cumsum(self.chance)
         chosen = np.minimum(np.searchsorted(cumulative, u * cumulative[-1], side="right"), len(self) - 1)
-        arrays = (values[chosen] for values in (self.index, self.state, self.weight))
+        arrays = (values[chosen] for values in (self.index, self.start, self.weight))
         return BaselinePaths(self.key, self.seed, self.order, *arrays)
 
     def content(self) -> memoryview:
@@ -86,6 +92,7 @@ class Candidates(BaselinePaths):
 
 
 def walk_candidates(
+    family: Family,
     environment: Environment,
     library: Library,
     settings: PoolSettings,
@@ -95,16 +102,16 @@ def walk_candidates(
 ) -> Candidates:
     """Walk so many paths beside an AV that holds its speed."""
     progress = progress or Progress()
-    aim = take_aim(environment, library, settings, progress)
+    aim = take_aim(family, environment, library, settings, progress)
     progress.stage("paths for baseline runs", candidates)
     n_surrogates = len(library.surrogates)
     rounds = range(PILOT_PATHS, PILOT_PATHS + candidates, ROUND_PATHS)
     parts = (aim.enumerator.run(first, ROUND_PATHS, progress) for first in rounds)
-    columns = [(part.index, part.state, part.weight, part.rates(n_surrogates)) for part in parts]
-    index, state, weight, rates = (np.concatenate(column) for column in zip(*columns, strict=True))
+    columns = [(part.index, part.start, part.weight, part.rates(n_surrogates)) for part in parts]
+    index, start, weight, rates = (np.concatenate(column) for column in zip(*columns, strict=True))
     chance = chances(rates, aim.share)
     order = conservative_first(rates)
-    return Candidates(key, settings.seed ^ POOL_SEED, order, index, state, weight / (candidates * chance), chance)
+    return Candidates(key, settings.seed ^ POOL_SEED, order, index, start, weight / (candidates * chance), chance)
 
 
 def chances(rates: FloatArray, share: FloatArray) -> FloatArray:
@@ -124,7 +131,7 @@ def _candidates_key(resolved: Resolved) -> str:
 
 def baseline_paths_name(resolved: Resolved) -> str:
     """What the candidates of a campaign's paths are kept under."""
-    return f"pools/shadow-{_candidates_key(resolved)}.npz"
+    return f"pools/baseline-{_candidates_key(resolved)}.npz"
 
 
 def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None) -> BaselinePaths:
@@ -132,15 +139,15 @@ def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None
     key, name, settings = _candidates_key(resolved), baseline_paths_name(resolved), resolved.campaign.pool
     if (content := cache.read(name)) is not None:
         with np.load(BytesIO(content)) as stored:
-            columns = {name: stored[name] for name in ("order", "index", "state", "weight", "chance")}
+            columns = {name: stored[name] for name in ("order", "index", "start", "weight", "chance")}
             candidates = Candidates(key, int(stored["seed"]), **columns)
     else:
-        candidates = walk_candidates(resolved.environment, resolved.library, settings, key, progress)
+        candidates = walk_candidates(resolved.family, resolved.environment, resolved.library, settings, key, progress)
         cache.keep(name, candidates.content())
     return candidates.draw(settings.shadow_paths)
 
 
-def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, learned: Learned | None = None) -> Pool:
+def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded, learned: Learned | None = None) -> Pool:
     """Pool of the vehicle that was driven along the paths.
 
     A surrogate that was ``learned`` from it has a shell beyond the boundary, if a share of its crashes lies there.
@@ -149,7 +156,7 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, l
     """
     environment, library = resolved.environment, resolved.library
     followers = library.followers(environment.lateral.present)
-    found = enumerate_cut_ins(paths.seed, paths.index, paths.state, environment, followers, runs)
+    found = resolved.family.events(environment, paths.seed, paths.paths, followers, runs)
     if not found.crashes.any():
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""
         none = f"no cut-in on {len(paths):,} paths{failed} after which even the most careless surrogate would crash"
@@ -162,7 +169,7 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, l
     order, crashes = paths.order, found.crashes
     if learned is not None:
         asked = (crashes != 0) & (mass > 0.0)
-        given = paths.seed, paths.index, paths.state, environment, runs, asked, followers.counts_above_mps
+        given = paths.seed, paths.index, paths.start, environment, runs, asked, followers.counts_above_mps
         place = order.tolist().index(list(library.surrogates).index(library.boundary)) + 1
         beyond = shells_of(crashes, order) >= place
         own = learned_crashes(learned, *given)
@@ -171,12 +178,13 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: BaselineRuns, l
             of_library = crashes & ((1 << n) - 1)
             crashes = of_library | ((own & beyond).astype(np.int64) << n) | ((crashes >> n) << (n + 1))
             order = np.insert(order, place, n)
-    enumerated = EnumeratedPaths(paths.index, paths.state, paths.weight, mass, crashes)
+    enumerated = EnumeratedPaths(paths.index, paths.start, paths.weight, mass, crashes)
     key = hashlib.sha256(" ".join(known).encode()).hexdigest()[:24]
-    pool = pool_of(enumerated, paths.seed, order, environment, library, resolved.campaign.pool, key, more)
+    made_of = environment, library, resolved.campaign.pool, key, more
+    pool = pool_of(resolved.family, enumerated, paths.seed, order, *made_of)
     hashes = motion_hashes(runs.x_m, runs.v_mps)
     row, step, onset = pool.cut_ins.row, pool.cut_ins.step, pool.cut_ins.onset
     # A kept cut-in stands for its like nearby, too, where these are too improbable to be kept one by one.
     least = pool.shell_p[pool.shell] * (len(paths) / np.bincount(pool.shell)[pool.shell])
     cut_ins = replace(pool.cut_ins, motion=hashes[row, onset], mass=np.maximum(mass[row, step], least))
-    return replace(pool, cut_ins=cut_ins, p_after_failure=float((found.p_after_failure * paths.weight).mean()))
+    return replace(pool, cut_ins=cut_ins, p_after_failure=float((found.after_failure * paths.weight).mean()))

@@ -1,30 +1,23 @@
 """The tables that a run leaves: Arrow schemas with units and meanings in the field metadata, and a shard's rows.
 
 Importance functions are in the order of `importance_names`: for the episode mixture the defensive ``forced`` cut-in
-first, then the surrogates; for the others the surrogates alone. Values are from `harness.loop.judge.end_episode`.
+first, then the surrogates; for the others the surrogates alone. Values are from `harness.loop.judge.end_test`.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
+from harness.families.protocol import Column
 from harness.loop.loop import Shard
-from harness.vocabulary import (
-    AV,
-    BV,
-    CRASH,
-    OUTCOMES,
-    STATE_COLUMNS,
-    VEHICLES,
-    FloatArray,
-    Int8Array,
-    IntArray,
-    RecordArray,
-)
+from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import CRASH, OUTCOMES, FloatArray, Int8Array, IntArray, RecordArray
 
 _F8, _I1, _I2, _I8 = pa.float64(), pa.int8(), pa.int16(), pa.int64()
 _NAME = pa.dictionary(_I1, pa.string())
@@ -38,18 +31,8 @@ def _or_null(name: str, kind: pa.DataType, unit: str, doc: str) -> pa.Field:
     return _field(name, kind, unit, doc, nullable=True)
 
 
-def _state_fields(which: str = "") -> list[pa.Field]:
-    docs = (
-        "speed of BV",
-        "gap LV-BV, bumper to bumper",
-        "rate of R1: v_LV - v_BV",
-        "gap BV-AV, bumper to bumper",
-        "rate of R2: v_BV - v_AV",
-    )
-    return [
-        _field(name, _F8, "m/s" if name.endswith("_mps") else "m", which + doc)
-        for name, doc in zip(STATE_COLUMNS, docs, strict=True)
-    ]
+def _facts(columns: Sequence[Column]) -> list[pa.Field]:
+    return [_field(each.name, each.kind, each.unit, each.doc) for each in columns]
 
 
 def _per(n: int) -> pa.DataType:
@@ -66,11 +49,18 @@ _OF_BASELINE_RUNS = (
 
 
 def episodes_schema(
-    n_importance: int, n_surrogates: int, n_cells: int = 0, *, acts: bool = False, takes_time: bool = False
+    columns: Sequence[Column],
+    n_importance: int = 0,
+    n_surrogates: int = 0,
+    n_cells: int = 0,
+    *,
+    acts: bool = False,
+    takes_time: bool = False,
 ) -> pa.Schema:
-    """Schema of the ``episodes`` table for given numbers of importance functions, surrogates, and cells of shells.
+    """Schema of the ``episodes`` table of a family, by numbers of importance functions, surrogates, cells of shells.
 
-    Shells of vehicles that act before the cut-in have columns of their own, and so have cut-ins that take time.
+    ``columns`` are the family's facts. Shells of vehicles that act before the cut-in have columns of their own, and so
+    have cut-ins that take time.
     """
     of_shells = [
         _field("cell", _I2, "1", "cell of shells.json: shell, and which references crash (method shells alone)"),
@@ -80,7 +70,7 @@ def episodes_schema(
         [
             _field("episode", _I8, "1", "index of the episode in the campaign"),
             _field("seed", _I8, "1", "campaign seed; with the index it determines every random number"),
-            *_state_fields("initial "),
+            *_facts(columns),
             _field("outcome", _NAME, "", "crash, passed, timeout, bv_lv_contact or failed"),
             _field("n_steps", _I2, "0.1 s", "steps simulated until the episode ended"),
             _or_null("cut_in_step", _I2, "0.1 s", "step in which BV cut in, null without one"),
@@ -98,8 +88,6 @@ def episodes_schema(
             _or_null("log_p_cut_in", _F8, "1", "log P(cut-in | path), where the method draws the path ahead"),
             _field("log_q", _per(n_importance), "1", "per importance function: sum of log(q_j/p)"),
             _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_(t-1) V_j (q_j,t/q_alpha,t - 1)"),
-            _field("lv_maneuvers", pa.list_(_I1), "1", "LV's draws, in order"),
-            _field("bv_maneuvers", pa.list_(_I1), "1", "BV's draws, in order; 31 marks the cut-in"),
             _or_null("pool_cut_in", _I8, "1", "row of the pool's cut-in (method shells), else null"),
             *(of_shells if n_cells else ()),
             *(_OF_BASELINE_RUNS if acts else ()),
@@ -122,13 +110,13 @@ def _lateral_fields() -> list[pa.Field]:
     ]
 
 
-def moments_schema(n_surrogates: int) -> pa.Schema:
-    """Schema of the ``moments`` table: one row per control step."""
+def moments_schema(columns: Sequence[Column], n_surrogates: int) -> pa.Schema:
+    """Schema of the ``moments`` table: one row per control step, with the ``columns`` of its state."""
     return pa.schema(
         [
             _field("episode", _I8, "1", "index of the episode"),
             _field("step", _I2, "0.1 s", "step of the control"),
-            *_state_fields(),
+            *_facts(columns),
             _field("maneuver", _I1, "1", "0..30 acceleration, 31 cut_in, 32 stay"),
             _field("p", _F8, "1", "exposure: probability under the NDE"),
             _field("q_sampled", _F8, "1", "probability it was drawn with, given the shared history"),
@@ -149,24 +137,22 @@ def traces_schema(*, takes_time: bool = False) -> pa.Schema:
             _field("lane", _I1, "1", "0 right, 1 left"),
             _field("x_m", _F8, "m", "position of the front bumper along the road"),
             _field("v_mps", _F8, "m/s", "speed"),
-            _or_null("a_mps2", _F8, "m/s2", "acceleration commanded for the next step"),
+            _or_null("a_mps2", _F8, "m/s2", "acceleration in the next step"),
             *([_field("lateral_m", _F8, "m", over)] if takes_time else ()),
         ]
     )
 
 
-def baseline_schema() -> pa.Schema:
-    """Schema of the ``shadow`` table: one row per baseline run."""
+def baseline_schema(columns: Sequence[Column]) -> pa.Schema:
+    """Schema of the ``shadow`` table: one row per baseline run, with the family's ``columns``."""
     return pa.schema(
         [
             _field("shadow", _I8, "1", "index of the run; tests on its path tell it to the vehicle"),
             _field("path", _I8, "1", "number of the path among those of the pool; may occur more than once"),
             _field("weight", _F8, "1", "naturalistic density of the path over that of the draw"),
-            *_state_fields("initial "),
+            *_facts(columns),
             _field("outcome", _NAME, "", "passed, timeout, bv_lv_contact or failed"),
             _field("n_steps", _I2, "0.1 s", "steps simulated until the run ended"),
-            _field("lv_maneuvers", pa.list_(_I1), "1", "LV's draws, in order"),
-            _field("bv_maneuvers", pa.list_(_I1), "1", "BV's draws, in order"),
             _field("av_position_m", pa.list_(_F8), "m", "front bumper of the AV, initially and after each step"),
             _field("av_speed_mps", pa.list_(_F8), "m/s", "speed of the AV, initially and after each step"),
             _or_null("failure", pa.string(), "", "cause, for failed runs"),
@@ -174,7 +160,7 @@ def baseline_schema() -> pa.Schema:
     )
 
 
-_WHO = {"av": AV, "bv": BV}
+_WHO = "av", "bv"
 
 
 def pilot_schema() -> pa.Schema:
@@ -204,9 +190,10 @@ class ShardTables(NamedTuple):
 
 def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> ShardTables:
     """Tables of a shard, sorted by episode, step and vehicle."""
+    drawn = shard.traffic.drawn
     return ShardTables(
         episodes_table(shard, seed),
-        moments_table(shard) if shard.results.moment_limit else None,
+        moments_table(shard) if drawn is not None and drawn.moment_limit else None,
         traces_table(shard) if keep_traces else None,
     )
 
@@ -246,48 +233,94 @@ def _names(codes: Int8Array, names: tuple[str, ...]) -> pa.Array:
     return pa.DictionaryArray.from_arrays(pa.array(codes.astype(np.int8)), pa.array(names))
 
 
+def padded(column: pa.ChunkedArray, width: int | None = None) -> tuple[np.ndarray, IntArray]:
+    """Lists (n,) as rows of zeros beyond their lengths, shape (n, width of the longest), and their lengths (n,)."""
+    lists = column.combine_chunks()
+    lengths, flat = np.asarray(lists.value_lengths()).astype(np.int64), np.asarray(lists.flatten())
+    places = np.arange(lengths.max(initial=0) if width is None else width)
+    values = np.zeros((len(lists), places.size), flat.dtype)
+    values[places < lengths[:, None]] = flat
+    return values, lengths
+
+
+def fact_columns(facts: RecordArray, columns: Sequence[Column]) -> dict[str, Any]:
+    """The facts (n,) of a family as columns."""
+
+    def of(column: Column) -> Any:
+        values = facts[column.name]
+        return prefixes(values, facts[column.length]) if column.length else pa.array(np.ascontiguousarray(values))
+
+    return {column.name: of(column) for column in columns}
+
+
+def facts_from(table: pa.Table, columns: Sequence[Column]) -> RecordArray:
+    """The facts (n,) that `fact_columns` has written."""
+    found: dict[str, np.ndarray] = {}
+    for column in columns:
+        values = table.column(column.name)
+        if column.length:
+            found[column.name], found[column.length] = padded(values)
+        else:
+            found[column.name] = np.asarray(values)
+    facts: RecordArray = np.zeros(
+        table.num_rows, np.dtype([(name, values.dtype, values.shape[1:]) for name, values in found.items()])
+    )
+    for name, values in found.items():
+        facts[name] = values
+    return facts
+
+
 def _driven(shard: Shard) -> dict[str, Any]:
     """Columns that tests and baseline runs have in common."""
-    results = shard.results
-    e = results.episode
-    return {
-        **{name: shard.states[name] for name in STATE_COLUMNS},
+    e = shard.episode
+    return fact_columns(shard.traffic.facts, shard.scenario.columns) | {
         "outcome": _names(e["outcome"], OUTCOMES),
-        "lv_maneuvers": prefixes(results.lv_path, e["n_lv"].astype(np.int64)),
-        "bv_maneuvers": prefixes(results.bv_path, e["n_bv"].astype(np.int64)),
         "failure": pa.array([shard.failures.get(row) for row in range(e.size)], pa.string()),
     }
 
 
+_CALLED = {
+    "cut_in_step": "event_step",
+    "cut_in_r2_m": "event_gap_m",
+    "cut_in_r2dot_mps": "event_rate_mps",
+    "onset_r2_m": "onset_gap_m",
+    "onset_r2dot_mps": "onset_rate_mps",
+    "log_p_cut_in": "log_p_event",
+}
+"""Columns that have another name in the loop."""
+
+
 def episodes_table(shard: Shard, seed: int) -> pa.Table:
     """One row per episode, in index order."""
-    e, n, prescribed = shard.results.episode, shard.results.episode.size, shard.cut_ins
-    columns = _driven(shard) | {
+    e, n, prescribed, drawn = shard.episode, shard.episode.size, shard.events, shard.traffic.drawn
+    log_q, martingale = (np.zeros((n, 0)),) * 2 if drawn is None else (drawn.log_q, drawn.martingale)
+    columns = _driven(shard) | {name: e[own] for name, own in _CALLED.items()}
+    columns |= {
         "episode": shard.first_episode + np.arange(n),
         "seed": np.full(n, seed, np.int64),
-        "log_q": rows(shard.results.log_q),
-        "martingale": rows(shard.results.martingale),
+        "log_q": rows(log_q),
+        "martingale": rows(martingale),
         "asked_to_speed_up": e["asked_to_speed_up"] > 0,
         "pool_cut_in": pa.nulls(n, pa.int64()) if prescribed is None else prescribed.row,
     }
     if prescribed is not None:
         columns |= {"cell": prescribed.cell.astype(np.int16), "cell_mass": rows(prescribed.cell_mass)}
         columns |= {"shadow": prescribed.shadow, "cut_in_mass": prescribed.mass}
-    if shard.lateral.present:
+    if shard.scenario.shows:
         columns |= _lateral_columns(e)
-    of_all = shard.results.log_q.shape[1], shard.results.martingale.shape[1]
-    n_cells = 0 if prescribed is None else prescribed.cell_mass.shape[1]
+    of_all = log_q.shape[1], martingale.shape[1], 0 if prescribed is None else prescribed.cell_mass.shape[1]
     acts = prescribed is not None and prescribed.shadow.size > 0
-    return _table(episodes_schema(*of_all, n_cells, acts=acts, takes_time=shard.lateral.present), columns, e)
+    schema = episodes_schema(shard.scenario.columns, *of_all, acts=acts, takes_time=shard.scenario.shows)
+    return _table(schema, columns, e)
 
 
 def _lateral_columns(e: RecordArray) -> dict[str, Any]:
     """What BV's lateral motion was like; `onset_step` and the like are in ``e`` itself."""
-    side = np.where(e["n_steps"] == e["cut_in_step"] + 1, "side", "rear")
+    side = np.where(e["n_steps"] == e["event_step"] + 1, "side", "rear")
     return {
         "lead_steps": pa.array(e["lead_steps"], mask=e["onset_step"] < 0),
-        "onset_ttc_s": _time_to_collision(e["onset_r2_m"], e["onset_r2dot_mps"]),
-        "overlap_ttc_s": _time_to_collision(e["cut_in_r2_m"], e["cut_in_r2dot_mps"]),
+        "onset_ttc_s": _time_to_collision(e["onset_gap_m"], e["onset_rate_mps"]),
+        "overlap_ttc_s": _time_to_collision(e["event_gap_m"], e["event_rate_mps"]),
         "contact": pa.array(side, pa.string(), mask=e["outcome"] != CRASH),
     }
 
@@ -299,41 +332,50 @@ def _time_to_collision(r2_m: FloatArray, r2dot_mps: FloatArray) -> FloatArray:
 
 
 def moments_table(shard: Shard) -> pa.Table:
-    """One row per control step, by episode and step."""
-    used = int(shard.results.moment_count[0])
-    m = shard.results.moment[:used]
+    """One row per control step, by episode and step, of tests that were drawn in the loop."""
+    drawn = shard.traffic.drawn
+    used = int(drawn.moment_count[0])
+    m = drawn.moment[:used]
     order = np.lexsort((m["step"], m["row"]))
-    m, q, v = m[order], shard.results.moment_q[:used][order], shard.results.moment_v[:used][order]
+    m, q, v = m[order], drawn.moment_q[:used][order], drawn.moment_v[:used][order]
     columns = {"episode": shard.first_episode + m["row"], "q": rows(q), "v": rows(v)}
-    return _table(moments_schema(q.shape[1]), columns, m)
+    of_state = [each for each in shard.scenario.columns if each.name in (m.dtype.names or ())]
+    return _table(moments_schema(of_state, q.shape[1]), columns, m)
 
 
 def traces_table(shard: Shard) -> pa.Table:
     """One row per step and vehicle of the traced episodes."""
-    schema, rows = traces_schema(takes_time=shard.lateral.present), sorted(shard.traces)
+    scenario, rows = shard.scenario, sorted(shard.traces)
+    schema, n_vehicles = traces_schema(takes_time=scenario.shows), len(scenario.vehicles)
     if not rows:
         return schema.empty_table()
     n_states = [shard.traces[row].shape[0] for row in rows]
-    row = np.repeat(rows, len(VEHICLES) * np.array(n_states))
-    step = np.repeat(np.concatenate([np.arange(n, dtype=np.int16) for n in n_states]), len(VEHICLES))
-    vehicle = np.tile(np.arange(len(VEHICLES), dtype=np.int8), sum(n_states))
-    episode, motion = shard.results.episode[row], np.concatenate([shard.traces[each].reshape(-1, 3) for each in rows])
-    cut = episode["cut_in_step"]
-    on_right = (vehicle == AV) | ((vehicle == BV) & (cut >= 0) & (step > cut))
+    row = np.repeat(rows, n_vehicles * np.array(n_states))
+    step = np.repeat(np.concatenate([np.arange(n, dtype=np.int16) for n in n_states]), n_vehicles)
+    vehicle = np.tile(np.arange(n_vehicles, dtype=np.int8), sum(n_states))
+    x, v, lane = np.concatenate([shard.traces[each].reshape(-1, 3) for each in rows]).T
+    over = _came_over(shard.episode[row], step, scenario.sideways_m)
     columns = {
         "episode": shard.first_episode + row,
         "step": step,
-        "vehicle": _names(vehicle, VEHICLES),
-        "lane": np.where(on_right, 0, 1).astype(np.int8),
-        **dict(zip(("x_m", "v_mps", "a_mps2"), motion.T, strict=True)),
-        "lateral_m": np.where(vehicle == BV, _came_over(episode, step, shard.lateral.distance_m), 0.0),
+        "vehicle": _names(vehicle, scenario.vehicles),
+        "lane": lane.astype(np.int8),
+        "x_m": x,
+        "v_mps": v,
+        "a_mps2": np.concatenate([_accelerations(shard.traces[each]).ravel() for each in rows]),
+        "lateral_m": np.where(vehicle == scenario.principal, over, 0.0),
     }
     return _table(schema, columns)
 
 
+def _accelerations(trace: FloatArray) -> FloatArray:
+    """Of a motion (steps + 1, V, 3) in the step after each state, shape (steps + 1, V); NaN in the last."""
+    return np.diff(trace[:, :, 1], axis=0, append=math.nan) / STEP_S
+
+
 def _came_over(episode: RecordArray, state: np.ndarray, distance_m: float) -> FloatArray:
     """How far (m) BV has come over in states (n,), each of its ``episode`` (n,)."""
-    lead, onset, cut = (episode[name].astype(np.int64) for name in ("lead_steps", "onset_step", "cut_in_step"))
+    lead, onset, cut = (episode[name].astype(np.int64) for name in ("lead_steps", "onset_step", "event_step"))
     begins = np.where(cut >= 0, cut - lead, onset)  # it may have begun before the test
     share = np.where(lead == 0, state > onset, np.clip((state - begins - 1) / np.maximum(lead, 1), 0.0, 1.0))
     return np.where(onset < 0, 0.0, distance_m * share)
@@ -341,26 +383,31 @@ def _came_over(episode: RecordArray, state: np.ndarray, distance_m: float) -> Fl
 
 def baseline_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
     """One row per baseline run of a shard that has kept all motion; ``path``, ``weight`` (n,) as in the schema."""
-    e, traces = shard.results.episode, [shard.traces[row] for row in range(shard.results.episode.size)]
+    e = shard.episode
     columns = _driven(shard) | {
         "shadow": shard.first_episode + np.arange(e.size),
         "path": path,
         "weight": weight,
-        "av_position_m": pa.array([trace[:, AV, 0] for trace in traces], pa.list_(pa.float64())),
-        "av_speed_mps": pa.array([trace[:, AV, 1] for trace in traces], pa.list_(pa.float64())),
+        **_motion(shard, {"av": -1}),
     }
-    return _table(baseline_schema(), columns, e)
+    return _table(baseline_schema(shard.scenario.columns), columns, e)
 
 
 def pilot_table(shard: Shard) -> pa.Table:
     """One row per pilot test of a shard that has kept all motion."""
-    e, traces = shard.results.episode, [shard.traces[row] for row in range(shard.results.episode.size)]
-    columns: dict[str, Any] = {
-        "shadow": shard.traffic.announced_index,
-        "onset_step": np.maximum(shard.traffic.cut_step - shard.traffic.lead, 0).astype(np.int16),
-        "outcome": _names(e["outcome"], OUTCOMES),
-        "failure": pa.array([shard.failures.get(row) for row in range(e.size)], pa.string()),
+    script = shard.traffic.script
+    columns = _driven(shard) | {
+        "shadow": script.announced_index,
+        "onset_step": np.maximum(script.at - script.lead, 0).astype(np.int16),
+        **_motion(shard, {"av": -1, "bv": shard.scenario.principal}),
     }
-    for (who, vehicle), (column, what) in product(_WHO.items(), enumerate(("position_m", "speed_mps"))):
-        columns[f"{who}_{what}"] = pa.array([trace[:, vehicle, column] for trace in traces], pa.list_(pa.float64()))
-    return _table(pilot_schema(), columns, e)
+    return _table(pilot_schema(), columns, shard.episode)
+
+
+def _motion(shard: Shard, who: Mapping[str, int]) -> dict[str, pa.Array]:
+    """Positions and speeds of vehicles, by their places, in each test."""
+    traces, kind = [shard.traces[row] for row in range(shard.episode.size)], pa.list_(pa.float64())
+    asked = product(who.items(), enumerate(("position_m", "speed_mps")))
+    return {
+        f"{name}_{what}": pa.array([each[:, place, k] for each in traces], kind) for (name, place), (k, what) in asked
+    }

@@ -15,8 +15,8 @@ import pyarrow.compute as pc
 from harness import numbers
 from harness.errors import HarnessError, RunFolderError, printable
 from harness.estimators.short_answer import deciding_words, pair_asked, vehicle_words
+from harness.families.cut_in.replay import LEAD, PATH_COLUMNS
 from harness.numbers import count, tenths
-from harness.pool.replay import LEAD, PATH_COLUMNS
 from harness.records.folder import read_as, write_bytes
 from harness.records.reader import read_traces, stored_columns
 from harness.report.page import sentence

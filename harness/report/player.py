@@ -24,9 +24,9 @@ from harness.compiled import unboxed
 from harness.errors import printable
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import Trajectory, empty_trajectory
+from harness.families.cut_in.replay import drive_others, stored_paths
 from harness.numbers import tenths
 from harness.pool.cut_ins import onset_steps
-from harness.pool.replay import drive_others, stored_paths
 from harness.records.folder import write_bytes
 from harness.report.summary import floats
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M

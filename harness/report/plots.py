@@ -9,11 +9,11 @@ import numpy as np
 from harness.compiled import unboxed
 from harness.estimators.answer import Estimates
 from harness.estimators.traffic import Sensitivity
+from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import empty_trajectory
+from harness.families.cut_in.replay import StoredPaths, drive_others
 from harness.numbers import count, number, plain, share
-from harness.pool.replay import StoredPaths, drive_others
-from harness.pool.walk import Script
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.player import OTHERS
 from harness.report.summary import RunSummary, ShownShells
@@ -264,7 +264,7 @@ def limits_of_others(
     bv = maneuvers.copy()
     bv[:, 1] = CUT_IN
     used, none = np.full(n, draws), np.zeros(n, np.int64)
-    script = Script(maneuvers, bv, used, used + 1, none)
+    script = Maneuvers(maneuvers, bv, used, used + 1, none)
     stored = StoredPaths(0, none, state, none, none, script)
     end, start = np.zeros((n, len(OTHERS)), np.int64), np.full((n, 2), np.nan)
     drivers = library_records([driver for _, driver in OTHERS.values()], see_onset=False)

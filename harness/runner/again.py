@@ -19,11 +19,11 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.clock import Clock
 from harness.controllers.find import build_host, has_foreign_code, run_apart
 from harness.errors import HarnessError
-from harness.loop.cells import PrescribedTraffic
-from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy, Shard, hash_of_index
+from harness.loop.loop import EpisodeLoop, RecordPolicy, Scenario, Shard, hash_of_index
+from harness.loop.repeat import Traffic
 from harness.records.folder import Repeated
 from harness.sampling.protocol import Source
-from harness.vocabulary import FAILED, RecordArray
+from harness.vocabulary import FAILED
 from harness.worlds.twin import TwinWorld
 
 MOST_REPEATED, FEWEST_REPEATED = 10, 2
@@ -37,11 +37,10 @@ Bits = tuple[bytes, bytes, str | None]
 
 
 class Tests(NamedTuple):
-    """Consecutive tests from the ``first`` on, which begin in ``states`` (n,), in a given or a drawn ``traffic``."""
+    """Consecutive tests from the ``first`` on, and what the others do in them."""
 
     first: int
-    states: RecordArray
-    traffic: PrescribedTraffic
+    traffic: Traffic
 
 
 class Again(NamedTuple):
@@ -54,7 +53,7 @@ class Again(NamedTuple):
 def bits_of(shard: Shard, row: int) -> Bits:
     """Everything that a test has left: its record, its motion where that was kept, and why it failed if it did."""
     trace = shard.traces.get(row)
-    record = shard.results.episode[row].tobytes()
+    record = shard.episode[row].tobytes()
     return record, b"" if trace is None else trace.tobytes(), shard.failures.get(row)
 
 
@@ -63,13 +62,13 @@ def run_elsewhere(source: Source, tests: Sequence[Tests], n_cells: int = 1, *, h
 
     Raises `AvEndedProcessError`: the controller ended the process.
     """
-    drawn = source.campaign.av, source.policy, source.records(), tests, n_cells
+    drawn = source.campaign.av, source.scenario, source.records(), tests, n_cells
     return run_apart(source.campaign.av, _run_here, *drawn, held)
 
 
 def _run_here(
     av: AutomatedVehicle,
-    drawing: Drawing,
+    scenario: Scenario,
     keep: RecordPolicy,
     tests: Sequence[Tests],
     n_cells: int,
@@ -79,11 +78,11 @@ def _run_here(
 ) -> Again:
     clock, found = Clock(held=held), list[Bits]()
     with clock.shown():
-        host = build_host(av, n_cells=n_cells, seed=drawing.seed, black_box=black_box)
-        with closing(EpisodeLoop(TwinWorld(n_cells), drawing, keep, host)) as loop:
-            for first, states, traffic in tests:
-                shard = loop.run(first, states, traffic)
-                found += [bits_of(shard, row) for row in range(states.size)]
+        host = build_host(av, n_cells=n_cells, seed=scenario.seed, black_box=black_box)
+        with closing(EpisodeLoop(TwinWorld(n_cells), scenario, keep, host)) as loop:
+            for first, traffic in tests:
+                shard = loop.run(first, traffic)
+                found += [bits_of(shard, row) for row in range(len(traffic))]
     return Again(found, clock.read_at)
 
 
@@ -100,8 +99,7 @@ def repeat(loop: EpisodeLoop, source: Source, shard: Shard) -> Repeated:
 
 
 def _test_of(shard: Shard, row: int) -> Tests:
-    traffic = PrescribedTraffic._make(column[row : row + 1] for column in shard.traffic)
-    return Tests(shard.first_episode + row, shard.states[row : row + 1], traffic)
+    return Tests(shard.first_episode + row, shard.traffic.rows(slice(row, row + 1)))
 
 
 def _each_elsewhere(source: Source, tests: list[Tests]) -> list[Bits | None]:
@@ -115,8 +113,8 @@ def _each_elsewhere(source: Source, tests: list[Tests]) -> list[Bits | None]:
 
 def _rows_to_repeat(shard: Shard, seed: int, *, acts_early: bool) -> list[int]:
     """Rows by a hash of their index, among those in which the AV had to act."""
-    episode = shard.results.episode
-    acted = (episode["outcome"] != FAILED) & (acts_early | (episode["cut_in_step"] >= 0))
+    episode = shard.episode
+    acted = (episode["outcome"] != FAILED) & (acts_early | (episode["event_step"] >= 0))
     rows = np.flatnonzero(acted)
     order = np.argsort(hash_of_index(seed, shard.first_episode + rows), kind="stable")
     n = min(MOST_REPEATED, max(FEWEST_REPEATED, episode.size // ONE_OF))

@@ -23,7 +23,6 @@ from harness.controllers.hosts import ControllerHost, Failures
 from harness.controllers.protocol import BatchObservation
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
-from harness.loop.cells import drawn_traffic
 from harness.loop.loop import EpisodeLoop, Shard
 from harness.resolved import require_world, resolve
 from harness.runner.again import Bits, Tests, bits_of, run_elsewhere
@@ -292,16 +291,16 @@ def _opened(source: Source, black_box: Path | None, n_cells: int | None = None) 
 def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, Speed]:
     """First run of the episodes, and the speed of the fastest of several."""
     with _opened(source, black_box) as loop:
-        loop.run(0, source.states(0, min(CELLS, n_episodes)))  # compiles, and constructs for every cell
-        states = source.states(0, n_episodes)
+        loop.run(0, source.tests(0, min(CELLS, n_episodes)))  # compiles, and constructs for every cell
+        tests = source.tests(0, n_episodes)
         began = time.perf_counter()
-        shard, elapsed_s = loop.run(0, states), time.perf_counter() - began
+        shard, elapsed_s = loop.run(0, tests), time.perf_counter() - began
         until = began + SHORTEST_TIMING_S
         while (again := time.perf_counter()) < until:
-            loop.run(0, states)
+            loop.run(0, tests)
             elapsed_s = min(elapsed_s, time.perf_counter() - again)
         made_s = loop.construction_s
-    steps = max(1, int(shard.results.episode["n_steps"].sum()))
+    steps = max(1, int(shard.episode["n_steps"].sum()))
     median_s = float(np.median(made_s)) if made_s else 0.0
     return shard, Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s, median_s, len(made_s))
 
@@ -311,11 +310,11 @@ def _run_in_another_order(source: Source, n_episodes: int, black_box: Path | Non
     half = n_episodes // 2
     order = [*range(half, n_episodes), *range(half)]
     parts = order[: n_episodes - half], order[n_episodes - half :]
-    halves = [Tests(part[0], source.states(part[0], len(part)), drawn_traffic()) for part in parts]
+    halves = [Tests(part[0], source.tests(part[0], len(part))) for part in parts]
     if has_foreign_code(source.campaign.av):
         return dict(zip(order, run_elsewhere(source, halves, OTHER_CELLS).bits, strict=True))
     with _opened(source, black_box, OTHER_CELLS) as loop:
-        shards = [(loop.run(*tests), row) for tests in halves for row in range(tests.states.size)]
+        shards = [(loop.run(*tests), row) for tests in halves for row in range(len(tests.traffic))]
     return {i: bits_of(shard, row) for i, (shard, row) in zip(order, shards, strict=True)}
 
 
@@ -336,8 +335,8 @@ def _first_answers(source: Source, av: AutomatedVehicle, n: int, black_box: Path
     """Of tests that did not fail."""
     host = build_host(av, n_cells=1, seed=source.campaign.seed, black_box=black_box)
     answers: Any = FirstAnswers(host) if host is not None else None
-    with closing(EpisodeLoop(TwinWorld(1), source.policy, source.records(), answers)) as loop:
-        failed = loop.run(0, source.states(0, n)).failures
+    with closing(EpisodeLoop(TwinWorld(1), source.scenario, source.records(), answers)) as loop:
+        failed = loop.run(0, source.tests(0, n)).failures
     return {i: answer for i, answer in answers.noted.items() if i not in failed}
 
 
@@ -353,9 +352,9 @@ def _likely_cause(source: Source, episode: int, black_box: Path | None) -> str:
     def bits(n_cells: int, begin: int, n_before: int) -> Bits:
         with _opened(source, black_box, n_cells) as loop:
             for each in range(begin, begin + n_before):
-                loop.run(each, source.states(each, 1))
+                loop.run(each, source.tests(each, 1))
             n = min(n_cells, source.campaign.stop.episodes - episode)
-            return bits_of(loop.run(episode, source.states(episode, n)), 0)
+            return bits_of(loop.run(episode, source.tests(episode, n)), 0)
 
     if has_foreign_code(source.campaign.av) and (cause := _cause_outside(source, episode)):
         return cause
@@ -375,7 +374,7 @@ _OF_ITS_OWN = (
 
 def _cause_outside(source: Source, episode: int) -> str:
     """Whether it is the process, or the clock, which is the same in the first two runs and another in the last."""
-    test = [Tests(episode, source.states(episode, 1), drawn_traffic())]
+    test = [Tests(episode, source.tests(episode, 1))]
     one, other, later = (run_elsewhere(source, test, held=held) for held in (True, True, False))
     if one.bits != other.bits:
         return (
@@ -389,13 +388,13 @@ def _cause_outside(source: Source, episode: int) -> str:
 
 
 def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
-    episode = shard.results.episode
+    episode = shard.episode
     acted, reactions = [], []
     for row, trace in sorted(shard.traces.items()):
-        cut, onset = int(episode["cut_in_step"][row]), int(episode["onset_step"][row])
+        cut, onset = int(episode["event_step"][row]), int(episode["onset_step"][row])
         if episode["outcome"][row] == FAILED:
             continue
-        commanded = trace[:-1, AV, 2]  # the last row commands nothing
+        commanded = np.diff(trace[:, AV, 1]) / STEP_S
         if early or cut >= 0:
             acted.append(commanded[0 if early else onset + 1 :])
         if cut >= 0:

@@ -52,7 +52,6 @@ from harness.runner.stored_shells import (
     ratio_of,
     require_shares,
 )
-from harness.sampling import distance_per_test_m
 from harness.strata import ShellDesign
 from harness.vocabulary import EstimatorName, FloatArray
 
@@ -88,7 +87,10 @@ def estimate_in_other_traffic(
     moved = moved_to(tested, there, environment, progress)
     keys = tested.manifest if moved.is_same else ("repeated",)
     told: dict[str, Any] = {key: tested.manifest[key] for key in keys if key in tested.manifest}
-    told |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_per_test_m(there.environment)}
+    told |= {
+        "campaign_hash": there.content_hash,
+        "distance_per_test_m": there.family.mean_distance_m(there.environment),
+    }
     blocks = map(moved.block, tested.blocks)
     parameters = load_parameters(there.campaign.environment)
     if parameters.replicates is not None and parameters.unseen:

@@ -261,7 +261,9 @@ def stored_shard(folder: Path, source: Source, listed: Mapping[str, Any], reques
     Raises `RunFolderError`: one of its files is damaged.
     """
     files = shard_files(folder, request.index)
-    needed = {"episodes"} | ({"moments"} if source.campaign.records.moments != "none" else set())
+    needed = {"episodes"} | (
+        {"moments"} if source.campaign.sampling.mixes and source.campaign.records.moments != "none" else set()
+    )
     if not needed <= files.keys():
         return None
     tables = {name: read_table(folder / path, crc32=listed_crc32(listed, name)) for name, path in files.items()}

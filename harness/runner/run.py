@@ -50,7 +50,7 @@ from harness.runner.resume import (
 )
 from harness.runner.stored import estimate_run
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
-from harness.sampling import distance_per_test_m, prepare
+from harness.sampling import prepare
 from harness.sampling.baseline import IN_MANIFEST, baseline_file, begin, stored_baseline
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
@@ -142,7 +142,7 @@ class Run:
             facts = {
                 "workers": self._workers.n_workers,
                 "cut_ins_take_time": resolved.environment.lateral.present,
-                "distance_per_test_m": distance_per_test_m(resolved.environment),
+                "distance_per_test_m": resolved.family.mean_distance_m(resolved.environment),
             }
             self.manifest = Manifest(out, resolved, earlier, began=began, **facts)
             self._keep_design()

@@ -329,7 +329,7 @@ def _share_beyond(old: Pool, new: Pool, blocks: list[Block]) -> float:
     weight = design.p * (crashes / np.maximum(tests, 1.0))
     outside = np.zeros(new.shell.size, np.bool_)
     for name, (low, high) in ranges(old).items():
-        outside |= (new.cut_ins.state[name] < low[new.shell]) | (new.cut_ins.state[name] > high[new.shell])
+        outside |= (new.cut_ins.facts[name] < low[new.shell]) | (new.cut_ins.facts[name] > high[new.shell])
     beyond = {name: float(outside[rows].mean()) for s, name in enumerate(old.names) if (rows := new.shell == s).any()}
     shares: FloatArray = np.array([beyond.get(name, 0.0) for name in design.strata])
     return float(weight @ shares / weight.sum()) if weight.any() else float(shares.max(initial=0.0))

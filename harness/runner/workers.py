@@ -127,12 +127,12 @@ class ShardRunner:
         self._fatal_episodes.update(fatal_episodes or {})
         source, paths = self._source, self._source.baseline_paths
         if paths is not None and request.baseline:
-            return run_baseline(self._loop, paths, source.resolved.environment, request)
+            return run_baseline(self._loop, paths, source.resolved, request)
         if paths is not None and not self._begun:
             self._begun = True
             table = read_table(self._baseline)
-            source.begin_after(as_recorded(table, source.resolved.environment), learned_in(table))
-            self._loop = self._loop.beside(drawing=source.policy)
+            source.begin_after(as_recorded(table, source.scenario.max_steps), learned_in(table))
+            self._loop = self._loop.beside()
         return self._tests(request)
 
     def _tests(self, request: ShardRequest) -> ShardResult:

@@ -20,17 +20,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.errors import RunFolderError
-from harness.families.cut_in.laws import Environment
-from harness.loop.cells import PrescribedTraffic, drawn_traffic
+from harness.families.cut_in.learned import Following, Learned, learn
+from harness.families.protocol import Paths, Recorded
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
-from harness.pool.cut_ins import padded
-from harness.pool.learned import Following, Learned, learn
+from harness.loop.repeat import Traffic
 from harness.pool.vehicle_pool import BaselinePaths
-from harness.pool.walk import BaselineRuns, write_script
 from harness.records.folder import parquet, read_table
-from harness.records.schemas import baseline_table, pilot_table
+from harness.records.schemas import baseline_table, padded, pilot_table
+from harness.resolved import Resolved
 from harness.sampling.protocol import ShardRequest, Source
-from harness.vocabulary import AV, FAILED, IntArray, RecordArray
+from harness.vocabulary import FAILED
 
 SHADOW = "shadow"
 """Folder of the baseline runs within a run folder; it keeps its first name."""
@@ -43,7 +42,7 @@ IN_MANIFEST = {BASELINE_RUNS: ("shadow_runs", "baseline_crc32"), PILOT_TESTS: ("
 """Keys of their numbers, and of their checksums."""
 LEARNED = b"harness.learned"
 """Key in the metadata of the baseline runs as workers get them."""
-ALL_MOTION = RecordPolicy(0, "all", 0.0)
+ALL_MOTION = RecordPolicy("all", 0.0)
 _MEND = "Delete this file and run again with --resume: the same baseline runs are made anew."
 
 
@@ -63,13 +62,11 @@ def baseline_requests(n: int) -> Iterator[ShardRequest]:
     return (ShardRequest(index, first, min(SHARD_RUNS, n - first), baseline=True) for index, first in firsts)
 
 
-def pilot_requests(prescribed: tuple[RecordArray, PrescribedTraffic]) -> Iterator[ShardRequest]:
+def pilot_requests(prescribed: Traffic) -> Iterator[ShardRequest]:
     """All pilot tests, in order."""
-    states, traffic = prescribed
-    for index, first in enumerate(range(0, states.size, SHARD_RUNS)):
-        rows = slice(first, first + SHARD_RUNS)
-        of_rows = states[rows], PrescribedTraffic._make(column[rows] for column in traffic)
-        yield ShardRequest(index, first, of_rows[0].size, baseline=True, prescribed=of_rows)
+    for index, first in enumerate(range(0, len(prescribed), SHARD_RUNS)):
+        of_rows = prescribed.rows(slice(first, first + SHARD_RUNS))
+        yield ShardRequest(index, first, len(of_rows), baseline=True, prescribed=of_rows)
 
 
 def baseline_file(folder: Path, request: ShardRequest) -> Path:
@@ -77,16 +74,15 @@ def baseline_file(folder: Path, request: ShardRequest) -> Path:
     return folder / (PILOT if request.prescribed else SHADOW) / f"shard-{request.index:06d}.parquet"
 
 
-def run_baseline(
-    loop: EpisodeLoop, paths: BaselinePaths, environment: Environment, request: ShardRequest
-) -> BaselineResult:
+def run_baseline(loop: EpisodeLoop, paths: BaselinePaths, resolved: Resolved, request: ShardRequest) -> BaselineResult:
     """Drive the loop's vehicle along a range of paths, or in pilot tests."""
     if request.prescribed is not None:
-        table = pilot_table(loop.beside(keep=ALL_MOTION).run(request.first_episode, *request.prescribed))
+        table = pilot_table(loop.beside(keep=ALL_MOTION).run(request.first_episode, request.prescribed))
         return BaselineResult(request, table, parquet(table), _causes(table))
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
-    shard = without_cut_in(loop, paths.seed, request.first_episode, paths.index[rows], paths.state[rows], environment)
-    table = baseline_table(shard, paths.index[rows], paths.weight[rows])
+    some = Paths(paths.index[rows], paths.start[rows])
+    shard = without_event(loop, resolved, paths.seed, some, request.first_episode)
+    table = baseline_table(shard, some.number, paths.weight[rows])
     return BaselineResult(request, table, parquet(table), _causes(table))
 
 
@@ -105,7 +101,7 @@ def stored_baseline(
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     name, wanted = "path", paths.index[rows]
     if request.prescribed is not None:
-        name, wanted = "shadow", request.prescribed[1].announced_index
+        name, wanted = "shadow", request.prescribed.script.announced_index
     if not np.array_equal(table.column(name).to_numpy(), wanted):
         expected = "those of this campaign and this version of the harness"
         mend = "Use a new folder, or the version that the run was begun with (manifest.json)."
@@ -117,13 +113,13 @@ def _causes(table: pa.Table) -> Counter[str]:
     return Counter(table.column("failure").drop_null().to_pylist())
 
 
-def begin(source: Source, drive: Callable[[str, Sequence[ShardRequest]], pa.Table]) -> tuple[pa.Table, BaselineRuns]:
+def begin(source: Source, drive: Callable[[str, Sequence[ShardRequest]], pa.Table]) -> tuple[pa.Table, Recorded]:
     """Let a campaign's tests follow from baseline runs and pilot tests, whose tables ``drive`` gives.
 
     Returns the baseline runs: as workers get them, with what was learned (`learned_in`), and as arrays.
     """
     table, learned = drive(BASELINE_RUNS, list(baseline_requests(len(source.baseline_paths or ())))), None
-    runs = as_recorded(table, source.resolved.environment)
+    runs = as_recorded(table, source.scenario.max_steps)
     source.begin_after(runs)
     if (pilot := source.pilot()) is not None:
         learned = learned_from(drive(PILOT_TESTS, list(pilot_requests(pilot))), runs)
@@ -151,7 +147,7 @@ def read_stored(
     return pa.concat_tables(done.table for done in found if done is not None)
 
 
-def learned_from(table: pa.Table, runs: BaselineRuns) -> Learned | None:
+def learned_from(table: pa.Table, runs: Recorded) -> Learned | None:
     """What all pilot tests teach that have not failed; None if those are none."""
     table = table.filter(pc.is_null(table.column("failure")))
     if not table.num_rows:
@@ -163,29 +159,29 @@ def learned_from(table: pa.Table, runs: BaselineRuns) -> Learned | None:
     return learn(Following(shadow, onset + 1, last - 1, x_av, *(values for values, _ in others)), runs)
 
 
-def as_recorded(table: pa.Table, environment: Environment) -> BaselineRuns:
+def as_recorded(table: pa.Table, max_steps: int) -> Recorded:
     """All baseline runs of a campaign as arrays."""
-    width = int(environment.numbers["max_steps"]) + 1
     n_steps = table.column("n_steps").to_numpy().astype(np.int64)
     failed = np.asarray(pc.equal(table.column("outcome").cast(pa.string()), "failed"))
-    motion = (padded(table.column(name), width)[0] for name in ("av_position_m", "av_speed_mps"))
-    return BaselineRuns(n_steps, failed, *motion)
+    motion = (padded(table.column(name), max_steps + 1)[0] for name in ("av_position_m", "av_speed_mps"))
+    return Recorded(n_steps, failed, *motion)
 
 
-def without_cut_in(
-    loop: EpisodeLoop, seed: int, first: int, index: IntArray, state: RecordArray, environment: Environment
-) -> Shard:
-    """Drive the loop's vehicle along paths (n,) on which nobody cuts in; the first is its episode ``first``."""
-    none = np.full(len(index), -1, np.int64)
-    lv, bv, *_ = write_script(seed, index, none, state, environment)
-    traffic = drawn_traffic()._replace(lv=lv, bv=bv, cut_step=none, stratum=none, log_weight=np.zeros(len(index)))
-    return loop.beside(keep=ALL_MOTION).run(first, state, traffic)
+def without_event(loop: EpisodeLoop, resolved: Resolved, seed: int, paths: Paths, first: int | None = None) -> Shard:
+    """Drive the loop's vehicle along paths (n,) on which nothing happens.
+
+    The first is its episode ``first``, or of the path's own number.
+    """
+    none = np.full(len(paths.number), -1, np.int64)
+    chosen = resolved.family.choose(resolved.environment, seed, paths, none)
+    traffic = Traffic(resolved.family.script(resolved.environment, chosen), chosen.facts)
+    return loop.beside(keep=ALL_MOTION).run(int(paths.number[0]) if first is None else first, traffic)
 
 
-def recorded(shard: Shard, environment: Environment) -> BaselineRuns:
+def recorded(shard: Shard) -> Recorded:
     """Baseline runs as they come from the loop."""
-    episode, width = shard.results.episode, int(environment.numbers["max_steps"]) + 1
-    x, v = np.zeros((2, episode.size, width))
+    episode = shard.episode
+    x, v = np.zeros((2, episode.size, shard.scenario.max_steps + 1))
     for row, trace in shard.traces.items():
-        x[row, : len(trace)], v[row, : len(trace)] = trace[:, AV, 0], trace[:, AV, 1]
-    return BaselineRuns(episode["n_steps"].astype(np.int64), episode["outcome"] == FAILED, x, v)
+        x[row, : len(trace)], v[row, : len(trace)] = trace[:, -1, 0], trace[:, -1, 1]
+    return Recorded(episode["n_steps"].astype(np.int64), episode["outcome"] == FAILED, x, v)

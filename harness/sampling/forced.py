@@ -1,64 +1,68 @@
-"""Every test has a cut-in; its weight is the probability that there is one on its path."""
+"""Every test has an event; its weight is the probability that there is one on its path."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.nade.decide import CUT_IN_DRAW
-from harness.loop.cells import PrescribedTraffic
+from harness.families.protocol import HOLDING, Paths, Recorded
+from harness.loop.cells import Script
 from harness.loop.judge import motion_hashes
 from harness.loop.loop import EpisodeLoop, Shard
-from harness.pool.cut_ins import onset_steps
-from harness.pool.walk import enumerate_cut_ins, write_script
-from harness.random_stream import CUT_IN, uniforms
-from harness.sampling.baseline import recorded, without_cut_in
+from harness.loop.repeat import Traffic
+from harness.random_stream import CUT_IN as EVENT
+from harness.random_stream import uniforms
+from harness.resolved import Resolved
+from harness.sampling.baseline import recorded, without_event
+from harness.sampling.naturalistic import EVENT_DRAW, NOBODY
 from harness.sampling.protocol import ShardRequest, Source
-from harness.vehicles.drivers import Followers, driver_records
-from harness.vocabulary import RecordArray
 
 AT_ONCE = 1000
 """Baseline runs whose motion is held in memory at once: some 15 MB."""
 
 
 class Forced(Source):
-    """The cut-in's step is drawn given that there is one.
+    """The event is drawn given that there is one.
 
-    A vehicle that acts before the cut-in is driven along the path without one first, which prescribes the test.
+    A vehicle that acts before the event is driven along the path without one first, which prescribes the test.
     """
+
+    def tests(self, first_episode: int, n_episodes: int) -> Traffic:
+        return forced(self.resolved, self.paths(first_episode, n_episodes))
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
+        first, n = request.first_episode, request.n_episodes
         if not self.campaign.has_baseline_runs:
             return super().run(loop, request)
-        first, states = request.first_episode, self.states(request.first_episode, request.n_episodes)
-        return loop.run(first, states, forced_traffic(loop, self.policy.seed, first, states, self.policy.environment))
+        return loop.run(first, forced_after_runs(loop, self.resolved, self.paths(first, n)))
 
 
-def forced_traffic(
-    loop: EpisodeLoop, seed: int, first: int, state: RecordArray, environment: Environment
-) -> PrescribedTraffic:
-    """Scripts of consecutive forced cut-ins (n,), each after a baseline run of its own on the same path.
+def forced_after_runs(loop: EpisodeLoop, resolved: Resolved, paths: Paths) -> Traffic:
+    """Tests (n,), each after a baseline run of its own on the same path.
 
-    The cut-in's step is drawn given that there is one, and its weight is the probability of that: both follow from the
-    baseline run. Where that fails there is no cut-in; the test fails as well, and weighs what it may have hidden.
+    Where that fails there is no event; the test fails as well, and weighs what it may have hidden.
     """
-    begins = range(0, len(state), AT_ONCE)
-    parts = [_forced(loop, seed, first + begin, state[begin : begin + AT_ONCE], environment) for begin in begins]
-    return PrescribedTraffic._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
+    parts = []
+    for begin in range(0, len(paths.number), AT_ONCE):
+        some = Paths(*(column[begin : begin + AT_ONCE] for column in paths))
+        parts.append(forced(resolved, some, recorded(without_event(loop, resolved, resolved.campaign.seed, some))))
+    script = Script._make(np.concatenate(columns) for columns in zip(*(part.script for part in parts), strict=True))
+    return Traffic(script, np.concatenate([part.facts for part in parts]))
 
 
-def _forced(
-    loop: EpisodeLoop, seed: int, first: int, state: RecordArray, environment: Environment
-) -> PrescribedTraffic:
-    n, index = len(state), first + np.arange(len(state))
-    runs = recorded(without_cut_in(loop, seed, first, index, state, environment), environment)
-    nobody = Followers(driver_records([]))
-    probability, _, p_after_failure = enumerate_cut_ins(seed, index, state, environment, nobody, runs)
-    cumulative = np.cumsum(probability, axis=1)
-    p_cut_in = cumulative[:, -1]
-    u = uniforms(seed, first, n, CUT_IN, CUT_IN_DRAW + 1)[:, CUT_IN_DRAW]
-    step = np.minimum((cumulative <= (u * p_cut_in)[:, None]).sum(1), (cumulative < p_cut_in[:, None]).sum(1))
-    step[runs.failed] = -1
-    lv, bv, _, _, lead = write_script(seed, index, step, state, environment, draws_per_cut_in=0)
-    motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), onset_steps(step, lead)]
-    return PrescribedTraffic(lv, bv, step, np.full(n, -1), np.log(p_cut_in + p_after_failure), index, motion, lead)
+def forced(resolved: Resolved, paths: Paths, runs: Recorded = HOLDING) -> Traffic:
+    """Tests (n,), where the vehicle keeps its speed until the event, or did so in baseline runs."""
+    family, environment, seed, n = resolved.family, resolved.environment, resolved.campaign.seed, len(paths.number)
+    events = family.events(environment, seed, paths, NOBODY, runs)
+    u = uniforms(seed, int(paths.number[0]), n, EVENT, EVENT_DRAW + 1)[:, EVENT_DRAW]
+    cumulative = np.cumsum(events.probability, axis=1)
+    total, log_weight = cumulative[:, -1], events.log_any
+    event = np.minimum((cumulative <= (u * total)[:, None]).sum(1), (cumulative < total[:, None]).sum(1))
+    if runs.failed.size:
+        event[runs.failed], log_weight = -1, np.log(total + events.after_failure)
+    chosen = family.choose(environment, seed, paths, event, of_pool=False)
+    script = family.script(environment, chosen)._replace(log_weight=log_weight, log_p_event=log_weight)
+    if runs.failed.size:
+        onset = np.maximum(chosen.at - chosen.lead, 0)
+        motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), onset]
+        script = script._replace(announced_index=paths.number, motion_hash=motion)
+    return Traffic(script, chosen.facts)

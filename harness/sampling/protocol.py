@@ -7,12 +7,13 @@ from. The runner knows no more of a method than this.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
+import numpy as np
 import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
@@ -21,27 +22,25 @@ from harness.controllers.hosts import Death
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import Rule, StopRule
-from harness.families.cut_in.laws import InitialStates
-from harness.families.cut_in.nade.functions import build_importance, mixture_weights
-from harness.families.cut_in.nade.tables import Tables, build_tables, tables_name
-from harness.loop.cells import PrescribedTraffic
-from harness.loop.loop import MOMENT_LIMITS, Drawing, EpisodeLoop, RecordPolicy, Shard
-from harness.pool.learned import Learned
+from harness.families.cut_in.learned import Learned
+from harness.families.protocol import Paths, Recorded
+from harness.loop.judge import judge
+from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
+from harness.loop.repeat import Traffic
 from harness.pool.shells import Draw
 from harness.pool.vehicle_pool import BaselinePaths
-from harness.pool.walk import BaselineRuns
 from harness.progress import Progress
+from harness.random_stream import INITIAL, uniforms
 from harness.resolved import Resolved
 from harness.strata import ShellDesign
-from harness.vocabulary import RecordArray
 from harness.worlds import World
 
 
 @dataclass(frozen=True)
 class ShardRequest:
-    """A fixed range of episodes, or of ``baseline`` runs; ``draws`` says which cut-ins they are, where that is so.
+    """A fixed range of episodes, or of ``baseline`` runs; ``draws`` says which events they are, where that is so.
 
-    Pilot tests have initial states and traffic ``prescribed``.
+    Pilot tests have their traffic ``prescribed``.
     """
 
     index: int
@@ -49,7 +48,7 @@ class ShardRequest:
     n_episodes: int
     draws: tuple[Draw, ...] = ()
     baseline: bool = False
-    prescribed: tuple[RecordArray, PrescribedTraffic] | None = None
+    prescribed: Traffic | None = None
 
 
 class Rounds(Protocol):
@@ -91,54 +90,51 @@ class KnownRounds(Rounds):
 class Source:
     """What the tests of a campaign are drawn from, built or read from the cache; tests are independent by default.
 
-    ``policy`` is what the episode loop needs to know, ``tables`` are challenges where surrogates' importance functions
-    are mixed, and ``design`` has the strata of those that have some. Along ``baseline_paths`` the vehicle has to be
-    driven without a cut-in before tests can be drawn; see `begin_after`.
+    ``scenario`` is what they have in common, and ``design`` has the strata of those that have some. Along
+    ``baseline_paths`` the vehicle has to be driven without an event before tests can be drawn; see `begin_after`.
     """
 
     columns: ClassVar[tuple[str, ...]] = EPISODE_COLUMNS
     """Of the episodes table, that estimates need."""
+    kernel: ClassVar[Callable[..., Any]] = staticmethod(judge)
+    """One of those that have to be compiled."""
 
-    def __init__(self, resolved: Resolved, progress: Progress) -> None:
+    def __init__(self, resolved: Resolved, progress: Progress) -> None:  # noqa: ARG002 - most build something
         self.resolved, self.campaign = resolved, resolved.campaign
-        self.tables: Tables | None = None
-        if self.campaign.sampling.mixes:
-            drivers = resolved.surrogates
-            progress.stage("criticality tables", len(drivers))
-            challenge = self.campaign.testing.challenge
-            self.tables = build_tables(resolved.environment, drivers, challenge, progress.advance)
-        importance = build_importance(self.campaign, self.tables)
-        self.policy = Drawing(self.campaign.seed, resolved.environment, importance, resolved.av)
-        self.initial_states = InitialStates(resolved.environment.numbers)
+        self.scenario = resolved.scenario
         self.design: ShellDesign | None = None
         self.baseline_paths: BaselinePaths | None = None
 
     @classmethod
-    def cached_files(cls, resolved: Resolved) -> list[str]:
+    def cached_files(cls, resolved: Resolved) -> list[str]:  # noqa: ARG003 - here nothing is built
         """What building leaves in the cache, or has found there, by names: with it another machine builds nothing."""
-        if not resolved.campaign.sampling.mixes:
-            return []
-        return [tables_name(resolved.environment, resolved.surrogates, resolved.campaign.testing.challenge)]
+        return []
 
     @classmethod
     def stored_design(cls, folder: Path) -> ShellDesign | None:  # noqa: ARG003 - there is none
         """Strata of a stored run."""
         return None
 
-    def begin_after(self, runs: BaselineRuns, learned: Learned | None = None) -> None:  # noqa: ARG002 - there are none
+    def begin_after(self, runs: Recorded, learned: Learned | None = None) -> None:  # noqa: ARG002 - there are none
         """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`; of pilot tests it learned.
 
         Raises `HarnessError`: nothing on these paths can be tested.
         """
         raise ValueError("this campaign has no baseline runs")
 
-    def pilot(self) -> tuple[RecordArray, PrescribedTraffic] | None:
+    def pilot(self) -> Traffic | None:
         """Tests that do not count, after baseline runs, from which a surrogate is to be learned; None for none."""
         return None
 
-    def states(self, first_episode: int, n_episodes: int) -> RecordArray:
-        """Initial states of consecutive episodes, shape (n_episodes,)."""
-        return self.initial_states.draw(self.campaign.seed, first_episode, n_episodes)
+    def paths(self, first_episode: int, n_episodes: int) -> Paths:
+        """Paths of consecutive episodes, (n_episodes,)."""
+        family, seed = self.resolved.family, self.campaign.seed
+        u = uniforms(seed, first_episode, n_episodes, INITIAL, family.n_uniforms)
+        return Paths(first_episode + np.arange(n_episodes), family.start(self.resolved.environment, u))
+
+    def tests(self, first_episode: int, n_episodes: int) -> Traffic:
+        """What the others do in consecutive episodes."""
+        raise NotImplementedError
 
     def loop(
         self,
@@ -157,12 +153,12 @@ class Source:
         av = build_host(
             campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box, fatal_episodes=fatal_episodes
         )
-        return EpisodeLoop(world, self.policy, self.records(traces), av)
+        return EpisodeLoop(world, self.scenario, self.records(traces), av)
 
     def records(self, traces: str | None = None) -> RecordPolicy:
         """What the campaign asks to be recorded of its tests, or with other ``traces``."""
         kept = self.campaign.records
-        return RecordPolicy(MOMENT_LIMITS[kept.moments], traces or kept.traces, kept.trace_share)
+        return RecordPolicy(traces or kept.traces, kept.trace_share)
 
     def rounds(self, held: int = 0) -> Rounds:  # noqa: ARG002 - only rounds that give up ask for it
         """Rounds of tests, for a folder that holds so many already."""
@@ -170,7 +166,7 @@ class Source:
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
         """Run the tests of a shard."""
-        return loop.run(request.first_episode, self.states(request.first_episode, request.n_episodes))
+        return loop.run(request.first_episode, self.tests(request.first_episode, request.n_episodes))
 
     def run_again(self, loop: EpisodeLoop, episode: int, stored: pa.Table) -> Shard:  # noqa: ARG002 - the index says all
         """Run an episode that is ``stored`` as one row."""
@@ -191,7 +187,7 @@ def block_of(campaign: Campaign, episodes: pa.Table, moments: pa.Table | None, d
         episodes,
         moments,
         method=campaign.testing.method,
-        alpha=mixture_weights(campaign),
+        alpha=campaign.mixture_weights,
         shells=design,
         counts_above_mps=campaign.crash.counts_above_mps,
         epsilon=campaign.testing.epsilon,

@@ -24,22 +24,22 @@ from harness.estimators.pairs import PairCounts
 from harness.estimators.shells import Shells as SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
-from harness.loop.cells import PrescribedTraffic
+from harness.families.cut_in.learned import Learned
+from harness.families.protocol import Recorded
 from harness.loop.loop import EpisodeLoop, Shard
+from harness.loop.repeat import Traffic
 from harness.numbers import plain
 from harness.pool.build import campaign_pool, campaign_pool_key, pool_name
 from harness.pool.cut_ins import Pool
-from harness.pool.learned import Learned
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_paths, vehicle_pool
-from harness.pool.walk import BaselineRuns
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
 from harness.sampling.allocation import CONFIDENCE, Allocation
 from harness.sampling.protocol import Rounds, ShardRequest, Source
 from harness.strata import ASSUMPTION_FREE, LEARNED, ShellDesign, StoredDesign
-from harness.vocabulary import IntArray, RecordArray
+from harness.vocabulary import IntArray
 
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
@@ -62,7 +62,7 @@ class Shells(Source):
             progress.remark = ""
 
     def _draw_from(self, pool: Pool) -> None:
-        self.prescribed = PrescribedEpisodes(self.campaign, pool)
+        self.prescribed = PrescribedEpisodes(self.resolved, pool)
         self.design = self.prescribed.design
 
     @classmethod
@@ -75,7 +75,7 @@ class Shells(Source):
         """Strata of a stored run; a `RunFolderError` where they are missing, damaged, or of a too early version."""
         return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
 
-    def begin_after(self, runs: BaselineRuns, learned: Learned | None = None) -> None:
+    def begin_after(self, runs: Recorded, learned: Learned | None = None) -> None:
         if self.baseline_paths is None:
             raise ValueError("this campaign has no baseline runs")
         self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs, learned))
@@ -83,7 +83,7 @@ class Shells(Source):
             said = f"{learned.n_tests:,} pilot tests, which do not count: {learned.in_words}"
             self.design = self.prescribed.design = replace(design, learned=said)
 
-    def pilot(self) -> tuple[RecordArray, PrescribedTraffic] | None:
+    def pilot(self) -> Traffic | None:
         n, asked = self.campaign.pool.pilot_tests, self.campaign.testing.shells.statement
         return self.prescribed.pilot(n, self.campaign.seed) if n and asked == ASSUMPTION_FREE else None
 
@@ -91,15 +91,15 @@ class Shells(Source):
         return ShellRounds(self.campaign, self.prescribed.design, self.prescribed.available, held)
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
-        states, traffic, cut_ins = self.prescribed.episodes(request.draws)
-        shard = loop.run(request.first_episode, states, traffic)
-        shard.cut_ins = cut_ins
+        traffic, events = self.prescribed.tests(request.draws)
+        shard = loop.run(request.first_episode, traffic)
+        shard.events = events
         return shard
 
     def run_again(self, loop: EpisodeLoop, episode: int, stored: pa.Table) -> Shard:
         row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
-        shard = loop.run(episode, *self.prescribed.of_rows(row, stratum))
-        shard.cut_ins = self.prescribed.cut_ins(row)
+        shard = loop.run(episode, self.prescribed.of_rows(row, stratum))
+        shard.events = self.prescribed.events(row)
         return shard
 
     def is_shard(self, request: ShardRequest, episodes: pa.Table) -> bool:

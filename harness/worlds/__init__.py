@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
+from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 
 if TYPE_CHECKING:
     from harness.campaign.campaign import Campaign
@@ -18,18 +18,20 @@ MOST_SUMO_CELLS = 256
 
 
 class World:
-    """K cells, each with LV, BV and AV on a two-lane road of its own.
+    """K cells, each with V ``vehicles``, the AV last, on a two-lane road of its own.
 
-    ``x``, ``v`` (K, 3) are front bumpers' positions (m) and speeds (m/s) of LV, BV, AV, as the world reports them. One
-    that ``drives_av`` itself (SUMO's own models, or a program connected to SUMO) does so from the start of an episode
-    if it ``acts_before_cut_in``, else from the step after the cut-in.
+    ``x``, ``v``, ``lane`` (K, V) are front bumpers' positions (m), speeds (m/s) and lanes (0 right, 1 left), as the
+    world reports them. One that ``drives_av`` itself (SUMO's own models, or a program connected to SUMO) does so from
+    the start of an episode if it ``acts_before_cut_in``, else from the step after the cut-in.
     """
 
     drives_av = acts_before_cut_in = False
 
-    def __init__(self, n_cells: int) -> None:
-        self.x: FloatArray = np.zeros((n_cells, 3))
-        self.v: FloatArray = np.zeros((n_cells, 3))
+    def __init__(self, n_cells: int, vehicles: Sequence[str] = VEHICLES) -> None:
+        self.vehicles = tuple(vehicles)
+        self.x: FloatArray = np.zeros((n_cells, len(vehicles)))
+        self.v: FloatArray = np.zeros((n_cells, len(vehicles)))
+        self.lane: Int8Array = np.zeros((n_cells, len(vehicles)), np.int8)
         self._contact: BoolArray = np.zeros(n_cells, np.bool_)
 
     @property
@@ -40,18 +42,18 @@ class World:
     def announce(self, cells: IntArray, episodes: IntArray) -> None:
         """Episodes (n,) of the given cells (n,), told before they are placed."""
 
-    def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        """Put the vehicles of the given cells (n,) at ``x[cells]``, ``v[cells]``; LV and BV left, AV right.
+    def place(self, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
+        """Put the vehicles of the given cells (n,) at ``x[cells]``, ``v[cells]``, on ``lane[cells]``.
 
-        ``x`` and ``v`` (K, 3) may be the world's own arrays, already overwritten.
+        ``x`` and ``v`` (K, V) may be the world's own arrays, already overwritten.
         """
         raise NotImplementedError
 
-    def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        """Advance all cells to the speeds (m/s, shape (K, 3)) at the end of the step.
+    def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
+        """Advance all cells to the speeds (m/s, shape (K, V)) at the end of the step.
 
-        ``cut_in`` (K,) says whose BV moves to the right lane in this step. Returns the cells (K,) in which vehicles on
-        the same lane have come into contact in it.
+        ``lane`` (K, V) are the lanes that vehicles are then on; the AV keeps its own. Returns the cells (K,) in which
+        vehicles have come into contact that are on one lane, or were before the step.
         """
         raise NotImplementedError
 

@@ -36,9 +36,9 @@ from traci.exceptions import FatalTraCIError, TraCIException
 from harness.campaign.vehicle import TraciProcess
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.processes import end
-from harness.vocabulary import AV, BV, LV, BoolArray, FloatArray, Int8Array, IntArray
+from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import AVLostError
-from harness.worlds.sumo import LEFT, NEVER_PLAN_S, OBEY, PLAN_NOW_S, RIGHT, SumoCells, sumo_program
+from harness.worlds.sumo import NEVER_PLAN_S, OBEY, PLAN_NOW_S, SumoCells, sumo_program
 from harness.worlds.twin import advance
 
 HARNESS_ORDER = 2
@@ -238,12 +238,19 @@ class TraciWorld(SumoCells):
 
     drives_av = True
 
-    def __init__(self, n_cells: int, av: TraciProcess, step_time_s: float, *, acts_before_cut_in: bool = False) -> None:
-        super().__init__(n_cells)
+    def __init__(
+        self,
+        n_cells: int,
+        av: TraciProcess,
+        step_time_s: float,
+        vehicles: Sequence[str] = VEHICLES,
+        *,
+        acts_before_cut_in: bool = False,
+    ) -> None:
+        super().__init__(n_cells, vehicles)
         self.acts_before_cut_in = acts_before_cut_in
         self._av, self._step_time_s, self._restarts_left = av, step_time_s, av.restarts
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
-        self._on_right: BoolArray = np.zeros(n_cells, np.bool_)
         self._program: ConnectedProgram | None = None
         self._given_up = ""
         atexit.register(self.close)
@@ -273,22 +280,22 @@ class TraciWorld(SumoCells):
             raise AVLostError(self._given_up or "the program is not running")
         return self._program
 
-    def _move(self, to: Any, k: int, vehicle: int, x: float, v: float) -> None:
+    def _move(self, to: Any, k: int, vehicle: int, x: float, v: float, lane: int) -> None:
         to.setSpeedMode(self._names[k][vehicle], OBEY)  # whatever the program has made of it
-        super()._move(to, k, vehicle, x, v)
+        super()._move(to, k, vehicle, x, v, lane)
 
-    def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
+    def place(self, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
         """Take the AVs of these cells back under command."""
         program = self._running()
         to = program.connection.vehicle
         for k in cells.tolist():
-            for vehicle in (LV, BV, AV):
-                program.answer(partial(self._move, to, k, vehicle, float(x[k, vehicle]), float(v[k, vehicle])))
-        self.x[cells], self.v[cells] = x[cells], v[cells]
+            for vehicle in self._in_order(k, lane[k]):
+                there = float(x[k, vehicle]), float(v[k, vehicle]), int(lane[k, vehicle])
+                program.answer(partial(self._move, to, k, vehicle, *there))
+        self.x[cells], self.v[cells], self.lane[cells] = x[cells], v[cells], lane[cells]
         self._released[cells] = self.acts_before_cut_in
-        self._on_right[cells] = False
 
-    def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
+    def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
         """Speeds of released AVs are ignored.
 
         Raises an `AVLostError` where the program did not take part in this step, a `WorldDisagreementError` where a
@@ -296,27 +303,27 @@ class TraciWorld(SumoCells):
         """
         program = self._running()
         api = program.connection
-        changing = np.flatnonzero(cut_in).tolist()
-        commanded = np.ones((self.n_cells, 3), np.bool_)
-        commanded[self._released, AV] = False
+        changing = self._changes(lane)
+        commanded = np.ones_like(self.x, np.bool_)
+        commanded[self._released, -1] = False
         try:
-            program.answer(lambda: self._command(api, commanded, speed, changing))
+            program.answer(lambda: self._command(api, commanded, speed, lane))
             program.answer(api.simulationStep)
             program.require_connected()
             contact = program.answer(lambda: self._contacts(api.simulation.getCollisions))
         except TraCIException as error:
             raise _meddled("a vehicle of the harness", str(error), "a vehicle that is there") from error
-        self._on_right[changing] = True
+        self.lane[:] = lane
         self._read(api.vehicle.getAllSubscriptionResults(), speed, commanded)
-        for k in changing:
-            program.answer(partial(api.vehicle.setActionStepLength, self._names[k][BV], NEVER_PLAN_S, True))
-        self._released[changing] = True
+        for k, vehicle in changing:
+            program.answer(partial(api.vehicle.setActionStepLength, self._names[k][vehicle], NEVER_PLAN_S, True))
+            self._released[k] = True
         return contact
 
-    def _command(self, api: BatchConnection, commanded: BoolArray, speed: FloatArray, changing: list[int]) -> None:
-        for k in changing:
-            api.vehicle.setActionStepLength(self._names[k][BV], PLAN_NOW_S, True)
-            api.vehicle.changeLane(self._names[k][BV], RIGHT, 0.0)
+    def _command(self, api: BatchConnection, commanded: BoolArray, speed: FloatArray, lane: Int8Array) -> None:
+        for k, vehicle in self._changes(lane):
+            api.vehicle.setActionStepLength(self._names[k][vehicle], PLAN_NOW_S, True)
+            api.vehicle.changeLane(self._names[k][vehicle], int(lane[k, vehicle]), 0.0)
         told = np.flatnonzero(commanded)
         api.set_speeds([self._flat[i] for i in told.tolist()], speed.ravel()[told].tolist())
 
@@ -325,13 +332,10 @@ class TraciWorld(SumoCells):
         x, v = self.x.copy(), self.v.copy()
         advance(x, v, speed)
         read = np.array([[found[name][variable] for variable in _SUBSCRIBED] for name in self._flat])
-        position, speed_read, lane = read.reshape(self.n_cells, 3, 3).transpose(2, 0, 1)
-        wanted_lane = np.full((self.n_cells, 3), LEFT)
-        wanted_lane[:, AV] = RIGHT
-        wanted_lane[self._on_right, BV] = RIGHT
+        position, speed_read, lane = read.reshape(*self.x.shape, len(_SUBSCRIBED)).transpose(2, 0, 1)
         for quantity, here, wanted in (("position, m", position, x), ("speed, m/s", speed_read, v)):
             self._require(quantity, here, wanted, commanded)
-        self._require("lane", lane, wanted_lane, np.ones_like(commanded))
+        self._require("lane", lane, self.lane, np.ones_like(commanded))
         self.x[:], self.v[:] = position, speed_read
 
     def _require(self, quantity: str, found: FloatArray, wanted: Any, which: BoolArray) -> None:

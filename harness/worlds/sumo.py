@@ -26,7 +26,7 @@ import numpy as np
 
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.processes import SharedFile
-from harness.vocabulary import AV, BV, LV, VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
+from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import MOST_SUMO_CELLS, World
 from harness.worlds.shim import Shim, open_shim
 from harness.worlds.system_libraries import SUMO_VERSION, not_importable
@@ -44,22 +44,23 @@ OBEY = 0
 """Speed mode in which commands are taken as they are."""
 NEVER_PLAN_S, PLAN_NOW_S = 1000.0, 0.1
 """Action steps: SUMO's own planning is switched off, except for the one step in which BV changes lanes."""
-PARKED_M = {LV: 300.0, BV: 200.0, AV: 100.0}
-"""Where the vehicles of a cell stand that has not been given an episode."""
+PARKED_M = 100.0
+"""Distance between the vehicles of a cell that has not been given a test, and of the last from the road's beginning."""
 
 
 class SumoCells(World):
-    """K roads in a SUMO, each with LV, BV and AV."""
+    """K roads in a SUMO, each with V vehicles."""
 
-    def __init__(self, n_cells: int) -> None:
-        super().__init__(n_cells)
+    def __init__(self, n_cells: int, vehicles: Sequence[str] = VEHICLES) -> None:
+        super().__init__(n_cells, vehicles)
+        self._parked = PARKED_M * np.arange(len(vehicles), 0, -1)
         self._park(np.arange(n_cells))
-        self._names = [[f"{vehicle}{k}" for vehicle in VEHICLES] for k in range(n_cells)]
+        self._names = [[f"{vehicle}{k}" for vehicle in vehicles] for k in range(n_cells)]
         self._flat = [name for cell in self._names for name in cell]
         self._cell_of = {name: k for k, cell in enumerate(self._names) for name in cell}
 
     def _park(self, cells: Any) -> None:
-        self.x[cells], self.v[cells] = [PARKED_M[LV], PARKED_M[BV], PARKED_M[AV]], 0.0
+        self.x[cells], self.v[cells] = self._parked, 0.0
 
     def _arguments(self) -> list[str]:
         """SUMO's command line, without the name of the program."""
@@ -71,27 +72,43 @@ class SumoCells(World):
         return [as_shared(committed_file("vehicles.add.xml")).path]
 
     def _type_of(self, vehicle: int) -> str:  # noqa: ARG002 - worlds whose AV is of another type look at it
-        """Name of the vehicle type of LV, BV or AV."""
+        """Name of the vehicle type of a vehicle, by its place."""
         return "exact"
 
     def _populate(self, api: Any) -> None:
         """Put the vehicles of all cells on the road, parked."""
+        self.lane[:], self.lane[:, -1] = LEFT, RIGHT
         for k, names in enumerate(self._names):
             api.route.add(f"cell{k}", [f"cell{k}"])
             for vehicle, name in enumerate(names):
-                lane, position = str(RIGHT if vehicle == AV else LEFT), str(PARKED_M[vehicle])
+                lane, position = str(RIGHT if self._is_av(vehicle) else LEFT), str(self._parked[vehicle])
                 api.vehicle.add(name, f"cell{k}", typeID=self._type_of(vehicle), departLane=lane, departPos=position)
                 api.vehicle.setSpeedMode(name, OBEY)
                 api.vehicle.setLaneChangeMode(name, 0)
-                self._move(api.vehicle, k, vehicle, PARKED_M[vehicle], 0.0)
+                self._move(api.vehicle, k, vehicle, float(self._parked[vehicle]), 0.0, int(lane))
         # A vehicle that is still pending after the first step ignores moveTo: all stand on the road before it.
         api.simulationStep()
 
-    def _move(self, to: Any, k: int, vehicle: int, x: float, v: float) -> None:
+    def _is_av(self, vehicle: int) -> bool:
+        return vehicle == len(self.vehicles) - 1
+
+    def _in_order(self, k: int, lane: Int8Array) -> list[int]:
+        """In which order a cell's vehicles are moved to the beginning of a test: who changes lanes for it comes last.
+
+        SUMO does not sort its list of a lane again when a vehicle is moved within it; one from another lane it puts at
+        the right place.
+        """
+        return sorted(range(len(self.vehicles)), key=lambda vehicle: bool(lane[vehicle] != self.lane[k, vehicle]))
+
+    def _move(self, to: Any, k: int, vehicle: int, x: float, v: float, lane: int) -> None:
         name = self._names[k][vehicle]
-        to.moveTo(name, f"cell{k}_{RIGHT if vehicle == AV else LEFT}", x)
+        to.moveTo(name, f"cell{k}_{lane}", x)
         to.setPreviousSpeed(name, v)
         to.setSpeed(name, v)
+
+    def _changes(self, lane: Int8Array) -> list[tuple[int, int]]:
+        """Cell and place of those who change to other lanes (K, V) in this step."""
+        return [(k, vehicle) for k, vehicle in np.argwhere(lane != self.lane).tolist()]
 
     def _contacts(self, get_collisions: Callable[[], Iterable[Any]]) -> BoolArray:
         """Cells with a collision in this step.
@@ -150,14 +167,21 @@ class SumoWorld(SumoCells):
     _shim: Shim | None = None
 
     def __init__(
-        self, n_cells: int, *, vanilla: bool = False, gui: bool = False, shim: bool = True, options: Sequence[str] = ()
+        self,
+        n_cells: int,
+        vehicles: Sequence[str] = VEHICLES,
+        *,
+        vanilla: bool = False,
+        gui: bool = False,
+        shim: bool = True,
+        options: Sequence[str] = (),
     ) -> None:
         if SumoWorld._open:
             mend = "Close the other world first, or use another process."
             raise CampaignError("libsumo", "a simulation that already runs in this process", "one at a time", mend)
-        super().__init__(n_cells)
+        super().__init__(n_cells, vehicles)
         self._vanilla = vanilla
-        self._told: FloatArray = np.zeros((n_cells, 3))
+        self._told: FloatArray = np.zeros_like(self.x)
         self._n_steps = 0
         self._running, self._options = False, options
         self._api: Any = start_gui(self._arguments()) if gui else start_libsumo(self._arguments())
@@ -190,22 +214,22 @@ class SumoWorld(SumoCells):
         if self._shim is not None:
             self._shim.find_vehicles()
 
-    def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
+    def place(self, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
         """Positions and speeds are read back and compared."""
         positions, speeds = x[cells], v[cells]
         for k, at, driving in zip(cells.tolist(), positions.tolist(), speeds.tolist(), strict=True):
-            for vehicle in (LV, BV, AV):
-                self._move(self._api.vehicle, k, vehicle, at[vehicle], driving[vehicle])
-        self.x[cells], self.v[cells], self._told[cells] = positions, speeds, speeds
+            for vehicle in self._in_order(k, lane[k]):
+                self._move(self._api.vehicle, k, vehicle, at[vehicle], driving[vehicle], int(lane[k, vehicle]))
+        self.x[cells], self.v[cells], self.lane[cells], self._told[cells] = positions, speeds, lane[cells], speeds
         names = [name for k in cells.tolist() for name in self._names[k]]
         self._require_equal("m", self._get_position, positions, names)
         self._require_equal("m/s", self._get_speed, speeds, names)
 
-    def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        changing = [self._names[k][BV] for k in cut_in.nonzero()[0].tolist()]
-        for name in changing:
+    def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
+        changing = [(self._names[k][vehicle], int(lane[k, vehicle])) for k, vehicle in self._changes(lane)]
+        for name, to in changing:
             self._plan_every(PLAN_NOW_S, name)
-            self._api.vehicle.changeLane(name, RIGHT, 0.0)
+            self._api.vehicle.changeLane(name, to, 0.0)
         advance(self.x, self.v, speed)
         if self._shim is not None:
             if not self._shim.step(speed):
@@ -223,10 +247,11 @@ class SumoWorld(SumoCells):
             self._n_steps += 1
             if self._n_steps % SPEED_CHECK_STEPS == 0:
                 self._require_equal("m/s", self._get_speed, self.v)
-        for name in changing:
+        for name, to in changing:
             self._plan_every(NEVER_PLAN_S, name)
-            if (lane := self._api.vehicle.getLaneIndex(name)) != RIGHT:
-                raise _disobeyed(f"{name}, lane", lane, RIGHT)
+            if (found := self._api.vehicle.getLaneIndex(name)) != to:
+                raise _disobeyed(f"{name}, lane", found, to)
+        self.lane[:] = lane
         return self._contacts(self._get_collisions)
 
     def _read_released(self) -> None:

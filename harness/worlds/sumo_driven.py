@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from harness.errors import CampaignError
 from harness.processes import SharedFile
 from harness.random_stream import controller_random
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
-from harness.vocabulary import AV, BoolArray, FloatArray, Int8Array, IntArray
+from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds.sumo import OBEY, SumoWorld
 
 SUMO_DECIDES = 31
@@ -138,18 +138,24 @@ class SumoAvWorld(SumoWorld):
     drives_av = True
 
     def __init__(
-        self, n_cells: int, av: Mapping[str, str | float], *, acts_before_cut_in: bool = False, **options: Any
+        self,
+        n_cells: int,
+        av: Mapping[str, str | float],
+        vehicles: Sequence[str] = VEHICLES,
+        *,
+        acts_before_cut_in: bool = False,
+        **options: Any,
     ) -> None:
         self.acts_before_cut_in = acts_before_cut_in
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
-        self._wanted: FloatArray = np.zeros((n_cells, 3))
+        self._wanted: FloatArray = np.zeros((n_cells, len(vehicles)))
         attributes = av_type(av)
         written = " ".join(f"{name}={quoteattr(str(value))}" for name, value in attributes.items())
         xml = f'<additional>\n    <vType id="{TYPE_NAME}" {written}/>\n</additional>\n'
         self._type_file, stderr = SharedFile(xml.encode()), SharedFile()
         try:
             with _stderr_to(stderr.path):
-                super().__init__(n_cells, **options)
+                super().__init__(n_cells, vehicles, **options)
         except Exception as error:
             lines = stderr.path.read_text(encoding="utf-8").splitlines()
             messages = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
@@ -164,36 +170,37 @@ class SumoAvWorld(SumoWorld):
         return [*super()._type_files(), self._type_file.path]
 
     def _type_of(self, vehicle: int) -> str:
-        return TYPE_NAME if vehicle == AV else super()._type_of(vehicle)
+        return TYPE_NAME if self._is_av(vehicle) else super()._type_of(vehicle)
 
-    def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
+    def place(self, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
         """Take the AVs of these cells back under command."""
         for k in cells.tolist():
-            self._api.vehicle.setSpeedMode(self._names[k][AV], OBEY)
-        super().place(cells, x, v)
+            self._api.vehicle.setSpeedMode(self._names[k][-1], OBEY)
+        super().place(cells, x, v, lane)
         self._released[cells] = False
         if self.acts_before_cut_in:
             self._let_go(cells)
 
-    def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
+    def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
         """Speeds of released AVs are ignored."""
         self._wanted[:] = speed
-        self._wanted[self._released, AV] = RELEASE
-        contact = super().step(self._wanted, cut_in)
-        if cut_in.any():
-            self._let_go(np.flatnonzero((cut_in == 1) & ~self._released))
+        self._wanted[self._released, -1] = RELEASE
+        meets = (lane != self.lane).any(1)
+        contact = super().step(self._wanted, lane)
+        if meets.any():
+            self._let_go(np.flatnonzero(meets & ~self._released))
         return contact
 
     def _let_go(self, cells: IntArray) -> None:
         """From the next step on SUMO decides."""
         for k in cells.tolist():
-            self._api.vehicle.setSpeedMode(self._names[k][AV], SUMO_DECIDES)
+            self._api.vehicle.setSpeedMode(self._names[k][-1], SUMO_DECIDES)
         self._released[cells] = True
 
     def _read_released(self) -> None:
         for k in np.flatnonzero(self._released).tolist():
-            name = self._names[k][AV]
-            self.x[k, AV], self.v[k, AV] = self._get_position(name), self._get_speed(name)
+            name = self._names[k][-1]
+            self.x[k, -1], self.v[k, -1] = self._get_position(name), self._get_speed(name)
 
 
 class FreshWorld(SumoAvWorld):
@@ -202,9 +209,11 @@ class FreshWorld(SumoAvWorld):
     For types whose vehicles keep hidden state or draw random numbers: slower, and the same again in any order.
     """
 
-    def __init__(self, av: Mapping[str, str | float], seed: int, **options: Any) -> None:
+    def __init__(
+        self, av: Mapping[str, str | float], seed: int, vehicles: Sequence[str] = VEHICLES, **options: Any
+    ) -> None:
         self._seed, self._sumo_seed = seed, 0
-        super().__init__(1, av, **options)
+        super().__init__(1, av, vehicles, **options)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - there is one cell
         """Load a new simulation for the coming episode."""

@@ -2,52 +2,44 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from harness.compiled import compiled
-from harness.vehicles.kinematics import CONTACT_M, gap, next_position, overlaps
-from harness.vocabulary import AV, BV, LV, BoolArray, FloatArray, Int8Array, IntArray
+from harness.vehicles.kinematics import next_position, overlaps
+from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import World
 
 
 @compiled
 def advance(x: FloatArray, v: FloatArray, speed: FloatArray) -> None:
-    """Move all vehicles (K, 3) to the commanded speeds, in SUMO's arithmetic."""
+    """Move all vehicles (K, V) to the commanded speeds, in SUMO's arithmetic."""
     for k in range(x.shape[0]):
-        for vehicle in range(3):
+        for vehicle in range(x.shape[1]):
             x[k, vehicle] = next_position(x[k, vehicle], v[k, vehicle], speed[k, vehicle])
             v[k, vehicle] = speed[k, vehicle]
 
 
 @compiled
-def contacts(x: FloatArray, on_right: Int8Array, cut_in: Int8Array, out: BoolArray) -> None:
+def contacts(x: FloatArray, before: Int8Array, lane: Int8Array, out: BoolArray) -> None:
     """Which cells (K,) have vehicles of one lane in contact.
 
-    ``on_right`` (K,) says whose BV has cut in, ``cut_in`` (K,) whose did in this step: it has moved on the left lane
-    before it changes to the right one, and may touch vehicles on both.
+    A vehicle that changes lanes in a step moves on the lane that it had ``before`` (K, V) and then changes to its
+    ``lane`` (K, V): it may touch vehicles on both.
     """
     for k in range(x.shape[0]):
         out[k] = False
-        if on_right[k]:
-            out[k] = overlaps(x[k, BV], x[k, AV])
-        if cut_in[k] or not on_right[k]:
-            out[k] = out[k] or gap(x[k, LV], x[k, BV]) < CONTACT_M
+        for one in range(x.shape[1]):
+            for other in range(one):
+                meet = lane[k, one] == lane[k, other] or before[k, one] == before[k, other]
+                out[k] = out[k] or (meet and overlaps(x[k, one], x[k, other]))
 
 
 class TwinWorld(World):
     """World without SUMO."""
 
-    def __init__(self, n_cells: int) -> None:
-        super().__init__(n_cells)
-        self._on_right: Int8Array = np.zeros(n_cells, np.int8)
+    def place(self, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
+        self.x[cells], self.v[cells], self.lane[cells] = x[cells], v[cells], lane[cells]
 
-    def place(self, cells: IntArray, x: FloatArray, v: FloatArray) -> None:
-        self.x[cells] = x[cells]
-        self.v[cells] = v[cells]
-        self._on_right[cells] = 0
-
-    def step(self, speed: FloatArray, cut_in: Int8Array) -> BoolArray:
-        self._on_right |= cut_in
+    def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
         advance(self.x, self.v, speed)
-        contacts(self.x, self._on_right, cut_in, self._contact)
+        contacts(self.x, self.lane, lane, self._contact)
+        self.lane[:] = lane
         return self._contact

@@ -59,7 +59,7 @@ def crashes_in_twin(campaign_json: str, part: tuple[int, int]) -> Tests:
     prepared, loop = prepared_twin(campaign_json)
     (first, n), parts = part, []
     for start in range(first, first + n, AT_ONCE):
-        rows = loop.run(start, prepared.states(start, min(AT_ONCE, first + n - start))).results.episode
+        rows = loop.run(start, prepared.tests(start, min(AT_ONCE, first + n - start))).episode
         parts.append(Tests.of(start, rows["outcome"], rows["log_weight"]))
     return Tests.joined(parts)
 

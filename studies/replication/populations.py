@@ -26,20 +26,21 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.find import build_host
 from harness.errors import CampaignError, HarnessError
+from harness.families import family_named
 from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.nade.functions import build_importance
-from harness.loop.cells import PrescribedTraffic
+from harness.families.cut_in.learned import Learned, learned_crashes
+from harness.families.protocol import Paths
 from harness.loop.judge import motion_hashes
-from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy
+from harness.loop.loop import EpisodeLoop, RecordPolicy
+from harness.loop.repeat import Traffic
+from harness.pool.aim import PILOT_PATHS, STRIDE, Enumerator
 from harness.pool.cut_ins import onset_steps
-from harness.pool.learned import Learned, learned_crashes
 from harness.pool.shells import CANDIDATES, PrescribedEpisodes, acceleration_limit
 from harness.pool.vehicle_pool import BaselinePaths, vehicle_pool, walk_candidates
-from harness.pool.walk import PILOT_PATHS, STRIDE, Enumerator, enumerate_cut_ins, write_script
 from harness.progress import Progress
 from harness.records.schemas import pilot_table
 from harness.resolved import Resolved, resolve
-from harness.sampling.baseline import ALL_MOTION, learned_from, recorded, without_cut_in
+from harness.sampling.baseline import ALL_MOTION, learned_from, recorded, without_event
 from harness.vehicles.drivers import Followers, av_records
 from harness.vehicles.library import Library
 from harness.vocabulary import CRASH, BoolArray, FloatArray, IntArray, RecordArray
@@ -143,7 +144,7 @@ def enumerate_paths(
     environment: Environment, drivers: Drivers, seed: int, n_paths: int, progress: Progress
 ) -> SuperPopulation:
     """Enumerate paths that are aimed at the drivers' crashes, and keep the cut-ins with crashes."""
-    pilot = Enumerator(environment, Followers(drivers.records, drivers.envelope), seed)
+    pilot = Enumerator(family_named("cut_in"), environment, Followers(drivers.records, drivers.envelope), seed)
     progress.stage(f"super-population of seed {seed}", n_paths + PILOT_PATHS)
     aimed, parts = pilot.aimed(pilot.run(0, PILOT_PATHS, progress).rates(drivers.records.size)), []
     for first in range(0, n_paths, CHUNK_PATHS):
@@ -265,7 +266,7 @@ def choose_paths(
 ) -> BaselinePaths:
     """Choose paths in the traffic of a campaign, out of so many, or of as many as are asked for."""
     resolved, settings = resolve(campaign), campaign.pool.model_copy(update={"seed": seed})
-    where, most = (resolved.environment, resolved.library), max(n_paths, candidates)
+    where, most = (resolved.family, resolved.environment, resolved.library), max(n_paths, candidates)
     return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
 
 
@@ -285,12 +286,11 @@ def learn_vehicle(campaign: Campaign, paths: BaselinePaths) -> list[Learned]:
     found, n_tests = list[Learned](), campaign.pool.pilot_tests
     for k in range(LEARNERS * (n_tests > 0)):
         rows = np.random.default_rng([paths.seed, k]).integers(0, len(paths), campaign.pool.shadow_paths)
-        some = replace(paths, **{name: getattr(paths, name)[rows] for name in ("index", "state", "weight")})
-        where = resolved.environment
-        runs = recorded(without_cut_in(loop, some.seed, 0, some.index, some.state, where), where)
+        some = replace(paths, **{name: getattr(paths, name)[rows] for name in ("index", "start", "weight")})
+        runs = recorded(without_event(loop, resolved, some.seed, some.paths, 0))
         pool = vehicle_pool(resolved, some, runs)
-        pilot = PrescribedEpisodes(resolved.campaign, pool).pilot(n_tests, k)
-        learned = learned_from(pilot_table(loop.beside(keep=ALL_MOTION).run(0, *pilot)), runs)
+        pilot = PrescribedEpisodes(resolved, pool).pilot(n_tests, k)
+        learned = learned_from(pilot_table(loop.beside(keep=ALL_MOTION).run(0, pilot)), runs)
         found += [] if learned is None else [learned]
     return found
 
@@ -298,9 +298,8 @@ def learn_vehicle(campaign: Campaign, paths: BaselinePaths) -> list[Learned]:
 def _ready(campaign: Campaign) -> tuple[Resolved, EpisodeLoop]:
     """A campaign and the loop of its vehicle, which keeps all of its motion."""
     resolved = resolve(campaign)
-    policy = Drawing(campaign.seed, resolved.environment, build_importance(campaign, None), resolved.av)
     host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
-    return resolved, EpisodeLoop(TwinWorld(CELLS), policy, RecordPolicy(0, "none", 0.0), host)
+    return resolved, EpisodeLoop(TwinWorld(CELLS), resolved.scenario, RecordPolicy("none", 0.0), host)
 
 
 def walk_paths(
@@ -319,7 +318,7 @@ def walk_paths(
     """
     jobs = []
     for first in range(0, len(paths), WALKED_CHUNK):
-        part = {name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in ("index", "state", "weight")}
+        part = {name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in ("index", "start", "weight")}
         jobs.append((first, replace(paths, **part)))
     walk = partial(_walk, campaign.model_dump_json(), stride, learned)
     return joined(results_of("walked paths", jobs, walk, progress, run=executor.map, size=lambda job: len(job[1])))
@@ -332,27 +331,27 @@ def _walk(
     first, paths = job
     resolved, loop = _ready(Campaign.model_validate_json(campaign_json))
     campaign, environment, library = resolved.campaign, resolved.environment, resolved.library
-    runs = recorded(without_cut_in(loop, paths.seed, first, paths.index, paths.state, environment), environment)
+    runs = recorded(without_event(loop, resolved, paths.seed, paths.paths, first))
     offset = np.random.default_rng([paths.seed, first]).integers(0, stride, len(paths))
-    where = paths.seed, paths.index, paths.state, environment, library.followers(environment.lateral.present)
-    probability, bits, _ = enumerate_cut_ins(*where, runs, stride, offset)
-    mass = probability * paths.weight[:, None]
+    followers = library.followers(environment.lateral.present)
+    events = resolved.family.events(environment, paths.seed, paths.paths, followers, runs, stride, offset)
+    bits, mass = events.crashes, events.probability * paths.weight[:, None]
     row, step = np.nonzero(mass > 0.0)
-    lv, bv, _, _, lead = write_script(paths.seed, paths.index[row], step, paths.state[row], environment)
-    motion = motion_hashes(runs.x_m, runs.v_mps)[row, onset_steps(step, lead)]
-    nowhere, weightless = np.full(row.size, -1), np.zeros(row.size)
-    traffic = PrescribedTraffic(lv, bv, step, nowhere, weightless, first + row, motion, lead)
-    tests = loop.run(0, paths.state[row], traffic)
+    chosen = resolved.family.choose(environment, paths.seed, Paths(paths.index[row], paths.start[row]), step)
+    motion = motion_hashes(runs.x_m, runs.v_mps)[row, onset_steps(step, chosen.lead)]
+    script = resolved.family.script(environment, chosen)
+    tests = loop.run(0, Traffic(script._replace(announced_index=first + row, motion_hash=motion), chosen.facts))
     if n_failed := int(runs.failed.sum()) + len(tests.failures):
         found = f"{n_failed:,} of {len(paths):,} shadow runs and {row.size:,} tests failed"
         expected = "none: what a vehicle would have done is not known, and so neither is its crash rate"
         mend = "Mend the vehicle (`harness av-check` looks at it in seconds), or leave it out of the experiment."
         raise HarnessError(f"avs: {campaign.av.controller or campaign.av.fmu}", found, expected, mend)
-    crashes = tests.results.episode["outcome"] == CRASH
+    crashes = tests.episode["outcome"] == CRASH
     of_cut_ins = bits[row, step] | (crashes.astype(np.int64) << library.n_drivers)  # the vehicle comes after these
+    where = paths.seed, paths.index, paths.start, environment
     for k, one in enumerate(learned):
         asked = (bits != 0) & (mass > 0.0)
-        own = learned_crashes(one, *where[:4], runs, asked, campaign.crash.counts_above_mps)
+        own = learned_crashes(one, *where, runs, asked, campaign.crash.counts_above_mps)
         of_cut_ins |= own[row, step].astype(np.int64) << (library.n_drivers + 1 + k)
     somebody = of_cut_ins != 0
     row, step = row[somebody], step[somebody]

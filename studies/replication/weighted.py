@@ -47,7 +47,7 @@ def twin_episodes(campaign: Campaign, seed: int, estimators: Sequence[EstimatorN
 
 def _twin_block(campaign: Campaign, first: int, n: int) -> Block:
     prepared, loop = prepared_twin(campaign.model_dump_json())
-    tables = shard_tables(loop.run(first, prepared.states(first, n)), campaign.seed, keep_traces=False)
+    tables = shard_tables(loop.run(first, prepared.tests(first, n)), campaign.seed, keep_traces=False)
     return block_of(campaign, tables.episodes, None if campaign.records.moments == "none" else tables.moments, None)
 
 

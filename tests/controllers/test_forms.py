@@ -80,11 +80,11 @@ def test_one_that_sees_nobody_keeps_its_speed_until_bv_is_on_its_lane_however_it
     av = f"controller: 'tests.controllers.test_forms:{form}'"
     held, waits = (drive(LATERAL, f"av={{{one}}}", n=400) for one in (av, "reaction: {perceives_lateral_m: 2.0}"))
     assert [held.traces[row].tobytes() for row in range(400)] == [waits.traces[row].tobytes() for row in range(400)]
-    episode, early = held.results.episode, waits.results.episode["asked_to_speed_up"]
+    episode, early = held.episode, waits.episode["asked_to_speed_up"]
     assert episode["asked_to_speed_up"].mean() > 0.9
     assert not early.any()
-    assert np.all(episode["took_over_step"] == episode["cut_in_step"] + 1)
-    at_once = drive(LATERAL, f"av={{{av}, takes_over: onset}}", n=400).results.episode
+    assert np.all(episode["took_over_step"] == episode["event_step"] + 1)
+    at_once = drive(LATERAL, f"av={{{av}, takes_over: onset}}", n=400).episode
     assert (at_once["outcome"] == CRASH).sum() > 1.2 * (episode["outcome"] == CRASH).sum()
 
 
@@ -106,8 +106,8 @@ def test_a_built_in_model_is_held_by_the_same_rule(takes_over):
     own = f"controller: 'tests.controllers.test_forms:Eager', takes_over: {takes_over}"
     built_in = f"reaction: {{perceives_lateral_m: 0.0}}, {EAGER}, takes_over: {takes_over}"
     ours, theirs = (drive(LATERAL, f"av={{{av}}}", n=400) for av in (own, built_in))
-    assert ours.results.episode.tobytes() == theirs.results.episode.tobytes()
-    asked = ours.results.episode["asked_to_speed_up"]
+    assert ours.episode.tobytes() == theirs.episode.tobytes()
+    asked = ours.episode["asked_to_speed_up"]
     assert (asked.sum() > 20) == (takes_over == "first_braking")
     assert any((ours.traces[row][:-1, 2, 2] > 0.0).any() for row in range(400))
 
@@ -138,8 +138,8 @@ def test_a_controller_acts_from_the_first_step(method):
     shard = drive(EARLY, f"testing={{method: {method}}}", "environment.lane_change_level=350", n=300)
     assert shard.failures == {}
     passed = cut_in = 0
-    for i, row in enumerate(shard.results.episode):
-        trace, cut = shard.traces[i], row["cut_in_step"]
+    for i, row in enumerate(shard.episode):
+        trace, cut = shard.traces[i], row["event_step"]
         np.testing.assert_array_equal(trace[: cut if cut >= 0 else -1, 2, 2], 0.5)
         cut_in += cut > 0
         if row["outcome"] == PASSED:

@@ -120,10 +120,10 @@ def test_a_state_that_starts_empty_is_filled_when_the_controller_acts(form, fill
 def test_a_command_of_the_warm_up_begins_anew_at_the_hand_over():
     runs = [drive(av("SlowsDownOnce", warm_up_s=s), "av.before_cut_in=hold_speed", n=12) for s in (0.0, 2.0, 20.0)]
     for row, trace in runs[0].traces.items():
-        onset = int(runs[0].results.episode["onset_step"][row])
+        onset = int(runs[0].episode["onset_step"][row])
         assert trace[onset + 1, 2, 2] == pytest.approx(-0.3)
     assert [run.failures for run in runs] == [{}] * 3
-    assert all(run.results.episode.tobytes() == runs[0].results.episode.tobytes() for run in runs[1:])
+    assert all(run.episode.tobytes() == runs[0].episode.tobytes() for run in runs[1:])
 
 
 @pytest.mark.parametrize("shim", [True, False])
@@ -138,7 +138,7 @@ def test_what_is_shown_is_what_was_and_before_the_test_nobody_changed_speed(epis
     shard = drive(av("Notes", warm_up_s=30), traffic, first=episode, n=1, cells=1)
     seen, trace = importlib.import_module(HERE).Notes.seen, shard.traces[0]
     assert shard.failures == {}
-    onset = int(shard.results.episode["onset_step"][0])
+    onset = int(shard.episode["onset_step"][0])
     assert [round(10.0 * each.time_s) for each in seen[:SHOWN]] == list(range(onset - SHOWN + 1, onset + 1))
     assert {each.set_speed_mps for each in seen} == {trace[0, 2, 1]}
     for each in seen[: SHOWN + 2]:
@@ -147,7 +147,7 @@ def test_what_is_shown_is_what_was_and_before_the_test_nobody_changed_speed(epis
         vehicles = (each.lv.position_m, each.bv.position_m, each.position_m)
         np.testing.assert_allclose(vehicles, there[:, 0] - ago_s * there[:, 1], rtol=1e-12)
         assert (each.lv.speed_mps, each.bv.speed_mps, each.speed_mps) == tuple(there[:, 1])
-    lead_s = shard.results.episode["lead_steps"][0] * 0.1
+    lead_s = shard.episode["lead_steps"][0] * 0.1
     for each in seen[SHOWN:]:
         assert each.bv_overlaps == (each.bv.lane == 0) == math.isfinite(each.gap_m)
         assert each.bv_lateral_speed_mps == pytest.approx(0.0 if each.bv_overlaps else 1.7 / lead_s)

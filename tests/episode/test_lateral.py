@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from harness.families.cut_in.nade.functions import build_importance
-from harness.loop.cells import drawn_traffic
-from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy
+from harness.families.cut_in.events import Maneuvers
+from harness.families.cut_in.script import facts_of, script_of
+from harness.families.protocol import Chosen
+from harness.loop.loop import EpisodeLoop, RecordPolicy
+from harness.loop.repeat import Traffic
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.vocabulary import AV, CRASH, CUT_IN, PASSED, STATE_DTYPE
@@ -22,7 +24,7 @@ def episodes(method: str = "forced", **settings):
 
 
 def outcome_bits(**settings) -> list[bytes]:
-    names = ("outcome", "n_steps", "crash_time_s", "impact_speed_mps", "log_weight", "cut_in_step")
+    names = ("outcome", "n_steps", "crash_time_s", "impact_speed_mps", "log_weight", "event_step")
     return [episodes(**settings)[name].tobytes() for name in names]
 
 
@@ -30,10 +32,10 @@ def outcome_bits(**settings) -> list[bytes]:
 @pytest.mark.parametrize(("method", "level"), [("nde", 1e5), ("forced", 1.0)])
 def test_the_crossing_looked_for_ahead_is_the_one_met_on_the_way(method, level, lateral):
     met, ahead = (episodes(method, level=level, **more) for more in ({}, lateral))
-    assert np.array_equal(met["cut_in_step"], ahead["cut_in_step"])
+    assert np.array_equal(met["event_step"], ahead["event_step"])
     assert np.array_equal(met["log_weight"], ahead["log_weight"])
-    came = ahead["cut_in_step"] >= 0
-    onset = np.maximum(ahead["cut_in_step"] - ahead["lead_steps"], 0)
+    came = ahead["event_step"] >= 0
+    onset = np.maximum(ahead["event_step"] - ahead["lead_steps"], 0)
     assert np.array_equal(ahead["onset_step"][came], onset[came])
     assert (ahead["lead_steps"][came] > 0).mean() > 0.9
 
@@ -49,7 +51,7 @@ def test_the_av_keeps_its_speed_until_it_may_act_and_acts_then():
     shard = run("forced", n=N, lead_s=1.0, av="sees the onset", traces="all").shard
     acted = 0
     for row, trace in list(shard.traces.items())[:500]:
-        commanded, onset = trace[:-1, AV, 2], int(shard.results.episode["onset_step"][row])
+        commanded, onset = np.diff(trace[:, AV, 1]), int(shard.episode["onset_step"][row])
         assert (commanded[: onset + 1] == 0.0).all()
         acted += commanded.size > onset + 1 and commanded[onset + 1] != 0.0
     assert acted > 450
@@ -59,20 +61,25 @@ BESIDE = [(-0.5, CRASH), (-9.9985, CRASH), (0.5, None), (-9.9995, PASSED), (-0.0
 
 
 def beside(r2_m: list[float]):
-    """States and traffic of cut-ins in the first step, at an R2 each; nobody but the AV changes speed."""
-    states, zero = np.array([(25.0, 60.0, 0.0, r2, 0.0) for r2 in r2_m], STATE_DTYPE), np.zeros(len(r2_m), np.int64)
-    lv, bv = np.full((2, len(r2_m), 22), 20, np.int8)
+    """Cut-ins in the first step, at an R2 each; nobody but the AV changes speed."""
+    return at_once(np.array([(25.0, 60.0, 0.0, r2, 0.0) for r2 in r2_m], STATE_DTYPE))
+
+
+def at_once(states: np.ndarray) -> Traffic:
+    """Cut-ins in the first step; LV and BV keep their speeds."""
+    n, environment = len(states), resolve(campaign("shells")).environment
+    lv, bv = np.full((2, n, 22), 20, np.int8)
     bv[:, 1] = CUT_IN
-    traffic = drawn_traffic()._replace(lv=lv, bv=bv, cut_step=zero, stratum=zero, log_weight=np.zeros(len(r2_m)))
-    return states, traffic._replace(lead=zero)
+    zero, used = np.zeros(n, np.int64), np.full(n, 20)
+    chosen = Chosen(facts_of(states, Maneuvers(lv, bv, used, used + 2, zero)), zero, zero)
+    return Traffic(script_of(environment, chosen)._replace(stratum=zero), chosen.facts)
 
 
 @pytest.mark.parametrize(("r2_m", "outcome"), BESIDE)
 def test_in_the_first_state_of_overlap_touching_is_a_crash_and_being_ahead_is_having_passed(r2_m, outcome):
-    resolved = resolve(one := campaign("shells", lead_s=1.0, av="holds"))
-    policy = Drawing(1, resolved.environment, build_importance(one, None), resolved.av)
-    shard = EpisodeLoop(TwinWorld(1), policy, RecordPolicy(0, "none", 0.0)).run(0, *beside([r2_m]))
-    episode = shard.results.episode[0]
+    resolved = resolve(campaign("shells", lead_s=1.0, av="holds"))
+    shard = EpisodeLoop(TwinWorld(1), resolved.scenario, RecordPolicy("none", 0.0)).run(0, beside([r2_m]))
+    episode = shard.episode[0]
     if outcome is None:
         assert episode["n_steps"] > 1
     else:

@@ -27,7 +27,7 @@ def test_no_weight_exceeds_the_known_bound():
     """Y ≤ P(cut-in | path)/α_0, whatever the AV does."""
     for av in ("idm", "never_brakes"):
         done = mixture(av=av, n=10_000)
-        bound = np.exp(done.episode["log_p_cut_in"]) / done.alpha[0]
+        bound = np.exp(done.episode["log_p_event"]) / done.alpha[0]
         assert done.crash.sum() > 5_000
         assert (done.y <= bound * (1.0 + 1e-12)).all()
 
@@ -36,7 +36,7 @@ def test_the_forced_component_in_closed_form():
     """Its ratio q/p is 1/P(cut-in | path) for paths with a cut-in and 0 for the others."""
     done = mixture()
     np.testing.assert_allclose(
-        done.log_q[done.cut_in, 0], -done.episode["log_p_cut_in"][done.cut_in], rtol=0, atol=1e-12
+        done.log_q[done.cut_in, 0], -done.episode["log_p_event"][done.cut_in], rtol=0, atol=1e-12
     )
     assert np.isneginf(done.log_q[~done.cut_in, 0]).all()
     assert 100 < (~done.cut_in).sum() < done.cut_in.sum()
@@ -84,7 +84,7 @@ def test_mean_ratio_of_every_component_is_one():
 
 @pytest.mark.parametrize("method", ["step_mixture", "episode_mixture"])
 def test_martingale_sums_have_mean_zero(method):
-    martingale = run(method, n=N).shard.results.martingale
+    martingale = run(method, n=N).shard.traffic.drawn.martingale
     for j in range(3):
         assert np.abs(martingale[:, j]).max() > 0.0
         assert Mean.of(martingale[:, j]).errors_from(0.0) < 4.0

@@ -98,7 +98,7 @@ class Run:
 
     @cached_property
     def episode(self):
-        return self.shard.results.episode
+        return self.shard.episode
 
     @property
     def log_weight(self):
@@ -106,7 +106,7 @@ class Run:
 
     @property
     def log_q(self):
-        return self.shard.results.log_q
+        return self.shard.traffic.drawn.log_q
 
     @property
     def crash(self):
@@ -114,7 +114,7 @@ class Run:
 
     @property
     def cut_in(self):
-        return self.episode["cut_in_step"] >= 0
+        return self.episode["event_step"] >= 0
 
     @cached_property
     def y(self):
@@ -126,12 +126,12 @@ class Run:
 
     @property
     def alpha(self):
-        return self.prepared.policy.importance.alpha
+        return self.prepared.importance.alpha
 
     @cached_property
     def moments(self):
         """Control steps (m,) by episode and step, with q_j and V_j (m, J) of each."""
-        results = self.shard.results
+        results = self.shard.traffic.drawn
         used = slice(results.moment_count[0])
         order = np.lexsort((results.moment["step"][used], results.moment["row"][used]))
         return results.moment[used][order], results.moment_q[used][order], results.moment_v[used][order]
@@ -152,4 +152,4 @@ def run(method: str, challenge: str = "recursive", *, n: int, traces: str = "non
     """The first n episodes of a campaign; the keys of ``settings`` are those of `campaign`."""
     ready = prepared(method, challenge, **settings)
     loop = ready.loop(TwinWorld(CELLS), traces=traces)
-    return Run(ready, loop.run(0, ready.states(0, n)))
+    return Run(ready, loop.run(0, ready.tests(0, n)))

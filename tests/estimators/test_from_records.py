@@ -6,7 +6,6 @@ import pytest
 
 from harness.errors import RunFolderError
 from harness.estimators.block import block_from_tables
-from harness.families.cut_in.nade.functions import mixture_weights
 from harness.vocabulary import OUTCOMES
 from tests.stored_runs import golden, stored_table
 
@@ -15,7 +14,7 @@ NAME = "step-recursive-twin"
 
 def read(episodes, moments=None, name=NAME):
     campaign = golden(name)
-    return block_from_tables(episodes, moments, method=campaign.testing.method, alpha=mixture_weights(campaign))
+    return block_from_tables(episodes, moments, method=campaign.testing.method, alpha=campaign.mixture_weights)
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import Block
 from harness.estimators.estimate import Unavailable, finite_json
 from harness.estimators.one_pass import ACCUMULATORS, Diagnostics, accumulator, one_pass
-from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, FAILED, SAMPLING, TIMEOUT
+from harness.vocabulary import CONTACT, ESTIMATORS, FAILED, SAMPLING, TIMEOUT
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
@@ -92,7 +92,7 @@ def test_what_is_counted_and_a_small_mean_weight_are_told_and_nothing_stops_the_
     for others in (block([False] * 10), block([False] * 10, [-5.0] * 10, method="forced")):
         assert "heavy_tail" not in diagnosed(others)
     base = block([False] * 4, [-1.0, 0.0, 0.0, 0.0], failed=[False, True, False, False])
-    result = diagnosed(base.ending(np.array([True, False, False, False]), BV_LV_CONTACT))
+    result = diagnosed(base.ending(np.array([True, False, False, False]), CONTACT))
     assert result["bv_lv_contact_share"]["mean"] == pytest.approx(np.exp(-1.0) / 4)
     assert (result["n_failed"], result["n_bv_lv_contacts"]) == (1, 1)
     assert diagnosed(block([False, False], [800.0, 0.0]))["mean_weight"]["mean"] == np.inf

@@ -5,11 +5,12 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.families.cut_in.events import enumerate_cut_ins
 from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import load_environment
+from harness.families.protocol import Paths
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
-from harness.pool.walk import enumerate_cut_ins
 from harness.resolved import resolve
 from harness.vehicles.drivers import Followers
 from tests.chains.seed import SEED
@@ -40,6 +41,6 @@ def enumerated(library, environment: Environment, n: int, *, enclosed=True, stri
     if not enclosed:  # the envelope is one among many then, which takes over at the onset as before
         followers.drivers["cruises"][followers.envelope] = 0
         followers = Followers(followers.drivers)
-    paths = SEED, np.arange(n), states
-    found = enumerate_cut_ins(*paths, environment, followers, stride=stride, offset=offsets)
+    paths = Paths(np.arange(n), states)
+    found = enumerate_cut_ins(SEED, paths, environment, followers, stride=stride, offset=offsets)
     return found.probability, found.crashes

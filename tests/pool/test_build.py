@@ -7,12 +7,13 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.campaign.sections import PoolSettings
+from harness.families import family_named
 from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.families.cut_in.parameters import EnvironmentParameters
+from harness.pool.aim import NATURALISTIC_SHARE, STRIDE, Enumerator, aimed_points, fit_proposal
 from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_name
 from harness.pool.cut_ins import environment_hash
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
-from harness.pool.walk import NATURALISTIC_SHARE, STRIDE, Enumerator, aimed_points, fit_proposal
 from harness.resolved import resolve
 from harness.vehicles.library import load_library
 from tests.chains.seed import SEED
@@ -94,7 +95,7 @@ def test_a_pool_that_is_damaged_is_built_again(campaign, pool, tmp_path, monkeyp
 
 
 def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside(campaign, pool):
-    prescribed = PrescribedEpisodes(campaign, pool)
+    prescribed = PrescribedEpisodes(resolve(campaign), pool)
     within, outermost = np.flatnonzero(pool.shell == 0), prescribed.design.n_inside
     assert prescribed.available[0] == within.size
     rows, stratum = prescribed.rows((Draw(0, 0, within.size), Draw(outermost, 0, 500)))
@@ -119,9 +120,9 @@ def test_how_many_paths_a_pool_has_does_not_depend_on_them(environment, monkeypa
         same = {"mass": np.full_like(paths.mass, 1e-9), "crashes": np.full_like(paths.crashes, 1)}
         return dataclasses.replace(paths, **same) if first else paths
 
-    n_paths = build_pool(environment, LIBRARY, settings, "of the paths").n_paths
+    n_paths = build_pool(FAMILY, environment, LIBRARY, settings, "of the paths").n_paths
     monkeypatch.setattr(Enumerator, "run", alike)
-    assert build_pool(environment, LIBRARY, settings, "of equal ones").n_paths == n_paths > 1024
+    assert build_pool(FAMILY, environment, LIBRARY, settings, "of equal ones").n_paths == n_paths > 1024
 
 
 def test_weights_of_a_proposal_make_up_for_its_aim():
@@ -139,6 +140,7 @@ def test_weights_of_a_proposal_make_up_for_its_aim():
 # -- enumerated cut-ins and strata --
 
 
+FAMILY = family_named("cut_in")
 LIBRARY = load_library("ladder-1")
 NAMES = list(LIBRARY.surrogates)
 ENVELOPE = NAMES.index(LIBRARY.envelope)

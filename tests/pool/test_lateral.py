@@ -6,14 +6,14 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.controllers.find import build_host
 from harness.families.cut_in.loading import load_environment
-from harness.families.cut_in.nade.functions import build_importance
-from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy
+from harness.loop.loop import EpisodeLoop, RecordPolicy
+from harness.loop.repeat import Traffic
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import pool_content, pool_from
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
-from harness.sampling.baseline import recorded, without_cut_in
+from harness.sampling.baseline import recorded, without_event
 from harness.vehicles.library import load_library
 from harness.vocabulary import CRASH, PASSED
 from harness.worlds.twin import TwinWorld
@@ -61,16 +61,17 @@ def test_full_throttle_contains_every_driver_also_where_it_passes(lateral, lead_
 @pytest.mark.parametrize("name", [*NAMES, *LIBRARY.references])
 def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name):
     """Sixty cut-ins of each stratum."""
-    prescribed = PrescribedEpisodes(lateral, lateral_pool)
-    states, traffic, cut_ins = prescribed.episodes(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
-    environment, rows = load_environment(lateral.environment), cut_ins.row
+    resolved = resolve(lateral)
+    prescribed = PrescribedEpisodes(resolved, lateral_pool)
+    traffic, cut_ins = prescribed.tests(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
+    environment, rows = resolved.environment, cut_ins.row
     driver = (
         LIBRARY.followers(environment.lateral.present).drivers[[*NAMES, *LIBRARY.references].index(name)][None].copy()
     )
     if name == LIBRARY.envelope:  # it acts from the onset
         driver["perceives_lateral_m"] = driver["cruises"] = 0
-    policy = Drawing(1, environment, build_importance(lateral, None), driver)
-    episode = EpisodeLoop(TwinWorld(16), policy, RecordPolicy(0, "none", 0.0)).run(0, states, traffic).results.episode
+    scenario = resolved.scenario._replace(driver=driver)
+    episode = EpisodeLoop(TwinWorld(16), scenario, RecordPolicy("none", 0.0)).run(0, traffic).episode
     reached = episode["outcome"] == CRASH
     if name == LIBRARY.envelope:
         reached |= episode["outcome"] == PASSED
@@ -91,20 +92,21 @@ def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow(
     acts = of("environment.parameters=ndd-overtaking-1-lateral", f"av={ACTING.format('Speeds')}", "world.engine=twin")
     resolved = resolve(acts)
     environment, library = resolved.environment, resolved.library
-    paths = walk_candidates(environment, library, acts.pool, "test", candidates=1024).draw(60)
-    policy = Drawing(1, environment, build_importance(acts, None), resolved.av)
-    loop = EpisodeLoop(TwinWorld(32), policy, RecordPolicy(0, "none", 0.0), build_host(acts.av, n_cells=32, seed=1))
-    motion = without_cut_in(loop, paths.seed, 0, paths.index, paths.state, environment)
-    pool = vehicle_pool(resolved, paths, recorded(motion, environment))
+    paths = walk_candidates(resolved.family, environment, library, acts.pool, "test", candidates=1024).draw(60)
+    loop = EpisodeLoop(
+        TwinWorld(32), resolved.scenario, RecordPolicy("none", 0.0), build_host(acts.av, n_cells=32, seed=1)
+    )
+    pool = vehicle_pool(resolved, paths, recorded(without_event(loop, resolved, paths.seed, paths.paths, 0)))
     rows = np.unique(np.linspace(0, len(pool.cut_ins.path) - 1, 800).astype(np.int64))
-    states, traffic = PrescribedEpisodes(acts, pool).of_rows(rows, np.zeros(rows.size, np.int64))
-    shard = loop.run(10**6, states, traffic)
+    traffic = PrescribedEpisodes(resolved, pool).of_rows(rows, np.zeros(rows.size, np.int64))
+    shard = loop.run(10**6, traffic)
     assert shard.failures == {}
-    episode = shard.results.episode
+    episode = shard.episode
     assert np.unique(episode["lead_steps"]).size > 10
     crashed = episode["outcome"] == CRASH
     enclosed = pool.cut_ins.crashes[rows, pool.names.index(library.envelope)]
     assert 50 < crashed.sum() < rows.size - 50
     assert np.all(enclosed[crashed])
-    other = traffic._replace(motion_hash=traffic.motion_hash + np.uint64(1))
-    assert len(loop.run(10**6, states, other).failures) == rows.size
+    script = traffic.script
+    other = Traffic(script._replace(motion_hash=script.motion_hash + np.uint64(1)), traffic.facts)
+    assert len(loop.run(10**6, other).failures) == rows.size

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from harness.pool.learned import Learned, learned_crashes
+from harness.families.cut_in.learned import Learned, learned_crashes
 from harness.pool.vehicle_pool import vehicle_pool
 from harness.sampling.baseline import learned_from, pilot_requests, run_baseline
 from harness.strata import LEARNED, OUTSIDE
@@ -19,8 +19,8 @@ AS_NEEDED = "av.controller=examples.acting:CarefulAsNeeded"
 def after_pilot(*more: str):
     """Campaign, loop and runs after the baseline runs, and what the pilot tests teach."""
     ready, loop, runs = prepared_after(acting("Speeds", AS_NEEDED, *more))
-    environment, paths = ready.policy.environment, ready.baseline_paths
-    tables = [run_baseline(loop, paths, environment, each).table for each in pilot_requests(ready.pilot())]
+    paths = ready.baseline_paths
+    tables = [run_baseline(loop, paths, ready.resolved, each).table for each in pilot_requests(ready.pilot())]
     return ready, loop, runs, pa.concat_tables(tables)
 
 
@@ -32,8 +32,8 @@ def late():
 def counted(ready, loop, stratum: int, n: int) -> float:
     """Share of the first tests of a stratum that crash."""
     rows = ready.prescribed._order[stratum][:n]
-    states, traffic = ready.prescribed.of_rows(rows, np.full(rows.size, stratum))
-    return float((loop.run(0, states, traffic).results.episode["outcome"] == CRASH).mean())
+    traffic = ready.prescribed.of_rows(rows, np.full(rows.size, stratum))
+    return float((loop.run(0, traffic).episode["outcome"] == CRASH).mean())
 
 
 def test_a_dead_time_is_found_and_the_shell_holds_nearly_all_crashes_beyond_the_boundaries(late):
@@ -61,15 +61,15 @@ def test_where_a_table_without_the_dead_time_says_otherwise_the_vehicle_does_as_
     """That is the sibling which the retraced tests have ruled out."""
     ready, loop, runs, tests = late
     learned = learned_from(tests, runs)
-    paths, environment = ready.baseline_paths, ready.policy.environment
+    paths, environment = ready.baseline_paths, ready.resolved.environment
     asked = np.zeros((len(paths), int(environment.numbers["max_steps"])), np.bool_)
     row, step = ready.prescribed._cut_ins.row, ready.prescribed._cut_ins.step
     asked[row, step] = True
-    where = paths.seed, paths.index, paths.state, environment, runs, asked, 0.0
+    where = paths.seed, paths.index, paths.start, environment, runs, asked, 0.0
     own, other = (learned_crashes(each, *where)[row, step] for each in (learned, learned._replace(dead_steps=0)))
     rows = np.flatnonzero(own != other)
-    shard = loop.run(0, *ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
-    crashed = shard.results.episode["outcome"] == CRASH
+    shard = loop.run(0, ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
+    crashed = shard.episode["outcome"] == CRASH
     assert rows.size > 100
     assert (crashed == own[rows]).mean() > 0.9
 

@@ -9,13 +9,14 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
 from harness.estimators.tally import CrashedTests, OnRuns, Tally
+from harness.families.cut_in.events import enumerate_cut_ins
+from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import motion_hashes
 from harness.pool.shells import CANDIDATES
 from harness.pool.vehicle_pool import EVENLY, chances, vehicle_pool
-from harness.pool.walk import BaselineRuns, enumerate_cut_ins
 from harness.resolved import resolve
 from harness.sampling import prepare
-from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline, without_cut_in
+from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline, without_event
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
@@ -36,10 +37,9 @@ def prepared_after(campaign):
     """The campaign after its baseline runs, its loop, and what the runs left."""
     ready = prepare(resolve(campaign))
     loop = ready.loop(TwinWorld(32))
-    environment = ready.policy.environment
     specs = baseline_requests(len(ready.baseline_paths))
-    tables = [run_baseline(loop, ready.baseline_paths, environment, spec).table for spec in specs]
-    runs = as_recorded(pa.concat_tables(tables), environment)
+    tables = [run_baseline(loop, ready.baseline_paths, ready.resolved, spec).table for spec in specs]
+    runs = as_recorded(pa.concat_tables(tables), ready.scenario.max_steps)
     ready.begin_after(runs)
     return ready, loop, runs
 
@@ -52,12 +52,12 @@ def speeds():
 def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
     """Against the hazard at the states of a trace, worked out one by one."""
     ready, loop, runs = speeds
-    paths, environment = ready.baseline_paths, ready.policy.environment
-    rows = slice(0, 10)
-    shard = without_cut_in(loop, paths.seed, 0, paths.index[rows], paths.state[rows], environment)
-    some = BaselineRuns._make(values[rows] for values in runs)
-    given = paths.seed, paths.index[rows], paths.state[rows], environment, Followers(driver_records([]))
-    probability = enumerate_cut_ins(*given, some).probability
+    rows, seed = slice(0, 10), ready.baseline_paths.seed
+    paths = Paths(*(column[rows] for column in ready.baseline_paths.paths))
+    shard = without_event(loop, ready.resolved, seed, paths, 0)
+    some = Recorded._make(values[rows] for values in runs)
+    nobody = Followers(driver_records([]))
+    probability = enumerate_cut_ins(seed, paths, ready.resolved.environment, nobody, some).probability
     for row in range(10):
         trace, stays = shard.traces[row], 1.0
         for step in range(len(trace) - 1):
@@ -77,9 +77,9 @@ def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one
     loop = prepare(resolve(acting("Speeds", brakes))).loop(TwinWorld(64))
     rows = np.unique(np.linspace(0, len(pool.cut_ins.path) - 1, 1500).astype(np.int64))
     rows = rows[pool.shell[rows] < pool.shell_p.size - 1]
-    shard = loop.run(10**6, *ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
+    shard = loop.run(10**6, ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
     assert shard.failures == {}
-    crashed = shard.results.episode["outcome"] == CRASH
+    crashed = shard.episode["outcome"] == CRASH
     expected = pool.cut_ins.crashes[rows, pool.names.index("brakes-3")]
     assert 300 < expected.sum() < rows.size - 300
     np.testing.assert_array_equal(crashed, expected)

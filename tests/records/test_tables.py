@@ -10,6 +10,7 @@ import pytest
 
 import harness
 from harness.errors import RunFolderError
+from harness.families.cut_in.family import CUT_IN, STATE_FACTS
 from harness.loop.loop import traced_by_index
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
 from harness.vocabulary import AV
@@ -22,7 +23,9 @@ LATERAL = ["lead_steps", "onset_step", "onset_r2_m", "onset_r2dot_mps", "onset_t
 """Columns where cut-ins take time."""
 
 
-@pytest.mark.parametrize("schema", [episodes_schema(4, 3), moments_schema(3), traces_schema()])
+@pytest.mark.parametrize(
+    "schema", [episodes_schema(CUT_IN.columns, 4, 3), moments_schema(STATE_FACTS, 3), traces_schema()]
+)
 def test_every_column_says_its_unit_and_what_it_is(schema):
     for field in schema:
         assert set(field.metadata) == {b"unit", b"doc"}
@@ -152,7 +155,7 @@ def test_frames_have_all_rows_and_say_what_columns_mean(stored_run):
     assert list(run.traces(["v_mps"]).columns) == ["v_mps"]
     with pytest.raises(RunFolderError, match="no column 'weight' in moments"):
         run.moments(["weight"])
-    assert list(harness.read(stored_run("mixture-twin")).moments().columns) == moments_schema(3).names
+    assert list(harness.read(stored_run("mixture-twin")).moments().columns) == moments_schema(STATE_FACTS, 3).names
 
 
 @pytest.mark.parametrize("name", ["mixture-twin", "shells-twin"])

@@ -19,7 +19,6 @@ from scipy.stats import binom, norm
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.estimators.block import Block, block_from_tables
-from harness.families.cut_in.nade.functions import mixture_weights
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
 from harness.records.schemas import episodes_table
@@ -51,13 +50,13 @@ def campaign(method: str, *more: str) -> Campaign:
 
 def drive(campaign: Campaign, n: int = N) -> pa.Table:
     ready = prepare(resolve(campaign))
-    return episodes_table(ready.loop(TwinWorld(256)).run(0, ready.states(0, n)), campaign.seed)
+    return episodes_table(ready.loop(TwinWorld(256)).run(0, ready.tests(0, n)), campaign.seed)
 
 
 def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> tuple[Block, BoolArray]:
     """The episodes, and which surrogates would have crashed in them."""
     method = campaign.testing.method
-    block = block_from_tables(table, None, method=method, alpha=mixture_weights(campaign))
+    block = block_from_tables(table, None, method=method, alpha=campaign.mixture_weights)
     return block, surrogates_crash(table, resolve(campaign), pool)
 
 

@@ -47,7 +47,7 @@ def run_in(world, av: AutomatedVehicle, ranges: Sequence[tuple[int, int]]) -> li
     prepared = prepare(resolve(campaign(av)))
     with closing(world):
         loop = prepared.loop(world, traces="all")
-        return [loop.run(first, prepared.states(first, n)) for first, n in ranges]
+        return [loop.run(first, prepared.tests(first, n)) for first, n in ranges]
 
 
 def run(av: AutomatedVehicle, first: int, n: int, *, cells: int = 4) -> Shard:
@@ -60,7 +60,7 @@ def run_idm(first: int, n: int) -> Shard:
 
 
 def bits(shard: Shard, row: int) -> bytes:
-    record = shard.results.episode[row].copy()
+    record = shard.episode[row].copy()
     record["took_over_step"] = 0  # nobody knows that of one whom others drive
     return record.tobytes() + shard.traces[row].tobytes()
 
@@ -80,14 +80,14 @@ def drive(*overrides: str, cells: int = 32, first: int = 0, n: int = 150, world:
     """Run episodes from the first on, all of them traced, in the twin or in another world."""
     ready = prepare(resolve(forced(*overrides)))
     with closing(ready.loop(world or TwinWorld(cells), traces="all")) as loop:
-        return loop.run(first, ready.states(first, n))
+        return loop.run(first, ready.tests(first, n))
 
 
 def motion(*overrides: str, **options) -> tuple[bytes, list[bytes]]:
     """Every bit of episodes that do not fail, and of their traces."""
     shard = drive(*overrides, **options)
     assert shard.failures == {}
-    return shard.results.episode.tobytes(), [shard.traces[row].tobytes() for row in sorted(shard.traces)]
+    return shard.episode.tobytes(), [shard.traces[row].tobytes() for row in sorted(shard.traces)]
 
 
 def fmu_av(file: str | Path, more: str = "") -> str:

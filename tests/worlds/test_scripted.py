@@ -7,23 +7,20 @@ import pytest
 
 from harness.compiled import unboxed
 from harness.families.cut_in.loading import load_environment
-from harness.families.cut_in.nade.functions import build_importance
 from harness.families.cut_in.path import empty_trajectory
-from harness.loop.cells import PrescribedTraffic, drawn_traffic
-from harness.loop.loop import Drawing, EpisodeLoop, RecordPolicy, Shard
-from harness.pool.replay import stored_paths
+from harness.families.cut_in.replay import stored_paths
+from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.vehicles.drivers import Followers
 from harness.vehicles.library import load_library
-from harness.vocabulary import BV_LV_CONTACT, CRASH, CUT_IN, STATE_DTYPE, TIMEOUT
+from harness.vocabulary import CONTACT, CRASH, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
 from studies.alarm import replay_surrogates
-from tests.episode.test_lateral import BESIDE, beside
+from tests.episode.test_lateral import BESIDE, at_once, beside
 from tests.retracing import retraced
 from tests.worlds.running import smoke
 
-KEEP_SPEED, BRAKE = 20, 0
 STATES = np.array(
     [
         (21.0, 0.3, -4.0, 30.0, -8.0),  # BV is over LV's rear when it has left the lane
@@ -33,34 +30,24 @@ STATES = np.array(
     ],
     STATE_DTYPE,
 )
-OUTCOMES = [BV_LV_CONTACT, TIMEOUT, CRASH, BV_LV_CONTACT]
-
-
-def cut_in_at_once() -> PrescribedTraffic:
-    """In every row BV cuts in in the first step; after it nobody changes speed."""
-    n = len(STATES)
-    lv, bv = np.full((n, 22), KEEP_SPEED, np.int8), np.full((n, 22), KEEP_SPEED, np.int8)
-    bv[:, 1] = CUT_IN
-    zeros = np.zeros(n, np.int64)
-    return drawn_traffic()._replace(lv=lv, bv=bv, cut_step=zeros, stratum=zeros, log_weight=np.zeros(n), lead=zeros)
+OUTCOMES = [CONTACT, TIMEOUT, CRASH, CONTACT]
 
 
 def loop_in(world, model: str) -> EpisodeLoop:
-    resolved = resolve(one := smoke("testing.method=shells", f"av={{model: {model}}}"))
-    policy = Drawing(1, resolved.environment, build_importance(one, None), resolved.av)
-    return EpisodeLoop(world, policy, RecordPolicy(0, "all", 0.0))
+    resolved = resolve(smoke("testing.method=shells", f"av={{model: {model}}}"))
+    return EpisodeLoop(world, resolved.scenario, RecordPolicy("all", 0.0))
 
 
 def run(world) -> Shard:
-    return loop_in(world, "idm").run(0, STATES, cut_in_at_once())
+    return loop_in(world, "idm").run(0, at_once(STATES))
 
 
 def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes():
     campaign = smoke("testing.method=shells")
     environment, library = load_environment(campaign.environment), load_library("ladder-1")
     shard = run(TwinWorld(4))
-    assert shard.results.episode["outcome"].tolist() == OUTCOMES
-    assert shard.results.episode["n_steps"].tolist() == [1, 200, 1, 1]
+    assert shard.episode["outcome"].tolist() == OUTCOMES
+    assert shard.episode["n_steps"].tolist() == [1, 200, 1, 1]
     episodes = episodes_table(shard, campaign.seed)
     assert retraced(episodes, resolve(campaign)) == []
     crashes = np.full(len(STATES), -1, np.int64)
@@ -76,17 +63,17 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
 @pytest.mark.parametrize("n_cells", [1, 4, 64])
 def test_sumo_agrees_also_with_cells_that_stay_empty(open_world, n_cells, shim):
     twin, sumo = run(TwinWorld(4)), run(open_world(n_cells, shim=shim))
-    assert twin.results.episode.tobytes() == sumo.results.episode.tobytes()
+    assert twin.episode.tobytes() == sumo.episode.tobytes()
     for row, trace in twin.traces.items():
         assert np.array_equal(trace, sumo.traces[row], equal_nan=True)
 
 
 def test_sumo_flags_vehicles_beside_each_other_by_the_rule_of_the_first_overlap(open_world):
     """Around -0.001 and -9.999 m: the loop stops where SUMO's own flag says something else than the positions."""
-    states, traffic = beside([r2_m for r2_m, _ in BESIDE])
+    traffic = beside([r2_m for r2_m, _ in BESIDE])
     episode = {}
     for name, world in (("twin", TwinWorld(4)), ("sumo", open_world(4))):
-        episode[name] = loop_in(world, "constant").run(0, states, traffic).results.episode
+        episode[name] = loop_in(world, "constant").run(0, traffic).episode
     assert episode["sumo"].tobytes() == episode["twin"].tobytes()
     for row, (_, outcome) in zip(episode["sumo"], BESIDE, strict=True):
         assert (row["n_steps"] > 1) if outcome is None else (row["outcome"], row["n_steps"]) == (outcome, 1)

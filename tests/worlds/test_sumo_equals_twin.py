@@ -19,11 +19,14 @@ import numpy as np
 import pytest
 
 from harness.campaign.yaml_text import yaml_text
+from harness.families.cut_in.nade.in_loop import DrawnInLoop
+from harness.families.cut_in.nade.source import InLoop
 from harness.loop.loop import Shard
+from harness.progress import Progress
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.vehicles.kinematics import STEP_S, next_position
-from harness.vocabulary import AV, BV, BV_LV_CONTACT, CRASH, LV, PASSED, STATE_DTYPE, VEHICLES
+from harness.vocabulary import AV, BV, CONTACT, CRASH, LV, PASSED, STATE_DTYPE, VEHICLES
 from harness.worlds.twin import TwinWorld
 from tests.episode.twin_runs import TWO
 from tests.traffic.tables import tabled
@@ -44,15 +47,13 @@ class Job(NamedTuple):
 class Motion(NamedTuple):
     """An episode as SUMO's getters or a world's traces show it.
 
-    ``x``, ``v``, ``lane`` (steps + 1, 3) of LV, BV, AV; ``contact`` (steps + 1,): whether a collision was flagged;
-    ``acceleration`` (steps, 3): what was commanded.
+    ``x``, ``v``, ``lane`` (steps + 1, 3) of LV, BV, AV; ``contact`` (steps + 1,): whether a collision was flagged.
     """
 
     x: np.ndarray
     v: np.ndarray
     lane: np.ndarray
     contact: np.ndarray
-    acceleration: np.ndarray
 
 
 def record(job: Job) -> tuple[list[Motion], np.ndarray]:
@@ -80,12 +81,12 @@ def record(job: Job) -> tuple[list[Motion], np.ndarray]:
         filled.append(placed)
 
     class RecordedWorld(SumoWorld):
-        def place(self, cells, x, v):
-            super().place(cells, x, v)
+        def place(self, cells, x, v, lane):
+            super().place(cells, x, v, lane)
             read(np.isin(np.arange(job.n_cells), cells))
 
-        def step(self, speed, cut_in):
-            contact = super().step(speed, cut_in)
+        def step(self, speed, lane):
+            contact = super().step(speed, lane)
             read(np.zeros(job.n_cells, bool))
             return contact
 
@@ -94,30 +95,30 @@ def record(job: Job) -> tuple[list[Motion], np.ndarray]:
     quantities, placed = [np.stack(values) for values in zip(*seen, strict=True)], np.stack(filled)
     steps = np.flatnonzero(~placed.any(axis=1))
     motions = []
-    for row, ((time, cell), n) in enumerate(zip(np.argwhere(placed), shard.results.episode["n_steps"], strict=True)):
+    for (time, cell), n in zip(np.argwhere(placed), shard.episode["n_steps"], strict=True):
         times = np.append(time, steps[steps > time][:n])
-        motions.append(Motion(*(values[times, cell] for values in quantities), shard.traces[row][:-1, :, 2]))
-    return motions, shard.results.episode["outcome"]
+        motions.append(Motion(*(values[times, cell] for values in quantities)))
+    return motions, shard.episode["outcome"]
 
 
 def run_episodes(job: Job, world) -> Shard:
     """Run the job's episodes in any world, all of them traced."""
     prepared = prepare(resolve(smoke(*job.overrides)))
-    states = prepared.states(0, job.n_episodes) if job.states is None else job.states
-    return prepared.loop(world, traces="all").run(0, states)
+    tests = prepared.tests(0, job.n_episodes)
+    if job.states is not None:
+        nde = InLoop(prepared.resolved, Progress())
+        tests = DrawnInLoop(job.states, prepared.resolved.environment, nde.importance)
+    return prepared.loop(world, traces="all").run(0, tests)
 
 
 def motions_computed(shard: Shard) -> list[Motion]:
     """Episodes of a shard that was run without SUMO, in index order; contact by the formula's verdict."""
     motions = []
-    for row, result in enumerate(shard.results.episode):
-        x, v, acceleration = np.moveaxis(shard.traces[row], 2, 0)
-        lane = np.tile([1, 1, 0], (len(x), 1))
-        if result["cut_in_step"] >= 0:
-            lane[result["cut_in_step"] + 1 :, 1] = 0
-        ended_by_contact = result["outcome"] in (CRASH, BV_LV_CONTACT)
+    for row, result in enumerate(shard.episode):
+        x, v, lane = np.moveaxis(shard.traces[row], 2, 0)
+        ended_by_contact = result["outcome"] in (CRASH, CONTACT)
         contact = ended_by_contact & (np.arange(len(x)) == result["n_steps"])
-        motions.append(Motion(x, v, lane, contact, acceleration[:-1]))
+        motions.append(Motion(x, v, lane.astype(int), contact))
     return motions
 
 
@@ -206,32 +207,32 @@ def twins(jobs) -> dict[str, Shard]:
 def test_sumo_and_twin_agree_in_every_bit(name, recordings, twins):
     motions, outcome = recordings[name]
     assert differences(motions, motions_computed(twins[name])) == {}
-    assert np.array_equal(outcome, twins[name].results.episode["outcome"])
+    assert np.array_equal(outcome, twins[name].episode["outcome"])
 
 
 def test_the_episodes_compared_are_many_and_of_every_kind(twins):
-    exact = np.concatenate([twins[name].results.episode for name in METHODS])
-    crashed, cut_in = exact["outcome"] == CRASH, exact["cut_in_step"] >= 0
+    exact = np.concatenate([twins[name].episode for name in METHODS])
+    crashed, cut_in = exact["outcome"] == CRASH, exact["event_step"] >= 0
     assert exact.size >= 1_000
     assert crashed.sum() >= 200
     assert (cut_in & ~crashed).sum() >= 200
     assert (~cut_in).sum() >= 10
-    assert (exact["outcome"] == BV_LV_CONTACT).sum() >= 10
-    vanilla = twins["vanilla"].results.episode
+    assert (exact["outcome"] == CONTACT).sum() >= 10
+    vanilla = twins["vanilla"].episode
     assert vanilla.size >= 200
     assert (vanilla["outcome"] == CRASH).sum() >= 50
-    assert ((vanilla["cut_in_step"] >= 0) & (vanilla["outcome"] != CRASH)).sum() >= 50
+    assert ((vanilla["event_step"] >= 0) & (vanilla["outcome"] != CRASH)).sum() >= 50
     speeds = [trace[..., 1] for name in ("mixture", "vanilla") for trace in twins[name].traces.values()]
     assert any(((v[1:] == 0.0) & (v[:-1] > 0.0)).any() for v in speeds), "somebody brakes to a standstill"
     assert any(((v[1:] > 0.0) & (v[:-1] == 0.0)).any() for v in speeds), "somebody drives off"
 
 
 def test_among_cut_ins_that_take_time_are_side_contacts_and_vehicles_that_have_passed(twins):
-    episode = twins["overtaken"].results.episode
-    at_overlap = episode["n_steps"] == episode["cut_in_step"] + 1
+    episode = twins["overtaken"].episode
+    at_overlap = episode["n_steps"] == episode["event_step"] + 1
     assert ((episode["outcome"] == PASSED) & at_overlap).sum() >= 5
     assert ((episode["outcome"] == CRASH) & at_overlap).sum() >= 5
-    seen = twins["seen"].results.episode
+    seen = twins["seen"].episode
     assert np.unique(seen["lead_steps"]).size >= 20
 
 
@@ -240,11 +241,11 @@ def test_one_speed_command_off_by_one_unit_in_the_last_place_is_found(vehicle, t
     class PerturbedTwin(TwinWorld):
         steps = 0
 
-        def step(self, speed, cut_in):
+        def step(self, speed, lane):
             self.steps += 1
             if self.steps == 10:
                 speed[5, vehicle] = np.nextafter(speed[5, vehicle], toward)
-            return super().step(speed, cut_in)
+            return super().step(speed, lane)
 
     perturbed = run_episodes(JOBS["mixture"], PerturbedTwin(48))
     found = differences(recordings["mixture"][0], motions_computed(perturbed))
@@ -303,11 +304,11 @@ SPEEDS = {
 def test_a_step_of_sumo_is_the_formula_in_every_bit(speeds, vanilla, open_world):
     random = np.random.default_rng(SEED)
     world = open_world(CELLS, vanilla=vanilla)
-    everywhere, nobody = np.arange(CELLS), np.zeros(CELLS, np.int8)
+    everywhere, lanes = np.arange(CELLS), np.tile(np.array([1, 1, 0], np.int8), (CELLS, 1))
     for _ in range(ROUNDS):
         x, (before, after) = random_positions(random), SPEEDS[speeds](random)
-        world.place(everywhere, x, before)
-        world.step(after, nobody)
+        world.place(everywhere, x, before, lanes)
+        world.step(after, lanes)
         for k in range(CELLS):
             for vehicle, name in enumerate(VEHICLES):
                 expected = next_position(x[k, vehicle], before[k, vehicle], after[k, vehicle])

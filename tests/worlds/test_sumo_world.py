@@ -16,7 +16,7 @@ from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreemen
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.resolved import resolve
 from harness.sampling import prepare
-from harness.vocabulary import CRASH, LV, VEHICLES
+from harness.vocabulary import BV, CRASH, LV, VEHICLES
 from harness.worlds import sumo
 from harness.worlds.shim import Shim, open_shim, shim_library
 from harness.worlds.sumo import committed_file
@@ -25,6 +25,7 @@ from tests.worlds.running import smoke
 
 X, V = (np.tile(values, (8, 1)) for values in ([300.0, 200.0, 100.0], [30.0, 28.0, 35.0]))
 """Positions and speeds of vehicles that do not meet."""
+LANES = np.tile(np.array([1, 1, 0], np.int8), (8, 1))
 
 
 @pytest.fixture
@@ -33,7 +34,7 @@ def driving(open_world) -> Callable:
 
     def make(n_cells: int, **options):
         world = open_world(n_cells, **options)
-        world.place(np.arange(n_cells), X[:n_cells], V[:n_cells])
+        world.place(np.arange(n_cells), X[:n_cells], V[:n_cells], LANES[:n_cells])
         return world
 
     return make
@@ -41,7 +42,7 @@ def driving(open_world) -> Callable:
 
 def drive(world, *, steps: int = 1) -> None:
     for _ in range(steps):
-        world.step(V[: world.n_cells], np.zeros(world.n_cells, np.int8))
+        world.step(V[: world.n_cells], LANES[: world.n_cells])
 
 
 # -- one simulation per process --
@@ -103,8 +104,10 @@ def test_a_speed_one_unit_in_the_last_place_off_is_noticed_within_ten_steps(vict
 
 
 def place_and_cut_in(world) -> None:
-    world.place(np.arange(4), X[:4] + 22.0, np.nextafter(V[:4], 0.0))
-    world.step(V[:4], np.array([0, 0, 1, 0], np.int8))
+    world.place(np.arange(4), X[:4] + 22.0, np.nextafter(V[:4], 0.0), LANES[:4])
+    lanes = LANES[:4].copy()
+    lanes[2, BV] = 0
+    world.step(V[:4], lanes)
 
 
 @pytest.mark.parametrize(
@@ -128,19 +131,19 @@ class LyingTwin(TwinWorld):
         super().__init__(n_cells)
         self.steps, self.nervous = 0, nervous
 
-    def step(self, speed, cut_in):
+    def step(self, speed, lane):
         self.steps += 1
-        flag = super().step(speed, cut_in)
+        flag = super().step(speed, lane)
         return flag | ((self.steps == 20) & (np.arange(self.n_cells) == 3)) if self.nervous else flag & False
 
 
 def run_in(world) -> Shard:
     prepared = prepare(resolve(smoke()))
-    return EpisodeLoop(world, prepared.policy, RecordPolicy(0, "none", 0.0)).run(500, prepared.states(500, 60))
+    return EpisodeLoop(world, prepared.scenario, RecordPolicy("none", 0.0)).run(500, prepared.tests(500, 60))
 
 
 def test_a_flag_that_the_positions_do_not_show_or_lack_stops_the_run_and_names_the_episode():
-    run = run_in(TwinWorld(16)).results.episode
+    run = run_in(TwinWorld(16)).episode
     crashes = {f"episode {500 + row}, step {run['n_steps'][row]}" for row in np.flatnonzero(run["outcome"] == CRASH)}
     with pytest.raises(WorldDisagreementError, match="found no collision where the positions show one") as raised:
         run_in(LyingTwin(16, nervous=False))
@@ -155,12 +158,11 @@ def test_a_flag_that_the_positions_do_not_show_or_lack_stops_the_run_and_names_t
 def test_a_collision_in_the_first_step_of_a_refilled_cell_is_flagged(open_world):
     world = open_world(2)
     speed = np.tile([0.0, 30.0, 20.0], (2, 1))
-    nobody = np.zeros(2, np.int8)
     for _ in range(3):
-        world.place(np.arange(2), np.tile([172.3, 166.0, 100.0], (2, 1)), speed)
-        assert world.step(speed, nobody).tolist() == [True, True]
-    world.place(np.array([0]), X[:2], speed)
-    assert world.step(speed, nobody).tolist() == [False, True]
+        world.place(np.arange(2), np.tile([172.3, 166.0, 100.0], (2, 1)), speed, LANES[:2])
+        assert world.step(speed, LANES[:2]).tolist() == [True, True]
+    world.place(np.array([0]), X[:2], speed, LANES[:2])
+    assert world.step(speed, LANES[:2]).tolist() == [False, True]
 
 
 # -- the compiled shim --
@@ -190,7 +192,7 @@ def test_vehicles_that_are_gone_are_an_error_and_those_of_another_simulation_are
         shim.find_vehicles()
     shim.close()
     world.load_again()
-    world.place(np.arange(2), X[:2], V[:2])
+    world.place(np.arange(2), X[:2], V[:2], LANES[:2])
     drive(world, steps=3)
     assert world.x[0, 0] == libsumo.vehicle.getLanePosition("LV0") > 300.0
 

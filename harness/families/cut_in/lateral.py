@@ -5,14 +5,11 @@ crossing, beside an AV that goes on as it did. The *onset* of lateral motion is 
 may act. The decision precedes the onset: BV does not abort.
 
 The lead is the distance from first lateral motion to overlap over the lateral speed, which is log-normal or gives a
-constant lead; it is rounded to whole steps. States are counted as everywhere: BV begins to move at the end of step
-``onset``, overlaps at the end of step ``cut = onset + lead``, and is at ``distance · (s - onset - 1) / lead`` in state
-s between them. A lead of zero is the cut-in of one step.
+constant lead; it is rounded to whole steps (`harness.vehicles.sideways`). A lead of zero is the cut-in of one step.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +22,6 @@ from harness.vocabulary import FloatArray
 
 DISTANCE_M = 1.7
 """Lane of 3.6 m less a car of 1.9 m [derived]."""
-_ROUNDING = 1e-9
 
 
 class LateralMotion(NamedTuple):
@@ -66,31 +62,3 @@ def draw_lead(cut: int, seed: int, episode: int, lateral: LateralMotion) -> int:
     while lead < last and lateral.cumulative[lead] <= u:
         lead += 1
     return lead
-
-
-@compiled_inline
-def onset_of(cut: int, lead: int) -> int:
-    """Step at whose end BV begins to move sideways: at the earliest the first of the test."""
-    return max(cut - lead, 0)
-
-
-@compiled_inline
-def lateral_position(state: int, cut: int, lead: int, distance_m: float) -> float:
-    """How far (m) BV has come over in a state between onset and overlap."""
-    if state > cut or lead == 0:
-        return distance_m
-    return distance_m * (state + lead - cut - 1) / lead
-
-
-@compiled_inline
-def perceived_in(perceives_m: float, cut: int, lead: int, distance_m: float) -> tuple[int, float]:
-    """First step in which somebody may act who perceives a lateral motion of so many metres; the overlap anyone.
-
-    And by how much of a step it was perceived before that: drivers whose delays need not be whole steps count it.
-    """
-    until = float(lead)
-    if lead > 0 and perceives_m < distance_m:
-        until = perceives_m * lead / distance_m
-    perceived = max(cut - lead + until, float(onset_of(cut, lead)))
-    first = math.ceil(perceived - _ROUNDING)
-    return first + 1, max(first - perceived, 0.0)

@@ -14,16 +14,16 @@ import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.cut_in import laws
-from harness.families.cut_in.lateral import onset_of, perceived_in
 from harness.families.cut_in.laws import Environment, acceleration
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.vehicles.drivers import MOST_FOLLOWERS, Followers
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
 from harness.vehicles.references import Memory, react, still_cruises
+from harness.vehicles.sideways import onset_of, perceived_in
 from harness.vocabulary import (
     AV,
     BV,
-    BV_LV_CONTACT,
+    CONTACT,
     LV,
     PASSED,
     RUNNING,
@@ -108,7 +108,7 @@ def end_in(step: int, path: Trajectory) -> int:
     """How an episode without a cut-in ends in a step that has been walked, or `RUNNING`."""
     x = path.x[step]
     if step > 0 and gap(x[LV], x[BV]) < CONTACT_M:
-        return BV_LV_CONTACT
+        return CONTACT
     if step > 0 and gap(x[BV], x[AV]) <= 0.0:
         return PASSED
     return RUNNING
@@ -134,7 +134,7 @@ def walk(
     place(state, path.x[0], path.v[0])
     for step in range(until):
         end = end_in(step, path)
-        if end == BV_LV_CONTACT or (end == PASSED and ends_passed):
+        if end == CONTACT or (end == PASSED and ends_passed):
             return step
         m, x, v, after = step // hold_steps, path.x[step], path.v[step], path.v[step + 1]
         if step % hold_steps == 0 and m >= known:

@@ -58,21 +58,6 @@ _ROUNDING_M = 1e-9
 """More than interpolation between gaps of up to a kilometre can lose."""
 
 
-def importance_names(campaign: Campaign) -> tuple[str, ...]:
-    """Names of the importance functions, in the order of ``log_q``."""
-    defensive = ("forced",) if campaign.sampling.forces else ()
-    return defensive + (tuple(campaign.surrogates) if campaign.sampling.mixes else ())
-
-
-def mixture_weights(campaign: Campaign) -> tuple[float, ...]:
-    """Weights α of the importance functions, in the order of `importance_names`."""
-    alpha = tuple(campaign.alpha()) if campaign.sampling.mixes else ()
-    if not campaign.sampling.forces:
-        return alpha
-    share = campaign.testing.defensive_share if alpha else 1.0
-    return (share, *((1.0 - share) * weight for weight in alpha))
-
-
 def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
     """Importance functions of a campaign; ``nde`` and ``forced`` need no challenge tables."""
     testing, sampling = campaign.testing, campaign.sampling
@@ -87,7 +72,7 @@ def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
         level_steps(round(campaign.environment.acceleration_hold_s * 10)),
         testing.epsilon,
         testing.criticality_threshold,
-        np.array(mixture_weights(campaign), dtype=np.float64),
+        np.array(campaign.mixture_weights, dtype=np.float64),
         *(none if tables is None else (*tables[:3], harmless_cells(tables, recursive=recursive))),
     )
 

@@ -7,10 +7,9 @@ shared history*, is the mixture Σ_j w_j q_j with
 * step mixture: w_j = α_j in every step;
 * episode mixture: the posterior weights w_j ∝ α_j exp(L_j). The drawn component itself is not part of the history.
 
-Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Forced cut-ins
-and shells know it at the beginning of the episode (`decide`): -log P(cut-in | path), and -log p_s.
-Each control step adds its ratios (`record_lane`, `record_acceleration`), and where the episode is over
-(`harness.loop.judge`) `log_weight` is what its record says.
+Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Each control step
+adds its ratios (`record_lane`, `record_acceleration`), and where the episode is over (`decide.finish`) `log_weight` is
+what its record says.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from __future__ import annotations
 import math
 
 from harness.compiled import compiled_inline
+from harness.families.cut_in.nade.cells import Nade
 from harness.families.cut_in.nade.functions import Importance
 from harness.loop.cells import KernelState
 from harness.vocabulary import CUT_IN, STAY, FloatArray, State
@@ -92,64 +92,64 @@ def forced_ratio(before: float, after: float, total: float, cut: bool) -> float:
 
 @compiled_inline
 def record_lane(
-    k: int, step: int, state: State, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState
+    k: int, step: int, state: State, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState, nade: Nade
 ) -> None:
     """Likelihood ratios of having stayed or cut in, and the moment if it was one of control.
 
     ``scratch.q`` and ``scratch.challenge`` (J,) are q_j(cut_in) and V_j where it is critical.
     """
-    cell, scratch, importance = kernel.cells.cell[k], kernel.scratch, kernel.importance
+    draws, scratch, importance = nade.draws.cell[k], nade.scratch, nade.importance
     sampled = 1.0
     if critical or importance.n_forced == 1:
         if importance.n_forced == 1:
-            scratch.ratio[0] = forced_ratio(cell.hazard, cell.hazard + hazard, cell.hazard_total, cut)
+            scratch.ratio[0] = forced_ratio(draws.hazard, draws.hazard + hazard, draws.hazard_total, cut)
         for j in range(importance.n_surrogates):
             q = scratch.q[j]
             scratch.ratio[importance.n_forced + j] = (q / p if cut else (1.0 - q) / (1.0 - p)) if critical else 1.0
             scratch.challenge[j] = scratch.challenge[j] if critical else 0.0
-        sampled = accumulate_step(k, kernel)
-    cell.hazard += hazard
-    if critical or (cut and importance.n_forced == 1 and not importance.mixes_episodes):
+        sampled = accumulate_step(k, nade)
+    draws.hazard += hazard
+    if critical:
         exposure = p if cut else 1.0 - p
         for j in range(importance.n_surrogates):
             scratch.q[j] = scratch.q[j] if cut else 1.0 - scratch.q[j]
-        record_moment(k, step, state, CUT_IN if cut else STAY, exposure, exposure * sampled, kernel)
+        record_moment(k, step, state, CUT_IN if cut else STAY, exposure, exposure * sampled, kernel, nade)
 
 
 @compiled_inline
-def record_acceleration(k: int, state: State, maneuver: int, kernel: KernelState) -> None:
+def record_acceleration(k: int, state: State, maneuver: int, kernel: KernelState, nade: Nade) -> None:
     """Likelihood ratios of an acceleration at a critical moment after the cut-in, and the moment.
 
     ``scratch.p`` (31,), ``scratch.q_acceleration`` (J, 31) and ``scratch.challenge`` (J,) are what it was drawn by.
     """
-    cell, scratch, importance = kernel.cells.cell[k], kernel.scratch, kernel.importance
+    cell, scratch, importance = kernel.cells.cell[k], nade.scratch, nade.importance
     p = scratch.p[maneuver]
     if importance.n_forced == 1:
         scratch.ratio[0] = 1.0
     for j in range(importance.n_surrogates):
         scratch.q[j] = scratch.q_acceleration[j, maneuver]
         scratch.ratio[importance.n_forced + j] = scratch.q[j] / p
-    sampled = accumulate_step(k, kernel)
-    record_moment(k, cell.step, state, maneuver, p, p * sampled, kernel)
+    sampled = accumulate_step(k, nade)
+    record_moment(k, cell.step, state, maneuver, p, p * sampled, kernel, nade)
 
 
 @compiled_inline
-def accumulate_step(k: int, kernel: KernelState) -> float:
+def accumulate_step(k: int, nade: Nade) -> float:
     """Take ``scratch.ratio`` and ``scratch.challenge`` of a step into the likelihood ratios; returns its q_α/p."""
-    cells, scratch, importance = kernel.cells, kernel.scratch, kernel.importance
-    cell, log_ratio, martingale = cells.cell[k], cells.log_ratio[k], cells.martingale[k]
-    sampled = accumulate(importance, scratch.ratio, scratch.challenge, cell.log_sampled, log_ratio, martingale)
+    scratch, importance, draws = nade.scratch, nade.importance, nade.draws.cell[k]
+    log_ratio, martingale = nade.draws.log_ratio[k], nade.draws.martingale[k]
+    sampled = accumulate(importance, scratch.ratio, scratch.challenge, draws.log_sampled, log_ratio, martingale)
     if importance.mixes_steps:
-        cell.log_sampled += math.log(sampled)
+        draws.log_sampled += math.log(sampled)
     return sampled
 
 
 @compiled_inline
 def record_moment(
-    k: int, step: int, state: State, maneuver: int, p: float, q_sampled: float, kernel: KernelState
+    k: int, step: int, state: State, maneuver: int, p: float, q_sampled: float, kernel: KernelState, nade: Nade
 ) -> None:
     """Count a control step, and keep it if the campaign keeps that many of an episode."""
-    results, scratch, cell = kernel.results, kernel.scratch, kernel.cells.cell[k]
+    results, scratch, cell = nade.drawn, nade.scratch, kernel.cells.cell[k]
     cell.n_control += 1
     if cell.n_control > results.moment_limit:
         return

@@ -19,11 +19,13 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads, unboxed
-from harness.families.cut_in.lateral import draw_lead, onset_of
+from harness.families.cut_in.events import FREE_DRAWS_PER_CUT_IN
+from harness.families.cut_in.lateral import draw_lead
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import SAFE_M, Trajectory, empty_trajectory, leave, walk
-from harness.pool.walk import FREE_DRAWS_PER_CUT_IN, BaselineRuns
+from harness.families.protocol import Recorded
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, next_position, next_speed, overlaps
+from harness.vehicles.sideways import onset_of
 from harness.vocabulary import BV, BoolArray, FloatArray, IntArray, RecordArray
 
 NEAR_M, NEAR_BIN_M, FAR_RATIO = 3.0, 0.1, 1.06
@@ -104,7 +106,7 @@ def _respond(
 
 
 @compiled_threads
-def _retrace(learned: Learned, tests: Following, runs: BaselineRuns, error: FloatArray) -> None:
+def _retrace(learned: Learned, tests: Following, runs: Recorded, error: FloatArray) -> None:
     """How far (m) from the vehicle its surrogate is at the end of each test (n,)."""
     wanted = np.zeros(tests.x_av.shape[1])
     for i in range(tests.first.size):
@@ -119,7 +121,7 @@ def _retrace(learned: Learned, tests: Following, runs: BaselineRuns, error: Floa
         error[i] = abs(x - tests.x_av[i, last])
 
 
-def learn(tests: Following, runs: BaselineRuns) -> Learned:
+def learn(tests: Following, runs: Recorded) -> Learned:
     """Learn the vehicle from tests in which it followed BV.
 
     Of tables from every other test that one is taken with which the tests in between are retraced best.
@@ -161,7 +163,7 @@ def learned_crashes(
     index: IntArray,
     state: RecordArray,
     environment: Environment,
-    runs: BaselineRuns,
+    runs: Recorded,
     asked: BoolArray,
     counts_above_mps: float,
 ) -> BoolArray:
@@ -179,7 +181,7 @@ def _drive(
     index: IntArray,
     state: RecordArray,
     environment: Environment,
-    runs: BaselineRuns,
+    runs: Recorded,
     path: Trajectory,
     wanted: FloatArray,
     asked: BoolArray,

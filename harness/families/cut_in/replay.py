@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.compiled import compiled_inline, compiled_threads
-from harness.families.cut_in.lateral import onset_of
+from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import (
     NO_CRASH,
@@ -23,8 +23,8 @@ from harness.families.cut_in.path import (
     take_over,
     walk,
 )
-from harness.pool.cut_ins import padded
-from harness.pool.walk import Script
+from harness.records.schemas import padded
+from harness.vehicles.sideways import onset_of
 from harness.vocabulary import (
     AV,
     CUT_IN,
@@ -53,7 +53,7 @@ class StoredPaths(NamedTuple):
     state: RecordArray
     n_steps: IntArray
     cut_step: IntArray
-    script: Script
+    script: Maneuvers
 
 
 def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
@@ -67,7 +67,7 @@ def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
         states_from(np.asarray(episodes.column(name)) for name in STATE_COLUMNS),
         _whole(episodes, "n_steps", 0),
         _whole(episodes, "cut_in_step", -1),
-        Script(lv, bv, n_lv, n_bv, lead),
+        Maneuvers(lv, bv, n_lv, n_bv, lead),
     )
 
 

@@ -1,0 +1,168 @@
+"""The cut-ins that could happen on a naturalistic path, their exact probabilities, and which drivers crash on them.
+
+LV's and BV's motion before the cut-in does not depend on the AV; BV's motion after it is drawn from free driving, which
+does not depend on the AV either. So a path is walked once, each of its cut-in times has a probability that is known
+once the AV's motion is (it keeps its speed, or has been recorded), and each driver is only a follower behind a given
+BV: about a microsecond.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.compiled import compiled_inline, compiled_threads, unboxed
+from harness.families.cut_in import laws
+from harness.families.cut_in.lateral import draw_lead
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.path import Trajectory, empty_trajectory, leave, state_of, walk, weigh_cut_ins, who_crashes
+from harness.families.protocol import HOLDING, Events, Paths, Recorded
+from harness.random_stream import LV_DRAWS, uniform
+from harness.vehicles.drivers import Followers
+from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
+from harness.vocabulary import AV, CUT_IN, LV, Int8Array, IntArray, RecordArray
+
+FREE_DRAWS_PER_CUT_IN = 256
+"""Stride of the uniforms for BV's free driving: each cut-in time of a path of a pool has draws of its own."""
+
+
+class Maneuvers(NamedTuple):
+    """Maneuvers of LV and BV on paths (n,).
+
+    ``lv``, ``bv`` (n, draws), 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,) how many there are. ``lead`` (n,) is how
+    many steps earlier BV begins to move sideways.
+    """
+
+    lv: Int8Array
+    bv: Int8Array
+    n_lv: IntArray
+    n_bv: IntArray
+    lead: IntArray
+
+
+def enumerate_cut_ins(
+    seed: int,
+    paths: Paths,
+    environment: Environment,
+    followers: Followers,
+    recorded: Recorded = HOLDING,
+    stride: int = 1,
+    offset: IntArray | None = None,
+) -> Events:
+    """Every ``stride``-th cut-in of paths (n,), by their steps; see `harness.families.protocol.Family.events`."""
+    n, steps = paths.number.size, int(environment.numbers["max_steps"])
+    found = Events(np.zeros((n, steps)), np.zeros((n, steps), np.int64), np.zeros(n), np.zeros(n))
+    first = np.zeros(n, np.int64) if offset is None else offset
+    scratch = empty_trajectory(environment)
+    known = unboxed(environment), unboxed(followers), unboxed(recorded)
+    _enumerate(seed, paths.number, paths.start, stride, first, *known, unboxed(scratch), unboxed(found))
+    return found
+
+
+@compiled_threads
+def _enumerate(
+    seed: int,
+    index: IntArray,
+    state: RecordArray,
+    stride: int,
+    offset: IntArray,
+    environment: Environment,
+    followers: Followers,
+    recorded: Recorded,
+    path: Trajectory,
+    found: Events,
+) -> None:
+    max_steps = environment.numbers.max_steps
+    for i in range(index.size):
+        if recorded.n_steps.size == 0:
+            steps = reach = walk(state[i], seed, index[i], 0, max_steps, True, environment, path)
+        else:
+            reach = walk(state[i], seed, index[i], 0, max_steps, False, environment, path)
+            steps = min(recorded.n_steps[i], reach)
+            for step in range(steps + 1):
+                path.x[step, AV], path.v[step, AV] = recorded.x_m[i, step], recorded.v_mps[i, step]
+        weigh_cut_ins(steps, environment, path)
+        hazard = 0.0
+        for cut in range(steps):
+            if path.hazard[cut] > 0.0 and cut % stride == offset[i]:
+                found.probability[i, cut] = stride * (math.exp(-hazard) * -math.expm1(-path.hazard[cut]))
+                if followers.drivers.size > 0:
+                    found.crashes[i, cut] = who_crashes_after(cut, seed, index[i], followers, environment, path)
+            hazard += path.hazard[cut]
+        found.log_any[i] = math.log(-math.expm1(-hazard))
+        if recorded.failed.size > 0 and recorded.failed[i]:
+            most = 0.0
+            for step in range(steps, reach):
+                wish = laws.opportunity(state_of(path.x[step], path.v[step]), environment)
+                most += laws.cut_in_hazard(wish, 1.0, environment)
+            found.after_failure[i] = math.exp(-hazard) * -math.expm1(-most)
+
+
+@compiled_inline
+def who_crashes_after(
+    cut: int, seed: int, index: int, followers: Followers, environment: Environment, path: Trajectory
+) -> int:
+    """One bit for each driver that crashes if BV cuts in in a step of a path that has been walked."""
+    leave(cut, environment.numbers.max_steps, seed, index, cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
+    if gap(path.x[cut + 1, LV], path.x_after[cut + 1]) < CONTACT_M:
+        return 0  # the episode ends as bv_lv_contact
+    return who_crashes(followers, cut, draw_lead(cut, seed, index, environment.lateral), environment, path)
+
+
+def write_maneuvers(
+    seed: int,
+    paths: Paths,
+    cut: IntArray,
+    environment: Environment,
+    draws_per_cut_in: int = FREE_DRAWS_PER_CUT_IN,
+) -> Maneuvers:
+    """What LV and BV do on paths (n,) with cut-ins in steps ``cut`` (n,), -1: none.
+
+    After a cut-in LV goes on to draw, to the end of the test. ``draws_per_cut_in`` is 0 outside of pools.
+    """
+    scratch, n = empty_trajectory(environment), paths.number.size
+    lv, bv = np.zeros((2, n, scratch.lv.size), np.int8)
+    n_lv, n_bv, lead = np.zeros((3, n), np.int64)
+    found = Maneuvers(lv, bv, n_lv, n_bv, lead)
+    known = unboxed(environment), unboxed(scratch), unboxed(found)
+    _write(seed, paths.number, cut, paths.start, draws_per_cut_in, *known)
+    return found
+
+
+@compiled_threads
+def _write(
+    seed: int,
+    index: IntArray,
+    cut: IntArray,
+    state: RecordArray,
+    draws_per_cut_in: int,
+    environment: Environment,
+    path: Trajectory,
+    found: Maneuvers,
+) -> None:
+    n, lv, bv = environment.numbers, found.lv, found.bv
+    for i in range(index.size):
+        until = cut[i] + 1 if cut[i] >= 0 else n.max_steps
+        steps = walk(state[i], seed, index[i], 0, until, False, environment, path)
+        before = (steps - 1) // n.hold_steps + 1
+        for m in range(before):
+            lv[i, m], bv[i, m] = path.lv[m], path.bv[m]
+        found.n_lv[i] = found.n_bv[i] = before
+        if cut[i] < 0:
+            continue
+        bv[i, before] = CUT_IN
+        drawn = leave(cut[i], n.max_steps, seed, index[i], cut[i] * draws_per_cut_in, 0, environment, path)
+        for m in range(drawn):
+            bv[i, before + 1 + m] = path.free[m]
+        found.n_bv[i] += 1 + drawn
+        found.lead[i] = draw_lead(cut[i], seed, index[i], environment.lateral)
+        found.n_lv[i] = (n.max_steps - 1) // n.hold_steps + 1
+        v = path.v[0, LV]
+        for step in range(n.max_steps):
+            m = step // n.hold_steps
+            if step % n.hold_steps == 0 and m >= before:
+                u = uniform(seed, index[i], LV_DRAWS, m)
+                lv[i, m] = laws.drive_freely(u, v, environment)
+            v = next_speed(v, laws.acceleration(lv[i, m]))

@@ -1,0 +1,93 @@
+"""The cut-in as a family of events: what the core asks, answered by the kernels of this package."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pyarrow as pa
+
+from harness.compiled import unboxed
+from harness.families.cut_in.events import FREE_DRAWS_PER_CUT_IN, enumerate_cut_ins, write_maneuvers
+from harness.families.cut_in.laws import Environment, InitialStates
+from harness.families.cut_in.path import empty_trajectory, mean_test_distance
+from harness.families.cut_in.script import facts_of, script_of
+from harness.families.protocol import HOLDING, Chosen, Column, Events, Paths, Recorded
+from harness.loop.cells import Script
+from harness.vehicles.drivers import Followers
+from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, FloatArray, IntArray, Method, RecordArray
+
+_STATE_DOCS = (
+    "speed of BV",
+    "gap LV-BV, bumper to bumper",
+    "rate of R1: v_LV - v_BV",
+    "gap BV-AV, bumper to bumper",
+    "rate of R2: v_BV - v_AV",
+)
+STATE_FACTS = tuple(
+    Column(name, pa.float64(), "m/s" if name.endswith("_mps") else "m", doc)
+    for name, doc in zip(STATE_COLUMNS, _STATE_DOCS, strict=True)
+)
+MANEUVER_FACTS = (
+    Column("lv_maneuvers", pa.list_(pa.int8()), "1", "LV's draws, in order", "n_lv"),
+    Column("bv_maneuvers", pa.list_(pa.int8()), "1", "BV's draws, in order; 31 marks the cut-in", "n_bv"),
+)
+
+
+DISTANCE_SEED = DISTANCE_PATHS = 20_000
+"""Paths over which the mean distance of a test is taken; its standard error is below 0.5 %. Tests with a cut-in are too
+few (some 3e-5 at level 1) to matter."""
+
+
+class CutIn:
+    """See `harness.families.protocol.Family`."""
+
+    name = "cut_in"
+    vehicles: tuple[str, ...] = VEHICLES
+    principal, ahead = BV, LV
+    columns: tuple[Column, ...] = (*(each._replace(doc=f"initial {each.doc}") for each in STATE_FACTS), *MANEUVER_FACTS)
+    n_uniforms = len(STATE_COLUMNS)
+
+    def max_steps(self, traffic: Environment) -> int:
+        return int(traffic.numbers["max_steps"])
+
+    def sideways_m(self, traffic: Environment) -> float:
+        return traffic.lateral.distance_m
+
+    def shows(self, traffic: Environment) -> bool:
+        return traffic.lateral.present
+
+    def mean_distance_m(self, traffic: Environment) -> float:
+        states = InitialStates(traffic.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
+        scratch = empty_trajectory(traffic)
+        return float(mean_test_distance(DISTANCE_SEED, states, unboxed(traffic), unboxed(scratch)))
+
+    def sources(self) -> Mapping[Method, type[Any]]:
+        from harness.families.cut_in.nade.source import InLoop  # noqa: PLC0415 - imports what draws on families
+
+        return dict.fromkeys(("nde", "step_mixture", "episode_mixture"), InLoop)
+
+    def start(self, traffic: Environment, u: FloatArray) -> RecordArray:
+        return InitialStates(traffic.numbers).from_uniforms(u)
+
+    def events(
+        self,
+        traffic: Environment,
+        seed: int,
+        paths: Paths,
+        drivers: Followers,
+        recorded: Recorded = HOLDING,
+        stride: int = 1,
+        offset: IntArray | None = None,
+    ) -> Events:
+        return enumerate_cut_ins(seed, paths, traffic, drivers, recorded, stride, offset)
+
+    def choose(self, traffic: Environment, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
+        maneuvers = write_maneuvers(seed, paths, event, traffic, FREE_DRAWS_PER_CUT_IN if of_pool else 0)
+        return Chosen(facts_of(paths.start, maneuvers), event, maneuvers.lead)
+
+    def script(self, traffic: Environment, chosen: Chosen) -> Script:
+        return script_of(traffic, chosen)
+
+
+CUT_IN = CutIn()

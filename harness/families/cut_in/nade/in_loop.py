@@ -1,0 +1,71 @@
+"""Tests whose cut-in is drawn in the loop: by importance functions, or as naturalistic traffic would."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from harness.compiled import unboxed
+from harness.families.cut_in.events import Maneuvers
+from harness.families.cut_in.laws import Environment
+from harness.families.cut_in.nade.cells import (
+    CONTROL_STEPS,
+    Nade,
+    empty_draws,
+    empty_scratch,
+    nothing_drawn,
+    with_more_room,
+)
+from harness.families.cut_in.nade.decide import decide, finish
+from harness.families.cut_in.nade.functions import Importance
+from harness.families.cut_in.script import beginning, facts_of
+from harness.loop.cells import KernelState, natural_script
+from harness.loop.repeat import Traffic, nothing_known
+from harness.vocabulary import BV, RecordArray
+
+
+class DrawnInLoop(Traffic):
+    """LV and BV in tests that begin in ``states`` (n,); ``moment_limit`` control steps are kept of each.
+
+    When the tests are over ``drawn`` says what happened in them.
+    """
+
+    def __init__(
+        self, states: RecordArray, environment: Environment, importance: Importance, moment_limit: int = 0
+    ) -> None:
+        n, nowhere = len(states), np.full(len(states), -1)
+        nothing = np.zeros((n, 0, BV + 1)), np.zeros((n, 0, BV + 1), np.int8)
+        super().__init__(natural_script(*beginning(states), *nothing, nowhere, np.zeros(n, np.int64)), nothing_known(n))
+        self._given = states, environment, importance, moment_limit
+
+    def rows(self, rows: slice) -> DrawnInLoop:
+        states, environment, importance, limit = self._given
+        return DrawnInLoop(states[rows], environment, importance, limit)
+
+    def begin(self, n_cells: int, first_episode: int) -> None:  # noqa: ARG002 - indices are the loop's
+        states, environment, importance, limit = self._given
+        room = CONTROL_STEPS * len(states) + n_cells
+        self.drawn = nothing_drawn(len(states), environment, importance, moment_limit=limit, capacity=room)
+        draws, scratch = empty_draws(n_cells, environment, importance), empty_scratch(environment, importance)
+        self._nade = Nade(states, draws, self.drawn, scratch, environment, importance)
+        self._unboxed = unboxed(self._nade)
+
+    def move(self, kernel: KernelState, placed: int) -> None:
+        if self.drawn.moment_count[0] > self.drawn.moment.size - len(self._nade.draws.cell):
+            self.drawn = with_more_room(self.drawn)
+            self._nade = self._nade._replace(drawn=self.drawn)
+            self._unboxed = unboxed(self._nade)
+        decide(kernel, self._unboxed, placed)
+
+    def finish(self, kernel: KernelState, n: int) -> None:
+        finish(kernel, self._unboxed, n)
+
+    @property
+    def facts(self) -> RecordArray:
+        drawn = self.drawn
+        leads = np.zeros(len(drawn.n_lv), np.int64)
+        return facts_of(self._given[0], Maneuvers(drawn.lv_path, drawn.bv_path, drawn.n_lv, drawn.n_bv, leads))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_given": self._given, "script": self.script}

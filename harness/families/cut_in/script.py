@@ -1,0 +1,104 @@
+"""What is to be known of a cut-in to repeat it, and the motion that this is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from harness.compiled import compiled_threads
+from harness.families.cut_in.events import Maneuvers
+from harness.families.cut_in.laws import Environment, acceleration
+from harness.families.cut_in.path import place
+from harness.families.protocol import Chosen
+from harness.loop.cells import Script, natural_script
+from harness.vehicles.kinematics import next_speed
+from harness.vocabulary import (
+    BV,
+    LV,
+    STATE_COLUMNS,
+    STATE_DTYPE,
+    VEHICLES,
+    FloatArray,
+    Int8Array,
+    IntArray,
+    RecordArray,
+    states_from,
+)
+
+LEFT, RIGHT = 1, 0
+_LENGTHS = {"lv_maneuvers": "n_lv", "bv_maneuvers": "n_bv"}
+
+
+def facts_of(state: RecordArray, maneuvers: Maneuvers) -> RecordArray:
+    """Initial states (n,), and the maneuvers of LV and BV from there on, 31 of BV's marking the cut-in."""
+    draws = maneuvers.lv.shape[1]
+    lists = [(name, np.int8, (draws,)) for name in _LENGTHS]
+    lengths = [(name, np.int64) for name in _LENGTHS.values()]
+    facts: RecordArray = np.zeros(len(state), np.dtype([*STATE_DTYPE.descr, *lists, *lengths]))
+    for name in STATE_COLUMNS:
+        facts[name] = state[name]
+    facts["lv_maneuvers"], facts["bv_maneuvers"] = maneuvers.lv, maneuvers.bv
+    facts["n_lv"], facts["n_bv"] = maneuvers.n_lv, maneuvers.n_bv
+    return facts
+
+
+def states_of(facts: RecordArray) -> RecordArray:
+    """Initial states (n,)."""
+    return states_from(facts[name] for name in STATE_COLUMNS)
+
+
+def beginning(state: RecordArray) -> tuple[FloatArray, FloatArray, Int8Array]:
+    """Positions (m), speeds (m/s) and lanes (n, 3) of LV, BV and AV in initial states (n,)."""
+    n = len(state)
+    x, v = np.zeros((2, n, len(VEHICLES)))
+    _place(state, x, v)
+    lane = np.zeros((n, len(VEHICLES)), np.int8)
+    lane[:, [LV, BV]] = LEFT
+    return x, v, lane
+
+
+@compiled_threads
+def _place(state: RecordArray, x: FloatArray, v: FloatArray) -> None:
+    for i in range(state.size):
+        place(state[i], x[i], v[i])
+
+
+def script_of(environment: Environment, chosen: Chosen) -> Script:
+    """The motion of LV and BV, to the end of the longest test; beyond the last maneuver nothing can be meant."""
+    facts, n, steps = chosen.facts, len(chosen.facts), int(environment.numbers["max_steps"])
+    x, v, lane = beginning(states_of(facts))
+    speed, lanes = np.zeros((n, steps, BV + 1)), np.full((n, steps, BV + 1), LEFT, np.int8)
+    lv, bv = (np.ascontiguousarray(facts[name]) for name in _LENGTHS)
+    n_lv, n_bv = (np.ascontiguousarray(facts[name]) for name in _LENGTHS.values())
+    _move(lv, bv, n_lv, n_bv, chosen.at, int(environment.numbers["hold_steps"]), v, speed, lanes)
+    return natural_script(x, v, lane, speed, lanes, chosen.at, chosen.lead)
+
+
+@compiled_threads
+def _move(
+    lv: Int8Array,
+    bv: Int8Array,
+    n_lv: IntArray,
+    n_bv: IntArray,
+    cut: IntArray,
+    hold_steps: int,
+    v: FloatArray,
+    speed: FloatArray,
+    lanes: Int8Array,
+) -> None:
+    for i in range(cut.size):
+        v_lv, v_bv, a_lv, a_bv, used = v[i, LV], v[i, BV], 0.0, 0.0, 0
+        for step in range(speed.shape[1]):
+            left, redraws = 0 <= cut[i] < step, step % hold_steps == 0
+            if redraws and step // hold_steps < n_lv[i]:
+                a_lv = acceleration(lv[i, step // hold_steps])
+            if left:
+                redraws = (step - cut[i] - 1) % hold_steps == 0
+            if redraws and used < n_bv[i]:
+                a_bv = acceleration(bv[i, used])
+                used += 1
+            if step == cut[i]:
+                used += 1  # the mark
+            v_lv, v_bv = next_speed(v_lv, a_lv), next_speed(v_bv, a_bv)
+            speed[i, step, LV], speed[i, step, BV] = v_lv, v_bv
+            if 0 <= cut[i] <= step:
+                lanes[i, step, BV] = RIGHT

@@ -1,0 +1,164 @@
+"""What a family of events brings: paths on which nothing happens, events on them, and the motion that they are.
+
+All that the harness does is: walk the others' motion without the event → list the events on it, each with its exact
+probability → ask which drivers crash on each → repeat some of them → count. A family is a package that answers the
+questions of `Family`, each once per batch; its kernels are its own, and what it says is arrays. The core repeats its
+scripts, judges, counts and shows them, and knows nothing else of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import pyarrow as pa
+
+from harness.loop.cells import Script
+from harness.vehicles.drivers import Followers
+from harness.vocabulary import BoolArray, FloatArray, IntArray, Method, RecordArray
+
+
+class Column(NamedTuple):
+    """A fact of each test that records keep: a field of the family's facts, and of the table of tests.
+
+    Of a fact with a length, ``length`` names the field that says how many of its entries are used.
+    """
+
+    name: str
+    kind: pa.DataType
+    unit: str
+    doc: str
+    length: str = ""
+
+
+class Recorded(NamedTuple):
+    """What vehicles did without an event, on paths (n,); for one that keeps its speed, `HOLDING` (0,).
+
+    ``n_steps``, ``failed`` (n,): steps that are on record, and whether the vehicle failed then. ``x_m``, ``v_mps``
+    (n, steps + 1) are its positions and speeds, undefined beyond.
+    """
+
+    n_steps: IntArray
+    failed: BoolArray
+    x_m: FloatArray
+    v_mps: FloatArray
+
+    def mean_distance_m(self, weight: FloatArray) -> float:
+        """Mean distance that the vehicle drives where nothing happens; paths have the ``weight`` (n,)."""
+        whole, rows = ~self.failed, np.arange(len(self.n_steps))
+        distance = self.x_m[rows, self.n_steps] - self.x_m[:, 0]
+        return float((weight * distance)[whole].sum() / weight[whole].sum())
+
+    def digest(self) -> str:
+        """Hash of what is on record."""
+        digest = hashlib.sha256(self.n_steps.tobytes() + self.failed.tobytes())
+        known = np.arange(self.x_m.shape[1]) <= self.n_steps[:, None]
+        for values in (self.x_m, self.v_mps):
+            digest.update(values[known].tobytes())
+        return digest.hexdigest()
+
+
+HOLDING = Recorded(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros((0, 1)), np.zeros((0, 1)))
+
+
+class Paths(NamedTuple):
+    """Paths (n,): the ``number`` of each, by which all that is drawn on it follows, and how it begins.
+
+    ``start`` (n,) is a record of the family's own, made from uniforms.
+    """
+
+    number: IntArray
+    start: RecordArray
+
+
+class Events(NamedTuple):
+    """All events that are asked of paths: rows are paths, columns the family's grid of E events.
+
+    ``probability`` (n, E) is ``stride`` · P(event | path) where it is asked, else 0: with uniform offsets the sum over
+    any set of events has its probability as mean. ``crashes`` (n, E) has one bit per driver. ``log_any`` (n,) is the
+    log probability that there is an event on the path. ``after_failure`` (n,) is the most that the probability of an
+    event after a failure of a recorded AV can be, wherever it may be then.
+    """
+
+    probability: FloatArray
+    crashes: IntArray
+    log_any: FloatArray
+    after_failure: FloatArray
+
+
+class Chosen(NamedTuple):
+    """Events (m,) that were chosen: what has to be known to repeat them.
+
+    ``facts`` (m,) are the family's; the event is in step ``at`` (m,), -1 for none, and shows itself ``lead`` (m,) steps
+    earlier.
+    """
+
+    facts: RecordArray
+    at: IntArray
+    lead: IntArray
+
+
+class Family(Protocol):
+    """A kind of events. ``traffic`` is all that its kernels need of its environment.
+
+    Attributes
+    ----------
+    name : str
+        As campaigns call it.
+    vehicles : tuple of str
+        Names of the vehicles of a cell, the AV last.
+    principal, ahead : int
+        Place of the vehicle that events are about, and of the one ahead of it, -1 without one.
+    columns : tuple of Column
+        The facts that records keep.
+    n_uniforms : int
+        How many uniforms the beginning of a path is made from: what a pool is aimed over.
+    """
+
+    name: str
+    vehicles: tuple[str, ...]
+    principal: int
+    ahead: int
+    columns: tuple[Column, ...]
+    n_uniforms: int
+
+    def max_steps(self, traffic: Any) -> int:
+        """Steps of the longest test."""
+
+    def sideways_m(self, traffic: Any) -> float:
+        """Way (m) from a first lateral motion to overlap."""
+
+    def shows(self, traffic: Any) -> bool:
+        """Whether events can be seen before they happen."""
+
+    def mean_distance_m(self, traffic: Any) -> float:
+        """Mean distance (m) that an AV which keeps its speed drives where nothing happens."""
+
+    def sources(self) -> Mapping[Method, type[Any]]:
+        """Methods of its own, which draw the event in the loop: a class each (`harness.sampling.protocol.Source`)."""
+
+    def start(self, traffic: Any, u: FloatArray) -> RecordArray:
+        """How paths begin, (n,), from uniforms (n, `n_uniforms`)."""
+
+    def events(
+        self,
+        traffic: Any,
+        seed: int,
+        paths: Paths,
+        drivers: Followers,
+        recorded: Recorded = HOLDING,
+        stride: int = 1,
+        offset: IntArray | None = None,
+    ) -> Events:
+        """Every ``stride``-th event of paths, from each one's ``offset`` (n,) on, and which drivers crash on it.
+
+        The AV keeps its speed until the event, or did what is ``recorded``; drivers take over from it after the onset.
+        """
+
+    def choose(self, traffic: Any, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
+        """Events of paths (m,), one of each, -1 for none; those of a pool are drawn each for itself."""
+
+    def script(self, traffic: Any, chosen: Chosen) -> Script:
+        """The motion that chosen events are, from their facts alone."""

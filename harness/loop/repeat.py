@@ -1,0 +1,145 @@
+"""Where tests begin, and what the others do in them, as a script prescribes it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from harness.compiled import compiled, compiled_inline
+from harness.loop.cells import KernelState, Script
+from harness.vehicles.kinematics import gap
+from harness.vehicles.sideways import onset_of
+from harness.vocabulary import RecordArray
+
+
+class Traffic:
+    """What the others do in the tests of a shard: here they repeat a ``script``.
+
+    A family whose events are drawn in the loop has a class of its own, with the same methods; ``drawn`` is then what it
+    knows beside the facts, as columns of the tests' table and as control steps (`harness.records.schemas`).
+    """
+
+    drawn: Any = None
+
+    def __init__(self, script: Script, facts: RecordArray) -> None:
+        self.script, self._facts = script, facts
+
+    def __len__(self) -> int:
+        return len(self.script.x)
+
+    @property
+    def facts(self) -> RecordArray:
+        """What records keep of each test's path and event, fields of the family, shape (n,)."""
+        return self._facts
+
+    def rows(self, rows: slice) -> Traffic:
+        """That of some tests alone."""
+        return Traffic(self.script.rows(rows), self._facts[rows])
+
+    def begin(self, n_cells: int, first_episode: int) -> None:
+        """Make room for the tests of a shard, which run in K cells."""
+
+    def move(self, kernel: KernelState, placed: int) -> None:  # noqa: ARG002 - a script begins with the test
+        """Say what the others do in the coming step; in the first ``placed`` cells tests begin."""
+        repeat(kernel)
+
+    def finish(self, kernel: KernelState, n: int) -> None:
+        """Keep what is known of the ``n`` tests that have just ended."""
+
+
+@compiled
+def refill(kernel: KernelState, given: int) -> int:
+    """Give every idle cell the next test of the shard, of which ``given`` rows have been given before.
+
+    The world's ``x`` and ``v`` receive their placement, ``cells.placed`` their cells; returns how many there are.
+    """
+    n, cells, script = 0, kernel.cells, kernel.script
+    for k in range(cells.cell.size):
+        for vehicle in range(cells.lane.shape[1]):
+            cells.lane_before[k, vehicle] = cells.lane[k, vehicle]
+        row = given + n
+        if row == script.x.shape[0] or cells.cell[k].row >= 0:
+            continue
+        for vehicle in range(cells.lane.shape[1]):
+            kernel.x[k, vehicle], kernel.v[k, vehicle] = script.x[row, vehicle], script.v[row, vehicle]
+            cells.lane[k, vehicle] = cells.lane_before[k, vehicle] = script.lane[row, vehicle]
+        begin_cell(k, row, kernel)
+        cells.placed[n] = k
+        n += 1
+    return n
+
+
+@compiled_inline
+def begin_cell(k: int, row: int, kernel: KernelState) -> None:
+    """Reset cell ``k`` for the test of a row."""
+    script, av = kernel.script, kernel.x.shape[1] - 1
+    cell, episode = kernel.cells.cell[k], kernel.first_episode + row
+    cell.row, cell.episode, cell.step, cell.n_control, cell.motion_hash = row, episode, 0, 0, 0
+    cell.event_step = cell.planned = cell.onset_step = cell.took_over_step = -1
+    cell.lead = cell.asked_to_speed_up = 0
+    cell.cruises, cell.set_speed = kernel.av_cruises, kernel.v[k, av]
+    cell.announced_index = script.announced_index[row] if script.announced_index.size > 0 else episode
+    cell.component, cell.log_weight = script.stratum[row], script.log_weight[row]
+    cell.log_p_event = script.log_p_event[row]
+    cell.min_ttc = cell.danger = math.inf
+    cell.event_gap = cell.event_rate = cell.onset_gap = cell.onset_rate = math.nan
+    cell.av_start = kernel.x[k, av]
+    kernel.cells.acceleration[k] = 0.0
+    if script.at[row] >= 0:
+        plan(k, script.at[row], script.lead[row], kernel)
+
+
+@compiled_inline
+def plan(k: int, at: int, lead: int, kernel: KernelState) -> None:
+    """The event will be in a step, and show itself some steps earlier."""
+    cell = kernel.cells.cell[k]
+    cell.planned, cell.lead, cell.onset_step = at, lead, onset_of(at, lead)
+
+
+@compiled
+def repeat(kernel: KernelState) -> None:
+    """The others do in every cell what the script prescribes."""
+    cells, script = kernel.cells, kernel.script
+    for k in range(cells.cell.size):
+        cell = cells.cell[k]
+        if cell.row < 0:
+            continue
+        for vehicle in range(script.speed.shape[2]):
+            cells.speed[k, vehicle] = script.speed[cell.row, cell.step, vehicle]
+            cells.lane[k, vehicle] = script.lanes[cell.row, cell.step, vehicle]
+        note_onset(k, kernel)
+        if cell.step == script.at[cell.row]:
+            note_event(k, kernel)
+            cell.n_control += cell.component >= 0 or cell.log_weight != 0.0
+
+
+@compiled_inline
+def note_onset(k: int, kernel: KernelState) -> None:
+    """Keep where the principal vehicle is when its event begins to show itself."""
+    cell = kernel.cells.cell[k]
+    if cell.step == cell.onset_step:
+        cell.onset_gap, cell.onset_rate = gap_and_rate(k, kernel)
+
+
+@compiled_inline
+def note_event(k: int, kernel: KernelState) -> None:
+    """The event is in this step: keep where the principal vehicle is."""
+    cell = kernel.cells.cell[k]
+    cell.event_step = cell.step
+    if cell.onset_step < 0:
+        cell.planned = cell.onset_step = cell.step
+    cell.event_gap, cell.event_rate = gap_and_rate(k, kernel)
+
+
+@compiled_inline
+def gap_and_rate(k: int, kernel: KernelState) -> tuple[float, float]:
+    """Gap (m) from the AV to the principal vehicle, bumper to bumper, and its rate (m/s)."""
+    x, v, av, principal = kernel.x, kernel.v, kernel.x.shape[1] - 1, kernel.principal
+    return gap(x[k, principal], x[k, av]), v[k, principal] - v[k, av]
+
+
+def nothing_known(n: int) -> RecordArray:
+    """Facts of tests of which nothing is to be kept, shape (n,)."""
+    return np.zeros(n, np.dtype([]))
