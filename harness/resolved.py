@@ -12,12 +12,10 @@ from harness.campaign.campaign import Campaign, Command, Use, refusal
 from harness.controllers.find import require_controller
 from harness.errors import CampaignError
 from harness.families import family_named
-from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.loading import load_environment, load_parameters
-from harness.families.protocol import Family
+from harness.families.protocol import Environment, Family
 from harness.loop.loop import Scenario
 from harness.vehicles.drivers import av_records, driver_records
-from harness.vehicles.library import OF_TRAFFIC, Library, load_library
+from harness.vehicles.library import Library, load_library
 from harness.vocabulary import RecordArray
 from harness.worlds.sumo_driven import av_type
 from harness.worlds.system_libraries import require_libraries
@@ -42,7 +40,7 @@ class Resolved:
     @property
     def family(self) -> Family:
         """What kind of events the campaign tests."""
-        return family_named("cut_in")
+        return family_named(self.campaign.scenario)
 
     @property
     def scenario(self) -> Scenario:
@@ -96,12 +94,13 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     Raises `CampaignError`: the environment's parameter file is missing or wrong, or something of the campaign does not
     go with the command.
     """
-    parameters = load_parameters(campaign.environment)
-    environment = load_environment(campaign.environment, parameters)
-    takes_time = environment.lateral.present
+    family = family_named(campaign.scenario)
+    parameters = family.parameters(campaign.environment)
+    environment = family.traffic(campaign.environment, parameters)
+    takes_time = family.shows(environment)
     if (words := refusal(campaign, Use(command, takes_time))) is not None:
         raise CampaignError(*words)
-    campaign = campaign.replaced(("pool", "library"), campaign.pool.library or OF_TRAFFIC[takes_time])
+    campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[takes_time])
     return Resolved(
         campaign,
         environment,

@@ -45,6 +45,7 @@ class Campaign(Section):
     seed: Whole = Field(
         1, ge=0, lt=2**63, description="random numbers of the tests follow from it; those of the pool from pool.seed"
     )
+    scenario: str = Field("cut_in", description="kind of events that are tested: cut_in, or one that a package brings")
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
     crash: CrashSettings = CrashSettings()
@@ -114,8 +115,9 @@ class Campaign(Section):
         Cells, workers, stop rule, trace policy and names are left out, so that a campaign can be continued to a
         smaller RHW or with other resources.
         """
+        others = {} if self.scenario == "cut_in" else {"scenario": self.scenario}
         unused = set() if self.av.acts_before_cut_in else {"shadow_paths", "pilot_tests"}
-        content = {
+        content = others | {
             "crash": self.crash.model_dump(),
             "seed": self.seed,
             "environment": self.environment.model_dump(exclude={"parameters"}),

@@ -31,8 +31,6 @@ from harness.files import real_path
 
 Model = TypeVar("Model", bound=BaseModel)
 
-SHIPPED_PARAMETERS = Path(__file__).parents[1] / "families" / "cut_in"
-
 
 SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"
 _FILES = {
@@ -90,7 +88,10 @@ def load_campaign(
             raise CampaignError(place(where), f"no file {file}", expected, mend)
         campaign = campaign.replaced(where, f"{file}:{end}" if end else file)
     if check_files:
-        shipped_or_own(campaign.environment.parameters, SHIPPED_PARAMETERS, place(("environment", "parameters")))
+        from harness.families import family_named  # noqa: PLC0415 - families read campaigns' sections
+
+        shipped = family_named(campaign.scenario, place(("scenario",))).shipped
+        shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))
     runtime_env = {
         key: _absolute(value, folder) if key in ("working_dir", "py_modules") else value
         for key, value in campaign.run.ray.runtime_env.items()

@@ -1,12 +1,38 @@
-"""Kinds of events that tests are made of, one package each; `protocol` says what a family brings."""
+"""Kinds of events that tests are made of, one package each; `protocol` says what a family brings.
+
+The core knows families by this file alone. An installed package brings its own as an entry point of the group
+``harness.families``: a name, and the object that answers `Family`.
+"""
 
 from __future__ import annotations
 
+from functools import cache
+from importlib.metadata import entry_points
+
+from harness.campaign.problems import did_you_mean
+from harness.campaign.sections import listed
+from harness.errors import CampaignError
 from harness.families.protocol import Family
 
+GROUP = "harness.families"
 
-def family_named(name: str) -> Family:
-    """The family that a campaign names."""
+
+@cache
+def families() -> dict[str, Family]:
+    """All that are installed, by name."""
     from harness.families.cut_in.family import CUT_IN  # noqa: PLC0415 - families are read when one is asked for
 
-    return {each.name: each for each in (CUT_IN,)}[name]
+    found: dict[str, Family] = {each.name: each.load() for each in entry_points(group=GROUP)}
+    return {**found, CUT_IN.name: CUT_IN}
+
+
+def family_named(name: str, where: str = "scenario") -> Family:
+    """The family that a campaign names.
+
+    Raises `CampaignError`: none has that name.
+    """
+    known = families()
+    if name not in known:
+        mend = did_you_mean(name, list(known)) or "Write one of them, or install the package that brings it."
+        raise CampaignError(where, f"'{name}'", f"a kind of events: {listed(known)}", mend)
+    return known[name]

@@ -10,14 +10,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 
+from harness.campaign.sections import EnvironmentSettings
 from harness.loop.cells import Script
 from harness.vehicles.drivers import Followers
 from harness.vocabulary import BoolArray, FloatArray, IntArray, Method, RecordArray
+
+Environment: TypeAlias = Any
+"""All that a family's kernels need of its traffic; what is in it the family alone knows."""
 
 
 class Column(NamedTuple):
@@ -115,6 +120,10 @@ class Family(Protocol):
         The facts that records keep.
     n_uniforms : int
         How many uniforms the beginning of a path is made from: what a pool is aimed over.
+    shipped : Path
+        Folder of the parameter files that a name alone stands for.
+    ladders : mapping of bool to str
+        Libraries of surrogates where nothing is said, by whether events show themselves before they happen.
     """
 
     name: str
@@ -124,27 +133,42 @@ class Family(Protocol):
     columns: tuple[Column, ...]
     n_uniforms: int
 
-    def max_steps(self, traffic: Any) -> int:
+    shipped: Path
+    ladders: Mapping[bool, str]
+
+    def parameters(self, settings: EnvironmentSettings) -> Any:
+        """The numbers that a campaign's environment names, with their ``content_hash()``.
+
+        Raises `CampaignError`: the file is missing or wrong, every place being named, or its laws are unsound.
+        """
+
+    def traffic(self, settings: EnvironmentSettings, parameters: Any = None) -> Environment:
+        """All that kernels need; ``parameters`` are read unless they are given."""
+
+    def digest(self, traffic: Environment) -> str:
+        """Hash of all numbers of it."""
+
+    def max_steps(self, traffic: Environment) -> int:
         """Steps of the longest test."""
 
-    def sideways_m(self, traffic: Any) -> float:
+    def sideways_m(self, traffic: Environment) -> float:
         """Way (m) from a first lateral motion to overlap."""
 
-    def shows(self, traffic: Any) -> bool:
+    def shows(self, traffic: Environment) -> bool:
         """Whether events can be seen before they happen."""
 
-    def mean_distance_m(self, traffic: Any) -> float:
+    def mean_distance_m(self, traffic: Environment) -> float:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens."""
 
     def sources(self) -> Mapping[Method, type[Any]]:
         """Methods of its own, which draw the event in the loop: a class each (`harness.sampling.protocol.Source`)."""
 
-    def start(self, traffic: Any, u: FloatArray) -> RecordArray:
+    def start(self, traffic: Environment, u: FloatArray) -> RecordArray:
         """How paths begin, (n,), from uniforms (n, `n_uniforms`)."""
 
     def events(
         self,
-        traffic: Any,
+        traffic: Environment,
         seed: int,
         paths: Paths,
         drivers: Followers,
@@ -157,8 +181,8 @@ class Family(Protocol):
         The AV keeps its speed until the event, or did what is ``recorded``; drivers take over from it after the onset.
         """
 
-    def choose(self, traffic: Any, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
+    def choose(self, traffic: Environment, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
         """Events of paths (m,), one of each, -1 for none; those of a pool are drawn each for itself."""
 
-    def script(self, traffic: Any, chosen: Chosen) -> Script:
+    def script(self, traffic: Environment, chosen: Chosen) -> Script:
         """The motion that chosen events are, from their facts alone."""

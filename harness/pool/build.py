@@ -13,10 +13,9 @@ import numpy as np
 from harness import cache
 from harness.campaign.sections import PoolSettings
 from harness.compiled import WORLD_SOURCES, source_hash
-from harness.families.cut_in.laws import Environment
-from harness.families.protocol import Family, Paths
+from harness.families.protocol import Environment, Family, Paths
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, Enumerator
-from harness.pool.cut_ins import FORMAT, CutIns, Pool, environment_hash, pool_content, pool_from
+from harness.pool.cut_ins import FORMAT, CutIns, Pool, pool_content, pool_from
 from harness.pool.shells import cells_of, conservative_first, shells_of
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
@@ -48,7 +47,7 @@ def campaign_pool_key(resolved: Resolved, order: Sequence[str] = ()) -> str:
         FORMAT,
         source_hash(WORLD_SOURCES),
         *(hashlib.sha256((Path(__file__).parent / name).read_bytes()).hexdigest() for name in _MADE_BY),
-        environment_hash(resolved.environment),
+        [resolved.family.name, resolved.family.digest(resolved.environment)],
         {name: model.model_dump() for name, model in library.surrogates.items()},
         [(name, model.model_dump()) for name, model in library.references.items()],
         [library.boundary, library.envelope],
@@ -123,7 +122,7 @@ def take_aim(
     family: Family, environment: Environment, library: Library, settings: PoolSettings, progress: Progress
 ) -> Aim:
     """Find out by a pilot run of naturalistic paths where surrogates crash."""
-    followers = library.followers(environment.lateral.present)
+    followers = library.followers(family.shows(environment))
     pilot = Enumerator(family, environment, followers, settings.seed ^ POOL_SEED)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(library.surrogates))
@@ -183,10 +182,11 @@ def pool_of(
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
     mass_kept = by_path[path].astype(np.float32)
-    sample = CutIns(PILOT_PATHS + path, step, cell[path, step], chosen.facts, chosen.lead, crashes, mass_kept)
+    sample = CutIns(PILOT_PATHS + path, step, cell[path, step], *chosen, crashes, mass_kept)
     return Pool(
         key=key,
-        environment=environment_hash(environment),
+        family=family.name,
+        environment=family.digest(environment),
         library=library,
         names=tuple(names[order].tolist()),
         n_paths=n,

@@ -5,7 +5,6 @@ On disk it is one Parquet file of cut-ins, with all that is known of cells and s
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -16,17 +15,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.families import family_named
-from harness.families.cut_in.laws import Environment
 from harness.pool.aim import PILOT_PATHS
 from harness.records.folder import parquet
 from harness.records.schemas import fact_columns, facts_from, rows
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, Float32Array, FloatArray, IntArray, RecordArray, UInt64Array
 
-FORMAT = 7
+FORMAT = 8
 """Raise it when the meaning of a pool changes."""
 _METADATA = b"harness_pool"
-COLUMNS = family_named("cut_in").columns
 
 
 def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
@@ -38,8 +35,8 @@ def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
 class CutIns:
     """A weighted sample of cut-ins, each with what has to be known to repeat it.
 
-    Within a shell all have the same probability. ``path``, ``step``, ``cell`` (n,): which path of the pool, cut-in
-    step, and cell; ``facts`` (n,) are the family's. ``crashes`` (n, D + R): which
+    Within a shell all have the same probability. ``path``, ``step``, ``cell`` (n,): which path of the pool, which of
+    its events, and cell; ``facts``, ``at``, ``lead`` (n,): see `Chosen` of families. ``crashes`` (n, D + R): which
     surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
     a cut-in of each cell. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
     in the pool of a vehicle that acts before it, or of its onset, and ``mass`` (n,) the probability of those
@@ -51,6 +48,7 @@ class CutIns:
     step: IntArray
     cell: IntArray
     facts: RecordArray
+    at: IntArray
     lead: IntArray
     crashes: BoolArray
     path_mass: Float32Array
@@ -60,7 +58,7 @@ class CutIns:
     @property
     def onset(self) -> IntArray:
         """Step of the onset of each, shape (n,)."""
-        return onset_steps(self.step, self.lead)
+        return onset_steps(self.at, self.lead)
 
     @property
     def row(self) -> IntArray:
@@ -72,7 +70,8 @@ class CutIns:
 class Pool:
     """Pool of one environment and one library.
 
-    ``key`` is the content hash of all that it was made from, ``environment`` that of its environment. ``names`` (D) are
+    ``key`` is the hash of all that it was made from, ``family`` names the kind of its events, ``environment`` is
+    the hash of its environment. ``names`` (D) are
     the surrogates, the most conservative first, ``mu`` (D,) their crash rates per test from ``n_paths`` paths, and
     ``mu_covariance`` (D, D) of their errors. ``p_cut_in`` is the probability that BV cuts in in a test, ``p_cut_in_se``
     its standard error, and ``p_cut_in_at_crash`` (D,) the mean P(cut-in | path) of the cut-ins on which each surrogate
@@ -84,6 +83,7 @@ class Pool:
     """
 
     key: str
+    family: str
     environment: str
     library: Library
     names: tuple[str, ...]
@@ -135,14 +135,6 @@ class Pool:
         }
 
 
-def environment_hash(environment: Environment) -> str:
-    """Hash of all numbers of an environment, level of lane changing and hold time included."""
-    numbers = environment.content()
-    if (lateral := environment.lateral).present:
-        numbers["lateral"] = [lateral.distance_m, lateral.cumulative.tolist()]
-    return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:24]
-
-
 def pool_content(pool: Pool) -> bytes:
     """A pool as the content of a file."""
     return parquet(_table(pool))
@@ -153,7 +145,8 @@ def _table(pool: Pool) -> pa.Table:
     probability = pool.shell_p / np.maximum(np.bincount(pool.shell, minlength=pool.shell_p.size), 1)
     columns: dict[str, tuple[pa.Array, str]] = {
         "path": (pa.array(c.path), "index of the path in the pool"),
-        "cut_in_step": (pa.array(c.step.astype(np.int16)), "step (0.1 s) in which BV cuts in"),
+        "event": (pa.array(c.step.astype(np.int16)), "which of the path's events"),
+        "cut_in_step": (pa.array(c.at.astype(np.int16)), "step (0.1 s) in which it is"),
         "probability": (pa.array(probability[pool.shell]), "P under the NDE that it stands for"),
         "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
         "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
@@ -161,8 +154,9 @@ def _table(pool: Pool) -> pa.Table:
         "path_mass": (rows(c.path_mass), "P of a cut-in of each cell on the path, times the path's weight"),
         "lead_steps": (pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"),
     }
-    known_of = fact_columns(c.facts, COLUMNS)
-    columns |= {each.name: (known_of[each.name], each.doc) for each in COLUMNS}
+    own = family_named(pool.family).columns
+    known_of = fact_columns(c.facts, own)
+    columns |= {each.name: (known_of[each.name], each.doc) for each in own}
     schema = pa.schema(
         [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
     )
@@ -186,8 +180,8 @@ def pool_from(content: bytes) -> Pool:
         values = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
         return np.asarray(values).reshape(table.num_rows, -1)
 
-    path, step, cell, lead = map(whole, ("path", "cut_in_step", "cell", "lead_steps"))
-    sample = facts_from(table, COLUMNS), lead, matrix("crashes"), matrix("path_mass")
+    path, step, cell, at, lead = map(whole, ("path", "event", "cell", "cut_in_step", "lead_steps"))
+    sample = facts_from(table, family_named(facts["family"]).columns), at, lead, matrix("crashes"), matrix("path_mass")
     cut_ins = CutIns(path, step, cell, *sample)
     known: dict[str, Any] = {
         name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from harness import cache
-from harness.families.cut_in.laws import Environment
+from harness.families.protocol import Environment
 from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import take_aim
-from harness.pool.cut_ins import Pool, environment_hash
+from harness.pool.cut_ins import Pool
 from harness.pool.shells import shells_in_strata, shells_of
 from harness.progress import Progress
 from harness.resolved import Resolved
@@ -76,7 +76,7 @@ class FewPaths:
         self._reaches_last = self._stratum[-1] >= 0
         self._range = ranges(pool)
         self._aimed: Enumerator | None = None
-        about = FORMAT, pool.key, environment_hash(resolved.environment), design.strata, settings.seed, N_PATHS
+        about = FORMAT, pool.key, resolved.family.digest(resolved.environment), design.strata, settings.seed, N_PATHS
         key = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:24]
         self._name = f"moved/{key}"
         kept: dict[str, list[float]] = json.loads(cache.read(self._name) or "{}")
@@ -87,7 +87,7 @@ class FewPaths:
         n_kept = len(self._seen)
         try:
             for environment in environments:
-                if (key := environment_hash(environment)) not in self._seen:
+                if (key := self._resolved.family.digest(environment)) not in self._seen:
                     self._seen[key] = self._walk(environment)
                 yield self._seen[key]
                 self._progress.advance(1)

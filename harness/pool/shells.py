@@ -220,7 +220,7 @@ class PrescribedEpisodes:
     def of_rows(self, rows: IntArray, stratum: IntArray) -> Traffic:
         """Tests of given cut-ins of the pool (n,), for given strata (n,)."""
         c, resolved = self._cut_ins, self._resolved
-        chosen = Chosen(c.facts[rows], c.step[rows], c.lead[rows])
+        chosen = Chosen(c.facts[rows], c.at[rows], c.lead[rows])
         script = resolved.family.script(resolved.environment, chosen)
         log_weight = np.log(self.design.p[stratum])
         script = script._replace(stratum=stratum.astype(np.int64), log_weight=log_weight)

@@ -23,9 +23,8 @@ import numpy as np
 from harness import cache
 from harness.campaign.sections import PoolSettings
 from harness.errors import HarnessError
-from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.learned import Learned, learned_crashes
-from harness.families.protocol import Family, Paths, Recorded
+from harness.families.protocol import Environment, Family, Paths, Recorded
 from harness.loop.judge import motion_hashes
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, contributions
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
@@ -155,7 +154,7 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded, learn
     Raises `HarnessError`: no cut-in was found on which even the envelope crashes.
     """
     environment, library = resolved.environment, resolved.library
-    followers = library.followers(environment.lateral.present)
+    followers = library.followers(resolved.family.shows(environment))
     found = resolved.family.events(environment, paths.seed, paths.paths, followers, runs)
     if not found.crashes.any():
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""

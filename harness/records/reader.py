@@ -21,8 +21,8 @@ from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
-from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.loading import load_environment, load_parameters
+from harness.families import family_named
+from harness.families.protocol import Environment
 from harness.processes import made_ahead
 from harness.records.folder import (
     CAMPAIGN,
@@ -71,7 +71,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
     require_unchanged(path, crc32, mend)
     if crc32 is None:  # its run was killed as it began
         with suppress(CampaignError):  # its environment file is gone: nobody can tell
-            parameters = load_parameters(campaign.environment)
+            parameters = family_named(campaign.scenario).parameters(campaign.environment)
             require_campaign(path, campaign.content_hash(parameters.content_hash()), manifest)
     return campaign
 
@@ -87,11 +87,12 @@ def require_campaign(path: Path, content_hash: str, manifest: Mapping[str, Any])
 def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment | None:
     """The run's traffic, where its parameters are still what they were; else others cannot be driven."""
     try:
-        parameters = load_parameters(campaign.environment)
+        family = family_named(campaign.scenario)
+        parameters = family.parameters(campaign.environment)
     except CampaignError:
         return None
     known = campaign.content_hash(parameters.content_hash()) == manifest["campaign_hash"]
-    return load_environment(campaign.environment, parameters) if known else None
+    return family.traffic(campaign.environment, parameters) if known else None
 
 
 def read_shards(folder: Path, columns: list[str] | None = None) -> Iterator[pa.Table]:

@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.estimators.severity import weighted_quantiles
-from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.replay import LEAD, PATH_COLUMNS
+from harness.families.protocol import Environment
 from harness.numbers import tenths
 from harness.records.reader import read_traces, stored_columns
 from harness.report.player import OTHERS, TRACE_COLUMNS, UNKNOWN, Scene, Scenes

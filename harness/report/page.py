@@ -13,7 +13,7 @@ from harness.campaign.files import dump_campaign
 from harness.errors import printable
 from harness.estimators.shells import Within
 from harness.estimators.traffic import Sensitivity
-from harness.families.cut_in.laws import Environment
+from harness.families.protocol import Environment
 from harness.numbers import count, leaves, number
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.records.reader import table_sizes, traffic_of

@@ -22,9 +22,9 @@ from markupsafe import Markup
 from harness.campaign.campaign import Campaign
 from harness.compiled import unboxed
 from harness.errors import printable
-from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import Trajectory, empty_trajectory
 from harness.families.cut_in.replay import drive_others, stored_paths
+from harness.families.protocol import Environment
 from harness.numbers import tenths
 from harness.pool.cut_ins import onset_steps
 from harness.records.folder import write_bytes

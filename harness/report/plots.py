@@ -10,9 +10,9 @@ from harness.compiled import unboxed
 from harness.estimators.answer import Estimates
 from harness.estimators.traffic import Sensitivity
 from harness.families.cut_in.events import Maneuvers
-from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import empty_trajectory
 from harness.families.cut_in.replay import StoredPaths, drive_others
+from harness.families.protocol import Environment
 from harness.numbers import count, number, plain, share
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.player import OTHERS

@@ -222,7 +222,7 @@ def check_av(
         source=tested.av.source,
         engine=tested.world.engine,
         method=tested.testing.method,
-        take_time=source.resolved.environment.lateral.present,
+        take_time=source.scenario.shows,
         n_episodes=n_episodes,
         failures=_by_cause(first.failures.values()),
         differing=differing,

@@ -34,7 +34,7 @@ from harness.families.cut_in.parameters import (
     content_hash,
 )
 from harness.numbers import number, share
-from harness.pool.cut_ins import Pool, environment_hash
+from harness.pool.cut_ins import Pool
 from harness.pool.moved import FewPaths
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
@@ -81,7 +81,7 @@ def estimate_in_other_traffic(
     tested = StoredShells.of(folder, progress)
     campaign = tested.here.campaign
     there = resolve(campaign.replaced(("environment", "parameters"), environment))
-    if own and environment_hash(there.environment) != tested.pool.environment:
+    if own and there.family.digest(there.environment) != tested.pool.environment:
         expected = "the environment that the folder's tests were run in: estimates.json is of that"
         raise CampaignError(f"{OPTION} with --write", f"{environment}, with other numbers", expected, ELSEWHERE)
     moved = moved_to(tested, there, environment, progress)

@@ -20,7 +20,6 @@ from harness.campaign.files import campaign_of
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import ended_by, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
-from harness.families.cut_in.loading import load_parameters
 from harness.files import checksum, remove_unfinished
 from harness.pool.build import campaign_pool
 from harness.pool.vehicle_pool import BaselinePaths
@@ -141,7 +140,7 @@ class Run:
             refused.callback(self._workers.close)
             facts = {
                 "workers": self._workers.n_workers,
-                "cut_ins_take_time": resolved.environment.lateral.present,
+                "cut_ins_take_time": resolved.family.shows(resolved.environment),
                 "distance_per_test_m": resolved.family.mean_distance_m(resolved.environment),
             }
             self.manifest = Manifest(out, resolved, earlier, began=began, **facts)
@@ -235,7 +234,7 @@ class Run:
         if (design := self.source.design) is not None and not self.campaign.has_baseline_runs:
             pool = campaign_pool(self.resolved, self._progress)
             self.manifest.note(assumed=assumed(self.resolved, pool, design, self._progress))
-        elif where := load_parameters(self.campaign.environment).unseen:
+        elif where := getattr(self.resolved.family.parameters(self.campaign.environment), "unseen", ()):
             self.manifest.note(assumed={"where": where})
 
     def finish(self, rule: Rule) -> RunResult:

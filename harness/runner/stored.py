@@ -19,7 +19,7 @@ from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block
 from harness.estimators.one_pass import SPACING
-from harness.families.cut_in.laws import Environment
+from harness.families.protocol import Environment
 from harness.processes import made_ahead
 from harness.records.folder import CAMPAIGN, concatenated, no_episodes, read_kept, read_manifest
 from harness.records.origin import require_trust

@@ -23,12 +23,12 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.shells import Shells as SeenShells
-from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.loading import load_environment, require_sound_laws
 from harness.families.cut_in.parameters import EnvironmentParameters
+from harness.families.protocol import Environment
 from harness.numbers import share
 from harness.pool.build import campaign_pool
-from harness.pool.cut_ins import Pool, environment_hash
+from harness.pool.cut_ins import Pool
 from harness.pool.moved import FewPaths, ranges
 from harness.pool.shells import acceleration_limit, design_shells
 from harness.progress import Progress
@@ -133,7 +133,7 @@ class StoredShells:
 
 def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progress) -> Moved:
     """The strata with the probabilities of other traffic; refused where the tests say nothing of it."""
-    if environment_hash(there.environment) == tested.pool.environment:
+    if there.family.digest(there.environment) == tested.pool.environment:
         return Moved(tested.design, tested.design)
     _require_same_kind(tested.here, there, name)
     require_shares(tested)

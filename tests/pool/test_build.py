@@ -12,7 +12,6 @@ from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.pool.aim import NATURALISTIC_SHARE, STRIDE, Enumerator, aimed_points, fit_proposal
 from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_name
-from harness.pool.cut_ins import environment_hash
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
 from harness.resolved import resolve
 from harness.vehicles.library import load_library
@@ -60,7 +59,7 @@ def test_tables_that_say_what_the_formulas_do_give_their_rates(campaign, environ
     shipped = load_parameters(campaign.environment).with_values({"cut_in__accept_scale_s": 0.001})
     tables = (EnvironmentParameters.model_validate(as_tables(share)) for share in (0.01, 0.02))
     traffic = [load_environment(campaign.environment, each) for each in (shipped, *tables)]
-    assert len({environment_hash(each) for each in [environment, *traffic]}) == 4
+    assert len({FAMILY.digest(each) for each in [environment, *traffic]}) == 4
     found = [enumerated(library, each, 500) for each in traffic]
     bits = np.arange(16)
     rates = [np.array([p[crashes >> bit & 1 == 1].sum() for bit in bits]) for p, crashes in found]

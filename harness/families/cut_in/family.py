@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import pyarrow as pa
 
+from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
 from harness.families.cut_in.events import FREE_DRAWS_PER_CUT_IN, enumerate_cut_ins, write_maneuvers
 from harness.families.cut_in.laws import Environment, InitialStates
+from harness.families.cut_in.loading import load_environment, load_parameters
+from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.script import facts_of, script_of
 from harness.families.protocol import HOLDING, Chosen, Column, Events, Paths, Recorded
@@ -47,6 +53,21 @@ class CutIn:
     principal, ahead = BV, LV
     columns: tuple[Column, ...] = (*(each._replace(doc=f"initial {each.doc}") for each in STATE_FACTS), *MANEUVER_FACTS)
     n_uniforms = len(STATE_COLUMNS)
+
+    shipped = SHIPPED_FOLDER
+    ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-2", True: "ladder-lateral-1"})
+
+    def parameters(self, settings: EnvironmentSettings) -> EnvironmentParameters:
+        return load_parameters(settings)
+
+    def traffic(self, settings: EnvironmentSettings, parameters: EnvironmentParameters | None = None) -> Environment:
+        return load_environment(settings, parameters)
+
+    def digest(self, traffic: Environment) -> str:
+        numbers = traffic.content()
+        if (lateral := traffic.lateral).present:
+            numbers["lateral"] = [lateral.distance_m, lateral.cumulative.tolist()]
+        return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:24]
 
     def max_steps(self, traffic: Environment) -> int:
         return int(traffic.numbers["max_steps"])
