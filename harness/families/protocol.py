@@ -105,6 +105,19 @@ class Chosen(NamedTuple):
     lead: IntArray
 
 
+class Driven(NamedTuple):
+    """How events (m,) end for drivers (D,).
+
+    ``end`` (m, D) is the step after which each has run into the principal vehicle, below zero for never. Of the last
+    event ``motion`` (D, steps + 1, 2) is each one's position (m) and speed (m/s), 0 where nobody drives, and ``ahead``
+    (steps + 1, 2) the principal vehicle's as if nobody had hit it; both are empty unless they were asked for.
+    """
+
+    end: IntArray
+    motion: FloatArray
+    ahead: FloatArray
+
+
 class Family(Protocol):
     """A kind of events. ``traffic`` is all that its kernels need of its environment.
 
@@ -186,3 +199,20 @@ class Family(Protocol):
 
     def script(self, traffic: Environment, chosen: Chosen) -> Script:
         """The motion that chosen events are, from their facts alone."""
+
+    def drive(
+        self, traffic: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
+    ) -> Driven:
+        """Other drivers (D,) in the AV's place, on chosen events (m,), from the end of the step of the onset on.
+
+        ``start`` (m, 2) is the AV's position (m) and speed (m/s) then, NaN where it has kept its speed until there.
+        With ``last`` the motion on the last event is told.
+        """
+
+    def avoidable(
+        self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray
+    ) -> BoolArray | None:
+        """Which drivers (D,) avoid a crash ``where`` (2, n) gap (m) and closing speed (m/s) at the event are so, (n, D).
+
+        ``facts`` are of typical tests. None where these two do not decide it.
+        """

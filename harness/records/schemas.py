@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.families.protocol import Column
+from harness.families.protocol import Chosen, Column, Family
 from harness.loop.loop import Shard
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, OUTCOMES, FloatArray, Int8Array, IntArray, RecordArray
@@ -268,6 +268,25 @@ def facts_from(table: pa.Table, columns: Sequence[Column]) -> RecordArray:
     for name, values in found.items():
         facts[name] = values
     return facts
+
+
+LEAD = "lead_steps"
+"""There where events can be seen before they happen."""
+
+
+def path_columns(family: Family) -> tuple[str, ...]:
+    """What of the episodes table determines the others' motion, `LEAD` beside it."""
+    return ("episode", "n_steps", "cut_in_step", *(column.name for column in family.columns))
+
+
+def chosen_from(rows: pa.Table, family: Family) -> Chosen:
+    """The events of rows (n,) of the episodes table, which has `path_columns`."""
+
+    def whole(name: str, null: int) -> IntArray:
+        return np.asarray(rows.column(name).fill_null(null)).astype(np.int64)
+
+    lead = whole(LEAD, 0) if LEAD in rows.column_names else np.zeros(rows.num_rows, np.int64)
+    return Chosen(facts_from(rows, family.columns), whole("cut_in_step", -1), lead)
 
 
 def _driven(shard: Shard) -> dict[str, Any]:

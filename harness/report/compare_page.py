@@ -15,10 +15,11 @@ import pyarrow.compute as pc
 from harness import numbers
 from harness.errors import HarnessError, RunFolderError, printable
 from harness.estimators.short_answer import deciding_words, pair_asked, vehicle_words
-from harness.families.cut_in.replay import LEAD, PATH_COLUMNS
+from harness.families import family_named
 from harness.numbers import count, tenths
 from harness.records.folder import read_as, write_bytes
 from harness.records.reader import read_traces, stored_columns
+from harness.records.schemas import LEAD, path_columns
 from harness.report.page import sentence
 from harness.report.player import TRACE_COLUMNS, Scene, Scenes, beside_other, templates
 from harness.report.plots import WHO, pairs_plot
@@ -124,7 +125,8 @@ def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:
 def motion_of(run: RunFolder, episode: int) -> tuple[pa.Table, pa.Table | None]:
     """Row and trace of an episode: the stored one, or of the test run again; None where that cannot be done."""
     lateral = {LEAD} & stored_columns(run.path)
-    rows = pa.Table.from_batches(run.episodes(*PATH_COLUMNS, "outcome", *lateral))
+    asked = path_columns(family_named(run.campaign.scenario))
+    rows = pa.Table.from_batches(run.episodes(*asked, "outcome", *lateral))
     trace = read_traces(run.path, {episode}, [*TRACE_COLUMNS, *(["lateral_m"] if lateral else [])])
     if trace is None:
         with suppress(HarnessError):  # of another version, a vehicle that is gone or does not do the same again

@@ -10,10 +10,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.estimators.severity import weighted_quantiles
-from harness.families.cut_in.replay import LEAD, PATH_COLUMNS
+from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.numbers import tenths
 from harness.records.reader import read_traces, stored_columns
+from harness.records.schemas import LEAD, path_columns
 from harness.report.player import OTHERS, TRACE_COLUMNS, UNKNOWN, Scene, Scenes
 from harness.report.summary import RunFolder, RunSummary
 from harness.vocabulary import BoolArray, FloatArray, IntArray
@@ -111,7 +112,7 @@ def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArra
 
 def _rows(run: RunFolder, episodes: set[int]) -> pa.Table:
     """What scenes need of episodes, in index order."""
-    columns = (*PATH_COLUMNS, "outcome", *({LEAD} & stored_columns(run.path)))
+    columns = (*path_columns(family_named(run.campaign.scenario)), "outcome", *({LEAD} & stored_columns(run.path)))
     wanted = pc.field("episode").isin(sorted(episodes))
     return pa.concat_tables([pa.table(batch).filter(wanted) for batch in run.episodes(*columns)])
 

@@ -13,6 +13,7 @@ from harness.campaign.files import dump_campaign
 from harness.errors import printable
 from harness.estimators.shells import Within
 from harness.estimators.traffic import Sensitivity
+from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.numbers import count, leaves, number
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
@@ -70,7 +71,7 @@ def write_report(folder: str | Path) -> Path:
 def _plots(run: RunFolder, summary: RunSummary, traffic: Environment | None) -> list[Plot]:
     plots = [
         severity_plot(run.estimates),
-        where_plot(summary, traffic),
+        where_plot(summary, family_named(run.campaign.scenario), traffic),
         None if run.shells is None else shells_plot(run.shells),
         sensitivity_plot(found) if (found := _sensitivity(run)) is not None and found.shown else None,
         convergence_plot(run.estimates, run.target_rhw, of_statement=run.asked_statement),

@@ -20,14 +20,13 @@ from jinja2 import PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from harness.campaign.campaign import Campaign
-from harness.compiled import unboxed
 from harness.errors import printable
-from harness.families.cut_in.path import Trajectory, empty_trajectory
-from harness.families.cut_in.replay import drive_others, stored_paths
-from harness.families.protocol import Environment
+from harness.families import family_named
+from harness.families.protocol import Driven, Environment
 from harness.numbers import tenths
 from harness.pool.cut_ins import onset_steps
 from harness.records.folder import write_bytes
+from harness.records.schemas import chosen_from
 from harness.report.summary import floats
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import LibraryDriver, library_records
@@ -60,35 +59,34 @@ Scene = dict[str, Any]
 class Scenes:
     """Scenes of a campaign's episodes; without its environment nobody else is driven.
 
-    Rows are of the episodes table, in index order, with `PATH_COLUMNS`; traces are those of the same episodes.
+    Rows are of the episodes table, in index order, with `path_columns`; traces are those of the same episodes.
     """
 
     def __init__(self, campaign: Campaign, environment: Environment | None) -> None:
-        self._name, self._seed, self._acts = campaign.name, campaign.seed, campaign.av.acts_before_cut_in
-        self._environment = environment
+        self._name, self._acts = campaign.name, campaign.av.acts_before_cut_in
+        self._family, self._environment = family_named(campaign.scenario), environment
 
     def ends(self, rows: pa.Table, traces: pa.Table | None) -> IntArray:
         """After which step each of `OTHERS` runs into BV in episodes with a cut-in, below zero for never, (n, D)."""
         if self._environment is None or not rows.num_rows:
             return np.full((rows.num_rows, len(OTHERS)), UNKNOWN)
-        return self._drive(self._environment, rows, traces, np.zeros((0, 0, 0)))[0]
+        return self._drive(self._environment, rows, traces).end
 
     def _drive(
-        self, environment: Environment, rows: pa.Table, traces: pa.Table | None, motion: FloatArray
-    ) -> tuple[IntArray, Trajectory]:
-        """The same, and the path as `drive_others` leaves it, which may fill ``motion``."""
-        stored, path = stored_paths(rows, self._seed), empty_trajectory(environment)
-        start, end = np.full((rows.num_rows, 2), np.nan), np.zeros((rows.num_rows, len(OTHERS)), np.int64)
+        self, environment: Environment, rows: pa.Table, traces: pa.Table | None, *, last: bool = False
+    ) -> Driven:
+        """The same, with the motion on the last of them."""
+        chosen, start = chosen_from(rows, self._family), np.full((rows.num_rows, 2), np.nan)
         if traces is not None:
             episode, step, x, v = (floats(_of(traces, "AV").column(name)) for name in ("episode", "step", *MOTION))
-            row = np.searchsorted(stored.episode, episode)
-            begins = step == onset_steps(stored.cut_step, stored.script.lead)[row] + 1
+            row = np.searchsorted(floats(rows.column("episode")), episode)
+            begins = step == onset_steps(chosen.at, chosen.lead)[row] + 1
             start[row[begins]] = np.stack((x, v), axis=1)[begins]
-        drivers = library_records([driver for _, driver in OTHERS.values()], environment.lateral.present)
-        drive_others(unboxed(stored), start, unboxed(environment), drivers, unboxed(path), end, motion)
+        drivers = library_records([driver for _, driver in OTHERS.values()], self._family.shows(environment))
+        driven = self._family.drive(environment, chosen, start, drivers, last=last)
         if self._acts:
-            end[np.isnan(start[:, 0])] = UNKNOWN
-        return end, path
+            driven.end[np.isnan(start[:, 0])] = UNKNOWN
+        return driven
 
     def scene(self, row: pa.Table, trace: pa.Table, *, why: str = "") -> Scene:
         """One episode, given its row and its trace, from shortly before the cut-in on; all of one without."""
@@ -99,8 +97,8 @@ class Scenes:
         av["crash"] = last if outcome == "crash" else None
         first, onset, ghosts = 0, None, list[Scene]()
         if cut is not None and cut < last:
-            stored = stored_paths(row, self._seed)
-            onset = int(onset_steps(stored.cut_step, stored.script.lead)[0])
+            chosen = chosen_from(row, self._family)
+            onset = int(onset_steps(chosen.at, chosen.lead)[0])
             first = max(min(onset - BEFORE, last - FEWEST), 0)
             if self._environment is not None:
                 ghosts = self._ghosts(self._environment, row, trace, onset, bv, av)
@@ -120,14 +118,13 @@ class Scenes:
         self, environment: Environment, row: pa.Table, trace: pa.Table, onset: int, bv: Scene, av: Scene
     ) -> list[Scene]:
         """`OTHERS` along an episode from its begin; after a crash BV goes on as long as they are shown."""
-        motion = np.zeros((len(OTHERS), int(environment.numbers["max_steps"]) + 1, 2))
-        [end], path = self._drive(environment, row, trace, motion)
+        [end], motion, ahead = self._drive(environment, row, trace, last=True)
         last = shown = av["x"].size - 1
         if av["crash"] is not None:
             ends = zip(end, motion, strict=True)
-            shown = max(_over(last, int(ended), driven[:, 1], path.v_after) for ended, driven in ends)
-            bv["x"] = np.append(bv["x"], path.x_after[last + 1 : shown + 1])
-            bv["v"] = np.append(bv["v"], path.v_after[last + 1 : shown + 1])
+            shown = max(_over(last, int(ended), driven[:, 1], ahead[:, 1]) for ended, driven in ends)
+            bv["x"] = np.append(bv["x"], ahead[last + 1 : shown + 1, 0])
+            bv["v"] = np.append(bv["v"], ahead[last + 1 : shown + 1, 1])
         ghosts = []
         for name, ended, driven in zip(OTHERS, end.tolist(), motion, strict=True):
             until = min(shown, onset + int(np.count_nonzero(driven[:, 0])))

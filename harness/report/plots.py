@@ -6,19 +6,15 @@ import math
 
 import numpy as np
 
-from harness.compiled import unboxed
 from harness.estimators.answer import Estimates
 from harness.estimators.traffic import Sensitivity
-from harness.families.cut_in.events import Maneuvers
-from harness.families.cut_in.path import empty_trajectory
-from harness.families.cut_in.replay import StoredPaths, drive_others
-from harness.families.protocol import Environment
+from harness.families.protocol import Environment, Family
 from harness.numbers import count, number, plain, share
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.player import OTHERS
 from harness.report.summary import RunSummary, ShownShells
 from harness.vehicles.library import library_records
-from harness.vocabulary import CRASH, CUT_IN, FAILED, FloatArray, IntArray, states_from
+from harness.vocabulary import CRASH, FAILED, FloatArray, IntArray
 
 POOL = "pool’s own error"
 WEIGHTED = (
@@ -33,7 +29,6 @@ IN_ROUNDS = (
 DASHED, DOTTED = "4 3", "1 3"
 SHARES = {0.0: "grid", 0.25: "red-1", 0.5: "red-2", 0.75: "red-4", 1.0: "red-6"}
 """Up to which share of cut-ins that crash a cell of the map has a colour."""
-KEEPS_SPEED = 20
 """Index of the maneuver 0 m/s²."""
 WHO = {"both": "grey", "only A": "blue", "only B": "reference"}
 """Who crashes, and the colour: on the page the player draws B in that of reference drivers."""
@@ -211,7 +206,7 @@ def _open_question(found: ShownShells, names: tuple[str, ...], half_widths: list
     return f"Most of what is not known lies in {name} ({most}): further tests do most there."
 
 
-def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | None:
+def where_plot(summary: RunSummary, family: Family, environment: Environment | None) -> Plot | None:
     """Map of the share of cut-ins that crash, over gap and closing speed, and what others avoid; None without any.
 
     ``environment`` is that in which others can be driven, None where that is not known any more.
@@ -235,8 +230,7 @@ def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | N
             row, column = np.nonzero((shares > low) & (shares <= high))
             label = f"≤ {share(high)}" if high else "tested, none"
             panel.add("boxes", colour, x[column], x[column + 1], y[row], y[row + 1], label=label)
-    known = environment is not None and not environment.lateral.present
-    lines = limits_of_others(environment, summary, fast) if environment is not None and known else {}
+    lines = {} if environment is None else limits_of_others(family, environment, summary, fast)
     for (name, (speeds, gaps)), colour, dash in zip(lines.items(), ("ink", "blue"), ("", DASHED), strict=False):
         panel.add("line", colour, gaps, speeds, dash=dash, label=f"{name}’s limit")
     text = (
@@ -252,25 +246,16 @@ def where_plot(summary: RunSummary, environment: Environment | None) -> Plot | N
 
 
 def limits_of_others(
-    environment: Environment, summary: RunSummary, fastest_mps: float
+    family: Family, environment: Environment, summary: RunSummary, fastest_mps: float
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Closing speeds (m/s), and the smallest gap (m) at which each of `OTHERS` avoids a crash, BV keeping its speed."""
+    """Closing speeds (m/s), and the smallest gap (m) at which each of `OTHERS` avoids a crash; none where unknown."""
     speeds, gaps = np.linspace(0.5, fastest_mps, 40), np.linspace(0.25, 60.0, 240)
     speed, gap = (each.ravel() for each in np.meshgrid(speeds, gaps, indexing="ij"))
-    n, draws = speed.size, int(environment.numbers["max_steps"] // environment.numbers["hold_steps"]) + 1
-    v_bv = np.full(n, float(np.median(summary.rows["v_bv_mps"])))
-    state = states_from((v_bv, np.full(n, 200.0), np.zeros(n), gap, -speed))
-    maneuvers = np.full((n, draws + 1), KEEPS_SPEED, np.int8)
-    bv = maneuvers.copy()
-    bv[:, 1] = CUT_IN
-    used, none = np.full(n, draws), np.zeros(n, np.int64)
-    script = Maneuvers(maneuvers, bv, used, used + 1, none)
-    stored = StoredPaths(0, none, state, none, none, script)
-    end, start = np.zeros((n, len(OTHERS)), np.int64), np.full((n, 2), np.nan)
     drivers = library_records([driver for _, driver in OTHERS.values()], see_onset=False)
-    path = unboxed(empty_trajectory(environment))
-    drive_others(unboxed(stored), start, unboxed(environment), drivers, path, end, np.zeros((0, 0, 0)))
-    crashes = (end >= 0).reshape(speeds.size, gaps.size, len(OTHERS))
+    avoided = family.avoidable(environment, summary.rows, np.stack((gap, speed)), drivers)
+    if avoided is None:
+        return {}
+    crashes = ~avoided.reshape(speeds.size, gaps.size, len(OTHERS))
     last = np.where(crashes.any(1), gaps[gaps.size - 1 - np.argmax(crashes[:, ::-1], axis=1)], 0.0)
     return {name: (speeds, last[:, d]) for d, name in enumerate(OTHERS)}
 

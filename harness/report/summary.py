@@ -25,6 +25,7 @@ from harness.estimators.answer import Estimates
 from harness.estimators.block import outcome_places
 from harness.estimators.estimate import Estimate, Unavailable
 from harness.estimators.shells import ShellDetails
+from harness.families import family_named
 from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_shards, stored_columns
 from harness.strata import ASSUMPTION_FREE
@@ -36,7 +37,7 @@ ROWS_TOGETHER = 5_000
 MOST_CAUSES = 1_000
 COLUMNS = (
     "episode", "component", "log_weight", "impact_speed_mps", "crash_time_s", "cut_in_step",
-    "cut_in_r2_m", "cut_in_r2dot_mps", "v_bv_mps",
+    "cut_in_r2_m", "cut_in_r2dot_mps",
 )  # fmt: skip
 
 
@@ -207,7 +208,9 @@ def summarise(run: RunFolder) -> RunSummary:
     """One pass over all episodes of a run; a `RunFolderError` where one has an unknown outcome."""
     count, causes, per_shell = np.zeros(len(OUTCOMES)), Counter[str](), Counter[int]()
     kept: list[dict[str, FloatArray]] = []
-    for batch in run.episodes(*COLUMNS, "outcome", "failure"):
+    of_family = [each.name for each in family_named(run.campaign.scenario).columns if not each.length]
+    asked = (*COLUMNS, *of_family)
+    for batch in run.episodes(*asked, "outcome", "failure"):
         outcome = outcome_places(pa.table(batch).column("outcome"), str(run.path / "episodes"))
         if (counted := run.campaign.crash.counts_above_mps) > 0.0:  # no harder is none here, as in the estimates
             outcome[(outcome == CRASH) & (floats(batch.column("impact_speed_mps")) <= counted)] = TIMEOUT
@@ -216,13 +219,13 @@ def summarise(run: RunFolder) -> RunSummary:
             # Causes may hold numbers and so be all different: memory stays bounded, the count per outcome is exact.
             if (cause := item["values"].as_py()) in causes or len(causes) < MOST_CAUSES:
                 causes[cause] += item["counts"].as_py()
-        columns = {name: floats(batch.column(name)) for name in COLUMNS} | {"outcome": outcome.astype(np.float64)}
+        columns = {name: floats(batch.column(name)) for name in asked} | {"outcome": outcome.astype(np.float64)}
         if run.shells is not None:
             shells, tests = np.unique(columns["component"].astype(np.int64), return_counts=True)
             per_shell.update(dict(zip(shells.tolist(), tests.tolist(), strict=True)))
         shown = np.isfinite(columns["cut_in_step"]) | (columns["log_weight"] != 0.0)
         kept.append({name: column[shown] for name, column in columns.items()})
-    rows = {name: np.concatenate([part[name] for part in kept] or [np.zeros(0)]) for name in (*COLUMNS, "outcome")}
+    rows = {name: np.concatenate([part[name] for part in kept] or [np.zeros(0)]) for name in (*asked, "outcome")}
     outcome = rows["outcome"].astype(np.int64)
     if run.shells is not None:
         rows["log_weight"] = rows["log_weight"] - _log_tests(per_shell, run)[rows["component"].astype(np.int64)]

@@ -14,10 +14,10 @@ from harness.estimators.block import Block, Drawn, joined
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import SPEEDS_MPS, Impacts
 from harness.estimators.shells import Shells as SeenShells
-from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.path import empty_trajectory
 from harness.families.cut_in.replay import StoredPaths
-from harness.families.cut_in.script import states_of
+from harness.families.cut_in.script import maneuvers_of, states_of
+from harness.families.protocol import Chosen
 from harness.pool.build import campaign_pool
 from harness.resolved import resolve
 from harness.runner.stored import stored_blocks
@@ -96,8 +96,7 @@ def driven(source, name):
     campaign = golden("shells-twin", VEHICLES[name])
     cut_ins = source.prescribed._cut_ins
     n, environment = cut_ins.step.size, source.resolved.environment
-    lists = (np.ascontiguousarray(cut_ins.facts[name]) for name in ("lv_maneuvers", "bv_maneuvers", "n_lv", "n_bv"))
-    script = Maneuvers(*lists, cut_ins.lead)
+    script = maneuvers_of(Chosen(cut_ins.facts, cut_ins.at, cut_ins.lead))
     stored = StoredPaths(1, np.arange(n), states_of(cut_ins.facts), np.full(n, 200), cut_ins.step, script)
     twin, scratch = np.zeros(n, RETRACED_DTYPE), empty_trajectory(environment)
     retrace(unboxed(stored), unboxed(environment), resolve(campaign).av, unboxed(scratch), twin)

@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import harness.report
+from harness.families import family_named
 from harness.numbers import number
 from harness.records.reader import traffic_of
 from harness.report import crashes
@@ -32,7 +33,11 @@ def colours(plot):
 @pytest.mark.parametrize("block", [LIGHT, DARK, PRINT], ids=["light", "dark", "print"])
 def test_every_plot_colour_is_a_css_variable_in_every_scheme(block, runs):
     run = runs["shells"]
-    plots = [severity_plot(run.estimates), where_plot(summarise(run), None), shells_plot(run.shells)]
+    plots = [
+        severity_plot(run.estimates),
+        where_plot(summarise(run), family_named("cut_in"), None),
+        shells_plot(run.shells),
+    ]
     used = set().union(*map(colours, plots), SHARES.values()) - {"reference"}
     assert used <= set(re.findall(r"--([\w-]+): #[0-9a-f]{6};", block))
 
@@ -93,7 +98,7 @@ def test_others_avoid_a_crash_from_the_gap_on_that_their_brakes_need(runs):
 
 
 def test_the_map_has_a_colour_for_every_cut_in(runs):
-    [panel] = where_plot(summarise(runs["shells"]), None).panels
+    [panel] = where_plot(summarise(runs["shells"]), family_named("cut_in"), None).panels
     cells = marks(panel, "boxes")
     assert next(iter(cells)) == "tested, none"
     assert set(cells) <= {"tested, none", "≤ 25 %", "≤ 50 %", "≤ 75 %", "≤ 100 %"}

@@ -17,11 +17,12 @@ from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
+from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
-from harness.families.protocol import HOLDING, Chosen, Column, Events, Paths, Recorded
+from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Paths, Recorded
 from harness.loop.cells import Script
 from harness.vehicles.drivers import Followers
-from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, FloatArray, IntArray, Method, RecordArray
+from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
 
 _STATE_DOCS = (
     "speed of BV",
@@ -109,6 +110,16 @@ class CutIn:
 
     def script(self, traffic: Environment, chosen: Chosen) -> Script:
         return script_of(traffic, chosen)
+
+    def drive(
+        self, traffic: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
+    ) -> Driven:
+        return drive_along(traffic, chosen, start, drivers, last=last)
+
+    def avoidable(
+        self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray
+    ) -> BoolArray | None:
+        return None if traffic.lateral.present else avoids(traffic, facts, where, drivers)
 
 
 CUT_IN = CutIn()

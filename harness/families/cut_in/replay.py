@@ -7,28 +7,34 @@ where SUMO takes hundreds.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from harness.compiled import compiled_inline, compiled_threads
+from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import (
     NO_CRASH,
     Trajectory,
+    empty_trajectory,
     follow,
     leave,
     take_over,
     walk,
 )
+from harness.families.cut_in.script import facts_of, maneuvers_of, states_of
+from harness.families.protocol import Chosen, Driven
 from harness.records.schemas import padded
 from harness.vehicles.sideways import onset_of
 from harness.vocabulary import (
+    ACCELERATIONS_MPS2,
     AV,
     CUT_IN,
     STATE_COLUMNS,
+    BoolArray,
     FloatArray,
     IntArray,
     RecordArray,
@@ -139,3 +145,32 @@ def drive_others(
                 end[i, d] = path.follower[0].end
                 if end[i, d] != NO_CRASH:
                     break
+
+
+def drive_along(
+    environment: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool
+) -> Driven:
+    """See `harness.families.protocol.Family.drive`."""
+    n, steps = len(chosen.facts), int(environment.numbers["max_steps"])
+    known = maneuvers_of(chosen)
+    stored = StoredPaths(0, np.zeros(n, np.int64), states_of(chosen.facts), np.full(n, steps), chosen.at, known)
+    end, path = np.zeros((n, len(drivers)), np.int64), empty_trajectory(environment)
+    motion = np.zeros((len(drivers), steps + 1, 2) if last else (0, 0, 0))
+    drive_others(unboxed(stored), start, unboxed(environment), drivers, unboxed(path), end, motion)
+    return Driven(end, motion, np.stack((path.x_after, path.v_after), axis=1))
+
+
+def avoids(
+    environment: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray
+) -> BoolArray:
+    """See `harness.families.protocol.Family.avoidable`: of cut-ins of one step, where BV keeps its speed."""
+    gap, closing = where
+    n, draws = gap.size, int(environment.numbers["max_steps"] // environment.numbers["hold_steps"]) + 1
+    v_bv = np.full(n, float(np.median(facts["v_bv_mps"])))
+    state = states_from((v_bv, np.full(n, 200.0), np.zeros(n), gap, -closing))
+    keeps_speed = int(np.argmin(np.abs(ACCELERATIONS_MPS2)))
+    lv, bv = np.full((2, n, draws + 1), keeps_speed, np.int8)
+    bv[:, 1] = CUT_IN
+    used, at_once = np.full(n, draws), np.zeros(n, np.int64)
+    chosen = Chosen(facts_of(state, Maneuvers(lv, bv, used, used + 1, at_once)), at_once, at_once)
+    return drive_along(environment, chosen, np.full((n, 2), np.nan), drivers, last=False).end < 0

@@ -46,6 +46,12 @@ def states_of(facts: RecordArray) -> RecordArray:
     return states_from(facts[name] for name in STATE_COLUMNS)
 
 
+def maneuvers_of(chosen: Chosen) -> Maneuvers:
+    """Maneuvers of chosen cut-ins (n,)."""
+    lv, bv, n_lv, n_bv = (np.ascontiguousarray(chosen.facts[name]) for name in (*_LENGTHS, *_LENGTHS.values()))
+    return Maneuvers(lv, bv, n_lv, n_bv, chosen.lead)
+
+
 def beginning(state: RecordArray) -> tuple[FloatArray, FloatArray, Int8Array]:
     """Positions (m), speeds (m/s) and lanes (n, 3) of LV, BV and AV in initial states (n,)."""
     n = len(state)
@@ -67,9 +73,7 @@ def script_of(environment: Environment, chosen: Chosen) -> Script:
     facts, n, steps = chosen.facts, len(chosen.facts), int(environment.numbers["max_steps"])
     x, v, lane = beginning(states_of(facts))
     speed, lanes = np.zeros((n, steps, BV + 1)), np.full((n, steps, BV + 1), LEFT, np.int8)
-    lv, bv = (np.ascontiguousarray(facts[name]) for name in _LENGTHS)
-    n_lv, n_bv = (np.ascontiguousarray(facts[name]) for name in _LENGTHS.values())
-    _move(lv, bv, n_lv, n_bv, chosen.at, int(environment.numbers["hold_steps"]), v, speed, lanes)
+    _move(*maneuvers_of(chosen)[:4], chosen.at, int(environment.numbers["hold_steps"]), v, speed, lanes)
     return natural_script(x, v, lane, speed, lanes, chosen.at, chosen.lead)
 
 
