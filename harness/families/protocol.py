@@ -212,7 +212,7 @@ class Family(Protocol):
     def avoidable(
         self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray
     ) -> BoolArray | None:
-        """Which drivers (D,) avoid a crash ``where`` (2, n) gap (m) and closing speed (m/s) at the event are so, (n, D).
+        """Which drivers (D,) avoid a crash ``where`` (2, n) gap (m) and closing speed (m/s) at the event are so (n, D).
 
         ``facts`` are of typical tests. None where these two do not decide it.
         """

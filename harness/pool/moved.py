@@ -12,8 +12,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pyarrow as pa
 
 from harness import cache
+from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import take_aim
@@ -22,7 +24,7 @@ from harness.pool.shells import shells_in_strata, shells_of
 from harness.progress import Progress
 from harness.resolved import Resolved
 from harness.strata import ShellDesign
-from harness.vocabulary import STATE_COLUMNS, FloatArray
+from harness.vocabulary import FloatArray
 
 N_PATHS = 4096
 FORMAT = 2
@@ -124,7 +126,8 @@ def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
     """
     shell, n = pool.shell, len(pool.names) + 1
     found = {}
-    for name in STATE_COLUMNS:
+    numbers = [each.name for each in family_named(pool.family).columns if pa.types.is_floating(each.kind)]
+    for name in numbers:
         low, high = np.full(n, -np.inf), np.full(n, np.inf)  # of a shell without cut-ins nothing is known
         for s in np.unique(shell):
             values = pool.cut_ins.facts[name][shell == s]

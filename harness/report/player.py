@@ -30,7 +30,7 @@ from harness.records.schemas import chosen_from
 from harness.report.summary import floats
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import LibraryDriver, library_records
-from harness.vocabulary import VEHICLES, FloatArray, IntArray
+from harness.vocabulary import FloatArray, IntArray
 
 OTHERS = {
     "r157-cc": ("a careful and competent driver", LibraryDriver(model="r157-cc")),
@@ -91,9 +91,9 @@ class Scenes:
     def scene(self, row: pa.Table, trace: pa.Table, *, why: str = "") -> Scene:
         """One episode, given its row and its trace, from shortly before the cut-in on; all of one without."""
         episode, outcome, cut = (row.column(name)[0].as_py() for name in ("episode", "outcome", "cut_in_step"))
-        tracks = [{"name": name, **_states(_of(trace, name)), "crash": None} for name in VEHICLES]
-        _, bv, av = tracks
-        last, over = av["x"].size - 1, share_over(_of(trace, "BV"))
+        tracks = [{"name": name, **_states(_of(trace, name)), "crash": None} for name in self._family.vehicles]
+        bv, av = tracks[self._family.principal], tracks[-1]
+        last, over = av["x"].size - 1, share_over(_of(trace, bv["name"]))
         av["crash"] = last if outcome == "crash" else None
         first, onset, ghosts = 0, None, list[Scene]()
         if cut is not None and cut < last:
@@ -105,8 +105,8 @@ class Scenes:
         for each in (*tracks, *ghosts):
             each |= {key: each[key][first:] for key in "xv"}
             each["brakes"] = _brakes(each["v"], first)
-        moments = [(cut, "BV cuts in"), (av["brakes"], "AV brakes"), (av["crash"], "crash")]
-        moments += [(onset, "BV comes over")] if onset != cut else []
+        moments = [(cut, f"{bv['name']} cuts in"), (av["brakes"], "AV brakes"), (av["crash"], "crash")]
+        moments += [(onset, f"{bv['name']} comes over")] if onset != cut else []
         scene = {
             "campaign": self._name, "episode": episode, "title": f"Episode {episode:,}: {why or outcome}",
             "first": first, "onset": onset, "cut_in": cut, "over": over[first:], "tracks": tracks, "ghosts": ghosts,
@@ -203,8 +203,8 @@ def _facts(scene: Scene, bv: Scene, av: Scene) -> list[tuple[str, str]]:
         return [("BV", "does not cut in")]
     rate, hardest = _closing(av, bv, cut - first), tenths(-float(np.diff(av["v"]).min()) / STEP_S)
     told = {
-        "BV comes over": f"{tenths(_gap(av, bv, onset - first))} m ahead",
-        "BV cuts in": f"{tenths(_gap(av, bv, cut - first))} m ahead and {tenths(abs(rate))} m/s "
+        f"{bv['name']} comes over": f"{tenths(_gap(av, bv, onset - first))} m ahead",
+        f"{bv['name']} cuts in": f"{tenths(_gap(av, bv, cut - first))} m ahead and {tenths(abs(rate))} m/s "
         + ("slower" if rate > 0.0 else "faster"),
         "AV brakes": f"at up to {hardest} m/s²",
     }

@@ -79,7 +79,7 @@ def _run_here(
     clock, found = Clock(held=held), list[Bits]()
     with clock.shown():
         host = build_host(av, n_cells=n_cells, seed=scenario.seed, black_box=black_box)
-        with closing(EpisodeLoop(TwinWorld(n_cells), scenario, keep, host)) as loop:
+        with closing(EpisodeLoop(TwinWorld(n_cells, scenario.vehicles), scenario, keep, host)) as loop:
             for first, traffic in tests:
                 shard = loop.run(first, traffic)
                 found += [bits_of(shard, row) for row in range(len(traffic))]

@@ -335,7 +335,9 @@ def _first_answers(source: Source, av: AutomatedVehicle, n: int, black_box: Path
     """Of tests that did not fail."""
     host = build_host(av, n_cells=1, seed=source.campaign.seed, black_box=black_box)
     answers: Any = FirstAnswers(host) if host is not None else None
-    with closing(EpisodeLoop(TwinWorld(1), source.scenario, source.records(), answers)) as loop:
+    with closing(
+        EpisodeLoop(TwinWorld(1, source.scenario.vehicles), source.scenario, source.records(), answers)
+    ) as loop:
         failed = loop.run(0, source.tests(0, n)).failures
     return {i: answer for i, answer in answers.noted.items() if i not in failed}
 

@@ -75,5 +75,5 @@ def compile_kernels(resolved: Resolved) -> None:
     naturalistic = campaign.model_copy(update={"testing": campaign.testing.model_copy(update={"method": "nde"})})
     nde = build if build.kernel is not judge else Naturalistic
     tests = nde(replace(resolved, campaign=naturalistic), Progress()).tests(0, 1)
-    EpisodeLoop(TwinWorld(1), resolved.scenario, RecordPolicy("none", 0.0)).run(0, tests)
+    EpisodeLoop(TwinWorld(1, resolved.scenario.vehicles), resolved.scenario, RecordPolicy("none", 0.0)).run(0, tests)
     resolved.family.mean_distance_m(resolved.environment)

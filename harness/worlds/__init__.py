@@ -81,21 +81,23 @@ def build_world(
     An AV whose SUMO model keeps hidden state gets one cell in any case; ``gui`` and ``options``: see `SumoWorld`.
     """
     # A run needs one of them, and not what the others import.
-    av, cells = campaign.av, n_cells or campaign.world.cells
+    from harness.families import family_named  # noqa: PLC0415 - families read what worlds are asked
+
+    av, cells, vehicles = campaign.av, n_cells or campaign.world.cells, family_named(campaign.scenario).vehicles
     if campaign.world.engine == "twin" and not in_sumo:
         from harness.worlds.twin import TwinWorld  # noqa: PLC0415
 
-        return TwinWorld(cells)
+        return TwinWorld(cells, vehicles)
     cells, early = min(cells, MOST_SUMO_CELLS), av.acts_before_cut_in
     if av.traci is not None:
         from harness.worlds.program import TraciWorld  # noqa: PLC0415
 
-        return TraciWorld(cells, av.traci, av.limits.step_time_s, acts_before_cut_in=early)
+        return TraciWorld(cells, av.traci, av.limits.step_time_s, vehicles, acts_before_cut_in=early)
     from harness.worlds.sumo import SumoWorld  # noqa: PLC0415
     from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld, recyclable  # noqa: PLC0415
 
     if av.sumo is None:
-        return SumoWorld(cells, gui=gui, options=options)
+        return SumoWorld(cells, vehicles, gui=gui, options=options)
     if recyclable(av.sumo) and not early:  # one that is released at the start remembers the last episode's cut-in
-        return SumoAvWorld(cells, av.sumo, gui=gui, options=options)
-    return FreshWorld(av.sumo, campaign.seed, acts_before_cut_in=early, gui=gui, options=options)
+        return SumoAvWorld(cells, av.sumo, vehicles, gui=gui, options=options)
+    return FreshWorld(av.sumo, campaign.seed, vehicles, acts_before_cut_in=early, gui=gui, options=options)

@@ -1,0 +1,98 @@
+"""A family of two events whose rates can be added up by hand: POV comes over close to the AV, or far ahead of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow as pa
+
+from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events
+from harness.loop.cells import natural_script
+
+AT = np.array([5, 7])
+"""Steps of the two events."""
+NEAR_M, FAR_M = 8.0, 100.0
+"""Gaps at the beginning, as probable as each other; POV drives 20 m/s, the AV 30."""
+P = {NEAR_M: (0.02, 0.01), FAR_M: (0.04, 0.03)}
+P_EVENT = 0.5 * (0.02 + 0.01) + 0.5 * (0.04 + 0.03)
+RATE = 0.5 * (0.02 + 0.01)
+"""3 m or 1 m ahead nobody can brake in time; 93 m ahead nobody arrives within the six seconds of a test."""
+STEPS = 60
+
+
+class Fake:
+    """See `harness.families.protocol.Family`."""
+
+    name = "fake"
+    vehicles = ("POV", "AV")
+    principal, ahead = 0, -1
+    columns = (
+        Column("gap_m", pa.float64(), "m", "initial gap"),
+        Column("event", pa.int64(), "1", "which of the two, -1 for none"),
+    )
+    n_uniforms = 1
+    shipped = Path(__file__).parent
+    ladders = {False: "ladder-2", True: "ladder-2"}
+
+    def parameters(self, settings):
+        return SimpleNamespace(content_hash=lambda: "fake", unseen=(), settings=settings)
+
+    def traffic(self, settings, parameters=None):
+        return "fake"
+
+    def digest(self, traffic):
+        return traffic
+
+    def max_steps(self, traffic):
+        return STEPS
+
+    def sideways_m(self, traffic):
+        return 1.7
+
+    def shows(self, traffic):
+        return False
+
+    def mean_distance_m(self, traffic):
+        return 180.0
+
+    def sources(self):
+        return {}
+
+    def start(self, traffic, u):
+        return np.array([(NEAR_M if one < 0.5 else FAR_M,) for one in u[:, 0]], [("gap_m", float)])
+
+    def events(self, traffic, seed, paths, drivers, recorded=HOLDING, stride=1, offset=None):
+        exact = np.array([P[gap] for gap in paths.start["gap_m"].tolist()]).reshape(-1, 2)
+        first = np.zeros(len(exact), np.int64) if offset is None else offset
+        asked = np.arange(2) % stride == first[:, None]
+        all_of_them = (1 << drivers.drivers.size) - 1
+        crashes = np.where(asked & (paths.start["gap_m"] == NEAR_M)[:, None], all_of_them, 0)
+        return Events(np.where(asked, stride * exact, 0.0), crashes, np.log(exact.sum(1)), np.zeros(len(exact)))
+
+    def choose(self, traffic, seed, paths, event, *, of_pool=True):
+        facts = np.zeros(len(event), [("gap_m", float), ("event", np.int64)])
+        facts["gap_m"], facts["event"] = paths.start["gap_m"], event
+        return Chosen(facts, np.where(event < 0, -1, AT[event]), np.zeros(len(event), np.int64))
+
+    def script(self, traffic, chosen):
+        n = len(chosen.facts)
+        x, v = np.tile([105.0, 100.0], (n, 1)), np.tile([20.0, 30.0], (n, 1))
+        x[:, 0] += chosen.facts["gap_m"]
+        lanes = np.where((chosen.at >= 0)[:, None] & (np.arange(STEPS) >= chosen.at[:, None]), 0, 1)
+        lane = np.tile(np.array([1, 0], np.int8), (n, 1))
+        speed = np.full((n, STEPS, 1), 20.0)
+        return natural_script(x, v, lane, speed, lanes.astype(np.int8)[:, :, None], chosen.at, chosen.lead)
+
+    def drive(self, traffic, chosen, start, drivers, *, last=False):
+        crash = (chosen.facts["gap_m"] == NEAR_M) & (chosen.at >= 0)
+        end = np.repeat(np.where(crash, chosen.at + 3, -1)[:, None], len(drivers), axis=1)
+        nowhere = np.zeros((len(drivers), STEPS + 1, 2) if last else (0, 0, 0))
+        return Driven(end, nowhere, np.zeros((STEPS + 1, 2)))
+
+    def avoidable(self, traffic, facts, where, drivers):
+        return None
+
+
+FAKE = Fake()

@@ -1,0 +1,77 @@
+"""The core knows no family: one of its own, with rates that one can add up, goes through all of it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import harness
+from harness import families
+from harness.campaign.files import load_campaign
+from harness.errors import CampaignError
+from harness.resolved import resolve
+from harness.sampling import prepare
+from tests.families.fake import FAKE, P_EVENT, RATE
+from tests.in_process import run_here
+from tests.stored_runs import ROOT
+
+SMOKE = ROOT / "scenarios" / "smoke.yaml"
+SMALL = (
+    "scenario=fake",
+    "environment.parameters=two-events",
+    "run.shard_size=500",
+    "pool.relative_error=0.02",
+    "pool.cut_ins_per_shell=4000",
+)
+
+
+@pytest.fixture(autouse=True)
+def _fake_is_known(monkeypatch):
+    known = {**families.families(), "fake": FAKE}
+    monkeypatch.setattr(families, "families", lambda: known)
+
+
+def estimate(out, *overrides: str):
+    """Headline of a run, and its folder."""
+    campaign = load_campaign(SMOKE, [*SMALL, *overrides])
+    run_here(campaign, out)
+    return json.loads((out / "estimates.json").read_text())["estimates"], harness.read(out)
+
+
+@pytest.mark.parametrize("engine", ["twin", "sumo"])
+@pytest.mark.parametrize("method", ["nde", "forced"])
+def test_naturalistic_and_forced_tests_have_the_exact_rate(method, engine, tmp_path):
+    """Within four standard errors, in the twin and in SUMO: a false alarm in 16,000."""
+    n = 6000 if engine == "twin" else 1500
+    stop = f"stop={{episodes: {n}, rhw: null}}"
+    found, run = estimate(tmp_path / "run", f"testing.method={method}", stop, f"world.engine={engine}")
+    episodes = run.episodes()
+    share = 1.0 if method == "forced" else P_EVENT
+    spread = np.sqrt(share * (1.0 - share) / n) if share < 1.0 else 1e-12
+    assert abs(episodes["cut_in_step"].notna().mean() - share) < 4.0 * spread
+    weighed = np.where(episodes["outcome"] == "crash", np.exp(episodes["log_weight"]), 0.0)
+    assert abs(weighed.mean() - RATE) < 4.0 * weighed.std() / np.sqrt(n)
+    headline = found["nde" if method == "nde" else "nade"]
+    assert headline["crash_rate"] == pytest.approx(weighed.mean(), rel=1e-12)
+    assert set(episodes["event"]) <= {-1, 0, 1}
+
+
+def test_the_pool_knows_the_rate_and_a_run_of_shells_finds_it(tmp_path):
+    resolved = resolve(load_campaign(SMOKE, [*SMALL, "testing.method=shells"]))
+    source = prepare(resolved)
+    assert source.design.p_cut_in == pytest.approx(P_EVENT, rel=0.1)
+    assert source.design.p.sum() == pytest.approx(RATE, rel=0.1)  # on the others nobody could crash
+    found, run = estimate(tmp_path / "run", "testing.method=shells", "world.engine=twin", "stop.rhw=0.1")
+    assert found["shells"]["ci_low"] < RATE < found["shells"]["ci_high"]
+    assert found["shells"]["crash_rate"] == pytest.approx(RATE, rel=0.1)
+    crashed = run.episodes().query("outcome == 'crash'")
+    assert set(crashed["gap_m"]) == {8.0}
+    again = harness.replay(tmp_path / "run", int(crashed["episode"].iloc[0]))
+    assert again.row["outcome"] == "crash"
+
+
+def test_an_unknown_family_is_refused_by_name():
+    with pytest.raises(CampaignError, match="Did you mean 'fake'"):
+        load_campaign(SMOKE, ["scenario=fak"])
