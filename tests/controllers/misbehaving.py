@@ -5,6 +5,7 @@ import math
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -275,6 +276,12 @@ class RaisesInClose(IDM):
         with Path(self.note).open("a") as file:
             file.write("closed\n")
         raise RuntimeError("cannot be closed")
+
+
+class GivesSocketsATimeout(IDM):
+    def __init__(self):
+        super().__init__()
+        socket.setdefaulttimeout(0.001)
 
 
 class Batch:
