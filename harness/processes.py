@@ -486,6 +486,7 @@ def _begin(descriptors: tuple[int, int], parent: int) -> None:
     """Do what this process has been started for: it hears that by one descriptor, and prints to the other."""
     descriptor, printed = descriptors
     leave_signals_to_parent()
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where a parent ignores it, children leave no exit code
     if sys.platform == "linux":  # what children leave behind becomes a child of this process
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
     for standard in (1, 2):

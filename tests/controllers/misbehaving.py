@@ -278,10 +278,11 @@ class RaisesInClose(IDM):
         raise RuntimeError("cannot be closed")
 
 
-class GivesSocketsATimeout(IDM):
+class ChangesItsProcess(IDM):
     def __init__(self):
         super().__init__()
         socket.setdefaulttimeout(0.001)
+        signal.signal(signal.SIGCHLD, signal.SIG_IGN)
 
 
 class Batch:

@@ -128,7 +128,7 @@ NO_FAULT = {
     "a function that is the vehicle": (_of("only_a_function", min_acceleration_mps2=-4.0), None),
     "a class with nothing but step": (_of("OnlyStep"), None),
     "one with nothing but step_batch": (_of("OnlyStepBatch"), None),
-    "a default timeout of sockets": (_of("GivesSocketsATimeout"), None),
+    "a default timeout of sockets, and a signal ignored": (_of("ChangesItsProcess"), None),
     "close raises": (_of("RaisesInClose", note="NOTE"), 40),
     "close ends the process": (_of("Always", where="close"), None),
 }
