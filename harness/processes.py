@@ -17,6 +17,7 @@ import mmap
 import os
 import pickle
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -32,7 +33,7 @@ from importlib import import_module
 from io import TextIOWrapper
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
-from multiprocessing.reduction import recv_handle, send_handle
+from multiprocessing.reduction import recv_handle, sendfds
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import FrameType
@@ -319,8 +320,10 @@ class ForkServer:
             child = self.start()
             with suppress(EOFError, OSError):  # it has been killed
                 child.connection.send(None)
-                for descriptor in descriptors:
-                    send_handle(child.connection, descriptor, 0)
+                with socket.fromfd(child.connection.fileno(), socket.AF_UNIX, socket.SOCK_STREAM) as sender:
+                    sender.setblocking(True)  # whatever a user's code makes the default
+                    for descriptor in descriptors:
+                        sendfds(sender, [descriptor])
                 answer = child.connection.recv()
                 break
         else:
@@ -483,6 +486,7 @@ def _begin(descriptors: tuple[int, int], parent: int) -> None:
     """Do what this process has been started for: it hears that by one descriptor, and prints to the other."""
     descriptor, printed = descriptors
     leave_signals_to_parent()
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where a parent ignores it, children leave no exit code
     if sys.platform == "linux":  # what children leave behind becomes a child of this process
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
     for standard in (1, 2):

@@ -13,8 +13,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
+from importlib.machinery import ExtensionFileLoader
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias
 
 from harness.controllers.hosts import NOT_THE_USERS, Guard
 
@@ -23,6 +25,7 @@ HELD_S, LOOK_S = 1e9, 1e-6
 _TRUE_DATETIME: TypeAlias = datetime.datetime
 _READ = ("time", "monotonic", "perf_counter", "process_time", "thread_time")
 _SHOWN = ("localtime", "gmtime", "ctime")
+_LOADS = ("create_module", "exec_module")
 
 
 class Clock:
@@ -62,6 +65,7 @@ class Clock:
         kept: dict[tuple[Any, str], Any] = {(time, name): getattr(time, name) for name in (*_READ, *_SHOWN)}
         kept |= {(time, f"{name}_ns"): getattr(time, f"{name}_ns") for name in _READ}
         kept[datetime, "datetime"] = datetime.datetime
+        kept |= {(ExtensionFileLoader, name): getattr(ExtensionFileLoader, name) for name in _LOADS}
         now = {name: self.function(name, kept[time, name]) for name in _READ}
         for name, function in now.items():
             setattr(time, name, function)
@@ -70,6 +74,8 @@ class Clock:
             show = kept[time, name]
             setattr(time, name, lambda secs=None, show=show: show(now["time"]() if secs is None else secs))
         datetime.datetime = _datetime(now["time"])  # type: ignore[misc]
+        for name in _LOADS:
+            setattr(ExtensionFileLoader, name, _by_true_datetime(kept[ExtensionFileLoader, name]))
         try:
             yield
         finally:
@@ -77,24 +83,41 @@ class Clock:
                 setattr(module, name, function)
 
 
+def _by_true_datetime(load: Callable[..., Any]) -> Callable[..., Any]:
+    """Loads a compiled module (of pandas, say), which keeps Python's own class and how its objects lie in memory."""
+
+    @wraps(load)
+    def loaded(*arguments: Any) -> Any:
+        shown, datetime.datetime = datetime.datetime, _TRUE_DATETIME  # type: ignore[misc]
+        try:
+            return load(*arguments)
+        finally:
+            datetime.datetime = shown  # type: ignore[misc]
+
+    return loaded
+
+
 def _datetime(now: Callable[[], float]) -> type[datetime.datetime]:
-    """A `datetime.datetime` by another clock; every datetime counts as one of its kind."""
+    """A `datetime.datetime` by another clock; every datetime counts as one of its kind, and every such class."""
 
     class Kind(type):
         def __instancecheck__(cls, instance: object) -> bool:
             return isinstance(instance, _TRUE_DATETIME)
 
+        def __subclasscheck__(cls, subclass: type) -> bool:
+            return issubclass(subclass, _TRUE_DATETIME)
+
     class Datetime(_TRUE_DATETIME, metaclass=Kind):
         @classmethod
-        def now(cls, tz: datetime.tzinfo | None = None) -> Datetime:
+        def now(cls, tz: datetime.tzinfo | None = None) -> Self:
             return cls.fromtimestamp(now(), tz)
 
         @classmethod
-        def today(cls) -> Datetime:
+        def today(cls) -> Self:
             return cls.now()
 
         @classmethod
-        def utcnow(cls) -> Datetime:
+        def utcnow(cls) -> Self:
             return cls.now(datetime.UTC).replace(tzinfo=None)
 
     return Datetime

@@ -102,10 +102,18 @@ def build_host(
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
         return VehicleHost(fmu_maker(av.fmu), n_cells, av, seed, guard, fatal_episodes)
-    make = _maker(av)
-    guard.restore_modes()
-    first = _made(make, str(av.controller), guard)
-    if _is_batch(first):
+    try:
+        make = _maker(av)
+        guard.restore_modes()
+        first = _made(make, str(av.controller), guard)
+        is_batch = _is_batch(first)
+    except HarnessError:
+        raise
+    except (Exception, SystemExit) as error:  # who looks for an attribute runs the user's code, too
+        found = f"{av.controller}, of which looking at its attributes fails ({cause_of(error)})"
+        mend = "Mend what is raised: a __getattr__ raises AttributeError for what is not there."
+        raise CampaignError("av.controller", found, "a controller (see docs/controllers.md)", mend) from error
+    if is_batch:
         return BatchHost(first, av, seed, guard)
     return VehicleHost(make, n_cells, av, seed, guard, fatal_episodes, first)
 

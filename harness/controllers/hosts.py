@@ -12,6 +12,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from sysconfig import get_path
 from time import monotonic, sleep
@@ -356,6 +357,16 @@ def _step(controller: VehicleController, seen: list[Any]) -> Any:
     return controller.step(Observation(*row))
 
 
+def _numbers(n: int, answer: Any) -> tuple[FloatArray | None, str | None]:
+    """An answer as (n,) float64, and what is wrong with it: a cast would make numbers of texts and of complex ones."""
+    found = np.array(answer)
+    if found.shape != (n,):
+        return None, f"returned an array of shape {found.shape}, expected ({n},)"
+    if found.dtype.kind not in "iufO":
+        return None, f"returned an array of {found.dtype}, expected accelerations in m/s2 as numbers"
+    return found.astype(np.float64), None
+
+
 class BatchHost(_Host):
     """One controller object for all cells. A fault that cannot be laid at one cell's door fails all that were asked."""
 
@@ -377,12 +388,10 @@ class BatchHost(_Host):
 
         def ask() -> Any:
             answer = self._controller.step_batch(observation)
-            return np.zeros(n) if warms_up else np.array(answer, dtype=np.float64)
+            return np.zeros(n) if warms_up else answer
 
         with self._guard:
-            answer, wrong = self._guard.call(STEP_BATCH, ask)
-        if wrong is None and answer.shape != (n,):
-            wrong = f"returned an array of shape {answer.shape}, expected ({n},)"
+            answer, wrong = self._guard.call(STEP_BATCH, ask, check=partial(_numbers, n))
         if wrong is not None:
             call = "step_batch, warming up" if warms_up else "step_batch"
             return np.zeros(n), dict.fromkeys(cells.tolist(), f"{call}: {wrong}")

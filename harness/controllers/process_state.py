@@ -13,7 +13,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-WATCHED = ("builtins", "math", "json", "os", "pickle", "struct", "time", "numpy")
+WATCHED = (
+    *("builtins", "math", "json", "os", "pickle", "signal", "struct", "time"),
+    *("numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
+)
 CHANGED_MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
 
 _CONTROL, _MXCSR, _MODES = 0, 7, 0xFFC0
@@ -52,13 +55,15 @@ class OtherModules:
     """What the modules that the harness itself rests on hold when it is made."""
 
     def __init__(self) -> None:
-        self._kept = {name: _functions_and_numbers(vars(sys.modules[name])) for name in WATCHED}
+        self._modules = {name: sys.modules[name] for name in WATCHED if name in sys.modules}
+        self._kept = {name: _functions_and_numbers(vars(module)) for name, module in self._modules.items()}
 
     def restored(self) -> list[str]:
-        """Names, as ``math.sqrt``, that had been replaced or deleted; they are as before."""
-        changed = []
+        """Names, as ``math`` or ``math.sqrt``, that had been replaced or deleted; they are as before."""
+        changed = [name for name, module in self._modules.items() if sys.modules.get(name) is not module]
+        sys.modules.update(self._modules)
         for name, kept in self._kept.items():
-            there = vars(sys.modules[name])
+            there = vars(self._modules[name])
             changed += [f"{name}.{key}" for key, value in kept.items() if there.get(key, self) is not value]
             there.update(kept)
         return changed

@@ -308,7 +308,7 @@ def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Map
         yield "SUMO switches lanes in one step: this vehicle cannot see BV come over, as other drivers do"
     elif counts.get("n_cut_ins") and not counts.get("n_took_over_early"):
         yield "it did nothing until BV was on its lane, though it can see it come over some 2 s before: bv_lateral_m"
-    if n := counts.get("n_asked_to_speed_up"):
+    if (n := counts.get("n_asked_to_speed_up")) and campaign.av.model is None:  # of our own it is known
         yield f"in {count(n)} tests it asked to speed up before BV was on its lane, and was held (av.takes_over)"
 
 

@@ -144,14 +144,14 @@ class Run:
                 "distance_per_test_m": resolved.family.mean_distance_m(resolved.environment),
             }
             self.manifest = Manifest(out, resolved, earlier, began=began, **facts)
-            self._keep_design()
-            self._note_what_is_assumed()
             refused.pop_all()
 
     @contextmanager
     def under_way(self) -> Iterator[Run]:
         """Tests are run within this: the manifest follows, so that an interrupted run can be read, and workers end."""
         try:
+            self._keep_design()
+            self._note_what_is_assumed()
             yield self
             self.manifest.require_few_failed()
         except BaseException:

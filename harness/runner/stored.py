@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from shutil import copyfile
 from typing import Annotated, Any
 
 import pyarrow as pa
@@ -20,7 +21,8 @@ from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block
 from harness.estimators.one_pass import SPACING
 from harness.families.protocol import Environment
-from harness.processes import made_ahead
+from harness.files import write_atomically
+from harness.processes import SharedFile, made_ahead
 from harness.records.folder import CAMPAIGN, concatenated, no_episodes, read_kept, read_manifest
 from harness.records.origin import require_trust
 from harness.records.reader import read_campaign, read_shard, require_campaign, traffic_of
@@ -212,7 +214,10 @@ def _simulated(
     else:
         require_world(campaign)
     replay = partial(run_apart, campaign.av, _replay) if has_foreign_code(campaign.av) else _replay
-    again = replay(resolved, folder, episode, stored["episodes"], gui, fcd)
+    written = None if fcd is None else SharedFile()  # SUMO takes no other path as it is
+    again = replay(resolved, folder, episode, stored["episodes"], gui, None if written is None else written.path)
+    if fcd is not None and written is not None:
+        write_atomically(fcd, partial(copyfile, written.path))
     compared = tuple(name for name in again if name in stored and stored[name].num_rows)
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
     why = None if bit_equal is not False else suspects(manifest, campaign)

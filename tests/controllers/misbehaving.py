@@ -5,6 +5,7 @@ import math
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -167,6 +168,19 @@ class OnlyStep:
         return only_a_function(seen, -4.0)
 
 
+class RaisesForOtherNames(OnlyStep):
+    def __getattr__(self, name):
+        raise RuntimeError(name)
+
+
+class RaisesForOtherNamesAsAClass(type):
+    def __getattr__(cls, name):
+        raise RuntimeError(name)
+
+
+class OfAClassThatRaises(OnlyStep, metaclass=RaisesForOtherNamesAsAClass): ...
+
+
 class OnlyStepBatch:
     def step_batch(self, seen):
         columns = zip(seen.speed_mps, seen.lead_speed_mps, seen.gap_m, strict=True)
@@ -209,16 +223,18 @@ class Global(IDM):
 
 
 class Replaces(IDM):
-    """Puts nothing in the place of a function of another module."""
+    """Puts nothing in the place of another module, or of a function in it."""
 
     def __init__(self, what, at):
         super().__init__()
-        self.what, self.at = what.split("."), at
+        (self.module, _, self.name), self.at = what.rpartition("."), at
         self.replace("constructor")
 
     def replace(self, at):
-        if at == self.at:
-            setattr(sys.modules[self.what[0]], self.what[1], None)
+        if at == self.at and self.module:
+            setattr(sys.modules[self.module], self.name, None)
+        elif at == self.at:
+            sys.modules[self.name] = None
 
     def step(self, seen):
         self.replace("step" if seen.bv_overlaps else "warm-up")
@@ -262,11 +278,18 @@ class RaisesInClose(IDM):
         raise RuntimeError("cannot be closed")
 
 
-class Batch:
-    """Over arrays: NaN for one episode, once an array of the wrong shape, or it writes into what it is handed."""
+class ChangesItsProcess(IDM):
+    def __init__(self):
+        super().__init__()
+        socket.setdefaulttimeout(0.001)
+        signal.signal(signal.SIGCHLD, signal.SIG_IGN)
 
-    def __init__(self, nan=-1, wrong_shape=False, overwrites=""):
-        self.nan, self.wrong_shape, self.overwrites = nan, wrong_shape, overwrites
+
+class Batch:
+    """Over arrays: NaN for one episode, once an array of the wrong kind, or it writes into what it is handed."""
+
+    def __init__(self, nan=-1, wrong_shape=False, wrong_type="", overwrites=""):
+        self.nan, self.wrong_shape, self.wrong_type, self.overwrites = nan, wrong_shape, wrong_type, overwrites
 
     def start_batch(self, cells, episodes, random):
         for name, handed in (("cells", cells), ("episodes", episodes)):
@@ -279,6 +302,9 @@ class Batch:
         if self.wrong_shape and seen.bv_overlaps.all():
             self.wrong_shape = False
             return np.zeros((seen.episode.size, 2))
+        if self.wrong_type and seen.bv_overlaps.all():
+            wrong_type, self.wrong_type = self.wrong_type, ""
+            return np.zeros(seen.episode.size).astype(wrong_type)
         return np.where(seen.episode == self.nan, np.nan, 0.0)
 
     def close(self): ...

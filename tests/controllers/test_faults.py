@@ -128,6 +128,7 @@ NO_FAULT = {
     "a function that is the vehicle": (_of("only_a_function", min_acceleration_mps2=-4.0), None),
     "a class with nothing but step": (_of("OnlyStep"), None),
     "one with nothing but step_batch": (_of("OnlyStepBatch"), None),
+    "a default timeout of sockets, and a signal ignored": (_of("ChangesItsProcess"), None),
     "close raises": (_of("RaisesInClose", note="NOTE"), 40),
     "close ends the process": (_of("Always", where="close"), None),
 }
@@ -173,6 +174,8 @@ REFUSED = [
         (_of("Always", SHORT_MADE, where="constructor", how=how), "av.controller", words)
         for how, words in IN_CONSTRUCTOR.items()
     ),
+    (_of("RaisesForOtherNames"), "av.controller", "fails (RuntimeError: step_batch (misbehaving.py:"),
+    (_of("OfAClassThatRaises"), "av.controller", "looking at its attributes fails (RuntimeError: "),
     (_of("says_nothing"), "av.controller", "without step"),
     (POPEN, "av.controller", "Popen without step"),
 ]
@@ -192,7 +195,13 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
 
 
 @pytest.mark.parametrize("at", ["constructor", "step"])
-@pytest.mark.parametrize("what", ["math.isfinite", "json.dumps", "numpy.stack", "builtins.sorted", "time.monotonic"])
+@pytest.mark.parametrize(
+    "what",
+    [
+        *("math.isfinite", "json.dumps", "numpy.stack", "builtins.sorted", "time.monotonic"),
+        *("pyarrow.parquet.write_table", "numpy"),
+    ],
+)
 def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, capsys):
     assert _run(tmp_path, _of("Replaces", what=what, at=at)) == EXIT_BAD_INPUT
     err = capsys.readouterr().err
@@ -221,12 +230,20 @@ def test_a_constructor_has_a_time_limit_of_its_own_in_tests_too(tmp_path):
     assert set(map(without_place, failed)) == {f"start: StepTimeoutError: {LATE_MADE}"}
 
 
-def test_a_batch_controllers_fault_is_laid_at_one_cell_or_else_fails_all_that_were_asked(tmp_path):
-    assert _run(tmp_path, _of("Batch", nan=357, wrong_shape=True), "run.max_failed_share=0.5") == EXIT_DONE
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"wrong_shape": True}, "an array of shape ("),
+        ({"wrong_type": "complex"}, "an array of complex128, expected accelerations in m/s2 as numbers"),
+        ({"wrong_type": "<U3"}, "an array of <U3, expected accelerations in m/s2 as numbers"),
+    ],
+)
+def test_a_batch_controllers_fault_is_laid_at_one_cell_or_else_fails_all_that_were_asked(wrong, words, tmp_path):
+    assert _run(tmp_path, _of("Batch", nan=357, **wrong), "run.max_failed_share=0.5") == EXIT_DONE
     failed = {row["episode"]: row["failure"] for row in _episodes(tmp_path) if row["outcome"] == "failed"}
     assert failed.pop(357) == "step_batch: returned nan, expected a finite acceleration in m/s2"
     assert failed
-    assert all("step_batch: returned an array of shape (" in cause for cause in failed.values())
+    assert all(f"step_batch: returned {words}" in cause for cause in failed.values())
 
 
 @pytest.mark.parametrize(("where", "how"), [("step", "ends_the_process"), ("step_batch", "closes_descriptors")])

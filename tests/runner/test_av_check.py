@@ -90,10 +90,13 @@ class ReadsTheTimeOfDay(Steady):
 
 
 class LooksAtTheClock(Steady):
-    """It does nothing with it."""
+    """It does nothing with it, but for a library whose compiled modules know how a datetime lies in memory."""
 
     def step(self, seen):
-        assert isinstance(datetime.datetime.now(), datetime.datetime)
+        import pandas
+
+        assert isinstance(pandas.Timestamp(datetime.datetime.now()), datetime.datetime)
+        assert issubclass(pandas.Timestamp, datetime.datetime)
         return super().step(seen) + 0.0 * time.perf_counter_ns()
 
 

@@ -26,7 +26,7 @@ from harness.sampling.protocol import ShardRequest
 from tests.in_process import workers_alive
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
-from tests.stored_runs import copy_of, manifest, sets, shard_files, unlike_columns
+from tests.stored_runs import copy_of, golden, manifest, sets, shard_files, unlike_columns
 
 SHARDS_BEFORE_FAILURE = 3
 
@@ -48,6 +48,16 @@ def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, 
         run(campaign(*TWIN), tmp_path, workers=2)
     assert manifest(tmp_path)["status"] == "interrupted"
     assert workers_alive() == []
+
+
+def test_one_that_is_interrupted_before_its_first_test_says_so(run_here, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(running, "assumed", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_here(golden("shells-twin"), tmp_path)
+    assert manifest(tmp_path)["status"] == "interrupted"
 
 
 def test_a_full_disk_is_told_and_the_run_can_be_resumed(run_here, campaign, twin_run, tmp_path, monkeypatch, capsys):
