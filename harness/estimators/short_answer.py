@@ -46,7 +46,7 @@ ENDED = {
     "below_reference": "far enough below the competent driver",
     "accept": "decision reached",
     "episodes": "budget spent",
-    "pool": "every cut-in of the pool was tested",
+    "pool": "the pool has no further cut-in that would narrow it",
     "pool_error": "the pool’s own error is too wide",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""

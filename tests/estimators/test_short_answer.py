@@ -173,7 +173,7 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
     )
     [row] = [row for row in answer.rows if row.key == "ratio"]
     assert (row.value, row.remark) == ("no ratio", "such drivers never crash here")
-    assert answer.scope.endswith("was tested, no crash seen, asked: ± 30 %; x")
+    assert answer.scope.endswith("would narrow it, no crash seen, asked: ± 30 %; x")
     forced = replace(read_run_folder(stored_run("forced-acting-twin")).headline, cautions=())  # asks no other driver
     answer = short_answer(golden("forced-acting-twin"), forced, None, {}, None, {})
     assert "ratio" not in {row.key for row in answer.rows}
