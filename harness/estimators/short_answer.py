@@ -30,7 +30,7 @@ from harness.numbers import (
     two_digits_up,
     words,
 )
-from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT, Assumed
 
 WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
@@ -163,10 +163,11 @@ def _rows(
     yield from reversed(rows) if unseen or (wide and beside and beside[0]["ratio_high"] < 1.0) else rows
     if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
-    if "ends" in (manifest.get("assumed") or {}) and (moved := assumed_times(best, manifest)) is not None:
+    highest = assumed_of(manifest).highest
+    if highest is not None and (moved := assumed_times(best, manifest)) is not None:
         high = moved[1] * (best.ci_high if best.n_crashes else best.upper_bound)
         ends = "" if from_below else f"up to {number(high)}"
-        remark = f"if {share(manifest['assumed']['ends'][1])} do not look"
+        remark = f"if {share(highest)} do not look"
         yield Row("assumed", "traffic", f"at most × {number(moved[1], 2)} (assumed)", ends, remark)
     if campaign.has_baseline_runs and best.n_crashes:
         yield from _whence(campaign, best, manifest.get("expected"))
@@ -184,24 +185,29 @@ def _rows(
         yield within(best.details["within"])
 
 
+def assumed_of(manifest: Mapping[str, Any]) -> Assumed:
+    """What the manifest says to be assumed."""
+    return Assumed(**manifest.get("assumed") or {})
+
+
 def assumed_times(best: Estimate, manifest: Mapping[str, Any]) -> tuple[float, float] | None:
     """By what the rate moves over what the manifest says to be ``assumed``; None where it does not.
 
     Without a crash it is the upper limit that moves, which lies in one stratum.
     """
-    given = manifest.get("assumed") or {}
-    if "times" not in given or not (shells := best.details.get("shells")):
+    times = assumed_of(manifest).times
+    if times is None or not (shells := best.details.get("shells")):
         return None
     p, n, share = np.array([(each["p"], max(each["n_episodes"], 1), each["crash_share"]) for each in shells]).T
-    of_strata = [p, *(p * np.array(each) for each in given["times"])]
+    of_strata = [p, *(p * np.array(each) for each in times)]
     rates = [float(each @ share) if best.n_crashes else float(np.max(each / n)) for each in of_strata]
     return rates[1] / rates[0], rates[2] / rates[0]
 
 
 def no_lower_limit(best: Estimate, manifest: Mapping[str, Any]) -> tuple[str, float] | None:
     """Where none of the lane changes was seen that a rate comes from, and by what that may raise it; None elsewhere."""
-    where: str | None = (manifest.get("assumed") or {}).get("where")
-    if where is None or (times := assumed_times(best, manifest)) is None or times[1] - times[0] < CARRIES:
+    where = assumed_of(manifest).where
+    if not where or (times := assumed_times(best, manifest)) is None or times[1] - times[0] < CARRIES:
         return None
     return where, times[1]
 
@@ -287,9 +293,9 @@ def _warnings(
         yield f"{count(n)} of {count(best.n_episodes)} tests FAILED; had they all crashed, the rate would be {had}"
     if severity is not None and severity.share_below_1_mps > 0.5:
         yield f"{share(severity.share_below_1_mps)} of this rate are touches below {plain(TOUCH_MPS)} m/s"
-    given = manifest.get("assumed") or {}
-    if "where" in given and "times" not in given:
-        yield unseen_words(given["where"])
+    given = assumed_of(manifest)
+    if given.where and given.times is None:
+        yield unseen_words(given.where)
     decision = manifest.get("decision")
     if decision is not None and not decision.get("driver") and (unseen := no_lower_limit(best, manifest)):
         yield f"no lane change was seen at {unseen[0]}: a limit on the rate rests on that; ask --accept r157-cc"

@@ -21,7 +21,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import ended_by, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
 from harness.files import checksum, remove_unfinished
-from harness.pool.build import campaign_pool
+from harness.pool.moved import assumed_in
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
 from harness.records.folder import (
@@ -36,7 +36,6 @@ from harness.records.folder import (
     write_shard,
 )
 from harness.resolved import Resolved, require_ready
-from harness.runner.other_traffic import assumed
 from harness.runner.resume import (
     SMALLEST_FAILED_SAMPLE,
     Manifest,
@@ -53,7 +52,6 @@ from harness.sampling import distance_per_test_m, prepare
 from harness.sampling.baseline import IN_MANIFEST, baseline_file, begin, stored_baseline
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
-from harness.traffic.loading import load_parameters
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
 ESTIMATES = "estimates.json"
@@ -146,7 +144,7 @@ class Run:
             }
             self.manifest = Manifest(out, resolved, earlier, began=began, **facts)
             self._keep_design()
-            self._note_what_is_assumed()
+            self.manifest.note(assumed=assumed_in(resolved, self.source.design, progress))
             refused.pop_all()
 
     @contextmanager
@@ -229,14 +227,6 @@ class Run:
         require_same_pool(self.out, self.source)
         if self.source.design is not None:
             write_sealed(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
-
-    def _note_what_is_assumed(self) -> None:
-        """Let the manifest say by what the strata move where a number of the traffic has a range."""
-        if (design := self.source.design) is not None and not self.campaign.has_baseline_runs:
-            pool = campaign_pool(self.resolved, self._progress)
-            self.manifest.note(assumed=assumed(self.resolved, pool, design, self._progress))
-        elif where := load_parameters(self.campaign.environment).unseen:
-            self.manifest.note(assumed={"where": where})
 
     def finish(self, rule: Rule) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no shard beyond the stop is left."""

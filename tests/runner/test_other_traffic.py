@@ -10,11 +10,11 @@ import pytest
 
 from harness.cli import main
 from harness.errors import CampaignError
-from harness.pool.moved import Moved as Few
+from harness.pool.moved import OnPaths
 from harness.progress import Progress
 from harness.runner import stored_shells
 from harness.runner.other_traffic import estimate_in_other_traffic
-from harness.runner.stored_shells import Moved, StoredShells, nearby
+from harness.runner.stored_shells import StoredShells
 from harness.traffic.parameters import SHIPPED_FOLDER
 from tests.stored_runs import copy_of, estimates
 
@@ -90,11 +90,10 @@ def test_a_vehicle_that_crashes_on_few_cut_ins_of_its_shells_is_refused(stored_r
 def test_a_reference_driver_told_too_low_is_as_far_off_as_one_told_too_high(stored_run, monkeypatch, times):
     """Its rate moves, and the shells do not; the vehicle's factor is widened by as much to both sides."""
     tested = StoredShells.of(stored_run("shells-twin"), Progress())
-    n_drivers, nothing = len(tested.pool.names) + len(tested.design.references), np.zeros_like(tested.design.p)
-    found = [Few(tested.design.p, np.full(n_drivers, rate), nothing, 0.0) for rate in (1.0, times)]
+    n_drivers, nothing = len(tested.design.references), np.zeros_like(tested.design.p)
+    found = [OnPaths(tested.design.p, np.full(n_drivers, rate), nothing, np.zeros(())) for rate in (1.0, times)]
     monkeypatch.setattr(stored_shells.FewPaths, "of", lambda *_: iter([found.pop(0)]))
-    here = tested.here
-    (near,) = nearby(tested, here, Moved(tested.design, tested.design), [here.environment], Progress())
+    (near,) = tested.itself.nearby([{}], Progress())
     assert (near.rate, near.off) == (1.0, pytest.approx(1.0))
     assert near.references == pytest.approx(times)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,14 +17,14 @@ from harness.errors import HarnessError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.traffic import ONE_LAW, too_few, uncertain
 from harness.pool import moved
+from harness.pool.moved import assumed
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
-from harness.runner.other_traffic import assumed, estimate_in_other_traffic
+from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.runner.run import run_campaign
-from harness.runner.stored_shells import Moved, StoredShells, environment_with, nearby
-from harness.traffic.loading import load_parameters
+from harness.runner.stored_shells import StoredShells
 from tests.golden.campaigns import COMPARED
 from tests.in_process import one_process, without_page
 from tests.stored_runs import copy_of, estimates, golden
@@ -62,9 +63,7 @@ def test_of_a_vehicle_whose_shares_may_change_there_is_an_upper_limit_alone(stor
     """All cut-ins of the shells that it crashes in may crash."""
     folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.01, 0.02]})
     tested = StoredShells.of(folder, Progress())
-    here, same = tested.here, Moved(tested.design, tested.design)
-    twice = environment_with(here, load_parameters(here.campaign.environment), {LOOK: 0.02})
-    (near,) = nearby(tested, here, same, [twice], Progress())
+    (near,) = tested.itself.nearby([{LOOK: 0.02}], Progress())
     monkeypatch.setattr(stored_shells, "LEAST_SHARE", 1.1)
     content = estimate_in_other_traffic(folder, mine)
     estimate, traffic = content["estimates"]["shells"], content["traffic"]
@@ -196,8 +195,8 @@ def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
     tested = StoredShells.of(stored_run("shells-twin"), Progress())
     there = resolve(tested.here.campaign.replaced(("environment", "parameters"), str(tmp_path / "mine.yaml")))
     found = assumed(there, tested.pool, tested.design, Progress())
-    assert (found["name"], found["value"], found["ends"]) == ("cut_in.ignore_share", 0.01, [0.005, 0.08])
-    content = estimate_blocks(tested.blocks, there.campaign, {**tested.manifest, "assumed": found})
+    assert (found.where, found.highest) == ("", 0.08)
+    content = estimate_blocks(tested.blocks, there.campaign, {**tested.manifest, "assumed": asdict(found)})
     (row,) = [row for row in content["answer"]["rows"] if row["key"] == "assumed"]
     assert (row["value"], row["remark"]) == ("at most × 8.0 (assumed)", "if 8.0 % do not look")
     assert content["assumed_times"] == pytest.approx([0.5, 8.0], rel=0.005)
