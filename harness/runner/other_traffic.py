@@ -18,22 +18,11 @@ import pyarrow as pa
 from harness.arguments import Confidence, checked
 from harness.campaign.files import shipped_or_own
 from harness.errors import CampaignError, RunFolderError
-from harness.estimators.answer import estimate_blocks
+from harness.estimators.answer import CARRIES, estimate_blocks
+from harness.estimators.answer import Elsewhere as OfOtherTraffic
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
-from harness.estimators.short_answer import CARRIES
-from harness.estimators.traffic import (
-    ONE_LAW,
-    Ends,
-    TrafficError,
-    Uncertain,
-    Unseen,
-    is_open,
-    rows,
-    too_few,
-    uncertain,
-)
-from harness.numbers import number, share
+from harness.estimators.traffic import ONE_LAW, Ends, TrafficError, Uncertain, Unseen, uncertain
 from harness.pool.cut_ins import environment_hash
 from harness.pool.moved import STEP, as_if_unseen, assumed
 from harness.progress import Progress
@@ -91,14 +80,10 @@ def estimate_in_other_traffic(
     blocks = map(moved.block, tested.blocks)
     content = estimate_blocks(blocks, there.campaign, told, estimators=asked, confidence=confidence)
     if not moved.is_same:
-        drivers = " and ".join(each.name for each in tested.design.references)
-        known = f" (off by {share(moved.reference_error(), least=0.001)} for {drivers})" if drivers else ""
+        drivers = tuple(each.name for each in tested.design.references)
         was, now = (Path(each).stem for each in (campaign.environment.parameters, environment))
-        words = f"tests of {was}, answered for {now}: holds if as large a share of each shell crashes as there{known}"
-        content["answer"] |= {"scope": words}
-    if (error := traffic_error(moved, content, progress)) is not None:
-        content |= told_traffic(error, content)
-    return content
+        content |= finite_json({"elsewhere": OfOtherTraffic(was, now, drivers, moved.reference_error())})
+    return content | finite_json({"traffic": traffic_error(moved, content, progress)})
 
 
 def traffic_error(moved: Elsewhere, content: Mapping[str, Any], progress: Progress) -> TrafficError | None:
@@ -128,9 +113,8 @@ def compare_in_other_traffic(
 ) -> dict[str, Any]:
     """What the stored tests of a comparison say of both vehicles in other traffic, and its replicates of their ratio.
 
-    Keys are ``traffic``, a `TrafficError` of A with its ratio to B unless B has not crashed, ``b``, the rate of B, and
-    ``rows``, what a terminal shows of A. Raises `HarnessError` as `estimate_in_other_traffic` does, and where there
-    are no replicates.
+    Keys are ``traffic``, a `TrafficError` of A with its ratio to B unless B has not crashed, and ``b``, the rate of B.
+    Raises `HarnessError` as `estimate_in_other_traffic` does, and where there are no replicates.
     """
     progress = progress or Progress()
     sides = [StoredShells.of(Path(folder) / side, progress) for side in ("a", "b")]
@@ -153,7 +137,7 @@ def compare_in_other_traffic(
     )
     ratios = {"B": found.ratio(told["ratio"], _ends(told), found.times(1))} if told["b"]["n_crashes"] else {}
     error = found.error(a, ratios)
-    return {"traffic": finite_json(error), "b": finite_json(b), "rows": [asdict(row) for row in rows(error)]}
+    return {"traffic": finite_json(error), "b": finite_json(b)}
 
 
 @dataclass(frozen=True)
@@ -225,29 +209,6 @@ def _unseen(moved: Elsewhere, parameters: EnvironmentParameters, progress: Progr
 
 def _ends(of: Mapping[str, Any]) -> Ends:
     return of["ratio_low"] or 0.0, math.inf if of["ratio_high"] is None else of["ratio_high"]
-
-
-def told_traffic(found: TrafficError, content: Mapping[str, Any]) -> dict[str, Any]:
-    """What of ``estimates.json`` tells of it: ``traffic`` itself, lines of the answer below rate and ratio."""
-    answer = content["answer"]
-    old = _limited(answer["rows"], found)
-    place = 1 + max((i for i, row in enumerate(old) if row["key"] in ("verdict", "rate", "ratio")), default=-1)
-    new = [asdict(row) for row in rows(found)]
-    warnings = [*answer["warnings"], *too_few(found.n_replicates, found.confidence)]
-    return {
-        "traffic": finite_json(found),
-        "answer": {**answer, "rows": [*old[:place], *new, *old[place:]], "warnings": warnings},
-    }
-
-
-def _limited(told: Sequence[Mapping[str, Any]], found: TrafficError) -> list[Mapping[str, Any]]:
-    """Rows of an answer, whose rate has but an upper limit where no lane change was seen: behind the ratio."""
-    if found.unseen is None or is_open(found):
-        return list(told)
-    seen = {"interval": f"{number(found.rate.value)} as fitted"} if found.rate.value else {}
-    limit = {"value": f"< {number(found.rate.both[1])} per test", "remark": f"none seen at {found.unseen.where}"}
-    limited = [{**row, **limit, **seen} if row["key"] == "rate" else row for row in told]
-    return sorted(limited, key=lambda row: {"verdict": 0, "ratio": 1}.get(row["key"], 2))
 
 
 def read_replicates(name: str, parameters: EnvironmentParameters) -> list[dict[str, float]]:

@@ -243,7 +243,7 @@ class Run:
             decided["decision"] = decision.to_json()
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
-        decided |= {"expected": expected, "remedy": pool_remedy(rule, self.campaign, stopped_by) or None}
+        decided |= {"expected": expected, "remedy": pool_remedy(rule, self.campaign, stopped_by)}
         manifest.write("done", stopped_by=stopped_by, unmet=rule.look.unmet, **decided)
         self._progress.stage("writing estimates and report", None)
         estimates = estimate_run(self.out)

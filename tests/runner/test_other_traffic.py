@@ -16,7 +16,8 @@ from harness.runner import stored_shells
 from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.runner.stored_shells import StoredShells
 from harness.traffic.parameters import SHIPPED_FOLDER
-from tests.stored_runs import copy_of, estimates
+from tests.stored_runs import answer as words
+from tests.stored_runs import copy_of, estimates, golden
 
 SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
 
@@ -51,7 +52,7 @@ def test_the_rate_is_proportional_to_the_share_that_does_not_look(stored_run, tm
     assert told["crash_rate"] == pytest.approx(2.0 * stored["crash_rate"], rel=0.05)
     ratios = [each["details"]["references"][0]["ratio"] for each in (told, stored)]
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
-    assert "as there" in estimate_in_other_traffic(folder, mine)["answer"]["scope"]
+    assert "as there" in words(estimate_in_other_traffic(folder, mine), golden("shells-twin"))["scope"]
 
 
 def test_the_page_of_the_old_traffic_is_not_named_below_the_answer(stored_run, tmp_path, capsys):
