@@ -27,13 +27,13 @@ from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
 from harness.families.cut_in.loading import load_parameters
 from harness.pool.build import campaign_pool
-from harness.pool.moved import FewPaths
+from harness.pool.moved import FewPaths, environment_with
 from harness.pool.shells import design_shells
 from harness.progress import Progress
 from harness.resolved import Resolved, resolve
 from harness.runner.other_traffic import estimate_in_other_traffic, read_replicates
 from harness.runner.run import run_campaign
-from harness.runner.stored_shells import MOST_OFF, Moved, environment_with
+from harness.runner.stored_shells import MOST_OFF, moved_design, reference_shares
 from harness.strata import ShellDesign
 from harness.vehicles.library import SHIPPED_FOLDER as LIBRARIES
 from harness.vocabulary import FloatArray
@@ -123,7 +123,7 @@ def moved(scenario: str, traffic: Mapping[str, Mapping[str, float]], error: floa
             print(f"{words:34}" + "".join(f"{each:12{form}}" for each in numbers) + after, flush=True)
 
         print(f"{base.campaign.environment.parameters:34}" + "".join(f"{name:>12}" for name in names), flush=True)
-        p, shares = tested.p, Moved(tested, tested).reference_shares()
+        p, shares = tested.p, reference_shares(tested)
         show("crashing share of shells", (p @ shares**2) / (p @ shares), ".2f")  # refused below `LEAST_SHARE`
         show("standard error of a rate", _error(tested), ".1%")
         for words, values in traffic.items():
@@ -132,9 +132,8 @@ def moved(scenario: str, traffic: Mapping[str, Mapping[str, float]], error: floa
                 print(f"{words:34}  no laws", flush=True)
                 continue
             pool = campaign_pool(replace(base, environment=environment), order=here.names)
-            there = Moved.of(tested, design_shells(pool, ENVELOPE_MPS2), words)
-            told, known = there.there.p @ there.reference_shares(), there.there.reference_rate
-            off = told / known - 1.0
+            there = moved_design(tested, design_shells(pool, ENVELOPE_MPS2), words)
+            off = there.p @ shares / there.reference_rate - 1.0
             show(words, off, ".1%", "  refused" if np.abs(off[shipped]).max() > MOST_OFF else "")
 
 
@@ -190,7 +189,7 @@ def spread(environment: str) -> None:
         environments = [environment_with(traffic, parameters, row) for row in rows]
         sound = [each for each in environments if each is not None]
         paths = FewPaths(traffic, pool, design_shells(pool, ENVELOPE_MPS2), ENVELOPE_MPS2, Progress())
-        first, *others = (each.rate[len(pool.names) :] for each in paths.of([traffic.environment, *sound]))
+        first, *others = (each.references for each in paths.of([traffic.environment, *sound]))
     drivers = list(pool.library.references)
     rate = np.array(others) / np.where(first > 0.0, first, np.nan)
     ratio = rate / rate[:, [drivers.index(BESIDE)]]

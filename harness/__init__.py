@@ -6,7 +6,7 @@ The same as the command line, in a few lines of Python::
 
     campaign = harness.load_campaign("scenarios/smoke.yaml", ["stop.rhw=0.1"])
     result = harness.run(campaign, "runs/smoke", workers=2)
-    print(result.estimates["answer"]["rows"])
+    print(result.estimates["crash_rate_per_1e6_km"])
     tests = harness.read("runs/smoke").episodes()
     harness.replay("runs/smoke", 17).outcome
 """

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ import pyarrow.parquet as pq
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.records.folder import SEAL, write_sealed
+from harness.records.reader import read_campaign
+from harness.report.words import answer_of
 from tests.golden.campaigns import BASE, RUNS
 from tests.golden.record import TABLES, tables_of
 
@@ -58,6 +61,16 @@ def estimates(folder: Path) -> dict[str, Any]:
     content = json.loads((folder / "estimates.json").read_text())
     del content[SEAL]
     return content
+
+
+def answer(content: dict[str, Any], campaign: Campaign, of: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The answer of estimates.json in words, with those of a manifest."""
+    return json.loads(json.dumps(asdict(answer_of(campaign, of or {}, content))))
+
+
+def answer_in(folder: Path) -> dict[str, Any]:
+    """That of a run."""
+    return answer(estimates(folder), read_campaign(folder, manifest(folder)), manifest(folder))
 
 
 def shard_files(folder: Path, table: str = "episodes") -> list[Path]:

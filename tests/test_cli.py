@@ -20,14 +20,15 @@ from harness.cli import cli, main
 from harness.commands.campaigns import _run_folder
 from harness.commands.printing import say
 from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooManyFailedError
-from harness.estimators.short_answer import lines
 from harness.numbers import interval, words
 from harness.progress import Progress
+from harness.report.lines import lines
+from harness.report.words import answer_of
 from harness.runner.stored import estimate_run
 from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
-from tests.stored_runs import SCENARIOS, copy_of, estimates, manifest, sets
+from tests.stored_runs import SCENARIOS, copy_of, estimates, golden, manifest, sets
 
 SMOKE = str(SCENARIOS / "smoke.yaml")
 
@@ -63,7 +64,11 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     command = ["run", *CAMPAIGN, "--out", str(folder), "--workers", "1", "--resume"]
     assert main(command) == 0
     out, content = capsys.readouterr().out.splitlines(), estimates(folder)
-    short = lines(content["answer"], manifest(folder)["wall_time_s"], folder / "report.html")
+    short = lines(
+        answer_of(golden("shells-refuted"), manifest(folder), content),
+        manifest(folder)["wall_time_s"],
+        folder / "report.html",
+    )
     assert (out, len(out)) == (short, 7)
     assert main([*command, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == content

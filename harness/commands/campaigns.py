@@ -26,7 +26,7 @@ from harness.commands.options import (
     workers_option,
 )
 from harness.commands.printing import (
-    print_answer,
+    answer_lines,
     print_json,
     print_table,
     say,
@@ -138,12 +138,13 @@ def run(
     if junit is not None:
         from harness.report.junit import statement_case, write_junit  # noqa: PLC0415 - keeps --help fast
 
-        case = statement_case(result.estimates, campaign.testing.shells.statement, result.exit_code)
+        told = "\n".join(answer_lines(result.estimates, folder, timed=False))
+        case = statement_case(result.estimates, told, campaign.testing.shells.statement, result.exit_code)
         write_junit(junit, campaign.name, [case], [result.report])
     if as_json:
         print_json(result.estimates)
     else:
-        print_answer(result.estimates, folder, result.report)
+        say(*answer_lines(result.estimates, folder, result.report))
     ctx.exit(result.exit_code)
 
 
@@ -287,8 +288,8 @@ def compare(
         found = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )
-    from harness.estimators.short_answer import pair_lines  # noqa: PLC0415 - keeps --help fast
     from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
+    from harness.report.lines import pair_lines  # noqa: PLC0415 - keeps --help fast
 
     took_s = (read_manifest(folder / "b")["wall_time_s"] or 0.0) / found.content["n_pairs"]
     told = pair_lines(found.content, a.crash.counts_above_mps, found.report, took_s)

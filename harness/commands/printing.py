@@ -134,9 +134,13 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
         print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])
 
 
-def print_answer(content: dict[str, Any], folder: Path, report: Path | None = None) -> None:
-    """Print the answer of a run in a few lines, with where its page is."""
-    from harness.estimators.short_answer import lines  # noqa: PLC0415 - keeps --help fast
+def answer_lines(content: dict[str, Any], folder: Path, report: Path | None = None, *, timed: bool = True) -> list[str]:
+    """The answer of a run in a few lines, with where its page is, and how long it took."""
     from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
+    from harness.records.reader import read_campaign  # noqa: PLC0415
+    from harness.report.lines import lines  # noqa: PLC0415
+    from harness.report.words import answer_of  # noqa: PLC0415
 
-    say(*lines(content["answer"], read_manifest(folder).get("wall_time_s"), report))
+    manifest = read_manifest(folder)
+    answer = answer_of(read_campaign(folder, manifest), manifest, content)
+    return lines(answer, manifest.get("wall_time_s") if timed else None, report)

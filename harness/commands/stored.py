@@ -10,7 +10,7 @@ import click
 
 import harness
 from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar
-from harness.commands.printing import print_answer, print_estimates, print_json, print_table, say
+from harness.commands.printing import answer_lines, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share
 from harness.vocabulary import COMPARISON, ESTIMATORS
@@ -94,7 +94,7 @@ def estimate(
         print_estimates(content, estimators)
     else:
         page = folder / "report.html"  # of the run's own traffic
-        print_answer(content, folder, page if environment is None and page.is_file() else None)
+        say(*answer_lines(content, folder, page if environment is None and page.is_file() else None))
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
 
@@ -108,8 +108,13 @@ def _compared_elsewhere(folder: Path, environment: str, confidence: float | None
     if as_json:
         print_json(content)
     else:
+        from harness.report.words import told_of_traffic  # noqa: PLC0415 - keeps --help fast
+
         traffic = content["traffic"]
-        told = [{key: row[key] for key in ("what", "value", "interval", "remark")} for row in content["rows"]]
+        told = [
+            dict(zip(("what", "value", "interval", "remark"), row.texts, strict=True))
+            for row in told_of_traffic(traffic)
+        ]
         print_table(f"A by {traffic['n_replicates']} replicates of {traffic['environment']}", told)
 
 

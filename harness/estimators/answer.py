@@ -7,6 +7,8 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import LEAST_POOL_ERROR, MOST_CUT_INS
 from harness.estimators.block import Block
@@ -14,11 +16,11 @@ from harness.estimators.estimate import Estimate, Number, Point, Unavailable, fi
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import Severity
-from harness.estimators.short_answer import ShortAnswer, assumed_times, short_answer
 from harness.estimators.stopping import RoundRule, Rule
 from harness.estimators.traffic import TrafficError
 from harness.numbers import two_digits_up
 from harness.records.folder import StoppedBy
+from harness.strata import Assumed
 from harness.vocabulary import ESTIMATORS, EstimatorName
 
 _PER_KM = 1e6
@@ -26,12 +28,45 @@ ROOM = 1.25
 """Tests go in steps, and not to all shells alike: beyond those that would just do [measured: 1.15 at most]."""
 
 
+CARRIES = 0.05
+"""Share of a rate from which on there is an upper limit alone, where nothing was seen of it [assumed]."""
+
+
+@dataclass(frozen=True)
+class AssumedOfRate:
+    """What is assumed of the traffic, see `Assumed`; ``times`` are the factors of the rate at both ends."""
+
+    where: str
+    highest: float | None
+    times: tuple[float, float] | None
+
+    @property
+    def most(self) -> float:
+        """By what the rate may be higher; NaN where nobody knows."""
+        return math.nan if self.times is None else self.times[1]
+
+    @property
+    def no_lower_limit(self) -> bool:
+        """Whether none of the lane changes was seen that a notable part of the rate comes from."""
+        return bool(self.where) and self.times is not None and self.times[1] - self.times[0] >= CARRIES
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """That tests of one traffic are answered for another, and by how much rates of ``drivers`` come out wrong."""
+
+    tested_in: str
+    answered_for: str
+    drivers: tuple[str, ...]
+    off: float
+
+
 @dataclass(frozen=True)
 class Estimates:
     """Content of ``estimates.json``, as it is written here and the page reads it; without a crash no severity.
 
-    ``assumed_times`` are the factors of the rate at both ends of what is assumed of the traffic, None where nothing is;
-    ``unmet`` the conditions of the stop rule that were met last, or not at all.
+    ``unmet`` are the conditions of the stop rule that were met last, or not at all; ``traffic`` is what replicates
+    leave open.
     """
 
     campaign: str
@@ -46,13 +81,20 @@ class Estimates:
     estimates: dict[str, Estimate | Unavailable]
     diagnostics: dict[str, Any]
     convergence: tuple[Point, ...]
-    answer: ShortAnswer
     severity: Severity | None = None
-    assumed_times: tuple[float, float] | None = None
+    assumed: AssumedOfRate | None = None
     stopped_by: StoppedBy | None = None
     unmet: tuple[str, ...] = ()
     decision: dict[str, Any] | None = None
     traffic: TrafficError | None = None
+    elsewhere: Elsewhere | None = None
+
+    @property
+    def best(self) -> Estimate:
+        """The estimate that answers the campaign's question."""
+        found = self.estimates[self.headline]
+        assert isinstance(found, Estimate)
+        return found
 
 
 def estimate_blocks(
@@ -89,14 +131,24 @@ def estimate_blocks(
             estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in estimates.items()},
             diagnostics=done.diagnostics.result(campaign.importance_names),
             convergence=tuple(done.convergence),
-            answer=short_answer(campaign, best, done.severity, manifest, distance_km, done.diagnostics.counts),
             severity=done.severity,
-            assumed_times=assumed_times(best, manifest),
+            assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
             stopped_by=manifest.get("stopped_by"),
             unmet=tuple(manifest.get("unmet", ())),
             decision=manifest.get("decision"),
         )
     )
+
+
+def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
+    """By what the rate moves; without a crash it is the upper limit that does, which lies in one stratum."""
+    times, shells = None, best.details.get("shells")
+    if assumed.times is not None and shells:
+        p, n, share = np.array([(each["p"], max(each["n_episodes"], 1), each["crash_share"]) for each in shells]).T
+        of_strata = p * np.vstack([np.ones_like(p), *map(np.array, assumed.times)])
+        rates = of_strata @ share if best.n_crashes else (of_strata / n).max(1)
+        times = float(rates[1] / rates[0]), float(rates[2] / rates[0])
+    return AssumedOfRate(assumed.where, assumed.highest, times)
 
 
 def per_distance(estimate: Estimate, distance_per_test_km: float) -> dict[str, float]:
@@ -116,26 +168,27 @@ def ended_by(campaign: Campaign, rule: Rule, n_episodes: int) -> StoppedBy:
     return "episodes" if n_episodes >= campaign.stop.episodes else "pool"
 
 
-def pool_remedy(rule: Rule, campaign: Campaign, stopped_by: StoppedBy) -> str:
-    """What is to be changed of a pool that ended a run, and to what where that is known; empty where none has.
+def pool_remedy(rule: Rule, campaign: Campaign, stopped_by: StoppedBy) -> dict[str, float | None] | None:
+    """Settings of a pool that ended a run, and to what each is to be changed, None where that is not known.
 
-    Paths leave 1/√2 of the asked precision, and the shells keep what the tests then take, as `expected_for` has it.
+    It is None where no pool did, and empty where none would lead further. Paths leave 1/√2 of the asked precision, and
+    the shells keep what the tests then take, as `expected_for` has it.
     """
     if stopped_by not in ("pool", "pool_error"):
-        return ""
+        return None
     pool, target, from_pool = campaign.pool, campaign.stop.rhw, rule.look.rhw_from_pool
     if campaign.has_baseline_runs or target is None or not isinstance(rule, RoundRule) or math.isinf(rule.look.rhw):
-        paths = "raise pool.shadow_paths" if campaign.has_baseline_runs else "lower pool.relative_error"
-        return paths if stopped_by == "pool_error" else "raise pool.cut_ins_per_shell"
+        paths = "pool.shadow_paths" if campaign.has_baseline_runs else "pool.relative_error"
+        return {paths if stopped_by == "pool_error" else "pool.cut_ins_per_shell": None}
     finer = max(2.0 * (from_pool / target) ** 2, 1.0)
     times = rule.seen.cut_ins_for(rule.more_tests(target, finer) * ROOM)
     own = target / math.sqrt(2.0) / Level.two_sided(campaign.stop.confidence).z  # a pool has some paths in any case
     error = min(pool.relative_error / math.sqrt(finer), own)
     kept = two_digits_up(min(pool.cut_ins_per_shell * times, 1e9))
     if error < LEAST_POOL_ERROR or kept > MOST_CUT_INS:
-        return "no pool gives as much: ask for a wider stop.rhw"
-    changes = [f"lower pool.relative_error to {math.floor(error * 1e4) / 1e4:g}"] if finer > 1.0 else []
-    return " and ".join(changes + [f"raise pool.cut_ins_per_shell to {kept:,}"] * (times > 1.0))
+        return {}
+    changes: dict[str, float | None] = {"pool.relative_error": math.floor(error * 1e4) / 1e4} if finer > 1.0 else {}
+    return changes | ({"pool.cut_ins_per_shell": kept} if times > 1.0 else {})
 
 
 def expected_for(rule: Rule, campaign: Campaign, n_tests: int) -> dict[str, int] | None:

@@ -108,9 +108,10 @@ def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: floa
 def spread(weights: FloatArray, lower: Counts, upper: Counts, level: Level, size: int, most: IntArray) -> IntArray:
     """Divide further tests among strata, shape (S,), so that they narrow the interval of Σ w_sj θ_sj most.
 
-    Portions of ``size`` tests are given one after the other, at most so many (S,) of each stratum. With shares and
-    threshold as they are one more test of a stratum moves a limit by KL(c_s ‖ θ_s)/ν, by the envelope theorem; one
-    without a test comes first. The counts (S, J) that either limit is from differ by what failed tests may have been.
+    Portions of ``size`` tests are given one after the other, at most so many (S,) of each stratum, and none where no
+    further test narrows anything. With shares and threshold as they are one more test of a stratum moves a limit by
+    KL(c_s ‖ θ_s)/ν, by the envelope theorem; one without a test comes first. The counts (S, J) that either limit is
+    from differ by what failed tests may have been.
     """
     given = np.zeros_like(most)
     below, above = WeightedSum.of(weights, lower, -1.0), WeightedSum.of(weights, upper, 1.0)
@@ -201,12 +202,14 @@ def give(
     """See `spread`; ``given`` and the numbers of tests, whose shares stay, grow."""
     while size > 0:
         nu_below, nu_above = outermost(below, level)[1], outermost(above, level)[1]
-        best, largest = 0, -1.0
+        best, largest = 0, 0.0
         for s in range(most.size):
             if given[s] < most[s]:
                 gain = _gain(below, s, nu_below) + _gain(above, s, nu_above)
                 if gain > largest:
                     best, largest = s, gain
+        if largest == 0.0:
+            break
         more = min(portion, size, most[best] - given[best])
         given[best] += more
         below.tests[best] += more

@@ -20,7 +20,6 @@ from harness.estimators.estimate import Estimate, FailureBounds, finite_json
 from harness.estimators.likelihood import Counts, Level, contrast_limit, ratio_limits, spread
 from harness.estimators.shells import Shells
 from harness.estimators.tally import Tally, mean_square
-from harness.numbers import share
 from harness.strata import ShellDesign
 from harness.vocabulary import FloatArray, IntArray
 
@@ -54,16 +53,6 @@ class PairDecision:
     verdict: PairVerdict
     confidence: float
     given_the_library: bool
-
-    @property
-    def words(self) -> str:
-        """The verdict in words."""
-        if not self.margin:
-            told = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
-            return told.get(self.verdict, "Not told apart")
-        most = share(self.margin)
-        told = {"proven": f"B is at most {most} worse than A", "refuted": f"B is more than {most} worse than A"}
-        return told.get(self.verdict, f"Open whether B is more than {most} worse than A")
 
 
 class Interval(NamedTuple):
@@ -278,10 +267,6 @@ def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
     """
     level, design, inside = Level.two_sided(confidence), pairs.design, pairs.inside()
     each, tallies = [_own(pairs, side, confidence) for side in (0, 1)], [pairs.tally(side) for side in (0, 1)]
-    warnings = [
-        f"{n:,} tests of {name} FAILED" for name, of in zip("AB", each, strict=True) if (n := of.details["n_failed"])
-    ]
-    warnings += [f"{name}: {text}" for name, of in zip("AB", each, strict=True) for text in of.warnings]
     counts = "n_both", "n_only_a", "n_only_b", "n_neither"
     shells = [
         {
@@ -300,7 +285,7 @@ def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
         "n_pairs_outside": int(pairs.tests.sum() - inside.tests.sum()),
         "refuted": any(tally.crashes[design.n_inside :].any() for tally in tallies),
     }
-    more = {"confidence": confidence, "conditional": conditional, "shells": shells, "warnings": warnings}
+    more = {"confidence": confidence, "conditional": conditional, "shells": shells}
     return finite_json({"a": each[0].shown, "b": each[1].shown, **contrast(pairs, level), **more})
 
 

@@ -13,26 +13,18 @@ the factor to both sides. A replicate that could not be answered counts as whate
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from harness.estimators.estimate import Number
-from harness.estimators.short_answer import Row
-from harness.numbers import MISSING, interval, number, ratio, share
 from harness.vocabulary import FloatArray
 
 ONE_LAW = 0.07
 """By how much a ratio of two vehicles may be wrong besides, as one law is fitted to drivers who differ [measured where
 they do in a simulation, and nearly alike vehicles came out 4 to 7 % off: `python -m studies roundtrip`]."""
-
-LEAST_REPLICATES = 100
-"""With fewer, quantiles far out in the tails change with their number [assumed]."""
-
-CLOSE = 0.1
-"""Factors closer to 1 than so much on a logarithmic scale are told with three digits."""
 
 Ends = tuple[float, Number]
 
@@ -80,6 +72,11 @@ class TrafficError:
     ratios: Mapping[str, Uncertain]
     unseen: Unseen | None = None
 
+    @property
+    def is_open(self) -> bool:
+        """Whether so many replicates could not be answered that nothing is said."""
+        return not math.isfinite(self.rate.times[1])
+
 
 def uncertain(
     value: float,
@@ -113,54 +110,6 @@ def uncertain(
 
 def _log(value: float) -> float:
     return math.log(value) if 0.0 < value < math.inf else math.copysign(math.inf, value - 1.0)
-
-
-def too_few(n_replicates: int, confidence: float) -> tuple[str, ...]:
-    """A warning of limits from few replicates; nothing where there are enough."""
-    if n_replicates >= LEAST_REPLICATES:
-        return ()
-    least = math.ceil(2.0 / (1.0 - confidence) - 1e-9)
-    none = f" (a {share(confidence)} interval needs {least} at least)" if n_replicates < least else ""
-    limits = f"limits of what is not known of the traffic change with their number below {LEAST_REPLICATES}"
-    return (f"{n_replicates} replicates{none}: {limits}",)
-
-
-def rows(found: TrafficError) -> Iterator[Row]:
-    """Lines of the short answer: of the rate, and of its ratio to the first of the others."""
-    why = "with sampling error" if found.unseen is None else f"none seen at {found.unseen.where}"
-    if is_open(found):
-        why = f"{found.n_refused} of {found.n_replicates} replicates unlike what was tested"
-    yield Row("traffic", "traffic", f"{times(found.rate)} (fitted)", _ends(found), why)
-    for name, each in list(found.ratios.items())[: 0 if is_open(found) else 1]:
-        yield Row(
-            "traffic_ratio", "traffic, × driver", f"{times(each)} (fitted)", _of_ratio(each), f"the ratio to {name}"
-        )
-
-
-def is_open(found: TrafficError) -> bool:
-    """Whether so many replicates could not be answered that nothing is said."""
-    return not math.isfinite(found.rate.times[1])
-
-
-def _ends(found: TrafficError) -> str:
-    if is_open(found):
-        return MISSING
-    return interval(*found.rate.both) if found.rate.times[0] > 0.0 else f"< {number(found.rate.both[1])}"
-
-
-def _of_ratio(of: Uncertain) -> str:
-    low, high = of.both
-    if math.isfinite(high):
-        return f"{ratio(low)} to {ratio(high)}" if low > 0.0 else f"< {ratio(high)}"
-    return f"at least {ratio(low)}" if low > 0.0 else "no limit"
-
-
-def times(of: Uncertain) -> str:
-    """``× 0.6 … × 2.1``, or ``at most × 27``."""
-    low, high = (number(end, 2 if abs(_log(end)) > CLOSE else 3) for end in of.times)
-    if of.times[0] > 0.0:
-        return f"× {low} … × {high}"
-    return f"at most × {high}" if math.isfinite(of.times[1]) else "no limit"
 
 
 @dataclass(frozen=True)

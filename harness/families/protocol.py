@@ -105,6 +105,17 @@ class Chosen(NamedTuple):
     lead: IntArray
 
 
+class LeftOpen(NamedTuple):
+    """What data leave open of a traffic: numbers by name at the two ``ends`` of what they may be.
+
+    ``where`` says where nothing was seen, else it is empty and ``highest`` the end of a stated range.
+    """
+
+    where: str
+    highest: float | None
+    ends: tuple[Mapping[str, float], Mapping[str, float]]
+
+
 class Driven(NamedTuple):
     """How events (m,) end for drivers (D,).
 
@@ -150,13 +161,21 @@ class Family(Protocol):
     ladders: Mapping[bool, str]
 
     def parameters(self, settings: EnvironmentSettings) -> Any:
-        """The numbers that a campaign's environment names, with their ``content_hash()``.
+        """The numbers that a campaign's environment names, with a ``content_hash()``, and where nothing was ``unseen``.
 
         Raises `CampaignError`: the file is missing or wrong, every place being named, or its laws are unsound.
         """
 
     def traffic(self, settings: EnvironmentSettings, parameters: Any = None) -> Environment:
         """All that kernels need; ``parameters`` are read unless they are given."""
+
+    def traffic_with(
+        self, settings: EnvironmentSettings, parameters: Any, values: Mapping[str, float]
+    ) -> Environment | None:
+        """The same with other numbers; None where they give no laws."""
+
+    def left_open(self, parameters: Any) -> LeftOpen | None:
+        """What data leave open of it."""
 
     def digest(self, traffic: Environment) -> str:
         """Hash of all numbers of it."""

@@ -8,7 +8,7 @@ It is written for one family of scenarios, a cut-in by BV while LV drives ahead 
 - `drive`: what the AV sees and follows;
 - `judge`: how an episode ends, and what stays of it;
 - `likelihood_ratio`: the hazard of the one decision, in `forced_ratio` and `record_lane`; its mixtures hold for any;
-- `harness.families.cut_in.laws`: initial states, accelerations, and the hazard; `harness.pool.walk` sums it.
+- `harness.families.cut_in.laws`: initial states, accelerations, and the hazard; `harness.pool.aim` sums it.
 
 They exchange arrays alone, all in one `cells.KernelState`: the world's positions and speeds (K cells, 3 vehicles),
 `Cells` (the K running episodes), `Results` (rows of the shard), `PrescribedTraffic` (what LV and BV do, where a pool or

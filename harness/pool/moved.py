@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -18,44 +19,32 @@ from harness import cache
 from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.pool.aim import PILOT_PATHS, Enumerator
-from harness.pool.build import take_aim
+from harness.pool.build import campaign_pool, take_aim
 from harness.pool.cut_ins import Pool
-from harness.pool.shells import shells_in_strata, shells_of
+from harness.pool.shells import acceleration_limit, shells_in_strata, shells_of
 from harness.progress import Progress
 from harness.resolved import Resolved
-from harness.strata import ShellDesign
+from harness.strata import Assumed, ShellDesign
 from harness.vocabulary import FloatArray
 
 N_PATHS = 4096
-FORMAT = 2
+FORMAT = 3
 """Raise it when the meaning of what is kept changes."""
 MARGIN = 0.05
 """Of the range of a sample of cut-ins, by which another may lie beyond it [assumed]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Moved:
-    """Of some traffic: probability per test of cut-ins of each stratum ``p`` (S,), and of crashes of drivers.
+class OnPaths(NamedTuple):
+    """Of some traffic: probability per test of cut-ins of each stratum ``p`` (S,), and rates of reference drivers (R,).
 
-    ``rate`` (D + R,) are rates of the surrogates, in the tested pool's order, and of the reference drivers. ``beyond``
-    (S,) is the part of ``p`` in cut-ins whose initial state is beyond all those of the same shell in the tested pool;
-    ``untested`` the probability of shells that the tested pool does not have.
+    ``beyond`` (S,) is the part of ``p`` in cut-ins whose initial state is beyond all those of the same shell in the
+    tested pool; ``untested`` () the probability of shells that the tested pool does not have.
     """
 
     p: FloatArray
-    rate: FloatArray
+    references: FloatArray
     beyond: FloatArray
-    untested: float
-
-    @property
-    def numbers(self) -> FloatArray:
-        """All of it in one row."""
-        return np.concatenate([self.p, self.rate, self.beyond, [self.untested]])
-
-    @classmethod
-    def of(cls, numbers: FloatArray, n_strata: int) -> Moved:
-        """From such a row."""
-        return cls(numbers[:n_strata], numbers[n_strata : -1 - n_strata], numbers[-1 - n_strata : -1], numbers[-1])
+    untested: FloatArray
 
 
 class FewPaths:
@@ -70,21 +59,20 @@ class FewPaths:
         library, settings = resolved.library, resolved.campaign.pool
         self._resolved, self._progress = resolved, progress
         self._order = np.array([list(library.surrogates).index(name) for name in pool.names])
-        self._drivers = np.append(self._order, len(pool.names) + np.arange(len(library.references)))
+        self._references = len(library.surrogates) + np.arange(len(library.references))
         self._stratum = np.full(len(pool.names) + 1, -1)
         for stratum, group in enumerate(shells_in_strata(pool, limit_mps2)):
             self._stratum[group] = stratum
         self._n_strata = len(design.strata)
-        self._reaches_last = self._stratum[-1] >= 0
         self._range = ranges(pool)
         self._aimed: Enumerator | None = None
         about = FORMAT, pool.key, resolved.family.digest(resolved.environment), design.strata, settings.seed, N_PATHS
         key = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:24]
         self._name = f"moved/{key}"
-        kept: dict[str, list[float]] = json.loads(cache.read(self._name) or "{}")
-        self._seen = {key: Moved.of(np.array(row), self._n_strata) for key, row in kept.items()}
+        kept: dict[str, list[Any]] = json.loads(cache.read(self._name) or "{}")
+        self._seen = {key: OnPaths(*map(np.array, row)) for key, row in kept.items()}
 
-    def of(self, environments: Sequence[Environment]) -> Iterator[Moved]:
+    def of(self, environments: Sequence[Environment]) -> Iterator[OnPaths]:
         """What is found in each."""
         n_kept = len(self._seen)
         try:
@@ -95,10 +83,10 @@ class FewPaths:
                 self._progress.advance(1)
         finally:
             if len(self._seen) > n_kept:
-                content = {key: each.numbers.tolist() for key, each in self._seen.items()}
+                content = {key: [of.tolist() for of in each] for key, each in self._seen.items()}
                 cache.keep(self._name, json.dumps(content).encode())
 
-    def _walk(self, environment: Environment) -> Moved:
+    def _walk(self, environment: Environment) -> OnPaths:
         if self._aimed is None:
             resolved, nobody = self._resolved, Progress()
             asked = resolved.family, resolved.environment, resolved.library, resolved.campaign.pool
@@ -111,12 +99,12 @@ class FewPaths:
         for name, (low, high) in self._range.items():
             state = paths.start[name][:, None]
             outside |= (state < low) | (state > high)
-        rate = [np.where((paths.crashes >> bit) & 1 == 1, mass, 0.0).sum() for bit in self._drivers]
+        rate = [np.where((paths.crashes >> bit) & 1 == 1, mass, 0.0).sum() for bit in self._references]
         in_stratum = self._stratum[:, None] == np.arange(self._n_strata)
         of_shell, unknown = by_path.sum(0), self._stratum < 0
         unknown[-1] = False  # no vehicle within the envelope crashes there
         beyond = (by_path * outside).sum(0) @ in_stratum
-        return Moved(of_shell @ in_stratum, np.array(rate), beyond, float(of_shell[unknown].sum()))
+        return OnPaths(of_shell @ in_stratum, np.array(rate), beyond, of_shell[unknown].sum())
 
 
 def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
@@ -136,3 +124,41 @@ def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
             low[s], high[s] = low[s] - margin, high[s] + margin
         found[name] = low, high
     return found
+
+
+def environment_with(there: Resolved, parameters: Any, values: Mapping[str, float]) -> Environment | None:
+    """The traffic ``there`` with other numbers; None where they give no laws."""
+    return there.family.traffic_with(there.campaign.environment, parameters, values)
+
+
+def assumed_in(resolved: Resolved, design: ShellDesign | None, progress: Progress) -> dict[str, Any] | None:
+    """Fields of `Assumed` for a campaign; without strata of this traffic there are no factors."""
+    if design is not None and not resolved.campaign.has_baseline_runs:
+        found = assumed(resolved, campaign_pool(resolved, progress), design, progress)
+    else:
+        parameters = resolved.family.parameters(resolved.campaign.environment)
+        found = Assumed(parameters.unseen) if parameters.unseen else None
+    return None if found is None else asdict(found)
+
+
+def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progress) -> Assumed | None:
+    """By what the strata's probabilities move over what data leave open of who cuts in closely; None without that.
+
+    That is the range that is stated for who does not look, or shares of lane changes at times to collision where none
+    was seen, which are anything up to what that many vehicles without one refuse.
+    """
+    parameters = traffic.family.parameters(traffic.campaign.environment)
+    if (left := traffic.family.left_open(parameters)) is None:
+        return None
+    ends = [environment_with(traffic, parameters, each) for each in left.ends]
+    if None in ends:
+        return None
+    paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)
+    base, *moved = paths.of([traffic.environment, *filter(None, ends)])
+    low, high = (tuple(ratio_of(each.p, base.p).tolist()) for each in moved)
+    return Assumed(left.where, left.highest, (low, high))
+
+
+def ratio_of(a: FloatArray, b: FloatArray) -> FloatArray:
+    """1 where there is nothing to compare with."""
+    return np.divide(a, b, out=np.ones_like(b), where=b > 0.0)

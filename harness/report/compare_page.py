@@ -14,7 +14,6 @@ import pyarrow.compute as pc
 
 from harness import numbers
 from harness.errors import HarnessError, RunFolderError, printable
-from harness.estimators.short_answer import deciding_words, pair_asked, vehicle_words
 from harness.families import family_named
 from harness.numbers import count, tenths
 from harness.records.folder import read_as, write_bytes
@@ -24,6 +23,7 @@ from harness.report.page import sentence
 from harness.report.player import TRACE_COLUMNS, Scene, Scenes, beside_other, templates
 from harness.report.plots import WHO, pairs_plot
 from harness.report.summary import RunFolder, floats, read_run_folder
+from harness.report.words import deciding_words, pair_asked, pair_warnings, pair_words, short_answer
 from harness.runner.stored import replay_episode
 from harness.vocabulary import COMPARISON, FloatArray, IntArray
 
@@ -48,9 +48,11 @@ def write_comparison(folder: str | Path) -> Path:
     pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
     plot = pairs_plot(pairs.who, pairs.weight, pairs.gap_m, pairs.closing_mps)
     environment = templates()
-    environment.filters.update(getmembers(numbers, isfunction), sentence=sentence, vehicle=vehicle_words)
+    environment.filters.update(getmembers(numbers, isfunction), sentence=sentence)
     page = environment.get_template("compare.html.j2").render(
         compared=stored, asked=asked, given=asked is not stored,
+        verdict=pair_words(stored["decision"]), warnings=list(pair_warnings(stored)),
+        answers=[short_answer(run.campaign, run.manifest, run.estimates) for run in runs],
         to_decide=deciding_words(stored), above=runs[0].campaign.crash.counts_above_mps,
         sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
         plot=plot, scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
-from harness.estimators.short_answer import lines, within
 from harness.records.folder import write_text
+from harness.report.words import within
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
 Outcome = Literal["passed", "failure", "error"]
@@ -36,18 +36,18 @@ def outcome_of(exit_code: int) -> Outcome:
     return "error" if exit_code == EXIT_BUDGET_SPENT else "failure"
 
 
-def statement_case(content: dict[str, Any], asked: str, exit_code: int) -> Case:
-    """Case of ``estimates.json``: the statement that was asked about decides, and fails where a test has refuted it.
+def statement_case(content: dict[str, Any], message: str, asked: str, exit_code: int) -> Case:
+    """Case of ``estimates.json``, which the ``message`` tells: the statement that was asked about decides.
 
-    Where there is no such statement, as under other methods than shells, the answer itself decides: a gate in which
-    nothing does would let everything pass. What is stated besides was not asked, and is no test that was skipped.
+    It fails where a test has refuted it. Where there is no such statement, as under other methods than shells, the
+    answer itself decides: a gate in which nothing does would let everything pass. What is stated besides was not asked,
+    and is no test that was skipped.
     """
     found = content["estimates"][content["headline"]].get("details", {}).get("within")
     asks = found is not None and asked == LIBRARY_STATEMENT
     besides = () if found is None or asks else (" ".join(filter(None, within(found).texts)),)
     outcome = "failure" if asks and found["refuted"] else outcome_of(exit_code)
-    name, message = asked if asks else ASSUMPTION_FREE, "\n".join(lines(content["answer"], None))
-    return Case(name, message, outcome, besides)
+    return Case(asked if asks else ASSUMPTION_FREE, message, outcome, besides)
 
 
 def write_junit(path: Path, suite: str, cases: Sequence[Case], attachments: Sequence[Path]) -> None:

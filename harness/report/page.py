@@ -23,6 +23,7 @@ from harness.report.drawing import Plot
 from harness.report.player import templates
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
+from harness.report.words import short_answer
 from harness.vocabulary import OUTCOMES
 
 PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")
@@ -44,10 +45,11 @@ def write_report(folder: str | Path) -> Path:
     sizes, summary, traffic = table_sizes(folder), summarise(run), traffic_of(run.campaign, run.manifest)
     plots = _plots(run, summary, traffic)
     gallery, scenes = crash_gallery(run, summary, traffic)
-    environment = templates()
+    environment, answer = templates(), short_answer(run.campaign, run.manifest, run.estimates)
     environment.filters.update(getmembers(numbers, isfunction), verdict=verdict, sentence=sentence)
     page = environment.get_template("report.html.j2").render(
         run=run,
+        answer=answer,
         summary=summary,
         sizes=sizes,
         gallery=gallery,
@@ -58,7 +60,7 @@ def write_report(folder: str | Path) -> Path:
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         outcomes=outcome_rows(summary),
         beside=what_if_rows(run),
-        warnings=[*run.estimates.answer.warnings, *uncovered(run, summary)],
+        warnings=[*answer.warnings, *uncovered(run, summary)],
         diagnostics=diagnostics(run),
         settings=dump_campaign(run.campaign),
         folder=run.typed,

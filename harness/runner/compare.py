@@ -26,7 +26,6 @@ from harness.campaign.sections import MOST_CUT_INS
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
 from harness.estimators.answer import ended_by
 from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
-from harness.estimators.short_answer import unseen_words
 from harness.estimators.stopping import PairRule
 from harness.families.cut_in.loading import load_parameters
 from harness.numbers import leaves, two_digits_up
@@ -118,16 +117,15 @@ def compare_campaigns(
             for name, label, side in zip(SIDES, labels, sides, strict=True)
         },
         **found,
-        "decision": {**asdict(rule.decision), "words": rule.decision.words},
+        "decision": asdict(rule.decision),
         "to_decide": _to_decide(sides[0].campaign, rounds, pairs),
         "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
         "ended": ended_by(a, rule, found["n_pairs"]),
+        "unseen": load_parameters(a.environment).unseen,
     }
     code = EXIT_DONE if rule.ended else EXIT_BUDGET_SPENT
     if margin is not None:
         code = EXIT_OF[rule.decision.verdict]
-    if where := load_parameters(a.environment).unseen:
-        content["warnings"].append(unseen_words(where))
     write_sealed(out / COMPARISON, content)
     from harness.report.compare_page import write_comparison  # noqa: PLC0415
 
@@ -179,19 +177,18 @@ def _compared(
 
 
 def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: PairCounts) -> dict[str, Any] | None:
-    """How many pairs would decide what was left open, and what to ask for; None where nobody can tell."""
+    """How many pairs would decide what was left open, and what to set; None where nobody can tell."""
     rule = rounds.rule
     if rule.decision.verdict != "open" or math.isinf(times := rule.more_pairs(pairs)):
         return None
-    options, needed = [f"--margin {rule.decision.margin:g}"], two_digits_up(int(pairs.tests.sum()) * times)
-    if needed > campaign.stop.episodes:
-        options.append(f"--set stop.episodes={needed}")
+    needed = two_digits_up(int(pairs.tests.sum()) * times)
+    settings = {"stop.episodes": needed} if needed > campaign.stop.episodes else {}
     if new_folder := (more := rounds.used_of_pool(pairs) * times) > 1.0:
         kept = two_digits_up(campaign.pool.cut_ins_per_shell * more)
         if kept > MOST_CUT_INS:
             return None
-        options.append(f"--set pool.cut_ins_per_shell={kept}")
-    return {"pairs": needed, "options": " ".join(options), "new_folder": new_folder}
+        settings["pool.cut_ins_per_shell"] = kept
+    return {"pairs": needed, "settings": settings, "new_folder": new_folder}
 
 
 def _stored_requests(folder: Path, earlier: Mapping[str, Any]) -> Iterator[ShardRequest]:

@@ -8,57 +8,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from scipy.special import gammainc, gammaincinv
 
 from harness.arguments import Confidence, checked
 from harness.campaign.files import shipped_or_own
 from harness.errors import CampaignError, RunFolderError
-from harness.estimators.answer import estimate_blocks
+from harness.estimators.answer import CARRIES, estimate_blocks
+from harness.estimators.answer import Elsewhere as OfOtherTraffic
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
-from harness.estimators.short_answer import CARRIES
-from harness.estimators.traffic import ONE_LAW, TrafficError, Unseen, is_open, rows, too_few, uncertain
+from harness.estimators.traffic import ONE_LAW, Ends, TrafficError, Uncertain, Unseen, uncertain
 from harness.families.cut_in.loading import load_parameters
-from harness.families.cut_in.parameters import (
-    OF_REPLICATES,
-    SHIPPED_FOLDER,
-    SMALLEST_SHARE,
-    AcceptanceSteps,
-    EnvironmentParameters,
-    content_hash,
-)
-from harness.numbers import number, share
-from harness.pool.cut_ins import Pool
-from harness.pool.moved import FewPaths
-from harness.pool.shells import acceleration_limit
+from harness.families.cut_in.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
+from harness.families.cut_in.unseen import STEP, as_if_unseen
+from harness.pool.moved import assumed
 from harness.progress import Progress
 from harness.records.folder import read_table
-from harness.resolved import Resolved, resolve
+from harness.resolved import resolve
 from harness.runner.stored_shells import (
     ELSEWHERE,
     OPTION,
-    Moved,
+    Elsewhere,
     Nearby,
     StoredShells,
-    environment_with,
     moved_to,
-    nearby,
-    ratio_of,
     require_shares,
 )
-from harness.strata import ShellDesign
 from harness.vocabulary import EstimatorName, FloatArray
-
-NOT_LOOKING = "cut_in__ignore_share"
-_STEP = "acceptance_steps__share__"
-ONE_SIDED = 0.95
-"""Quantile of a step's share that no replicate has drawn."""
 
 
 @checked("estimate_in_other_traffic")
@@ -91,52 +72,41 @@ def estimate_in_other_traffic(
         "campaign_hash": there.content_hash,
         "distance_per_test_m": there.family.mean_distance_m(there.environment),
     }
-    blocks = map(moved.block, tested.blocks)
     parameters = load_parameters(there.campaign.environment)
     if parameters.replicates is not None and parameters.unseen:
         told.pop("assumed", None)  # replicates say it better
     elif not moved.is_same:
-        told["assumed"] = assumed(there, tested.pool, tested.design, progress)
+        found = assumed(there, tested.pool, tested.design, progress)
+        told["assumed"] = found and asdict(found)
     asked: list[EstimatorName] | None = None if moved.is_same else ["shells"]
+    blocks = map(moved.block, tested.blocks)
     content = estimate_blocks(blocks, there.campaign, told, estimators=asked, confidence=confidence)
     if not moved.is_same:
-        drivers = " and ".join(each.name for each in tested.design.references)
-        known = f" (off by {share(moved.reference_error(), least=0.001)} for {drivers})" if drivers else ""
+        drivers = tuple(each.name for each in tested.design.references)
         was, now = (Path(each).stem for each in (campaign.environment.parameters, environment))
-        words = f"tests of {was}, answered for {now}: holds if as large a share of each shell crashes as there{known}"
-        content["answer"] |= {"scope": words}
-    if (found := traffic_error(tested, there, moved, content, progress)) is not None:
-        content |= told_traffic(found, content)
-    return content
+        content |= finite_json({"elsewhere": OfOtherTraffic(was, now, drivers, moved.reference_error())})
+    return content | finite_json({"traffic": traffic_error(moved, content, progress)})
 
 
-def traffic_error(
-    tested: StoredShells, there: Resolved, moved: Moved, content: Mapping[str, Any], progress: Progress
-) -> TrafficError | None:
-    """What the replicates of the traffic ``there`` leave open of an answer; None where it has none.
+def traffic_error(moved: Elsewhere, content: Mapping[str, Any], progress: Progress) -> TrafficError | None:
+    """What the replicates of its traffic leave open of an answer; None where it has none.
 
     Raises `HarnessError`: their file is missing or wrong.
     """
-    unseen = _unseen(tested, there, moved, progress)
-    if (found := _answered([tested], there, moved, progress, unseen)) is None:
+    tested, estimate = moved.tested, content["estimates"]["shells"]
+    if (found := _replicated([moved], content["confidence"], progress)) is None:
         return None
-    (near,), n = found
-    estimate, confidence = content["estimates"]["shells"], content["confidence"]
-    times, off, n_refused = np.array([each.rate for each in near]), _off(near), n - len(near)
-    sampling = estimate["ci_low"], estimate["ci_high"]
-    if not estimate["n_crashes"] or not tested.holds:
+    sampling, held = (estimate["ci_low"], estimate["ci_high"]), tested.holds
+    if not estimate["n_crashes"] or not held:
         sampling = 0.0, estimate["upper_bound"]
-    about, held = (off, n_refused, confidence), tested.holds
-    from_below = unseen is None and held
-    of_rate = uncertain(estimate["crash_rate"], sampling, times, *about, from_below=from_below, held=held)
-    ratios = {}
-    for r, driver in enumerate(tested.design.references):
-        for each in estimate["details"]["references"]:
-            if each["reference"] == driver.name:
-                ends, moves = _ends(each), times / np.array([one.references[r] for one in near])
-                further = off + ONE_LAW, *about[1:]
-                ratios[driver.name] = uncertain(each["ratio"], ends, moves, *further, from_below=held, held=held)
-    return TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), of_rate, ratios, unseen)
+    rate = found.uncertain(estimate["crash_rate"], sampling, 0, from_below=found.unseen is None and held, held=held)
+    known = {each["reference"]: each for each in estimate["details"]["references"]}
+    ratios = {
+        name: found.ratio(each["ratio"], _ends(each), np.array([one.references[r] for one in found.near[0]]), held=held)
+        for r, name in enumerate(each.name for each in tested.design.references)
+        if (each := known.get(name)) is not None
+    }
+    return found.error(rate, ratios)
 
 
 @checked("compare_in_other_traffic")
@@ -145,9 +115,8 @@ def compare_in_other_traffic(
 ) -> dict[str, Any]:
     """What the stored tests of a comparison say of both vehicles in other traffic, and its replicates of their ratio.
 
-    Keys are ``traffic``, a `TrafficError` of A with its ratio to B unless B has not crashed, ``b``, the rate of B, and
-    ``rows``, what a terminal shows of A. Raises `HarnessError` as `estimate_in_other_traffic` does, and where there
-    are no replicates.
+    Keys are ``traffic``, a `TrafficError` of A with its ratio to B unless B has not crashed, and ``b``, the rate of B.
+    Raises `HarnessError` as `estimate_in_other_traffic` does, and where there are no replicates.
     """
     progress = progress or Progress()
     sides = [StoredShells.of(Path(folder) / side, progress) for side in ("a", "b")]
@@ -155,143 +124,93 @@ def compare_in_other_traffic(
         require_shares(tested)
     there = resolve(sides[0].here.campaign.replaced(("environment", "parameters"), environment))
     moved = [moved_to(side, there, environment, progress) for side in sides]
-    pairs = PairedShells(moved[0].there)
-    for side, tested in enumerate(sides):
-        for block in tested.blocks:
-            pairs.add(side, moved[side].block(block))
+    pairs = PairedShells(moved[0].design)
+    for side, of in enumerate(moved):
+        for block in of.tested.blocks:
+            pairs.add(side, of.block(block))
     confidence = confidence or there.campaign.stop.confidence
     told = paired_estimate(pairs.first(np.minimum(pairs.tests(0), pairs.tests(1))), confidence)
-    unseen = _unseen(sides[0], there, moved[0], progress)
-    if (found := _answered(sides, there, moved[0], progress, unseen)) is None:
+    if (found := _replicated(moved, confidence, progress)) is None:
         expected = "an environment that names replicates, as `harness fit` writes them"
         raise CampaignError(OPTION, f"{environment}, which names none", expected, "Compare in that environment.")
-    near, n = found
-    times, n_refused = [np.array([each.rate for each in of]) for of in near], n - len(near[0])
-    off = _off(near[0])  # the strata of both are the same
-    about = off, n_refused, confidence
     a, b = (
-        uncertain(of["crash_rate"], (of["ci_low"], of["ci_high"]), factors, *about, from_below=unseen is None)
-        for of, factors in zip((told["a"], told["b"]), times, strict=True)
+        found.uncertain(of["crash_rate"], (of["ci_low"], of["ci_high"]), side, from_below=found.unseen is None)
+        for side, of in enumerate((told["a"], told["b"]))
     )
-    ratios = {}
-    if told["b"]["n_crashes"]:
-        ratios["B"] = uncertain(told["ratio"], _ends(told), times[0] / times[1], off + ONE_LAW, *about[1:])
-    error = TrafficError(_name(there), confidence, n, n_refused, float(off.mean()), a, ratios, unseen)
-    return {"traffic": finite_json(error), "b": finite_json(b), "rows": [asdict(row) for row in rows(error)]}
+    ratios = {"B": found.ratio(told["ratio"], _ends(told), found.times(1))} if told["b"]["n_crashes"] else {}
+    error = found.error(a, ratios)
+    return {"traffic": finite_json(error), "b": finite_json(b)}
 
 
-def _unseen(tested: StoredShells, there: Resolved, moved: Moved, progress: Progress) -> Unseen | None:
-    """Steps of acceptance in which no lane change was seen, of those that carry a notable part of the rate.
+@dataclass(frozen=True)
+class Replicated:
+    """What each run says of those replicates that all can answer, ``near``; the strata of all are the same."""
 
-    What a step carries is what its share of the wishes moves: a rate is linear in it.
-    """
-    parameters = load_parameters(there.campaign.environment)
-    steps = parameters.acceptance_steps
-    if parameters.replicates is None or steps is None or steps.events is None or steps.exposure is None:
-        return None
-    empty = steps.without_events
-    halves = [{f"{_STEP}{step}": 0.5 * steps.share[step].value} for step in empty]
-    halved = [environment_with(there, parameters, each) for each in halves]
-    found = nearby(tested, there, moved, [each for each in halved if each is not None], progress)
-    known = [step for step, each in zip(empty, halved, strict=True) if each is not None]
-    carried = {step: 2.0 * (1.0 - each.rate) for step, each in zip(known, found, strict=True)}
-    carried = {step: part for step, part in carried.items() if part > CARRIES}
-    return Unseen(steps.where(carried), min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
+    environment: str
+    confidence: float
+    near: Sequence[Sequence[Nearby]]
+    n_refused: int
+    unseen: Unseen | None
+
+    def times(self, side: int) -> FloatArray:
+        """By what the rate of a run moves, (B,)."""
+        return np.array([each.rate for each in self.near[side]])
+
+    @property
+    def off(self) -> FloatArray:
+        """By how much each may be off, (B,)."""
+        return np.array([each.off for each in self.near[0]])
+
+    def uncertain(self, value: float, sampling: Ends, side: int, **how: bool) -> Uncertain:
+        """A rate of a run, see `uncertain`."""
+        return uncertain(value, sampling, self.times(side), self.off, self.n_refused, self.confidence, **how)
+
+    def ratio(self, value: float, sampling: Ends, moves: FloatArray, *, held: bool = True) -> Uncertain:
+        """Of the first run to another rate, which ``moves`` by factors (B,)."""
+        about = self.times(0) / moves, self.off + ONE_LAW, self.n_refused, self.confidence
+        return uncertain(value, sampling, *about, from_below=held, held=held)
+
+    def error(self, rate: Uncertain, ratios: Mapping[str, Uncertain]) -> TrafficError:
+        """All of it."""
+        n, off = len(self.near[0]) + self.n_refused, float(self.off.mean())
+        return TrafficError(self.environment, self.confidence, n, self.n_refused, off, rate, ratios, self.unseen)
 
 
-def as_if_unseen(row: Mapping[str, float], steps: AcceptanceSteps) -> dict[str, float]:
-    """A replicate with what zero events leave open upwards, in place of the draw that is right in the mean.
-
-    In all steps without events, whichever carry a vehicle's rate: so what is found serves others, too. Draws are of
-    (½)-gamma quantiles over the exposure; the same quantile of 1-gamma is what no event at all refuses.
-    """
-    moved = dict(row)
-    for step in steps.without_events:
-        name, exposure = f"{_STEP}{step}", (steps.exposure or ())[step]
-        below = float(gammainc(0.5, row[name] * exposure)) if name in row else ONE_SIDED
-        moved[name] = min(float(gammaincinv(1.0, below)) / exposure, 1.0) if exposure > 0.0 else 1.0
-    return moved
-
-
-def _answered(
-    sides: Sequence[StoredShells], there: Resolved, moved: Moved, progress: Progress, unseen: Unseen | None
-) -> tuple[list[list[Nearby]], int] | None:
-    """What each run says of the replicates that all can answer, and how many there are; None without any."""
-    settings = there.campaign.environment
+def _replicated(sides: Sequence[Elsewhere], confidence: float, progress: Progress) -> Replicated | None:
+    """Answers of stored runs in the replicates of one traffic; None without any."""
+    settings = sides[0].traffic.campaign.environment
     parameters = load_parameters(settings)
     if parameters.replicates is None:
         return None
-    values = read_replicates(settings.parameters, parameters)
+    values, unseen = read_replicates(settings.parameters, parameters), _unseen(sides[0], parameters, progress)
     if unseen is not None and parameters.acceptance_steps is not None:
         values = [as_if_unseen(row, parameters.acceptance_steps) for row in values]
-    environments = [each for row in values if (each := environment_with(there, parameters, row)) is not None]
-    progress.stage("replicates of the traffic", len(sides) * len(environments))
-    found = [list(nearby(tested, there, moved, environments, progress)) for tested in sides]
+    found = [[each for each in of.nearby(values, progress) if each is not None] for of in sides]
     kept = [row for row in zip(*found, strict=True) if not any(each.refused for each in row)]
     if not kept:
         expected = "replicates that these tests can answer"
         raise CampaignError(OPTION, f"{len(values)} replicates, of which none can be", expected, ELSEWHERE)
-    return [list(of) for of in zip(*kept, strict=True)], len(values)
+    name, near = Path(settings.parameters).stem, [list(of) for of in zip(*kept, strict=True)]
+    return Replicated(name, confidence, near, len(values) - len(kept), unseen)
 
 
-def _off(near: Sequence[Nearby]) -> FloatArray:
-    return np.array([each.off for each in near])
+def _unseen(moved: Elsewhere, parameters: EnvironmentParameters, progress: Progress) -> Unseen | None:
+    """Steps of acceptance in which no lane change was seen, of those that carry a notable part of the rate.
 
-
-def _ends(of: Mapping[str, Any]) -> tuple[float, float]:
-    return of["ratio_low"] or 0.0, math.inf if of["ratio_high"] is None else of["ratio_high"]
-
-
-def _name(there: Resolved) -> str:
-    return Path(there.campaign.environment.parameters).stem
-
-
-def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progress) -> dict[str, Any] | None:
-    """By what the strata's probabilities move over what data leave open of who cuts in closely; None without that.
-
-    ``times`` are the factors at both ends, (2, S): of the ``range`` that is stated for who does not look, with its
-    ``name``, ``value`` and ``ends``; or of shares of lane changes at the times to collision ``where`` none was seen,
-    which are anything up to what that many vehicles without one refuse.
+    What a step carries is what its share of the wishes moves: a rate is linear in it.
     """
-    parameters = load_parameters(traffic.campaign.environment)
-    number, steps = parameters.numbers().get(NOT_LOOKING), parameters.acceptance_steps
-    if number is not None and number.range is not None:
-        of: dict[str, Any] = {"name": NOT_LOOKING.replace("__", "."), "value": number.value, "ends": list(number.range)}
-        settings = [{NOT_LOOKING: end} for end in number.range]
-    elif steps is not None and parameters.unseen:
-        of = {"where": parameters.unseen}
-        settings = [{f"{_STEP}{step}": SMALLEST_SHARE for step in steps.without_events}, as_if_unseen({}, steps)]
-    else:
+    steps = parameters.acceptance_steps
+    if steps is None or steps.events is None or steps.exposure is None:
         return None
-    ends = [environment_with(traffic, parameters, each) for each in settings]
-    if None in ends:
-        return None
-    paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)
-    base, *moved = paths.of([traffic.environment, *filter(None, ends)])
-    return {**of, "times": [ratio_of(each.p, base.p).tolist() for each in moved]}
+    empty = steps.without_events
+    found = moved.nearby([{f"{STEP}{step}": 0.5 * steps.share[step].value} for step in empty], progress)
+    carried = {step: 2.0 * (1.0 - near.rate) for step, near in zip(empty, found, strict=True) if near is not None}
+    carried = {step: part for step, part in carried.items() if part > CARRIES}
+    return Unseen(steps.where(carried), min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
 
 
-def told_traffic(found: TrafficError, content: Mapping[str, Any]) -> dict[str, Any]:
-    """What of ``estimates.json`` tells of it: ``traffic`` itself, lines of the answer below rate and ratio."""
-    answer = content["answer"]
-    old = _limited(answer["rows"], found)
-    place = 1 + max((i for i, row in enumerate(old) if row["key"] in ("verdict", "rate", "ratio")), default=-1)
-    new = [asdict(row) for row in rows(found)]
-    warnings = [*answer["warnings"], *too_few(found.n_replicates, found.confidence)]
-    return {
-        "traffic": finite_json(found),
-        "answer": {**answer, "rows": [*old[:place], *new, *old[place:]], "warnings": warnings},
-    }
-
-
-def _limited(told: Sequence[Mapping[str, Any]], found: TrafficError) -> list[Mapping[str, Any]]:
-    """Rows of an answer, whose rate has but an upper limit where no lane change was seen: behind the ratio."""
-    if found.unseen is None or is_open(found):
-        return list(told)
-    seen = {"interval": f"{number(found.rate.value)} as fitted"} if found.rate.value else {}
-    limit = {"value": f"< {number(found.rate.both[1])} per test", "remark": f"none seen at {found.unseen.where}"}
-    limited = [{**row, **limit, **seen} if row["key"] == "rate" else row for row in told]
-    return sorted(limited, key=lambda row: {"verdict": 0, "ratio": 1}.get(row["key"], 2))
+def _ends(of: Mapping[str, Any]) -> Ends:
+    return of["ratio_low"] or 0.0, math.inf if of["ratio_high"] is None else of["ratio_high"]
 
 
 def read_replicates(name: str, parameters: EnvironmentParameters) -> list[dict[str, float]]:

@@ -21,7 +21,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import ended_by, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
 from harness.files import checksum, remove_unfinished
-from harness.pool.build import campaign_pool
+from harness.pool.moved import assumed_in
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
 from harness.records.folder import (
@@ -36,7 +36,6 @@ from harness.records.folder import (
     write_shard,
 )
 from harness.resolved import Resolved, require_ready
-from harness.runner.other_traffic import assumed
 from harness.runner.resume import (
     SMALLEST_FAILED_SAMPLE,
     Manifest,
@@ -151,7 +150,7 @@ class Run:
         """Tests are run within this: the manifest follows, so that an interrupted run can be read, and workers end."""
         try:
             self._keep_design()
-            self._note_what_is_assumed()
+            self.manifest.note(assumed=assumed_in(self.resolved, self.source.design, self._progress))
             yield self
             self.manifest.require_few_failed()
         except BaseException:
@@ -229,14 +228,6 @@ class Run:
         if self.source.design is not None:
             write_sealed(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
 
-    def _note_what_is_assumed(self) -> None:
-        """Let the manifest say by what the strata move where a number of the traffic has a range."""
-        if (design := self.source.design) is not None and not self.campaign.has_baseline_runs:
-            pool = campaign_pool(self.resolved, self._progress)
-            self.manifest.note(assumed=assumed(self.resolved, pool, design, self._progress))
-        elif where := getattr(self.resolved.family.parameters(self.campaign.environment), "unseen", ()):
-            self.manifest.note(assumed={"where": where})
-
     def finish(self, rule: Rule) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no shard beyond the stop is left."""
         manifest, decision, decided = self.manifest, rule.look.decision, dict[str, Any]()
@@ -252,7 +243,7 @@ class Run:
             decided["decision"] = decision.to_json()
         if others := self._workers.cpus():  # bits may have come from any of them
             manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
-        decided |= {"expected": expected, "remedy": pool_remedy(rule, self.campaign, stopped_by) or None}
+        decided |= {"expected": expected, "remedy": pool_remedy(rule, self.campaign, stopped_by)}
         manifest.write("done", stopped_by=stopped_by, unmet=rule.look.unmet, **decided)
         self._progress.stage("writing estimates and report", None)
         estimates = estimate_run(self.out)

@@ -23,10 +23,11 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import EnvironmentParameters
+from harness.families.cut_in.unseen import as_if_unseen
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
-from harness.runner.other_traffic import as_if_unseen, read_replicates
-from harness.runner.stored_shells import Moved, Nearby, StoredShells, environment_with, nearby, require_shares
+from harness.runner.other_traffic import read_replicates
+from harness.runner.stored_shells import Nearby, StoredShells, require_shares
 
 BLOCKS = {
     "initial state": ("initial_state",),
@@ -72,11 +73,7 @@ def sensitivity(
         found = f"{settings.parameters}, of which no number has a standard error (se) or a range"
         mend = "State one, e.g. --range cut_in.ignore_share=0.001:0.08."
         raise CampaignError(_OPTION, found, "numbers that are said to be uncertain", mend)
-    traffic = [environment_with(tested.here, parameters, each) for move in asked for each in move.settings]
-    environments = [each for each in traffic if each is not None]
-    progress.stage("other traffic", len(environments))
-    answered = nearby(tested, tested.here, Moved(tested.design, tested.design), environments, progress)
-    results = iter([None if each is None else next(answered) for each in traffic])
+    results = tested.itself.nearby([each for move in asked for each in move.settings], progress)
     bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
     drivers = [each.name for each in tested.design.references]
     content = finite_json(

@@ -10,7 +10,7 @@ there are upper limits alone, in traffic close by; of traffic with cut-ins that 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,13 +23,11 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.shells import Shells as SeenShells
-from harness.families.cut_in.loading import load_environment, require_sound_laws
-from harness.families.cut_in.parameters import EnvironmentParameters
-from harness.families.protocol import Environment
+from harness.families.cut_in.loading import load_parameters
 from harness.numbers import share
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
-from harness.pool.moved import FewPaths, ranges
+from harness.pool.moved import FewPaths, OnPaths, environment_with, ranges, ratio_of
 from harness.pool.shells import acceleration_limit, design_shells
 from harness.progress import Progress
 from harness.records.folder import read_manifest
@@ -91,6 +89,11 @@ class StoredShells:
         """Hardest acceleration of the vehicle."""
         return acceleration_limit(self.here.campaign.av)
 
+    @property
+    def itself(self) -> Elsewhere:
+        """As it answers for its own traffic."""
+        return Elsewhere(self, self.here, self.design)
+
     @cached_property
     def blocks(self) -> list[Block]:
         """Its tests."""
@@ -131,25 +134,6 @@ class StoredShells:
         return likelihood_limit(p, crashes, worst.tests, Level.two_sided(0.9), 1.0)
 
 
-def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progress) -> Moved:
-    """The strata with the probabilities of other traffic; refused where the tests say nothing of it."""
-    if there.family.digest(there.environment) == tested.pool.environment:
-        return Moved(tested.design, tested.design)
-    _require_same_kind(tested.here, there, name)
-    require_shares(tested)
-    progress.stage("pool of the other traffic", None)
-    elsewhere = campaign_pool(there, progress, order=tested.pool.names)
-    moved = Moved.of(tested.design, design_shells(elsewhere, tested.limit_mps2), name)
-    off, beyond = moved.reference_error(), _share_beyond(tested.pool, elsewhere, tested.blocks)
-    if beyond > MOST_BEYOND or off > MOST_OFF:
-        found = f"traffic where {share(beyond)} of the crashes are in cut-ins unlike any that was tested"
-        if beyond <= MOST_BEYOND:
-            found = f"traffic for which the rate of a reference driver would come out wrong by {share(off)}"
-        expected = f"at most {share(MOST_BEYOND)} and {share(MOST_OFF)}: crash shares within shells must stay the same"
-        raise CampaignError(OPTION, found, expected, ELSEWHERE)
-    return moved
-
-
 @dataclass(frozen=True)
 class Nearby:
     """Some traffic beside another: probabilities of the strata ``p`` (S,), and by what rates move from there to here.
@@ -176,50 +160,87 @@ class Nearby:
         return not (self.off <= FAR_OFF and self.beyond <= MOST_BEYOND)
 
 
-def nearby(
-    tested: StoredShells, there: Resolved, moved: Moved, environments: Sequence[Environment], progress: Progress
-) -> Iterator[Nearby]:
-    """Traffic close to that of ``there``, by few paths.
+@dataclass(frozen=True, eq=False)
+class Elsewhere:
+    """A stored run as it answers for some ``traffic``: the strata as tested, with their probabilities there."""
 
-    Of a vehicle whose shares may change with it, the factor is that of its upper limit.
-    """
-    paths = FewPaths(there, tested.pool, tested.design, tested.limit_mps2, progress)
-    (base,), p, shares = paths.of([there.environment]), moved.there.p, moved.reference_shares()
-    tally, n_surrogates = tested.seen.tally, len(tested.pool.names)
-    crash_share = tally.share if tally.crashes.any() else np.ones_like(p)
-    limit = tested.limit(p)
-    for found in paths.of(environments):
-        now = p * ratio_of(found.p, base.p)
-        known = ratio_of(found.rate[n_surrogates:], base.rate[n_surrogates:])
-        crashing = now * crash_share
-        new = _share(found.beyond, found.p) - _share(base.beyond, base.p)  # ends of a sample are not those of a law
-        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-            off = np.expm1(np.abs(np.log(ratio_of(now @ shares, p @ shares) / known)))
-            beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum() + found.untested / found.p.sum())
-        times = tested.rate(now) / tested.rate(p) if tested.holds else tested.limit(now, at_worst=True) / limit
-        yield Nearby(now, times, known, float(np.max(off, initial=0.0)), beyond)
+    tested: StoredShells
+    traffic: Resolved
+    design: ShellDesign
+
+    @property
+    def is_same(self) -> bool:
+        """Whether the traffic is that of the tests."""
+        return self.design is self.tested.design
+
+    def block(self, block: Block) -> Block:
+        """Tests as they count there: a path's probability of cut-ins is taken to change as that of all paths."""
+        if self.is_same:
+            return block
+        old, new = self.tested.design.cell_p, self.design.cell_p
+        times = np.divide(new, old, out=np.zeros_like(new), where=old > 0.0)
+        columns = {**block.columns, "cell_mass": block.cell_mass * times}
+        with np.errstate(divide="ignore"):
+            log_weight = np.log(self.design.p[block.stratum])
+        return replace(block, columns=columns, drawn=replace(block.drawn, shells=self.design), log_weight=log_weight)
+
+    def reference_error(self) -> float:
+        """By how much the rate of a reference driver comes out wrong at most, by its shares of strata."""
+        told, known = self.design.p @ reference_shares(self.tested.design), self.design.reference_rate
+        return float(np.max(np.abs(told[known > 0.0] / known[known > 0.0] - 1.0), initial=0.0))
+
+    def nearby(self, rows: Iterable[Mapping[str, float]], progress: Progress) -> Iterator[Nearby | None]:
+        """The same traffic with other numbers, by few paths; None where they give no laws.
+
+        Of a vehicle whose shares may change with it, the factor is that of its upper limit.
+        """
+        parameters = load_parameters(self.traffic.campaign.environment)
+        traffic = [environment_with(self.traffic, parameters, row) for row in rows]
+        known = [each for each in traffic if each is not None]
+        progress.stage("other traffic", len(known))
+        tested, p, shares = self.tested, self.design.p, reference_shares(self.tested.design)
+        paths = FewPaths(self.traffic, tested.pool, tested.design, tested.limit_mps2, progress)
+        (base,), found = paths.of([self.traffic.environment]), paths.of(known)
+        crash_share = tested.seen.tally.share if tested.seen.tally.crashes.any() else np.ones_like(p)
+
+        def moved(to: OnPaths) -> Nearby:
+            now, references = p * ratio_of(to.p, base.p), ratio_of(to.references, base.references)
+            crashing = now * crash_share
+            # Ends of a sample are not those of a law.
+            new = _share(to.beyond, to.p) - _share(base.beyond, base.p)
+            with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+                off = np.expm1(np.abs(np.log(ratio_of(now @ shares, p @ shares) / references)))
+                beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum() + to.untested / to.p.sum())
+            rate = tested.rate(now) / tested.rate(p)
+            if not tested.holds:
+                rate = tested.limit(now, at_worst=True) / tested.limit(p)
+            return Nearby(now, rate, references, float(np.max(off, initial=0.0)), beyond)
+
+        for each in traffic:
+            yield None if each is None else moved(next(found))
+
+
+def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progress) -> Elsewhere:
+    """The strata with the probabilities of other traffic; refused where the tests say nothing of it."""
+    if there.family.digest(there.environment) == tested.pool.environment:
+        return Elsewhere(tested, there, tested.design)
+    _require_same_kind(tested.here, there, name)
+    require_shares(tested)
+    progress.stage("pool of the other traffic", None)
+    elsewhere = campaign_pool(there, progress, order=tested.pool.names)
+    moved = Elsewhere(tested, there, moved_design(tested.design, design_shells(elsewhere, tested.limit_mps2), name))
+    off, beyond = moved.reference_error(), _share_beyond(tested, elsewhere)
+    if beyond > MOST_BEYOND or off > MOST_OFF:
+        found = f"traffic where {share(beyond)} of the crashes are in cut-ins unlike any that was tested"
+        if beyond <= MOST_BEYOND:
+            found = f"traffic for which the rate of a reference driver would come out wrong by {share(off)}"
+        expected = f"at most {share(MOST_BEYOND)} and {share(MOST_OFF)}: crash shares within shells must stay the same"
+        raise CampaignError(OPTION, found, expected, ELSEWHERE)
+    return moved
 
 
 def _share(part: FloatArray, whole: FloatArray) -> FloatArray:
     return np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0.0)
-
-
-def ratio_of(a: FloatArray, b: FloatArray) -> FloatArray:
-    """1 where there is nothing to compare with."""
-    return np.divide(a, b, out=np.ones_like(b), where=b > 0.0)
-
-
-def environment_with(
-    there: Resolved, parameters: EnvironmentParameters, values: Mapping[str, float]
-) -> Environment | None:
-    """The traffic ``there`` with other numbers; None where they give no laws."""
-    settings = there.campaign.environment
-    try:
-        environment = load_environment(settings, parameters.with_values(values))
-        require_sound_laws(environment, settings.parameters)
-    except (CampaignError, ValueError):
-        return None
-    return environment
 
 
 def _require_shells(campaign: Campaign, option: str) -> None:
@@ -251,66 +272,29 @@ def _require_same_kind(here: Resolved, there: Resolved, name: str) -> None:
         raise CampaignError(OPTION, f"{name}, in which cut-ins {now}", expected, ELSEWHERE)
 
 
-@dataclass(frozen=True, eq=False)
-class Moved:
-    """Strata as they were ``tested``, and the same, ``there``, with the probabilities of other traffic."""
+def moved_design(tested: ShellDesign, new: ShellDesign, environment: str) -> ShellDesign:
+    """The strata ``tested`` with the probabilities of a ``new`` design.
 
-    tested: ShellDesign
-    there: ShellDesign
-
-    @classmethod
-    def of(cls, tested: ShellDesign, new: ShellDesign, environment: str) -> Moved:
-        """Cells of the new design are those of the old by stratum and reference drivers; a `CampaignError` if not."""
-        keys = [_keys(each) for each in (tested, new)]
-        p = np.zeros(len(keys[0]))
-        for key, of_cell in zip(keys[1], new.cell_p.tolist(), strict=True):
-            alike = [key, *((key[0], other) for s, other in keys[0] if s == key[0])]
-            place = next((keys[0].index(each) for each in alike if each in keys[0]), None)
-            if place is None:
-                found = f"{environment}, whose shell {key[0]} was never tested (probability {of_cell:.3g})"
-                mend = ELSEWHERE
-                raise CampaignError(OPTION, found, f"shells among {', '.join(tested.strata)}", mend)
-            p[place] += of_cell
-        there = replace(
-            tested,
-            pool=new.pool,
-            cell_p=p,
-            n_paths=new.n_paths,
-            p_cut_in=new.p_cut_in,
-            p_unreachable=new.p_unreachable,
-            reference_rate=new.reference_rate,
-            reference_square=new.reference_square,
-        )
-        return cls(tested, there)
-
-    def block(self, block: Block) -> Block:
-        """Tests as they count there: a path's probability of cut-ins is taken to change as that of all paths."""
-        old, new = self.tested.cell_p, self.there.cell_p
-        times = np.divide(new, old, out=np.zeros_like(new), where=old > 0.0)
-        columns = {**block.columns, "cell_mass": block.cell_mass * times}
-        drawn = replace(block.drawn, shells=self.there)
-        with np.errstate(divide="ignore"):
-            log_weight = np.log(self.there.p[block.stratum])
-        return replace(block, columns=columns, drawn=drawn, log_weight=log_weight)
-
-    @property
-    def is_same(self) -> bool:
-        """Whether the traffic is that of the tests."""
-        return self.tested is self.there
-
-    def reference_shares(self) -> FloatArray:
-        """Share of each stratum on which each reference driver crashes, as it was tested, shape (S, R)."""
-        old = self.tested
-        crashing = old.joined.T @ np.array([old.cell_p * old.crashes_too(r) for r in range(len(old.references))]).T
-        shares: FloatArray = np.divide(
-            crashing, old.p[:, None], out=np.zeros_like(crashing), where=old.p[:, None] > 0.0
-        )
-        return shares
-
-    def reference_error(self) -> float:
-        """By how much the rate of a reference driver comes out wrong at most, by its shares of strata."""
-        told, known = self.there.p @ self.reference_shares(), self.there.reference_rate
-        return float(np.max(np.abs(told[known > 0.0] / known[known > 0.0] - 1.0), initial=0.0))
+    Its cells are those of the old one by stratum and reference drivers; a `CampaignError` if not.
+    """
+    places, unknown = _keys(tested), _keys(new)
+    p = np.zeros(len(places))
+    for (stratum, drivers), of_cell in zip(unknown, new.cell_p.tolist(), strict=True):
+        alike = [(s, r != drivers, i) for i, (s, r) in enumerate(places) if s == stratum]
+        if not alike:
+            found = f"{environment}, whose shell {stratum} was never tested (probability {of_cell:.3g})"
+            raise CampaignError(OPTION, found, f"shells among {', '.join(tested.strata)}", ELSEWHERE)
+        p[min(alike)[2]] += of_cell
+    return replace(
+        tested,
+        pool=new.pool,
+        cell_p=p,
+        n_paths=new.n_paths,
+        p_cut_in=new.p_cut_in,
+        p_unreachable=new.p_unreachable,
+        reference_rate=new.reference_rate,
+        reference_square=new.reference_square,
+    )
 
 
 def _keys(design: ShellDesign) -> list[tuple[str, int]]:
@@ -318,15 +302,16 @@ def _keys(design: ShellDesign) -> list[tuple[str, int]]:
     return list(zip(names, design.cell_references, strict=True))
 
 
-def _share_beyond(old: Pool, new: Pool, blocks: list[Block]) -> float:
+def reference_shares(design: ShellDesign) -> FloatArray:
+    """Share of each stratum on which each reference driver crashes, shape (S, R)."""
+    crashes_too = np.array([design.crashes_too(r) for r in range(len(design.references))])
+    crashing = design.joined.T @ (design.cell_p * crashes_too.reshape(-1, design.cell_p.size)).T
+    return _share(crashing, np.broadcast_to(design.p[:, None], crashing.shape))
+
+
+def _share_beyond(tested: StoredShells, new: Pool) -> float:
     """Share of crashes in cut-ins whose initial state is beyond all those of the same shell that were there."""
-    design = blocks[0].drawn.shells
-    assert design is not None
-    tests, crashes = (np.zeros(len(design.strata)) for _ in range(2))
-    for block in blocks:
-        np.add.at(tests, block.stratum, 1.0)
-        np.add.at(crashes, block.stratum[block.crash], 1.0)
-    weight = design.p * (crashes / np.maximum(tests, 1.0))
+    design, old, weight = tested.design, tested.pool, tested.design.p * tested.seen.tally.share
     outside = np.zeros(new.shell.size, np.bool_)
     for name, (low, high) in ranges(old).items():
         outside |= (new.cut_ins.facts[name] < low[new.shell]) | (new.cut_ins.facts[name] > high[new.shell])

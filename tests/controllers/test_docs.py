@@ -15,7 +15,7 @@ import pytest
 
 from harness.cli import main
 from tests.pool.conftest import SMALL_POOL
-from tests.stored_runs import ROOT
+from tests.stored_runs import ROOT, answer_in
 
 PAGE = (ROOT / "docs/controllers.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
@@ -106,5 +106,5 @@ def test_the_first_vehicle_of_a_new_user_runs(page, tmp_path, monkeypatch):
     code = main([*command.split(), "--workers", "1", "--quiet", *short])
     sys.modules.pop("my_av", None)
     assert code == 0
-    rows = json.loads(Path("runs/my_av-MyAV/estimates.json").read_text("utf-8"))["answer"]["rows"]
+    rows = answer_in(Path("runs/my_av-MyAV"))["rows"]
     assert "ratio" in [row["key"] for row in rows]

@@ -255,6 +255,13 @@ def test_strata_without_a_test_come_first_and_all_that_there_is_is_given():
     assert spread(weights, counts, counts, LEVEL, 100, np.array([5, 7])).tolist() == [5, 7]
 
 
+def test_nothing_is_given_to_strata_that_narrow_nothing():
+    """Where those of another one are used up: of two vehicles without a differing pair, so much less probable."""
+    weights = np.array([[1.0], [1e-3]]) * np.array([1.0, -1.0, 0.0])
+    counts = np.array([[0, 0, 100], [0, 0, 100]])
+    assert spread(weights, counts, counts, LEVEL, 60, np.array([40, 1000])).tolist() == [40, 0]
+
+
 def test_shares_end_at_0_and_1_and_without_a_crash_the_bound_is_the_exact_one_at_its_level():
     assert binomial([1.0], [0], [20], LEVEL)[0] == pytest.approx(0.0, abs=1e-12)
     assert binomial([1.0], [20], [20], LEVEL)[1] == pytest.approx(1.0, abs=1e-12)

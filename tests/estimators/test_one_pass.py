@@ -13,6 +13,7 @@ from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import block, fed, in_shells
+from tests.stored_runs import answer
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 SIZES = [600, 600, 300]
@@ -22,26 +23,28 @@ def drawn(method: str):
     return list(blocks(CHAIN, method, SIZES, SEED))
 
 
-def answered(parts, **manifest) -> dict:
-    """Content of ``estimates.json`` from blocks in memory."""
+def answered(parts, **manifest) -> tuple[dict, dict]:
+    """Content of ``estimates.json`` from blocks in memory, and its answer in words."""
     campaign = {"name": "chain", "environment": {"lane_change_level": 3.0}, "stop": {"confidence": 0.8}}
     campaign |= {"surrogates": {"one": {"model": "idm"}, "two": {"model": "fvdm"}}}
     campaign["testing"] = {"method": parts[0].drawn.method}
-    return estimate_blocks(parts, Campaign.model_validate(campaign), {"campaign_hash": "c0ffee", **manifest})
+    campaign = Campaign.model_validate(campaign)
+    content = estimate_blocks(parts, campaign, {"campaign_hash": "c0ffee", **manifest})
+    return content, answer(content, campaign)
 
 
 def test_rates_are_per_test_and_per_distance_where_that_is_known():
-    unknown, known = (answered(drawn("forced"), distance_per_test_m=of) for of in (None, 400.0))
+    (unknown, in_tests), (known, in_km) = (answered(drawn("forced"), distance_per_test_m=of) for of in (None, 400.0))
     assert unknown["crash_rate_per_1e6_km"] is None
-    assert "km" not in unknown["answer"]["rows"][0]["remark"]
+    assert "km" not in in_tests["rows"][0]["remark"]
     assert known["distance_per_test_km"] == 0.4
     assert known["crash_rate_per_1e6_km"]["rate"] == pytest.approx(known["estimates"]["nade"]["crash_rate"] / 0.4 * 1e6)
-    assert "per million km" in known["answer"]["rows"][0]["remark"]
+    assert "per million km" in in_km["rows"][0]["remark"]
 
 
 def test_unbounded_weights_lead_the_warnings_and_claim_no_precision():
-    content = answered(drawn("step_mixture"))
-    assert content["answer"]["warnings"][0].startswith("the true rate may lie far above this interval: the weights")
+    content, told = answered(drawn("step_mixture"))
+    assert told["warnings"][0].startswith("the true rate may lie far above this interval: the weights")
     for name, n_cautions in (("nade", 1), ("scv", 2)):
         found = content["estimates"][name]
         assert (found["rhw"], found["cautions"]) == (None, found["warnings"][:n_cautions])
@@ -52,8 +55,8 @@ def test_unbounded_weights_lead_the_warnings_and_claim_no_precision():
 def test_one_crash_that_could_double_the_rate_leads_the_warnings(n, doubts):
     """Three tests in a hundred crash, with weight 0.001; the largest weight, 0.1, counts as much as 100 of them."""
     some = block([k % 100 < 3 for k in range(n)], [-6.9] * n, method="forced", log_p_cut_in=np.full(n, np.log(0.1)))
-    content = answered([some])
-    said = content["answer"]["warnings"][0]
+    content, told = answered([some])
+    said = told["warnings"][0]
     assert said.startswith("the true rate may lie far above this interval: one more crash") == doubts
     assert ("might add 1.65 times it" in said) == doubts
     assert (content["estimates"]["nade"]["rhw"] is None) == doubts

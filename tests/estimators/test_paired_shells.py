@@ -15,11 +15,11 @@ from harness.estimators.pairs import (
     FAILED,
     NO_CRASH,
     PairCounts,
-    PairDecision,
     PairedShells,
     no_pairs,
     paired_estimate,
 )
+from harness.report.words import pair_warnings, pair_words
 from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import SHELLS, in_shells
 
@@ -70,7 +70,7 @@ def test_failed_tests_widen_both_ways():
     assert ratio.ci_high == pytest.approx(worst_a.ratio(LEVEL).ci_high)
     assert ratio.ci_low == pytest.approx(worst_b.ratio(LEVEL).ci_low)
     estimate = paired_estimate(failed, 0.9)
-    assert estimate["warnings"][:2] == ["3 tests of A FAILED", "2 tests of B FAILED"]
+    assert list(pair_warnings(estimate))[:2] == ["3 tests of A FAILED", "2 tests of B FAILED"]
     assert estimate["shells"][0]["n_failed_tests"] == 5
 
 
@@ -122,7 +122,7 @@ def test_equal_vehicles_are_not_told_apart_and_json_has_no_infinity():
     ],
 )
 def test_the_verdict_in_words(margin, verdict, said):
-    assert PairDecision(margin, verdict, 0.95, True).words == said
+    assert pair_words({"margin": margin, "verdict": verdict}) == said
 
 
 def test_more_pairs_that_end_as_often_say_the_same_with_less_doubt():

@@ -39,6 +39,12 @@ class Fake:
     def parameters(self, settings):
         return SimpleNamespace(content_hash=lambda: "fake", unseen=(), settings=settings)
 
+    def traffic_with(self, settings, parameters, values):
+        return None
+
+    def left_open(self, parameters):
+        return None
+
     def traffic(self, settings, parameters=None):
         return "fake"
 

@@ -11,17 +11,17 @@ import pytest
 import harness
 from harness.cli import main
 from harness.errors import RunFolderError
-from harness.estimators.short_answer import deciding_words
 from harness.numbers import interval, number, ratio
 from harness.report.compare_page import crashing_pairs, write_comparison
 from harness.report.plots import WHO
 from harness.report.summary import read_run_folder
+from harness.report.words import deciding_words
 from tests.golden.campaigns import SHELLS
 from tests.golden.record import load
 from tests.in_process import controllers_here, one_process, without_page
 from tests.report.page_text import Page
 from tests.report.test_player import motion, scenes_in
-from tests.stored_runs import copy_of, edit, stored_table
+from tests.stored_runs import answer_in, copy_of, edit, stored_table
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +42,7 @@ def test_the_numbers_are_those_of_the_comparison(compared, page):
     for side in ("a", "b"):
         assert f"{found[side]['n_crashes']:,} in {found[side]['n_episodes']:,}" in shown
         assert number(found[f"only_{side}"]["value"]) in shown
-        rows = {
-            row["key"]: row for row in json.loads((compared / side / "estimates.json").read_text())["answer"]["rows"]
-        }
+        rows = {row["key"]: row for row in answer_in(compared / side)["rows"]}
         assert f"{rows['ratio']['value']} {rows['ratio']['interval']}" in shown
     assert f"A/B = {ratio(found['ratio'])} ({ratio(found['ratio_low'])} to {ratio(found['ratio_high'])})" in shown
     assert "B idm min_acceleration_mps2 −8 reaction.delay_s 0.5" in shown

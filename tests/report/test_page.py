@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,9 +13,11 @@ from junitparser import JUnitXml
 
 from harness.errors import RunFolderError
 from harness.records.folder import write_sealed
+from harness.report import page
 from harness.report.junit import statement_case, write_junit
 from harness.report.page import uncovered, write_report
 from harness.report.summary import read_run_folder, summarise, typed_folder
+from harness.report.words import Row
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
 from tests.stored_runs import truncate
 
@@ -70,12 +73,15 @@ def test_notes_say_what_is_stale(run_folder):
     assert "cover 2,000 tests but the records hold 3,000" in "".join(uncovered(run, summarise(run)))
 
 
-def test_a_ratio_that_leads_says_of_what_it_is(reports, tmp_path):
+def test_a_ratio_that_leads_says_of_what_it_is(reports, tmp_path, monkeypatch):
     folder = shutil.copytree(reports["shells"], tmp_path / "run")
-    answer = edit(folder / "estimates.json")["answer"]
-    row = {"key": "ratio", "what": "× competent driver", "value": "< 0.25 (crashes less)", "interval": "no crash seen"}
-    row["remark"] = ""
-    edit(folder / "estimates.json", answer=answer | {"rows": [row, *answer["rows"]]})
+    row = Row("ratio", "× competent driver", "< 0.25 (crashes less)", "no crash seen")
+    told = page.short_answer
+
+    def led(*given):
+        return replace(answer := told(*given), rows=(row, *answer.rows))
+
+    monkeypatch.setattr(page, "short_answer", led)
     write_report(folder)
     assert "Crash rate < 0.25 × a competent driver's crashes less, no crash seen" in Page(folder).words
 
@@ -162,18 +168,24 @@ def test_what_no_run_has_written_is_named(run_folder, file, damage, said):
 # -- JUnit XML as a CI system reads it --
 
 
+ABOVE = "REJECTED  <above> & beyond\x1b[31m"
+
+
 def content(**within):
     keys = "crash_rate", "ci_low", "ci_high", "n_crashes", "n_crashes_outside"
     library = {"name": "library", "refuted": False, **dict.fromkeys(keys, 0), "n_episodes_outside": 9, **within}
-    rows = [{"what": "REJECTED", "value": "<above> & beyond\x1b[31m", "interval": "", "remark": ""}]
-    answer = {"vehicle": "idm", "tests": "9 tests", "parameters": [], "rows": rows, "warnings": [], "scope": "all"}
-    return {"answer": answer, "headline": "shells", "estimates": {"shells": {"details": {"within": library}}}}
+    return {"headline": "shells", "estimates": {"shells": {"details": {"within": library}}}}
 
 
 @pytest.mark.parametrize(("code", "kind"), [(0, None), (4, "Error"), (5, "Failure"), (3, "Failure")])
 def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     file, report = tmp_path / "gate.xml", tmp_path / "report.html"
-    write_junit(file, "smoke", [statement_case(content(), "assumption_free", code)], [report])
+    write_junit(
+        file,
+        "smoke",
+        [statement_case(content(), "REJECTED  <above> & beyond\x1b[31m", "assumption_free", code)],
+        [report],
+    )
     (suite,) = JUnitXml.fromfile(str(file))
     assert (suite.name, suite.tests, suite.skipped) == ("smoke", 1, 0)
     assert (suite.failures, suite.errors) == (int(kind == "Failure"), int(kind == "Error"))
@@ -189,12 +201,12 @@ def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     ("refuted", "code", "outcome"), [(False, 0, "passed"), (True, 0, "failure"), (True, 4, "failure")]
 )
 def test_a_refuted_assumption_that_was_asked_about_fails(refuted, code, outcome):
-    case = statement_case(content(refuted=refuted), "library", code)
+    case = statement_case(content(refuted=refuted), "", "library", code)
     assert (case.name, case.outcome) == ("library", outcome)
 
 
 def test_a_gate_never_passes_because_nothing_was_asked():
     """A method without shells may still carry a statement's name in its settings."""
     none = {**content(), "estimates": {"shells": {"details": {}}}}
-    case = statement_case(none, "library", 4)
+    case = statement_case(none, "", "library", 4)
     assert (case.name, case.outcome) == ("assumption_free", "error")

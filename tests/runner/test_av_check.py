@@ -19,7 +19,7 @@ from harness.records.folder import read_manifest
 from harness.runner.look import check_av
 from harness.runner.stored import replay_episode, suspects
 from tests.pool.test_vehicle_pool import ACTING
-from tests.stored_runs import copy_of, edit
+from tests.stored_runs import answer_in, copy_of, edit
 from tests.worlds.running import EXAMPLE, ROOT
 
 MIXTURE_FILE, FORCED = (str(ROOT / f"scenarios/overtaking_{name}.yaml") for name in ("mixture", "forced"))
@@ -285,7 +285,7 @@ def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_afte
     assert one["repeated"] == two["repeated"]
     assert len(one["repeated"]["differing"]) == one["repeated"]["n_episodes"] == 10
     assert (one["reproducible"], two["reproducible"]) == (False, False)
-    warnings = json.loads((folders[0] / "estimates.json").read_text())["answer"]["warnings"]
+    warnings = answer_in(folders[0])["warnings"]
     assert any(told.startswith("NOT REPRODUCIBLE: 10 of 10 tests") for told in warnings)
     with pytest.raises(CampaignError, match="10 of 10 tests that it repeated itself came out otherwise"):
         replay_episode(folders[0], 3)

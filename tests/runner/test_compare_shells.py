@@ -11,6 +11,7 @@ import pytest
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.records.reader import read_shards
+from harness.report.words import pair_words
 from harness.runner.compare import compare_campaigns
 from harness.runner.run import Run
 from harness.runner.workers import ShardRunner
@@ -118,7 +119,7 @@ def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_c
     a, b = reversed(campaigns) if swapped else campaigns
     found = compare_campaigns(a, b, tmp_path, workers=1, margin=0.1)
     assert (found.content["decision"]["verdict"], found.exit_code) == (verdict, exit_code)
-    assert "10 %" in found.content["decision"]["words"]
+    assert "10 %" in pair_words(found.content["decision"])
     assert manifest(tmp_path / "a")["unmet"] == ["--margin (0.1)"]
 
 
@@ -126,7 +127,7 @@ def test_it_ends_when_it_is_known_who_crashes_less_often(campaigns, done, tmp_pa
     """Sooner than at a half-width that is asked by hand, and whatever the campaigns' stop.rhw says of one vehicle."""
     found = compare_campaigns(*campaigns, tmp_path, workers=1)
     content = found.content
-    assert content["decision"]["words"] == "B crashes less often than A"
+    assert pair_words(content["decision"]) == "B crashes less often than A"
     assert (content["ended"], manifest(tmp_path / "b")["stopped_by"], found.exit_code) == ("accept", "accept", 0)
     assert content["n_pairs"] < done.content["n_pairs"]
     assert content["conditional"]["rhw"] > 0.15 >= done.content["conditional"]["rhw"]

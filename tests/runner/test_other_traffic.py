@@ -11,12 +11,13 @@ import pytest
 from harness.cli import main
 from harness.errors import CampaignError
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
-from harness.pool.moved import Moved as Few
+from harness.pool.moved import OnPaths
 from harness.progress import Progress
 from harness.runner import stored_shells
 from harness.runner.other_traffic import estimate_in_other_traffic
-from harness.runner.stored_shells import Moved, StoredShells, nearby
-from tests.stored_runs import copy_of, estimates
+from harness.runner.stored_shells import StoredShells
+from tests.stored_runs import answer as words
+from tests.stored_runs import copy_of, estimates, golden
 
 SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
 
@@ -51,7 +52,7 @@ def test_the_rate_is_proportional_to_the_share_that_does_not_look(stored_run, tm
     assert told["crash_rate"] == pytest.approx(2.0 * stored["crash_rate"], rel=0.05)
     ratios = [each["details"]["references"][0]["ratio"] for each in (told, stored)]
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
-    assert "as there" in estimate_in_other_traffic(folder, mine)["answer"]["scope"]
+    assert "as there" in words(estimate_in_other_traffic(folder, mine), golden("shells-twin"))["scope"]
 
 
 def test_the_page_of_the_old_traffic_is_not_named_below_the_answer(stored_run, tmp_path, capsys):
@@ -90,11 +91,10 @@ def test_a_vehicle_that_crashes_on_few_cut_ins_of_its_shells_is_refused(stored_r
 def test_a_reference_driver_told_too_low_is_as_far_off_as_one_told_too_high(stored_run, monkeypatch, times):
     """Its rate moves, and the shells do not; the vehicle's factor is widened by as much to both sides."""
     tested = StoredShells.of(stored_run("shells-twin"), Progress())
-    n_drivers, nothing = len(tested.pool.names) + len(tested.design.references), np.zeros_like(tested.design.p)
-    found = [Few(tested.design.p, np.full(n_drivers, rate), nothing, 0.0) for rate in (1.0, times)]
+    n_drivers, nothing = len(tested.design.references), np.zeros_like(tested.design.p)
+    found = [OnPaths(tested.design.p, np.full(n_drivers, rate), nothing, np.zeros(())) for rate in (1.0, times)]
     monkeypatch.setattr(stored_shells.FewPaths, "of", lambda *_: iter([found.pop(0)]))
-    here = tested.here
-    (near,) = nearby(tested, here, Moved(tested.design, tested.design), [here.environment], Progress())
+    (near,) = tested.itself.nearby([{}], Progress())
     assert (near.rate, near.off) == (1.0, pytest.approx(1.0))
     assert near.references == pytest.approx(times)
 

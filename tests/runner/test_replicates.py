@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,23 +15,28 @@ import pytest
 from harness.cli import main
 from harness.errors import HarnessError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.traffic import ONE_LAW, too_few, uncertain
-from harness.families.cut_in.loading import load_parameters
+from harness.estimators.traffic import ONE_LAW, uncertain
 from harness.pool import moved
+from harness.pool.moved import assumed
 from harness.progress import Progress
+from harness.report.words import pair_warnings, too_few
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
-from harness.runner.other_traffic import assumed, estimate_in_other_traffic
+from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.runner.run import run_campaign
-from harness.runner.stored_shells import Moved, StoredShells, environment_with, nearby
+from harness.runner.stored_shells import StoredShells
 from tests.golden.campaigns import COMPARED
 from tests.in_process import one_process, without_page
-from tests.stored_runs import copy_of, estimates, golden
+from tests.stored_runs import answer, answer_in, copy_of, estimates, golden
 from tests.traffic.tables import TEXT as SHIPPED
 from tests.traffic.tables import fitted
 
 LOOK = "cut_in__ignore_share"
+
+
+def told(content):
+    return answer(content, golden("shells-twin"))
 
 
 @pytest.fixture(autouse=True)
@@ -52,9 +58,9 @@ def test_the_rate_moves_with_the_share_that_does_not_look_and_the_ratio_does_not
     assert traffic["rate"]["value"] == pytest.approx(stored["crash_rate"])
     assert traffic["rate"]["sampling"] == pytest.approx([stored["ci_low"], stored["ci_high"]])
     assert traffic["ratios"]["r157-cc"]["times"] == pytest.approx([1.0 / (1.0 + ONE_LAW), 1.0 + ONE_LAW], rel=0.005)
-    keys = [row["key"] for row in content["answer"]["rows"]]
+    keys = [row["key"] for row in told(content)["rows"]]
     assert keys[keys.index("ratio") + 1 :][:2] == ["traffic", "traffic_ratio"]
-    (warning,) = [text for text in content["answer"]["warnings"] if "replicates" in text]
+    (warning,) = [text for text in told(content)["warnings"] if "replicates" in text]
     assert warning.startswith("5 replicates (a 90 % interval needs 20 at least): limits ")
 
 
@@ -62,16 +68,14 @@ def test_of_a_vehicle_whose_shares_may_change_there_is_an_upper_limit_alone(stor
     """All cut-ins of the shells that it crashes in may crash."""
     folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.01, 0.02]})
     tested = StoredShells.of(folder, Progress())
-    here, same = tested.here, Moved(tested.design, tested.design)
-    twice = environment_with(here, load_parameters(here.campaign.environment), {LOOK: 0.02})
-    (near,) = nearby(tested, here, same, [twice], Progress())
+    (near,) = tested.itself.nearby([{LOOK: 0.02}], Progress())
     monkeypatch.setattr(stored_shells, "LEAST_SHARE", 1.1)
     content = estimate_in_other_traffic(folder, mine)
     estimate, traffic = content["estimates"]["shells"], content["traffic"]
     worst = tested.limit(near.p, at_worst=True) / tested.limit(tested.design.p)
     assert traffic["rate"]["times"] == [0.0, pytest.approx(worst, rel=0.01)]
     assert traffic["rate"]["both"] == [0.0, pytest.approx(estimate["upper_bound"] * traffic["rate"]["times"][1])]
-    (row,) = [row for row in content["answer"]["rows"] if row["key"] == "traffic"]
+    (row,) = [row for row in told(content)["rows"] if row["key"] == "traffic"]
     assert (row["value"][:9], row["interval"][:2]) == ("at most ×", "< ")
 
 
@@ -87,7 +91,7 @@ def test_replicates_that_tests_cannot_answer_leave_the_interval_open(stored_run,
     """One in which the AV closes in faster than in any test, one whose laws are none."""
     columns = {"initial_state__r2dot_min_mps": [-10.0, -16.0, -10.0], "cut_in__intercept": [-8.7, -8.7, 900.0]}
     content = estimate_in_other_traffic(stored_run("shells-twin"), fitted(tmp_path, **columns))
-    traffic, answer = content["traffic"], content["answer"]
+    traffic, answer = content["traffic"], told(content)
     assert (traffic["n_replicates"], traffic["n_refused"]) == (3, 2)
     assert traffic["rate"]["times"] == [0.0, None]
     (row,) = [row for row in answer["rows"] if row["key"].startswith("traffic")]
@@ -149,7 +153,7 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
     assert part > 0.9
     far = -math.log1p(-math.erf(math.sqrt(a * 50.0))) / 50.0  # the same quantile, of what zero events refuse
     assert traffic["rate"]["times"] == [0.0, pytest.approx(1.0 + part * (far / 0.01 - 1.0), rel=0.03)]
-    (row,) = [row for row in content["answer"]["rows"] if row["key"] == "traffic"]
+    (row,) = [row for row in told(content)["rows"] if row["key"] == "traffic"]
     assert row["value"].startswith("at most × ")
     assert row["remark"] == "none seen at TTC < 2 s"
 
@@ -161,19 +165,19 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
     assert 0.5 < fewer["share"] < part
 
     # What is known comes first: the ratio.
-    first, rate, *_ = content["answer"]["rows"]
+    first, rate, *_ = told(content)["rows"]
     assert (first["key"], rate["value"]) == ("ratio", f"{row['interval']} per test")
-    assert content["assumed_times"] is None
+    assert content["assumed"] is None
 
     # So it does where no replicates are asked, as in a run in that traffic.
     (tmp_path / "mine.yaml").write_text(text)
     content = estimate_in_other_traffic(stored_run("shells-twin"), str(tmp_path / "mine.yaml"))
-    first, rate, *_ = content["answer"]["rows"]
+    first, rate, *_ = told(content)["rows"]
     stored, none = content["estimates"]["shells"], -math.log(0.05) / 50.0
     high = stored["ci_high"] * (1.0 + part * (none / 0.01 - 1.0))
     assert (first["key"], rate["value"][:2], rate["remark"]) == ("ratio", "< ", "none seen at TTC < 2 s")
     assert float(rate["value"].split()[1]) == pytest.approx(high * 10 ** -math.floor(math.log10(high)), rel=0.03)
-    assert content["assumed_times"][1] == pytest.approx(high / stored["ci_high"], rel=0.03)
+    assert content["assumed"]["times"][1] == pytest.approx(high / stored["ci_high"], rel=0.03)
 
 
 def test_runs_that_cannot_tell_by_how_much_and_comparisons_warn(tmp_path):
@@ -185,7 +189,7 @@ def test_runs_that_cannot_tell_by_how_much_and_comparisons_warn(tmp_path):
     with one_process(), without_page():
         run_campaign(golden("forced-twin", mine), tmp_path / "forced")
         compared = compare_campaigns(*pair, tmp_path / "pair", workers=1)
-    for warnings in (estimates(tmp_path / "forced")["answer"]["warnings"], compared.content["warnings"]):
+    for warnings in (answer_in(tmp_path / "forced")["warnings"], pair_warnings(compared.content)):
         assert [text[: len(seen)] for text in warnings if "lane change" in text and "level" not in text] == [seen]
 
 
@@ -196,11 +200,11 @@ def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
     tested = StoredShells.of(stored_run("shells-twin"), Progress())
     there = resolve(tested.here.campaign.replaced(("environment", "parameters"), str(tmp_path / "mine.yaml")))
     found = assumed(there, tested.pool, tested.design, Progress())
-    assert (found["name"], found["value"], found["ends"]) == ("cut_in.ignore_share", 0.01, [0.005, 0.08])
-    content = estimate_blocks(tested.blocks, there.campaign, {**tested.manifest, "assumed": found})
-    (row,) = [row for row in content["answer"]["rows"] if row["key"] == "assumed"]
+    assert (found.where, found.highest) == ("", 0.08)
+    content = estimate_blocks(tested.blocks, there.campaign, {**tested.manifest, "assumed": asdict(found)})
+    (row,) = [row for row in told(content)["rows"] if row["key"] == "assumed"]
     assert (row["value"], row["remark"]) == ("at most × 8.0 (assumed)", "if 8.0 % do not look")
-    assert content["assumed_times"] == pytest.approx([0.5, 8.0], rel=0.005)
+    assert content["assumed"]["times"] == pytest.approx([0.5, 8.0], rel=0.005)
     assert assumed(tested.here, tested.pool, tested.design, Progress()) is None
 
 

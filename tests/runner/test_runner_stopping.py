@@ -11,7 +11,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolde
 from harness.progress import Progress
 from harness.report.page import write_report
 from tests.runner.conftest import SHELLS
-from tests.stored_runs import copy_of, estimates, manifest, shard_files, unlike_columns
+from tests.stored_runs import answer_in, copy_of, estimates, manifest, shard_files, unlike_columns
 
 LOOSE, TIGHT = "stop.rhw=0.3", "stop.rhw=0.15"
 COMMON = (
@@ -95,7 +95,7 @@ def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, 
     decided = run_here(campaign(*SHELLS, "world.engine=twin", *changes), tmp_path / "run")
     found = decided.estimates["decision"]
     assert (decided.exit_code, found["verdict"]) == (code, verdict)
-    row, key = decided.estimates["answer"]["rows"][0], "times_reference" if "r157-cc" in changes[0] else "crash_rate"
+    row, key = answer_in(decided.folder)["rows"][0], "times_reference" if "r157-cc" in changes[0] else "crash_rate"
     assert decided.estimates["unmet"][0].startswith(f"accept.{key}")
     assert (found["driver"] == "r157-cc") == ("r157-cc" in row["value"]) == ("r157-cc" in changes[0])
     assert (decided.stopped_by == "accept") == (code != 4)
@@ -113,7 +113,7 @@ def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(campaign, run_h
     far = run_here(asked("stop.below_reference=2"), tmp_path / "far")
     assert (far.exit_code, far.stopped_by, far.estimates["decision"]) == (0, "below_reference", None)
     assert far.estimates["unmet"] == ["stop.below_reference (2)"]
-    assert far.estimates["answer"]["scope"].endswith("ended by: far enough below the competent driver")
+    assert answer_in(far.folder)["scope"].endswith("ended by: far enough below the competent driver")
     n = far.estimates["n_episodes"]
     others = run_here(asked("stop.below_reference=0.3"), tmp_path / "other")
     assert (others.exit_code, others.estimates["n_episodes"]) == (4, 2000)

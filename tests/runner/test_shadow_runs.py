@@ -18,7 +18,17 @@ from harness.report.page import write_report
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.conftest import SHELLS
-from tests.stored_runs import copy_of, edit, estimates, golden, manifest, shard_files, stored_table, unlike_columns
+from tests.stored_runs import (
+    answer_in,
+    copy_of,
+    edit,
+    estimates,
+    golden,
+    manifest,
+    shard_files,
+    stored_table,
+    unlike_columns,
+)
 
 SHADOWS, TWIN = "pool.shadow_paths=120", "world.engine=twin"
 FORCED = ("testing.method=forced", "stop.episodes=600", "run.shard_size=100")
@@ -132,7 +142,7 @@ def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_
     shells = result.estimates["estimates"]["shells"]
     assert (result.exit_code, result.stopped_by) == (4, "pool_error")
     assert (shells["ci_low"], shells["ci_high"], shells["rhw"]) == (0.0, 1.0, None)
-    told = " ".join(result.estimates["answer"]["warnings"])
+    told = " ".join(answer_in(result.folder)["warnings"])
     assert "no interval: nearly all crashes lie on some" in told
     assert "raise pool.shadow_paths" in told
     assert shells["details"]["references"] == []

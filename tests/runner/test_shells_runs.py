@@ -18,7 +18,7 @@ from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import tally as counted
 from tests.in_process import run_here as run_golden
 from tests.runner.conftest import SHELLS
-from tests.stored_runs import copy_of, edit, golden, manifest, shard_files
+from tests.stored_runs import answer_in, copy_of, edit, golden, manifest, shard_files
 
 
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
@@ -28,8 +28,8 @@ def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
     tests = [shell["n_episodes"] for shell in result.estimates["estimates"]["shells"]["details"]["shells"]]
     assert tests[-1] >= 100
     assert result.estimates["n_episodes"] < 1000
-    assert set(re.findall(r"pool\.[a-z_]+", json.dumps(result.estimates))) == {"pool.cut_ins_per_shell"}
-    assert re.search(r"; raise pool\.cut_ins_per_shell to \d,?\d+$", result.estimates["answer"]["scope"])
+    assert set(re.findall(r"pool\.[a-z_]+", json.dumps(answer_in(result.folder)))) == {"pool.cut_ins_per_shell"}
+    assert re.search(r"; raise pool\.cut_ins_per_shell to \d,?\d+$", answer_in(result.folder)["scope"])
 
 
 def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
@@ -40,7 +40,7 @@ def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
     assert (fresh.exit_code, fresh.stopped_by) == (4, "pool_error")
     found = fresh.estimates["estimates"]["shells"]
     assert found["rhw"] > found["details"]["rhw_from_pool"] > 0.05
-    scope = fresh.estimates["answer"]["scope"]
+    scope = answer_in(fresh.folder)["scope"]
     assert re.search(r"; lower pool\.relative_error to 0\.0\d+(?: and [^;]+)?$", scope)
     assert "pool." not in "".join(found["warnings"])
 

@@ -12,14 +12,16 @@ import pyarrow as pa
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
+from harness.errors import CampaignError
 from harness.families.cut_in.events import FREE_DRAWS_PER_CUT_IN, enumerate_cut_ins, write_maneuvers
 from harness.families.cut_in.laws import Environment, InitialStates
-from harness.families.cut_in.loading import load_environment, load_parameters
+from harness.families.cut_in.loading import load_environment, load_parameters, require_sound_laws
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
-from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Paths, Recorded
+from harness.families.cut_in.unseen import left_open
+from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, LeftOpen, Paths, Recorded
 from harness.loop.cells import Script
 from harness.vehicles.drivers import Followers
 from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
@@ -63,6 +65,19 @@ class CutIn:
 
     def traffic(self, settings: EnvironmentSettings, parameters: EnvironmentParameters | None = None) -> Environment:
         return load_environment(settings, parameters)
+
+    def traffic_with(
+        self, settings: EnvironmentSettings, parameters: EnvironmentParameters, values: Mapping[str, float]
+    ) -> Environment | None:
+        try:
+            environment = load_environment(settings, parameters.with_values(values))
+            require_sound_laws(environment, settings.parameters)
+        except (CampaignError, ValueError):
+            return None
+        return environment
+
+    def left_open(self, parameters: EnvironmentParameters) -> LeftOpen | None:
+        return left_open(parameters)
 
     def digest(self, traffic: Environment) -> str:
         numbers = traffic.content()

@@ -14,7 +14,7 @@ once a second with probability p_1s; a step of 0.1 s has p = 1 - (1 - p_1s)^0.1,
 - p_1s). A cut-in time is drawn by one exponential clock: it happens in the first step whose accumulated hazard
 exceeds -ln(1 - U). Given that no cut-in has happened before, this is the Bernoulli(p) draw of the step, and the same
 clock runs unchanged under importance functions and under the forced cut-in. Those that draw a path beforehand sum its
-hazards (`weigh_cut_ins` in `path`), pools of shells too (`harness.pool.walk`); all others go step by step
+hazards (`weigh_cut_ins` in `path`), pools of shells too (`harness.pool.aim`); all others go step by step
 (`choose_lane` in `nade.decide`).
 """
 

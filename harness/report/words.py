@@ -1,22 +1,26 @@
-"""The answer at a glance: some nine lines for a terminal, and the same rows for the first screen of the page."""
+"""The answer at a glance, in words: rows of a run or a comparison for terminal, page and JUnit, from numbers alone.
+
+They are those of ``estimates.json`` and ``compare.json``; `harness.report.lines` lays them out for a terminal.
+"""
 
 from __future__ import annotations
 
 import math
-import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
+from harness.estimators.answer import Elsewhere, Estimates
 from harness.estimators.estimate import Estimate
-from harness.estimators.severity import HARD_MPS, TOUCH_MPS, Severity
+from harness.estimators.severity import HARD_MPS, TOUCH_MPS
+from harness.estimators.traffic import TrafficError, Uncertain
 from harness.numbers import (
+    MISSING,
     WIDEST_RHW,
     count,
     duration,
@@ -32,21 +36,21 @@ from harness.numbers import (
 )
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
-WIDTH, LINES, LABEL = 100, 9, 26
-MOST_WARNINGS = 3
 CUT_OFF_SHARE = 0.2
 """Weight, relative to the rate, from which tests that were cut off are warned of, if the interval leaves them out."""
 ANY_SHARE = 0.95
 """Width of the interval of a share from which on it says nothing [assumed]."""
-CARRIES = 0.05
-"""Share of a rate from which on there is an upper limit alone, where nothing was seen of it [assumed]."""
+LEAST_REPLICATES = 100
+"""With fewer, quantiles far out in the tails change with their number [assumed]."""
+CLOSE = 0.1
+"""Factors closer to 1 than so much on a logarithmic scale are told with three digits."""
 _BRAKES_HARDEST = "brakes-8"
 ENDED = {
     "rhw": "precision reached",
     "below_reference": "far enough below the competent driver",
     "accept": "decision reached",
     "episodes": "budget spent",
-    "pool": "every cut-in of the pool was tested",
+    "pool": "the pool has no further cut-in that would narrow it",
     "pool_error": "the pool’s own error is too wide",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
@@ -83,27 +87,29 @@ class ShortAnswer:
     scope: str
 
 
-def short_answer(
-    campaign: Campaign,
-    best: Estimate,
-    severity: Severity | None,
-    manifest: Mapping[str, Any],
-    distance_km: float | None,
-    counts: Mapping[str, int],
-) -> ShortAnswer:
-    """The answer by a campaign's own estimate ``best``; ``distance_km`` is the mean of a test, if it is known.
+_ESTIMATES = TypeAdapter(Estimates)
 
-    ``counts`` says in how many tests the vehicle did something before BV was on its lane, or asked for it in vain.
-    """
+
+def answer_of(campaign: Campaign, manifest: Mapping[str, Any], content: Mapping[str, Any]) -> ShortAnswer:
+    """The answer of ``estimates.json``."""
+    return short_answer(campaign, manifest, _ESTIMATES.validate_python(content))
+
+
+def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> ShortAnswer:
+    """The answer by a campaign's own estimate, with what the ``manifest`` of the run says besides."""
     vehicle, parameters = vehicle_words(campaign.av)
     engine = "SUMO" if campaign.world.engine == "sumo" else "SUMO’s twin"
     return ShortAnswer(
         vehicle=vehicle,
         parameters=tuple(parameters),
-        tests=f"{count(best.n_episodes)} tests in {engine}",
-        rows=tuple(_rows(campaign, best, severity, manifest, distance_km)),
-        warnings=(*_warnings(campaign, best, severity, manifest), *_before_overlap(campaign, manifest, counts)),
-        scope=_scope(campaign, best, manifest.get("stopped_by"), manifest.get("remedy")),
+        tests=f"{count(told.n_episodes)} tests in {engine}",
+        rows=tuple(_with_traffic(list(_rows(campaign, manifest, told)), told.traffic)),
+        warnings=(
+            *_warnings(campaign, manifest, told),
+            *_before_overlap(campaign, manifest, told.diagnostics),
+            *_few_replicates(told.traffic),
+        ),
+        scope=_scope(campaign, manifest, told),
     )
 
 
@@ -129,14 +135,9 @@ def vehicle_words(av: AutomatedVehicle) -> tuple[str, list[tuple[str, str]]]:
     return name, [(path, plain(value) if isinstance(value, float) else words(value)) for path, value in leaves(given)]
 
 
-def _rows(
-    campaign: Campaign,
-    best: Estimate,
-    severity: Severity | None,
-    manifest: Mapping[str, Any],
-    distance_km: float | None,
-) -> Iterator[Row]:
-    if (decision := manifest.get("decision")) is not None:
+def _rows(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[Row]:
+    best, decision, assumed, distance_km = told.best, told.decision, told.assumed, told.distance_per_test_km
+    if decision is not None:
         yield _decided(decision)
     from_mps = campaign.crash.counts_above_mps
     counted = f"crash rate > {plain(from_mps)} m/s" if from_mps else "crash rate"
@@ -148,29 +149,29 @@ def _rows(
     elif not best.n_crashes or wide:
         less, shown = "< ", best.ci_high if best.n_crashes else best.upper_bound
         ends = f"{number(best.crash_rate)} seen" if best.n_crashes else "no crash seen"
-    unseen = no_lower_limit(best, manifest)
+    unseen = assumed if assumed is not None and assumed.no_lower_limit else None
     if unseen is not None:
         less, ends = "< ", f"{number(best.crash_rate)} as fitted" if best.n_crashes else ends
-        shown = unseen[1] * (best.ci_high if best.n_crashes else best.upper_bound)
+        shown = unseen.most * (best.ci_high if best.n_crashes else best.upper_bound)
     per_km = "" if not distance_km else f"{less}{number(shown * 1e6 / distance_km)} per million km"
-    remark = per_km if unseen is None else f"none seen at {unseen[0]}"
+    remark = per_km if unseen is None else f"none seen at {unseen.where}"
     so_far = " so far" if best.untested and best.n_crashes else ""
     rows = [Row("rate", f"{counted}{so_far}", f"{less}{number(shown)} per test", ends, remark)]
     beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
     acts = campaign.av.acts_before_cut_in
     rows += [_beside(each, acts=acts, wide=wide, from_below=from_below) for each in beside]
     # Where little else is known of the rate than a limit, what is known comes first: the ratio.
-    yield from reversed(rows) if unseen or (wide and beside and beside[0]["ratio_high"] < 1.0) else rows
+    yield from reversed(rows) if unseen or (wide and beside and _end(beside[0]["ratio_high"]) < 1.0) else rows
     if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
-    if "ends" in (manifest.get("assumed") or {}) and (moved := assumed_times(best, manifest)) is not None:
-        high = moved[1] * (best.ci_high if best.n_crashes else best.upper_bound)
+    if assumed is not None and assumed.highest is not None and assumed.times is not None:
+        high = assumed.most * (best.ci_high if best.n_crashes else best.upper_bound)
         ends = "" if from_below else f"up to {number(high)}"
-        remark = f"if {share(manifest['assumed']['ends'][1])} do not look"
-        yield Row("assumed", "traffic", f"at most × {number(moved[1], 2)} (assumed)", ends, remark)
+        value = f"at most × {number(assumed.most, 2)} (assumed)"
+        yield Row("assumed", "traffic", value, ends, f"if {share(assumed.highest)} do not look")
     if campaign.has_baseline_runs and best.n_crashes:
         yield from _whence(campaign, best, manifest.get("expected"))
-    if severity is not None:
+    if (severity := told.severity) is not None:
         above = _share_within(severity.share_above_5_mps, severity.limits_above_5_mps, f" > {plain(HARD_MPS)} m/s")
         below = _share_within(severity.share_below_1_mps, severity.limits_below_1_mps, f" < {plain(TOUCH_MPS)} m/s")
         value = f"median {tenths(severity.median_mps)} m/s"
@@ -184,28 +185,6 @@ def _rows(
         yield within(best.details["within"])
 
 
-def assumed_times(best: Estimate, manifest: Mapping[str, Any]) -> tuple[float, float] | None:
-    """By what the rate moves over what the manifest says to be ``assumed``; None where it does not.
-
-    Without a crash it is the upper limit that moves, which lies in one stratum.
-    """
-    given = manifest.get("assumed") or {}
-    if "times" not in given or not (shells := best.details.get("shells")):
-        return None
-    p, n, share = np.array([(each["p"], max(each["n_episodes"], 1), each["crash_share"]) for each in shells]).T
-    of_strata = [p, *(p * np.array(each) for each in given["times"])]
-    rates = [float(each @ share) if best.n_crashes else float(np.max(each / n)) for each in of_strata]
-    return rates[1] / rates[0], rates[2] / rates[0]
-
-
-def no_lower_limit(best: Estimate, manifest: Mapping[str, Any]) -> tuple[str, float] | None:
-    """Where none of the lane changes was seen that a rate comes from, and by what that may raise it; None elsewhere."""
-    where: str | None = (manifest.get("assumed") or {}).get("where")
-    if where is None or (times := assumed_times(best, manifest)) is None or times[1] - times[0] < CARRIES:
-        return None
-    return where, times[1]
-
-
 def unseen_words(where: str) -> str:
     """The same where it is not known by what the rate may rise."""
     return f"no lane change was seen at {where} in the data of this traffic: rates have only an upper limit"
@@ -213,7 +192,7 @@ def unseen_words(where: str) -> str:
 
 def _whence(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | None) -> Iterator[Row]:
     """Which of baseline runs and tests makes the interval as wide as it is, and how many of both may do."""
-    whole, runs = best.rhw, best.details.get("rhw_from_pool", math.inf)
+    whole, runs = best.rhw, _end(best.details.get("rhw_from_pool"))
     if not (math.isfinite(whole) and math.isfinite(runs)):
         return
     which = "runs" if 2.0 * runs * runs > whole * whole else "tests"
@@ -244,7 +223,7 @@ def _decided(decision: Mapping[str, Any]) -> Row:
 
 
 def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: bool) -> Row:
-    low, high = found["ratio_low"], found["ratio_high"]
+    low, high = found["ratio_low"], _end(found["ratio_high"])
     who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
     if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
         who = f"{found['reference']}, same approach"
@@ -274,25 +253,24 @@ def within(found: Mapping[str, Any]) -> Row:
     return Row("within", what, number(found["crash_rate"]), interval(found["ci_low"], found["ci_high"]), beyond)
 
 
-def _warnings(
-    campaign: Campaign, best: Estimate, severity: Severity | None, manifest: Mapping[str, Any]
-) -> Iterator[str]:
+def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[str]:
     """What changes the meaning of the rows, a line each."""
+    best, severity, assumed = told.best, told.severity, told.assumed
     yield from best.cautions
     repeated = manifest.get("repeated") or {}
     if n := len(repeated.get("differing", ())):
         yield f"NOT REPRODUCIBLE: {count(n)} of {count(repeated['n_episodes'])} tests that ran twice came out otherwise"
-    if n := best.details["n_failed"]:
+    if n_failed := best.details["n_failed"]:
         had = number(best.details["crash_rate_if_failed_had_crashed"])
-        yield f"{count(n)} of {count(best.n_episodes)} tests FAILED; had they all crashed, the rate would be {had}"
+        of = count(best.n_episodes)
+        yield f"{count(n_failed)} of {of} tests FAILED; had they all crashed, the rate would be {had}"
     if severity is not None and severity.share_below_1_mps > 0.5:
         yield f"{share(severity.share_below_1_mps)} of this rate are touches below {plain(TOUCH_MPS)} m/s"
-    given = manifest.get("assumed") or {}
-    if "where" in given and "times" not in given:
-        yield unseen_words(given["where"])
-    decision = manifest.get("decision")
-    if decision is not None and not decision.get("driver") and (unseen := no_lower_limit(best, manifest)):
-        yield f"no lane change was seen at {unseen[0]}: a limit on the rate rests on that; ask --accept r157-cc"
+    if assumed is not None and assumed.where and assumed.times is None:
+        yield unseen_words(assumed.where)
+    on_rate = told.decision is not None and not told.decision.get("driver")
+    if on_rate and assumed is not None and assumed.no_lower_limit:
+        yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; ask --accept r157-cc"
     worst = best.crash_rate + (0.0 if severity is None else severity.cut_off)
     if worst > max((1.0 + CUT_OFF_SHARE) * best.crash_rate, best.ci_high):
         yield f"time was up while it closed in: had all these tests crashed, {number(worst)} per test"
@@ -312,59 +290,146 @@ def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Map
         yield f"in {count(n)} tests it asked to speed up before BV was on its lane, and was held (av.takes_over)"
 
 
-def _scope(campaign: Campaign, best: Estimate, stopped_by: str | None, remedy: str | None) -> str:
+def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> str:
+    if told.elsewhere is not None:
+        return elsewhere_words(told.elsewhere)
+    best, stopped_by = told.best, told.stopped_by
     ended, target = ENDED.get(stopped_by or "", "interrupted"), campaign.stop.rhw
     if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept"):
         within = campaign.testing.shells.statement != ASSUMPTION_FREE and best.details.get("within")
-        asked = within["rhw"] if within else best.precision
+        asked = _end(within["rhw"]) if within else best.precision
         reached = f" ± {share(asked)}" if asked <= WIDEST_RHW else f" at over ± {share(WIDEST_RHW)}"
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
-        ended += f"{reached}, asked: ± {share(target)}"
-        ended += f"; {remedy}" if remedy else ""
+        ended += f"{reached}, asked: ± {share(target)}{remedy_words(manifest.get('remedy'))}"
     elif stopped_by == "episodes" and campaign.accept is None:
         ended = "all tests done"
     return f"sampling error in this simulated traffic only ({share(best.confidence)}); ended by: {ended}"
 
 
-def lines(answer: Mapping[str, Any], took_s: float | None, report: Path | None = None) -> list[str]:
-    """An answer (``answer`` in ``estimates.json``) for a terminal: at most `LINES` lines.
+def remedy_words(changes: Mapping[str, float | None] | None) -> str:
+    """What would have led further, by settings of the pool; one without a number is to be tried."""
+    if changes is None:
+        return ""
+    if not changes:
+        return "; no pool gives as much: ask for a wider stop.rhw"
+    told = []
+    for key, value in changes.items():
+        way = "lower" if key == "pool.relative_error" else "raise"
+        told.append(f"{way} {key}" + ("" if value is None else f" to {value:,.10g}"))
+    return f"; {' and '.join(told)}"
 
-    Those of more than `WIDTH` columns go on below. Where there is much to warn of the last rows give way: all of it is
-    on the page.
+
+def elsewhere_words(found: Elsewhere) -> str:
+    """On what an answer for other traffic rests."""
+    drivers = " and ".join(found.drivers)
+    known = f" (off by {share(found.off, least=0.001)} for {drivers})" if drivers else ""
+    rests = f"holds if as large a share of each shell crashes as there{known}"
+    return f"tests of {found.tested_in}, answered for {found.answered_for}: {rests}"
+
+
+def _end(value: float | None) -> float:
+    """What JSON has as null, because it was infinite."""
+    return math.inf if value is None else value
+
+
+# -- what replicates of the traffic say --
+
+
+def _with_traffic(rows: list[Row], found: TrafficError | None) -> list[Row]:
+    """Rows of an answer with those of its traffic below rate and ratio.
+
+    Where no lane change was seen the rate has but an upper limit, and stands behind the ratio.
     """
-    warnings = [f"! {text}" for text in answer["warnings"]]
-    if len(warnings) > MOST_WARNINGS:
-        warnings[MOST_WARNINGS - 1 :] = [f"! {count(len(warnings) - MOST_WARNINGS + 1)} more warnings: see the report"]
-    ends = [answer["scope"], *([] if report is None else [f"report  {report}"])]
-    rows = answer["rows"][: LINES - 1 - len(warnings) - len(ends)]
-    parameters = ", ".join(f"{name} {value}" for name, value in answer["parameters"])
-    head = [answer["vehicle"], answer["tests"], *([] if took_s is None else [duration(took_s)])]
-    if parameters:
-        room = WIDTH - len(" · ".join(head)) - 3
-        head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
-    table = _columns([(row["what"], row["value"], row["interval"], row["remark"]) for row in rows])
-    return [" · ".join(head), *table, *_wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+    if found is None:
+        return rows
+    if found.unseen is not None and not found.is_open:
+        limit, why = f"< {number(found.rate.both[1])} per test", f"none seen at {found.unseen.where}"
+        for i, row in enumerate(rows):
+            if row.key == "rate":
+                seen = f"{number(found.rate.value)} as fitted" if found.rate.value else row.interval
+                rows[i] = replace(row, value=limit, interval=seen, remark=why)
+        rows = sorted(rows, key=lambda row: {"verdict": 0, "ratio": 1}.get(row.key, 2))
+    place = 1 + max((i for i, row in enumerate(rows) if row.key in ("verdict", "rate", "ratio")), default=-1)
+    return [*rows[:place], *traffic_rows(found), *rows[place:]]
 
 
-def _columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Rows of equally many texts, each column as wide as its widest; a row too long for that is pushed together."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        *others, last = (text.ljust(width) for text, width in zip(row, widths, strict=True))
-        left, remark = "  ".join(["", *others]).rstrip(), last.rstrip()
-        line = "  ".join(["", *others, remark]).rstrip()
-        if len(line) > WIDTH:
-            line = f"{left}  {remark:>{max(WIDTH - 2 - len(left), 0)}}"
-        yield from [line] if len(line) <= WIDTH else _wrapped(["  ".join(filter(None, row))])
+def told_of_traffic(content: Mapping[str, Any]) -> list[Row]:
+    """Rows of a `TrafficError` from JSON."""
+    return list(traffic_rows(TypeAdapter(TrafficError).validate_python(content)))
 
 
-def _wrapped(texts: Iterable[str]) -> Iterator[str]:
-    """Lines of at most `WIDTH` columns, which begin after two spaces and go on after four."""
-    fill = textwrap.TextWrapper(WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
-    for text in texts:
-        whole = text.replace(" %", "\u00a0%").replace("± ", "±\u00a0")  # a number and its sign stay together
-        yield from (line.replace("\u00a0", " ") for line in fill.wrap(whole))
+def _few_replicates(found: TrafficError | None) -> tuple[str, ...]:
+    return () if found is None else too_few(found.n_replicates, found.confidence)
+
+
+def too_few(n_replicates: int, confidence: float) -> tuple[str, ...]:
+    """A warning of limits from few replicates; nothing where there are enough."""
+    if n_replicates >= LEAST_REPLICATES:
+        return ()
+    least = math.ceil(2.0 / (1.0 - confidence) - 1e-9)
+    none = f" (a {share(confidence)} interval needs {least} at least)" if n_replicates < least else ""
+    limits = f"limits of what is not known of the traffic change with their number below {LEAST_REPLICATES}"
+    return (f"{n_replicates} replicates{none}: {limits}",)
+
+
+def traffic_rows(found: TrafficError) -> Iterator[Row]:
+    """Lines of the short answer: of the rate, and of its ratio to the first of the others."""
+    why = "with sampling error" if found.unseen is None else f"none seen at {found.unseen.where}"
+    if found.is_open:
+        why = f"{found.n_refused} of {found.n_replicates} replicates unlike what was tested"
+    yield Row("traffic", "traffic", f"{times(found.rate)} (fitted)", _ends(found), why)
+    for name, each in list(found.ratios.items())[: 0 if found.is_open else 1]:
+        yield Row(
+            "traffic_ratio", "traffic, × driver", f"{times(each)} (fitted)", _of_ratio(each), f"the ratio to {name}"
+        )
+
+
+def _ends(found: TrafficError) -> str:
+    if found.is_open:
+        return MISSING
+    return interval(*found.rate.both) if found.rate.times[0] > 0.0 else f"< {number(found.rate.both[1])}"
+
+
+def _of_ratio(of: Uncertain) -> str:
+    low, high = of.both
+    if math.isfinite(high):
+        return f"{ratio(low)} to {ratio(high)}" if low > 0.0 else f"< {ratio(high)}"
+    return f"at least {ratio(low)}" if low > 0.0 else "no limit"
+
+
+def times(of: Uncertain) -> str:
+    """``× 0.6 … × 2.1``, or ``at most × 27``."""
+    low, high = (number(end, 2 if end > 0.0 and abs(math.log(end)) > CLOSE else 3) for end in of.times)
+    if of.times[0] > 0.0:
+        return f"× {low} … × {high}"
+    return f"at most × {high}" if math.isfinite(of.times[1]) else "no limit"
+
+
+# -- a comparison --
+
+
+def pair_words(decision: Mapping[str, Any]) -> str:
+    """What is known of who crashes less often (``decision`` in ``compare.json``)."""
+    margin, verdict = decision["margin"], decision["verdict"]
+    if not margin:
+        told = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
+        return told.get(verdict, "Not told apart")
+    most = share(margin)
+    told = {"proven": f"B is at most {most} worse than A", "refuted": f"B is more than {most} worse than A"}
+    return told.get(verdict, f"Open whether B is more than {most} worse than A")
+
+
+def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
+    """What changes the meaning of a comparison (``compare.json``)."""
+    sides = {name: content[name.lower()] for name in "AB"}
+    for name, of in sides.items():
+        if n := of["details"]["n_failed"]:
+            yield f"{count(n)} tests of {name} FAILED"
+    for name, of in sides.items():
+        yield from (f"{name}: {text}" for text in of["warnings"])
+    if where := content.get("unseen"):
+        yield unseen_words(where)
 
 
 def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) -> str | None:
@@ -376,7 +441,9 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     where, done = (" and a new --out", 0) if needed["new_folder"] else ("", content["n_pairs"])
     n = two_digits_up(needed["pairs"] - done)
     cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
-    return f"to decide, give the same command with {needed['options']}{where}: some {count(n)} more pairs{cost}"
+    settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
+    options = f"--margin {content['decision']['margin']:g}{settings}"
+    return f"to decide, give the same command with {options}{where}: some {count(n)} more pairs{cost}"
 
 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -384,34 +451,3 @@ def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
     given = content.get("asked") == LIBRARY_STATEMENT and not content["conditional"].get("refuted")
     asked: Mapping[str, Any] = content["conditional"] if given else content
     return asked
-
-
-def pair_lines(
-    content: Mapping[str, Any], counts_above_mps: float, report: Path, s_per_pair: float | None = None
-) -> list[str]:
-    """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is what a pair takes."""
-    asked = pair_asked(content)
-    rows = []
-    for name in "AB":
-        of, label = content[name.lower()], content["campaigns"][name.lower()]["label"]
-        rate, ends = number(of["crash_rate"]), interval(of["ci_low"], of["ci_high"])
-        if not of["n_crashes"]:
-            rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
-        label = label if len(label) <= LABEL else f"{label[: LABEL - 2]} …"
-        rows.append((f"{name} {label}", rate, ends, f"{count(of['n_crashes'])} crashes"))
-    if asked["ratio"] is not None:
-        most = "no limit" if asked["ratio_high"] is None else ratio(asked["ratio_high"])
-        rows.append(("A / B", ratio(asked["ratio"]), f"{ratio(asked['ratio_low'])} to {most}", ""))
-    alone = f"A alone {count(asked['n_only_a'])}, B alone {count(asked['n_only_b'])}"
-    rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), alone))
-    remarks = [f"! {text}" for text in content["warnings"]]
-    if asked is not content:
-        given = f"A / B and A − B are given that both crash only where {asked['boundary']} of the library does"
-        remarks.insert(0, given)
-    ended = ENDED.get(content.get("ended", ""), "interrupted")
-    scope = f"sampling error in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"
-    counted = f" above {plain(counts_above_mps)} m/s" if counts_above_mps else ""
-    pairs = f"{count(content['n_pairs'])} pairs of tests"
-    head = f"{content['decision']['words']} · {pairs} · crashes{counted} per test"
-    last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
-    return [head, *_columns(rows), *_wrapped([*remarks[: 3 - len(last)], *last]), f"  report  {report}"]

@@ -3,28 +3,20 @@
 import json
 import math
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import pytest
 
 from harness.campaign.files import load_campaign
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.short_answer import (
-    LINES,
-    WIDTH,
-    _whence,
-    deciding_words,
-    lines,
-    pair_lines,
-    short_answer,
-    vehicle_words,
-)
 from harness.records.folder import read_manifest
+from harness.report.lines import LINES, WIDTH, lines, pair_lines
 from harness.report.summary import read_run_folder
+from harness.report.words import _whence, answer_of, deciding_words, remedy_words, short_answer, vehicle_words
 from harness.runner.stored import stored_blocks
 from tests.golden.campaigns import BASE, RUNS
-from tests.stored_runs import estimates, golden
+from tests.stored_runs import answer_in, estimates, golden
 
 SAID = {
     "nde-twin": ["lane-change level 3,000,000: never compare", "impact "],
@@ -49,7 +41,8 @@ SAID = {
 
 
 def shown(folder):
-    return lines(estimates(folder)["answer"], 3.21, folder / "report.html")
+    run = read_run_folder(folder)
+    return lines(short_answer(run.campaign, run.manifest, run.estimates), 3.21, folder / "report.html")
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -67,13 +60,20 @@ def test_it_is_short_and_says_what_changes_the_meaning(name, stored_run):
 def answered(stored_run, name="shells-twin", **manifest):
     folder = stored_run(name)
     known = {**read_manifest(folder), **manifest}
-    return estimate_blocks(stored_blocks(folder, moments=False), golden(name, "stop.rhw=0.1"), known)["answer"]
+    campaign = golden(name, "stop.rhw=0.1")
+    return answer_of(campaign, known, estimate_blocks(stored_blocks(folder, moments=False), campaign, known))
+
+
+def said(run, best=None, campaign=None, manifest=None, **changes):
+    """The answer of a run, had its estimate, or others of its numbers, been other ones."""
+    found = {run.estimates.headline: best or run.headline}
+    return short_answer(campaign or run.campaign, manifest or {}, replace(run.estimates, estimates=found, **changes))
 
 
 def test_a_vehicle_that_is_not_reproducible_and_a_precision_that_was_not_reached(stored_run):
     answer = answered(stored_run, repeated={"n_episodes": 16, "differing": [3, 4, 5]})
-    assert answer["warnings"] == ["NOT REPRODUCIBLE: 3 of 16 tests that ran twice came out otherwise"]
-    assert re.search(r"ended by: budget spent ± \d+ %, asked: ± 10 %$", answer["scope"])
+    assert list(answer.warnings) == ["NOT REPRODUCIBLE: 3 of 16 tests that ran twice came out otherwise"]
+    assert re.search(r"ended by: budget spent ± \d+ %, asked: ± 10 %$", answer.scope)
 
 
 def test_a_limit_that_is_rejected_or_open(stored_run):
@@ -81,7 +81,7 @@ def test_a_limit_that_is_rejected_or_open(stored_run):
     for verdict, value in (("rejected", "above 4 × 10⁻⁷ per test"), ("undecided", "limit 4 × 10⁻⁷ per test")):
         asked = {**decision, "verdict": verdict}
         answer = answered(stored_run, decision=asked)
-        assert (answer["rows"][0]["what"], answer["rows"][0]["value"]) == (verdict.upper(), value)
+        assert (answer.rows[0].what, answer.rows[0].value) == (verdict.upper(), value)
         assert len([line for line in lines(answer, 1.0) if not line.startswith("    ")]) <= LINES
 
 
@@ -90,11 +90,11 @@ def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     folder, campaign = stored_run("shells-twin"), golden("shells-twin", "crash.counts_above_mps=50")
     blocks = [block.harder_than(50.0) for block in stored_blocks(folder, moments=False)]
     content = estimate_blocks(blocks, campaign, read_manifest(folder))
-    rows = {row["key"]: row for row in content["answer"]["rows"]}
+    rows = {row.key: row for row in answer_of(campaign, {}, content).rows}
     assert set(rows) == {"rate", "ratio"}
-    assert (rows["rate"]["what"], rows["rate"]["interval"]) == ("crash rate > 50 m/s", "no crash seen")
-    assert rows["rate"]["value"].startswith("< ")
-    assert rows["rate"]["remark"].startswith("< ")
+    assert (rows["rate"].what, rows["rate"].interval) == ("crash rate > 50 m/s", "no crash seen")
+    assert rows["rate"].value.startswith("< ")
+    assert rows["rate"].remark.startswith("< ")
     assert content["severity"] is None
 
 
@@ -106,17 +106,18 @@ def test_a_vehicle_that_only_touches_is_said_so(stored_run):
         for block in stored_blocks(folder, moments=False)
     ]
     content = estimate_blocks(blocks, campaign, read_manifest(folder))
-    text = lines(content["answer"], 1.0)
+    answer = answer_of(campaign, {}, content)
+    text = lines(answer, 1.0)
     assert any(
         re.match(r"  impact +median 0.1 m/s +0 % \(0–\d+ %\) > 5 m/s +100 % \(\d+–100 %\) < 1 m/s", line)
         for line in text
     )
     assert "  ! 100 % of this rate are touches below 1 m/s" in text
-    assert content["answer"]["rows"][0] == estimates(folder)["answer"]["rows"][0]
+    assert asdict(answer.rows[0]) == answer_in(folder)["rows"][0]
 
 
 def test_much_to_warn_of_leaves_room_for_the_rate(stored_run):
-    answer = {**answered(stored_run), "warnings": ["a" * 120, "b", "c", "d", "e"]}
+    answer = replace(answered(stored_run), warnings=("a" * 120, "b", "c", "d", "e"))
     text = lines(answer, None)
     assert text[1].startswith("  crash rate ")
     assert "  ! 3 more warnings: see the report" in text
@@ -140,14 +141,14 @@ def test_vehicles_are_named_with_what_is_not_a_default():
 @pytest.mark.parametrize(("name", "untested"), [("shells-inside", True), ("shells-twin", False)])
 def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, untested, stored_run):
     content = estimates(stored_run(name))
-    (rate,) = [row for row in content["answer"]["rows"] if row["key"] == "rate"]
+    rows = {row["key"]: row for row in answer_in(stored_run(name))["rows"]}
+    rate = rows["rate"]
     shells = content["estimates"]["shells"]["details"]["shells"]
     assert any(not each["n_episodes"] for each in shells) == untested
     assert (rate["what"] == "crash rate so far") == untested
     assert rate["remark"].endswith(" per million km")
-    others = {row["key"]: row for row in content["answer"]["rows"]}
-    assert not others["ratio"]["value"].startswith("≥")
-    assert (others["unavoidable"]["what"] == "unavoidable so far") == untested
+    assert not rows["ratio"]["value"].startswith("≥")
+    assert (rows["unavoidable"]["what"] == "unavoidable so far") == untested
 
 
 @pytest.mark.parametrize(
@@ -165,26 +166,25 @@ def test_of_a_vehicle_that_acts_it_says_whether_runs_or_tests_are_missing(alone,
 
 
 def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what_to_raise(stored_run):
-    folder = stored_run("shells-acting-twin")
-    best = read_run_folder(folder).headline
+    run = read_run_folder(stored_run("shells-acting-twin"))
+    best = run.headline
     best = replace(best, n_crashes=0, rhw=math.inf, cautions=(), details={**best.details, "references": []})
-    answer = short_answer(
-        golden("shells-acting-twin", "stop.rhw=0.3"), best, None, {"stopped_by": "pool", "remedy": "x"}, None, {}
-    )
+    campaign = golden("shells-acting-twin", "stop.rhw=0.3")
+    manifest = {"remedy": {"pool.cut_ins_per_shell": 3200}}
+    answer = said(run, best, campaign, severity=None, stopped_by="pool", manifest=manifest)
     [row] = [row for row in answer.rows if row.key == "ratio"]
     assert (row.value, row.remark) == ("no ratio", "such drivers never crash here")
-    assert answer.scope.endswith("was tested, no crash seen, asked: ± 30 %; x")
-    forced = replace(read_run_folder(stored_run("forced-acting-twin")).headline, cautions=())  # asks no other driver
-    answer = short_answer(golden("forced-acting-twin"), forced, None, {}, None, {})
+    assert answer.scope.endswith("would narrow it, no crash seen, asked: ± 30 %; raise pool.cut_ins_per_shell to 3,200")
+    run = read_run_folder(stored_run("forced-acting-twin"))
+    answer = said(run, replace(run.headline, cautions=()))  # asks no other driver
     assert "ratio" not in {row.key for row in answer.rows}
 
 
 def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time(stored_run):
-    best = read_run_folder(stored_run("forced-krauss")).headline
     for name, takes_time, warned in (
         ("forced-krauss", True, True), ("forced-krauss", False, False), ("forced-twin", True, False)
     ):  # fmt: skip
-        answer = short_answer(golden(name), best, None, {"cut_ins_take_time": takes_time}, None, {})
+        answer = said(read_run_folder(stored_run(name)), manifest={"cut_ins_take_time": takes_time})
         assert any("cannot see BV come over" in each for each in answer.warnings) == warned
 
 
@@ -205,8 +205,8 @@ def test_only_of_a_vehicle_of_the_users_own_it_is_said_that_it_was_held(name, sa
 )
 def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, value, ends, stored_run):
     """An upper limit, where the interval is wide or nothing crashed; the ratio's, where it says something."""
-    folder = stored_run("shells-lateral-twin")
-    best = read_run_folder(folder).headline
+    run = read_run_folder(stored_run("shells-lateral-twin"))
+    best = run.headline
     [beside, *_] = best.details["references"]
     low = 0.0 if seen == 0.0 else 0.05
     beside = {**beside, "reference": "r157-cc", "crash_rate": 3e-8, "ratio": seen, "ratio_low": low, "ratio_high": high}
@@ -214,7 +214,7 @@ def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, va
     tested = [{**each, "n_episodes": 9} for each in best.details["shells"]]
     details = {**best.details, "references": [beside], "shells": tested}
     best = replace(best, **rate, n_crashes=2 * (seen > 0.0), details=details)
-    rows = short_answer(golden("shells-lateral-twin", "stop.rhw=0.3"), best, None, {}, None, {}).rows
+    rows = said(run, best, golden("shells-lateral-twin", "stop.rhw=0.3"), severity=None).rows
     assert (rows[0].key, rows[0].value, rows[0].interval) == (first, value, ends)
 
 
@@ -233,7 +233,7 @@ def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     best = replace(run.headline, **rate, details={**details, "shells": shells})
     limits = {"limits_above_5_mps": (0.0, 1.0), "limits_below_1_mps": (0.001, 0.41)}
     severity = replace(run.estimates.severity, **limits, share_below_1_mps=0.0)
-    rows = short_answer(run.campaign, best, severity, {"decision": decision}, None, {}).rows
+    rows = said(run, best, severity=severity, decision=decision).rows
     found = {row.key: (row.value, row.interval) for row in rows}
     assert found["rate"] == ("> 1.00 × 10⁻⁷ per test", "2.00 × 10⁻⁷ seen")
     assert found["ratio"] == ("> 2.00 (crashes more)", "3.98 seen")
@@ -247,7 +247,7 @@ def severe(stored_run, cut_off=0.0, **of_rate):
     rate = run.headline.crash_rate
     best = replace(run.headline, **{name: times * rate for name, times in of_rate.items()})
     severity = replace(run.estimates.severity, cut_off=cut_off * rate)
-    return lambda **other: short_answer(golden("shells-twin"), best, replace(severity, **other), {}, None, {})
+    return lambda **other: said(run, best, severity=replace(severity, **other))
 
 
 @pytest.mark.parametrize(("cut_off", "high", "warned"), [(0.19, 1.1, False), (0.3, 1.2, True), (0.3, 1.4, False)])
@@ -268,15 +268,16 @@ def test_only_what_the_hardest_brakes_do_not_avoid_is_called_unavoidable(driver,
 def test_a_comparison_is_as_short():
     """With what makes it long: names, far limits, warnings, a margin."""
     side = {"crash_rate": 1.4e-7, "ci_low": 1e-10, "ci_high": 2e-7, "n_crashes": 93, "upper_bound": 1e-6}
+    side |= {"warnings": ["w" * 120] * 2, "details": {"n_failed": 0}}
     inside = {
         "ratio": 138.0, "ratio_low": 0.1, "ratio_high": None, "difference": -2e-7, "ci_low": -3e-7, "ci_high": -1e-7,
         "n_only_a": 31, "n_only_b": 1000, "boundary": "brakes-2-late-1s",
     }  # fmt: skip
     content = {
         **inside, "conditional": inside, "a": side, "b": {**side, "n_crashes": 0}, "n_pairs": 1234, "confidence": 0.9,
-        "campaigns": {"a": {"label": "a" * 40}, "b": {"label": "b c " * 20}}, "warnings": ["w" * 120] * 4,
-        "decision": {"verdict": "open", "words": "Open whether B is more than 10 % worse than A"}, "ended": "rhw",
-        "to_decide": {"pairs": 7000, "options": "--margin 0.1 --set stop.episodes=7000", "new_folder": False},
+        "campaigns": {"a": {"label": "a" * 40}, "b": {"label": "b c " * 20}},
+        "decision": {"verdict": "open", "margin": 0.1}, "ended": "rhw",
+        "to_decide": {"pairs": 7000, "settings": {"stop.episodes": 7000}, "new_folder": False},
         "asked": "library",
     }  # fmt: skip
     text = pair_lines(content, 2.0, "runs/ab/report.html", 0.01)
@@ -300,11 +301,27 @@ def test_a_comparison_is_as_short():
         ("open", None, "too much alike"),
         (
             "open",
-            {"pairs": 1000, "options": "--margin 0", "new_folder": True},
+            {"pairs": 1000, "settings": {}, "new_folder": True},
             "--margin 0 and a new --out: some 1,000",
         ),
     ],
 )
 def test_what_would_decide(verdict, needed, said):
-    told = deciding_words({"decision": {"verdict": verdict}, "to_decide": needed, "n_pairs": 900})
+    told = deciding_words({"decision": {"verdict": verdict, "margin": 0.0}, "to_decide": needed, "n_pairs": 900})
     assert told is None if said is None else said in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        (None, ""),
+        ({}, "; no pool gives as much: ask for a wider stop.rhw"),
+        ({"pool.shadow_paths": None}, "; raise pool.shadow_paths"),
+        (
+            {"pool.relative_error": 0.0123, "pool.cut_ins_per_shell": 12000},
+            "; lower pool.relative_error to 0.0123 and raise pool.cut_ins_per_shell to 12,000",
+        ),
+    ],
+)
+def test_what_leads_further(changes, told):
+    assert remedy_words(changes) == told

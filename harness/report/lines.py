@@ -1,0 +1,85 @@
+"""Answers laid out for a terminal: some nine lines of 100 columns."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from harness.numbers import count, duration, interval, number, plain, ratio, share
+from harness.report.words import ENDED, ShortAnswer, deciding_words, pair_asked, pair_warnings, pair_words
+
+WIDTH, LINES, LABEL = 100, 9, 26
+MOST_WARNINGS = 3
+
+
+def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None = None) -> list[str]:
+    """An answer for a terminal: at most `LINES` lines.
+
+    Those of more than `WIDTH` columns go on below. Where there is much to warn of the last rows give way: all of it is
+    on the page.
+    """
+    warnings = [f"! {text}" for text in answer.warnings]
+    if len(warnings) > MOST_WARNINGS:
+        warnings[MOST_WARNINGS - 1 :] = [f"! {count(len(warnings) - MOST_WARNINGS + 1)} more warnings: see the report"]
+    ends = [answer.scope, *([] if report is None else [f"report  {report}"])]
+    rows = answer.rows[: LINES - 1 - len(warnings) - len(ends)]
+    parameters = ", ".join(f"{name} {value}" for name, value in answer.parameters)
+    head = [answer.vehicle, answer.tests, *([] if took_s is None else [duration(took_s)])]
+    if parameters:
+        room = WIDTH - len(" · ".join(head)) - 3
+        head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
+    table = _columns([row.texts for row in rows])
+    return [" · ".join(head), *table, *_wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Rows of equally many texts, each column as wide as its widest; a row too long for that is pushed together."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        *others, last = (text.ljust(width) for text, width in zip(row, widths, strict=True))
+        left, remark = "  ".join(["", *others]).rstrip(), last.rstrip()
+        line = "  ".join(["", *others, remark]).rstrip()
+        if len(line) > WIDTH:
+            line = f"{left}  {remark:>{max(WIDTH - 2 - len(left), 0)}}"
+        yield from [line] if len(line) <= WIDTH else _wrapped(["  ".join(filter(None, row))])
+
+
+def _wrapped(texts: Iterable[str]) -> Iterator[str]:
+    """Lines of at most `WIDTH` columns, which begin after two spaces and go on after four."""
+    fill = textwrap.TextWrapper(WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
+    for text in texts:
+        whole = text.replace(" %", "\u00a0%").replace("± ", "±\u00a0")  # a number and its sign stay together
+        yield from (line.replace("\u00a0", " ") for line in fill.wrap(whole))
+
+
+def pair_lines(
+    content: Mapping[str, Any], counts_above_mps: float, report: Path, s_per_pair: float | None = None
+) -> list[str]:
+    """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is what a pair takes."""
+    asked = pair_asked(content)
+    rows = []
+    for name in "AB":
+        of, label = content[name.lower()], content["campaigns"][name.lower()]["label"]
+        rate, ends = number(of["crash_rate"]), interval(of["ci_low"], of["ci_high"])
+        if not of["n_crashes"]:
+            rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
+        label = label if len(label) <= LABEL else f"{label[: LABEL - 2]} …"
+        rows.append((f"{name} {label}", rate, ends, f"{count(of['n_crashes'])} crashes"))
+    if asked["ratio"] is not None:
+        most = "no limit" if asked["ratio_high"] is None else ratio(asked["ratio_high"])
+        rows.append(("A / B", ratio(asked["ratio"]), f"{ratio(asked['ratio_low'])} to {most}", ""))
+    alone = f"A alone {count(asked['n_only_a'])}, B alone {count(asked['n_only_b'])}"
+    rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), alone))
+    remarks = [f"! {text}" for text in pair_warnings(content)]
+    if asked is not content:
+        given = f"A / B and A − B are given that both crash only where {asked['boundary']} of the library does"
+        remarks.insert(0, given)
+    ended = ENDED.get(content.get("ended", ""), "interrupted")
+    scope = f"sampling error in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"
+    counted = f" above {plain(counts_above_mps)} m/s" if counts_above_mps else ""
+    pairs = f"{count(content['n_pairs'])} pairs of tests"
+    head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per test"
+    last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
+    return [head, *_columns(rows), *_wrapped([*remarks[: 3 - len(last)], *last]), f"  report  {report}"]
