@@ -92,10 +92,14 @@ class Fake:
         return natural_script(x, v, lane, speed, lanes.astype(np.int8)[:, :, None], chosen.at, chosen.lead)
 
     def drive(self, traffic, chosen, start, drivers, *, last=False):
+        """Drivers who do nothing: near ones touch POV when the gap is used up at 1 m a step."""
         crash = (chosen.facts["gap_m"] == NEAR_M) & (chosen.at >= 0)
-        end = np.repeat(np.where(crash, chosen.at + 3, -1)[:, None], len(drivers), axis=1)
-        nowhere = np.zeros((len(drivers), STEPS + 1, 2) if last else (0, 0, 0))
-        return Driven(end, nowhere, np.zeros((STEPS + 1, 2)))
+        end = np.repeat(np.where(crash, int(NEAR_M) + 1, -1)[:, None], len(drivers), axis=1)
+        step = np.arange(STEPS + 1)
+        av = np.column_stack((100.0 + 3.0 * step, np.full(step.size, 30.0)))
+        ahead = np.column_stack((105.0 + chosen.facts["gap_m"][-1] + 2.0 * step, np.full(step.size, 20.0)))
+        av[(step <= chosen.at[-1]) | ((step > end[-1, 0]) & crash[-1])] = 0.0
+        return Driven(end, np.tile(av, (len(drivers), 1, 1)) if last else np.zeros((0, 0, 0)), ahead)
 
     def avoidable(self, traffic, facts, where, drivers):
         return None
