@@ -77,7 +77,7 @@ def main() -> None:
             prepared = prepare(
                 resolve(load_campaign(ROOT / "scenarios/overtaking_mixture.yaml", [f"av={av}", "av.warm_up_s=0"]))
             )
-            loops[name] = prepared.loop(world, traces="none", black_box=Path(folder) / "black-box")
+            loops[name] = prepared.loop(world, traces="none")
             loops[name].run(0, prepared.tests(0, 96))
         tests = prepared.tests(0, given.episodes)
         for _ in range(given.rounds):

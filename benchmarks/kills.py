@@ -71,7 +71,7 @@ class Here:
         """What can be killed."""
         return {
             "run": [run.pid],
-            "worker": [pid for pid in descendants(run.pid) if started_by(pid, b"harness.processes")],
+            "worker": [pid for pid in descendants(run.pid) if started_by(pid, b"multiprocessing.forkserver")],
         }
 
     def mend(self) -> None:
@@ -98,7 +98,7 @@ class OnMachines(Here):
         everywhere = [pid for machine in machines for pid in machine]
         return {
             "run": [pid for pid in descendants(run.pid) if started_by(pid, b"harness\0run")],
-            "worker": [pid for pid in everywhere if started_by(pid, b"harness.processes")],
+            "worker": [pid for pid in everywhere if started_by(pid, b"multiprocessing.forkserver")],
             "actor": [pid for pid in everywhere if started_by(pid, b"ray::OnMachine")],
             "raylet": [pid for machine in machines[1:] for pid in machine if started_by(pid, b"/raylet/raylet")],
         }

@@ -48,15 +48,6 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         cache.keep(mark, b"done")
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _workers_begin_at_once() -> Iterator[None]:
-    """Only tests that start a program by themselves pay for a fresh Python."""
-    from tests.in_process import forked_workers
-
-    with forked_workers():
-        yield
-
-
 @pytest.fixture(scope="session")
 def stored_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """The folder of a golden campaign, run when it is first asked for, once for all workers. Damage a copy only."""

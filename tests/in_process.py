@@ -6,17 +6,9 @@ Whoever moves what is patched here mends it here: no other file of the tests kno
 from __future__ import annotations
 
 import os
-import pickle
-import subprocess
-import sys
-import tempfile
-import time
-import traceback
-import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,8 +16,7 @@ import pytest
 from benchmarks.kills import descendants, started_by
 from harness import run
 from harness.campaign.campaign import Campaign
-from harness.controllers.hosts import Death
-from harness.processes import ForkServer
+from harness.resolved import Resolved
 from harness.runner import workers
 from harness.runner.run import RunResult
 from harness.runner.workers import ShardResult, ShardRunner
@@ -44,11 +35,11 @@ def without_page() -> Iterator[None]:
 class WorkerInThisProcess:
     """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
 
-    def __init__(self, server: ForkServer, serve: Callable[..., None], resolved: Path, baseline: Path) -> None:
-        self._runner = ShardRunner(pickle.loads(resolved.read_bytes()), baseline)
+    def __init__(self, _serve: Callable[..., None], resolved: Resolved, baseline: Path) -> None:
+        self._runner = ShardRunner(resolved, baseline)
 
-    def give(self, spec: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
-        self._done = self._runner.run(spec, fatal_episodes)
+    def give(self, request: ShardRequest, fatal: Mapping[int, str], alone: bool) -> bool:
+        self._done = self._runner.run(request, fatal)
         return True
 
     def answer(self) -> ShardResult:
@@ -59,7 +50,6 @@ class WorkerInThisProcess:
 
     def dismiss(self) -> None:
         self._runner.close()
-        self._runner._loop._world.close()
 
     def wait(self, seconds: float) -> None: ...
 
@@ -70,12 +60,12 @@ def one_process() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(workers, "WorkerProcess", WorkerInThisProcess)
         patch.setattr(workers.LocalWorkers, "first_to_answer", lambda _, busy: busy[0])
+        patch.setattr(workers, "start_server", lambda: None)
         yield
 
 
 def _work_here(_: Any, work: Callable[..., Any], *arguments: Any) -> Any:
-    with tempfile.TemporaryDirectory() as folder:
-        return work(*arguments, black_box=Path(folder) / "black-box")
+    return work(*arguments)
 
 
 @contextmanager
@@ -98,45 +88,7 @@ def run_with_workers(campaign: Campaign, out: Path, **options: Any) -> RunResult
         return run(campaign, out, **options)
 
 
-class ForkedPython(subprocess.Popen):
-    """Instead of a fresh Python for a worker, a copy of this one: its imports take seconds, and are done here."""
-
-    def _execute_child(self, args: Any, executable: Any, preexec_fn: Any, close_fds: Any, *rest: Any) -> None:
-        if not (isinstance(args, list) and args[:2] == [sys.executable, "-c"] and "harness.processes" in args[2]):
-            super()._execute_child(args, executable, preexec_fn, close_fds, *rest)
-            return
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # threads of xdist are nothing to a worker
-            self.pid = os.fork()
-        if self.pid == 0:
-            try:
-                os.setsid()
-                sys.stdout, sys.stderr = (open(fd, "w", buffering=1, closefd=False) for fd in (1, 2))  # noqa: SIM115
-                nothing = os.open(os.devnull, os.O_RDWR)  # Arrow aborts a copy of this copy if its pipe is closed
-                for fd in {int(each.name) for each in Path("/proc/self/fd").iterdir()} - {0, 1, 2, nothing, *rest[0]}:
-                    with suppress(OSError):  # that of the folder itself
-                        os.fstat(fd)
-                        os.dup2(nothing, fd, inheritable=False)
-                exec(args[2], {"__name__": "__worker__"})
-                os._exit(0)
-            except SystemExit as error:
-                os._exit(error.code if isinstance(error.code, int) else 1)
-            except BaseException:  # noqa: BLE001 - nothing of pytest may go on in a copy
-                traceback.print_exc()
-                os._exit(1)
-        while os.getsid(self.pid) != self.pid:  # as after a true start: from now on it can be ended
-            time.sleep(0.0)
-        self._child_created = True
-
-
-@contextmanager
-def forked_workers() -> Iterator[None]:
-    """Workers that are processes of their own begin at once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.processes.subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": ForkedPython}))
-        yield
-
-
 def workers_alive() -> list[int]:
-    """Processes below this one, but for Python's own watcher of shared memory, which other tests may have started."""
-    return [pid for pid in descendants(os.getpid()) if not started_by(pid, b"resource_tracker")]
+    """Workers of this process."""
+    of_server = [pid for pid in descendants(os.getpid()) if started_by(pid, b"multiprocessing.forkserver")]
+    return [pid for pid in of_server if os.getsid(pid) == pid]

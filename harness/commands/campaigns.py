@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
@@ -32,6 +32,7 @@ from harness.commands.printing import (
     say,
 )
 from harness.numbers import leaves, words
+from harness.processes import start_server
 
 
 @click.command(
@@ -129,11 +130,9 @@ def run(
     seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
     campaign = harness.load_campaign(campaign_file, [*seeds, *overrides, *limit, *where], av=av)
     chosen, folder = folder is None, folder or _run_folder(campaign.name, resume=resume)
-    from harness.processes import imports_ahead, worker_modules  # noqa: PLC0415 - keeps --help fast
-
-    is_local = campaign.run.executor == "local"
-    ahead = imports_ahead(*worker_modules(campaign.world.engine)) if is_local else nullcontext()
-    with named_if_written(folder, chosen=chosen), ahead, progress_bar() as bar:
+    if campaign.run.executor == "local":
+        start_server()
+    with named_if_written(folder, chosen=chosen), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
     if junit is not None:
         from harness.report.junit import statement_case, write_junit  # noqa: PLC0415 - keeps --help fast

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import closing
+from collections.abc import Callable
 from copy import deepcopy
 from functools import cache, partial
 from importlib.util import module_from_spec, spec_from_file_location
@@ -20,8 +19,8 @@ from harness.campaign.problems import did_you_mean
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import (
     BatchHost,
+    BeforeTest,
     ControllerHost,
-    Death,
     Guard,
     VehicleHost,
     cause_of,
@@ -30,7 +29,7 @@ from harness.controllers.hosts import (
 from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.files import real_path
-from harness.processes import CONSTRUCTOR, Apart, ForkServer, WorkerDeath, first_to_answer, tell
+from harness.processes import Child, WorkerDeath, first_to_answer, tell
 
 _Answer = TypeVar("_Answer")
 
@@ -88,8 +87,7 @@ def build_host(
     *,
     n_cells: int,
     seed: int,
-    black_box: Path | None = None,
-    fatal_episodes: Mapping[int, Death] | None = None,
+    before_test: BeforeTest = lambda _: None,
 ) -> ControllerHost | None:
     """Host of the AV's controller, or None for an AV that needs none (built in, or driven by SUMO).
 
@@ -97,11 +95,11 @@ def build_host(
     """
     if av.source not in ("controller", "fmu"):
         return None
-    guard = Guard(av.limits, black_box)
+    guard = Guard(av.limits)
     if av.fmu is not None:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
-        return VehicleHost(fmu_maker(av.fmu), n_cells, av, seed, guard, fatal_episodes)
+        return VehicleHost(fmu_maker(av.fmu), n_cells, av, seed, guard, before_test)
     try:
         make = _maker(av)
         guard.restore_modes()
@@ -114,8 +112,8 @@ def build_host(
         mend = "Mend what is raised: a __getattr__ raises AttributeError for what is not there."
         raise CampaignError("av.controller", found, "a controller (see docs/controllers.md)", mend) from error
     if is_batch:
-        return BatchHost(first, av, seed, guard)
-    return VehicleHost(make, n_cells, av, seed, guard, fatal_episodes, first)
+        return BatchHost(first, av, seed, guard, before_test)
+    return VehicleHost(make, n_cells, av, seed, guard, before_test, first)
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
@@ -206,7 +204,7 @@ def _require_controller(made: Any, name: str) -> None:
 def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
     with guard:
-        controller, wrong = guard.call(CONSTRUCTOR, make, makes=True)
+        controller, wrong = guard.call(make, makes=True)
     if wrong is not None:
         mend = "Mend its constructor, or what it needs (av.parameters; av.limits.construction_time_s, if that is time)."
         raise CampaignError("av.controller", f"{name}, whose constructor failed: {wrong}", "a controller", mend)
@@ -221,28 +219,24 @@ def has_foreign_code(av: AutomatedVehicle) -> bool:
 
 
 def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
-    """``work(*arguments, black_box=…)``, which runs an AV, in a process of its own.
+    """``work(*arguments)``, which runs an AV, in a process of its own.
 
-    Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process, naming the call.
+    Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process.
     """
-    with closing(ForkServer()) as server:
-        child = Apart(server, _work_and_tell, work, arguments)
-        try:
-            answer = first_to_answer([child]).answer()
-        finally:
-            child.kill()
+    child = Child(_work_and_tell, work, arguments)
+    try:
+        answer = first_to_answer([child]).answer()
+    finally:
+        child.kill()
     if isinstance(answer, WorkerDeath):
-        cause, call = death_cause(answer.exit_code, av.limits, answer.call), answer.call
-        found = f"{cause}, {'while it was found' if call is None else f'in {call}'}"
+        found = death_cause(answer.exit_code, av.limits)
         mend = "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again."
         raise AvEndedProcessError(f"av.{av.source}", found, "a controller that returns or raises", mend)
     return answer  # type: ignore[no-any-return]
 
 
-def _work_and_tell(
-    connection: Connection, work: Callable[..., Any], arguments: tuple[Any, ...], black_box: Path
-) -> None:
-    tell(connection, partial(work, *arguments, black_box=black_box))
+def _work_and_tell(connection: Connection, work: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    tell(connection, partial(work, *arguments))
 
 
 def require_controller(av: AutomatedVehicle) -> str | None:
@@ -259,8 +253,8 @@ def require_controller(av: AutomatedVehicle) -> str | None:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
 
 
-def _source_of_made(av: AutomatedVehicle, *, black_box: Path | None = None) -> str | None:
-    build_host(av, n_cells=1, seed=0, black_box=black_box)  # what it holds ends with the process
+def _source_of_made(av: AutomatedVehicle) -> str | None:
+    build_host(av, n_cells=1, seed=0)  # what it holds ends with the process
     if av.controller is None:
         return None
     module = sys.modules.get(getattr(controller_class(av.controller), "__module__", ""))

@@ -11,14 +11,15 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
+from multiprocessing import parent_process
 from pathlib import Path
 from sysconfig import get_path
 from time import monotonic, sleep
 from traceback import walk_tb
 from types import FrameType
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -34,33 +35,18 @@ from harness.controllers.protocol import (
     VehicleController,
 )
 from harness.errors import CampaignError
-from harness.processes import (
-    CLOSE,
-    CLOSED_PIPE_EXIT_CODE,
-    MAKING,
-    OF_EPISODE,
-    START,
-    START_BATCH,
-    STEP_BATCH,
-    BlackBox,
-    Call,
-)
+from harness.processes import CLOSED_PIPE_EXIT_CODE
 from harness.random_stream import controller_random
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, IntArray, read_only
 
-HUNG_EXIT_CODE = 75
-"""Exit code of a worker whose controller could not be interrupted."""
+HUNG_EXIT_CODES = 74, 75
+"""Exit codes of a worker whose controller could not be interrupted, in its constructor the latter."""
 
 Failures = dict[int, str]
 """Cell → cause."""
-
-
-class Death(NamedTuple):
-    """A call that is known to end the process: its step, `START` or `MAKING`, and the cause for the record."""
-
-    step: int
-    cause: str
+BeforeTest = Callable[[int], str | None]
+"""Is told of each episode in which controllers are about to be asked; its answer is why that must not be, if it is."""
 
 
 def time_limit(limits: Limits, *, makes: bool) -> tuple[float, str]:
@@ -70,10 +56,10 @@ def time_limit(limits: Limits, *, makes: bool) -> tuple[float, str]:
     return seconds, f"no answer within {seconds:g} s (av.limits.{key})"
 
 
-def death_cause(exit_code: int | None, limits: Limits, call: Call | None) -> str:
-    """Cause for the record of an episode whose controller took the worker process along, in this call."""
-    if exit_code == HUNG_EXIT_CODE:
-        _, late = time_limit(limits, makes=call is not None and call.makes)
+def death_cause(exit_code: int | None, limits: Limits) -> str:
+    """Cause for the record of an episode whose controller took the process along."""
+    if exit_code in HUNG_EXIT_CODES:
+        _, late = time_limit(limits, makes=exit_code == HUNG_EXIT_CODES[True])
         return f"{late}, and the call could not be interrupted"
     if exit_code == CLOSED_PIPE_EXIT_CODE:
         return "the controller closed file descriptors that are not its own (os.close, os.closerange)"
@@ -130,27 +116,26 @@ class StepTimeoutError(BaseException):
 class Guard:
     """Makes the calls of a host's controllers, inside of ``with guard``, and limits the time of each.
 
-    The limit is a signal, and needs the main thread, where workers run controllers. The call under way is noted in the
-    file ``black_box``, if any, so that the parent knows it should the process die; with one, a call that the exception
-    does not end (compiled code, a bare ``except``) ends the process.
+    The limit is a signal, and needs the main thread, where workers run controllers. In a worker a call that the
+    exception does not end (compiled code, a bare ``except``) ends the process.
     """
 
     _current: ClassVar[Guard | None] = None
     n_calls: ClassVar[int] = 0
     """Of all controllers of this process."""
 
-    def __init__(self, limits: Limits, black_box: Path | None) -> None:
+    def __init__(self, limits: Limits) -> None:
         self._low, self._high = limits.min_acceleration_mps2, limits.max_acceleration_mps2
         self._limits = [time_limit(limits, makes=makes) for makes in (False, True)]
-        self._seconds, self._late = self._limits[False]
+        self._makes = False
         """Of the call under way."""
-        self._black_box = BlackBox(black_box)
+        self._pid = os.getpid()
         self._modes, self._others = FloatingPointModes(), OtherModules()
         self.construction_s: list[float] = []
         """Time that each constructor took."""
         self._since: float | None = None
         """When the call under way began, None between calls: the harness itself may take its time."""
-        if black_box is not None:
+        if parent_process() is not None:
             threading.Thread(target=self._watch, name="controller watchdog", daemon=True).start()
 
     def __enter__(self) -> Self:
@@ -164,11 +149,8 @@ class Guard:
 
     def call(
         self,
-        kind: int,
         function: Callable[..., Any],
         *arguments: Any,
-        episode: int = 0,
-        step: int = START,
         check: Callable[[Any], tuple[Any, str | None]] | None = None,
         makes: bool = False,
     ) -> tuple[Any, str | None]:
@@ -177,15 +159,13 @@ class Guard:
         One that ``makes`` a controller has a time limit of its own.
         """
         Guard.n_calls += 1
-        self._black_box.enter(kind, episode, step)
-        self._seconds, self._late = self._limits[makes]
+        self._makes = makes
         self._since = since = monotonic()
-        signal.setitimer(signal.ITIMER_REAL, self._seconds)
+        signal.setitimer(signal.ITIMER_REAL, self._limits[makes][0])
         try:
             answer = function(*arguments)
-            misdeed = CHANGED_MODES if self._modes.restored() else self._black_box.misdeed()
-            if misdeed is not None:
-                return answer, misdeed
+            if self._modes.restored():
+                return answer, CHANGED_MODES
             return check(answer) if check else (answer, None)
         except BaseException as error:  # noqa: BLE001 - whatever a user's code raises is its episode's end
             require_fault(error)
@@ -195,7 +175,8 @@ class Guard:
             self._since = None  # the timer itself is set again by the next call
             if makes:
                 self.construction_s.append(monotonic() - since)
-            self._black_box.leave()
+            if os.getpid() != self._pid:  # a copy that the controller has made of the process
+                os._exit(0)
 
     def restore_modes(self) -> None:
         """After a module has been imported: libraries that were compiled for speed change how this thread computes."""
@@ -213,7 +194,7 @@ class Guard:
         """Close controllers; what they raise is nobody's concern: they have failed before, or the run is over."""
         for controller in controllers:
             if controller is not None:
-                self.call(CLOSE, optional("close"), controller)
+                self.call(optional("close"), controller)
 
     def end(self, controllers: Iterable[Any]) -> None:
         """Close the last controllers, and leave SIGALRM as it is by default."""
@@ -240,15 +221,15 @@ class Guard:
 
     def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
         if self._since is not None:
-            raise StepTimeoutError(self._late)
+            raise StepTimeoutError(self._limits[self._makes][1])
 
     def _watch(self) -> None:
         """End the process when a call outlasts the exception that should have ended it."""
         while True:
             sleep(0.5)
-            since = self._since
-            if since is not None and monotonic() - since > 2.0 * self._seconds + 1.0:
-                os._exit(HUNG_EXIT_CODE)
+            since, makes = self._since, self._makes
+            if since is not None and monotonic() - since > 2.0 * self._limits[makes][0] + 1.0:
+                os._exit(HUNG_EXIT_CODES[makes])
 
 
 def optional(name: str, *arguments: Any) -> Callable[[Any], None]:
@@ -259,18 +240,15 @@ def optional(name: str, *arguments: Any) -> Callable[[Any], None]:
 class _Host:
     """What both hosts are told: the campaign's seed, who makes the calls, and when the loop asks."""
 
-    def __init__(self, av: AutomatedVehicle, seed: int, guard: Guard) -> None:
+    def __init__(self, av: AutomatedVehicle, seed: int, guard: Guard, before_test: BeforeTest) -> None:
         self.acts_before_cut_in, self.warm_up_steps = av.acts_before_cut_in, av.warm_up_steps
         self.cruises = av.takes_over == "first_braking"
-        self._seed, self._guard = seed, guard
+        self._seed, self._guard, self._before_test = seed, guard, before_test
         self.require_untouched, self.construction_s = guard.require_untouched, guard.construction_s
 
 
 class VehicleHost(_Host):
-    """One controller object per cell, made by ``make``; the ``first``, if there is one already, is that of cell 0.
-
-    ``fatal_episodes`` are known to kill the process: they fail just before the call that did. They may become more.
-    """
+    """One controller object per cell, made by ``make``; the ``first``, if there is one already, is that of cell 0."""
 
     def __init__(
         self,
@@ -279,14 +257,12 @@ class VehicleHost(_Host):
         av: AutomatedVehicle,
         seed: int,
         guard: Guard,
-        fatal_episodes: Mapping[int, Death] | None = None,
+        before_test: BeforeTest,
         first: VehicleController | None = None,
     ) -> None:
-        super().__init__(av, seed, guard)
+        super().__init__(av, seed, guard, before_test)
         self._make = make
         self._controllers: list[VehicleController | None] = [first, *[None] * (n_cells - 1)]
-        self._episodes = [-1] * n_cells
-        self._fatal_episodes = {} if fatal_episodes is None else fatal_episodes
 
     def start(self, cells: IntArray, episodes: IntArray, announced: IntArray, set_speed_mps: FloatArray) -> Failures:
         """Begin episodes, ``announced`` to their controllers under these indices; returns those that failed at once."""
@@ -294,15 +270,12 @@ class VehicleHost(_Host):
         with self._guard:
             begun = cells.tolist(), episodes.tolist(), announced.tolist(), set_speed_mps.tolist()
             for k, episode, index, set_speed in zip(*begun, strict=True):
-                self._episodes[k] = episode
-                wrong = self._known_death(episode, START)
+                wrong = self._before_test(episode)
                 if wrong is None and self._controllers[k] is None:
-                    made = OF_EPISODE, self._make
-                    self._controllers[k], wrong = self._guard.call(*made, episode=episode, step=MAKING, makes=True)
+                    self._controllers[k], wrong = self._guard.call(self._make, makes=True)
                 if wrong is None:
                     start = EpisodeStart(index, STEP_S, controller_random(self._seed, index), set_speed)
-                    begin = OF_EPISODE, optional("start", start), self._controllers[k]
-                    _, wrong = self._guard.call(*begin, episode=episode)
+                    _, wrong = self._guard.call(optional("start", start), self._controllers[k])
                 if wrong is not None:
                     failures[k] = f"start: {wrong}"
                     self._drop(k)
@@ -319,23 +292,15 @@ class VehicleHost(_Host):
         call, check = self._guard.call, None if warms_up else self._guard.acceleration
         with self._guard:
             for i, (k, _, *seen) in enumerate(rows):
-                controller, episode = self._controllers[k], self._episodes[k]
-                if controller is None:
+                if (controller := self._controllers[k]) is None:
                     continue  # its episode has failed in this turn's start
-                step = max(round(seen[0] / STEP_S), 0)
-                wrong = self._known_death(episode, step)
-                if wrong is None:
-                    value, wrong = call(OF_EPISODE, _step, controller, seen, episode=episode, step=step, check=check)
+                value, wrong = call(_step, controller, seen, check=check)
                 if wrong is not None:
                     failures[k] = f"{'step, warming up' if warms_up else 'step'}: {wrong}"
                     self._drop(k)
                 elif not warms_up:
                     answer[i] = value
         return answer, failures
-
-    def _known_death(self, episode: int, step: int) -> str | None:
-        death = self._fatal_episodes.get(episode)
-        return death.cause if death and step >= death.step else None
 
     def _drop(self, k: int) -> None:
         """A controller that failed is not used again: its next episode gets a new one."""
@@ -370,17 +335,23 @@ def _numbers(n: int, answer: Any) -> tuple[FloatArray | None, str | None]:
 class BatchHost(_Host):
     """One controller object for all cells. A fault that cannot be laid at one cell's door fails all that were asked."""
 
-    def __init__(self, controller: BatchController, av: AutomatedVehicle, seed: int, guard: Guard) -> None:
-        super().__init__(av, seed, guard)
+    def __init__(
+        self, controller: BatchController, av: AutomatedVehicle, seed: int, guard: Guard, before_test: BeforeTest
+    ) -> None:
+        super().__init__(av, seed, guard, before_test)
         self._controller = controller
 
-    def start(self, cells: IntArray, _episodes: IntArray, announced: IntArray, _set_speed_mps: FloatArray) -> Failures:
+    def start(self, cells: IntArray, episodes: IntArray, announced: IntArray, _set_speed_mps: FloatArray) -> Failures:
         """As `VehicleHost.start`."""
+        causes = [self._before_test(episode) for episode in episodes.tolist()]
+        failures = {k: f"start: {cause}" for k, cause in zip(cells.tolist(), causes, strict=True) if cause is not None}
+        sound = np.array([cause is None for cause in causes])
+        cells, announced = cells[sound], announced[sound]
         random = [controller_random(self._seed, index) for index in announced.tolist()]
-        handed = read_only(cells.copy()), read_only(announced.copy())
         with self._guard:
-            _, wrong = self._guard.call(START_BATCH, optional("start_batch", *handed, random), self._controller)
-        return {} if wrong is None else dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")
+            begin = optional("start_batch", read_only(cells), read_only(announced), random)
+            _, wrong = self._guard.call(begin, self._controller)
+        return failures if wrong is None else failures | dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")
 
     def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:
         """As `VehicleHost.act`."""
@@ -391,7 +362,7 @@ class BatchHost(_Host):
             return np.zeros(n) if warms_up else answer
 
         with self._guard:
-            answer, wrong = self._guard.call(STEP_BATCH, ask, check=partial(_numbers, n))
+            answer, wrong = self._guard.call(ask, check=partial(_numbers, n))
         if wrong is not None:
             call = "step_batch, warming up" if warms_up else "step_batch"
             return np.zeros(n), dict.fromkeys(cells.tolist(), f"{call}: {wrong}")

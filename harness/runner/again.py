@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -73,12 +72,10 @@ def _run_here(
     tests: Sequence[Tests],
     n_cells: int,
     held: bool,
-    *,
-    black_box: Path | None,
 ) -> Again:
     clock, found = Clock(held=held), list[Bits]()
     with clock.shown():
-        host = build_host(av, n_cells=n_cells, seed=scenario.seed, black_box=black_box)
+        host = build_host(av, n_cells=n_cells, seed=scenario.seed)
         with closing(EpisodeLoop(TwinWorld(n_cells, scenario.vehicles), scenario, keep, host)) as loop:
             for first, traffic in tests:
                 shard = loop.run(first, traffic)

@@ -191,8 +191,6 @@ class AvCheck:
 def check_av(
     campaign: Campaign | str | Path,
     n_episodes: Annotated[int, Field(ge=2)] = EPISODES,
-    *,
-    black_box: Path | None = None,
 ) -> AvCheck:
     """Run a few dozen episodes with a campaign's AV, twice, and say what is to be seen.
 
@@ -200,7 +198,7 @@ def check_av(
     an earlier episode, shares state between instances or draws from a global stream gives other bits there.
 
     The campaign's method, engine and records are replaced by what the check needs; its AV and seed are not.
-    ``n_episodes`` is at least 2; the file ``black_box`` tells in which call of the controller the process died.
+    ``n_episodes`` is at least 2.
 
     Raises `HarnessError`: the campaign is wrong, or the AV cannot be found, made or started.
     """
@@ -208,10 +206,10 @@ def check_av(
     tested = _as_checked(asked)
     require_world(tested)
     source = prepare(resolve(tested, "av-check"))
-    first, own_speed = _timed_run(source, n_episodes, black_box)
+    first, own_speed = _timed_run(source, n_episodes)
     if own_speed.constructions > 1:  # one for each cell
         own_speed = replace(own_speed, constructions=asked.world.cells)
-    again = _run_in_another_order(source, n_episodes, black_box)
+    again = _run_in_another_order(source, n_episodes)
     idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
     of_idm, idm_speed = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
     own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
@@ -226,9 +224,9 @@ def check_av(
         n_episodes=n_episodes,
         failures=_by_cause(first.failures.values()),
         differing=differing,
-        likely_cause=_likely_cause(source, differing[0], black_box) if differing else "",
+        likely_cause=_likely_cause(source, differing[0]) if differing else "",
         limits_mps2=limits,
-        moved_mps2=_moved_by_warm_up(source, min(n_episodes, WARM_UP_EPISODES), black_box),
+        moved_mps2=_moved_by_warm_up(source, min(n_episodes, WARM_UP_EPISODES)),
         behaviour=_behaviour(first, limits, early=early),
         idm_behaviour=_behaviour(of_idm, limits, early=early),
         speed=own_speed,
@@ -278,9 +276,9 @@ class FirstAnswers:
 
 
 @contextmanager
-def _opened(source: Source, black_box: Path | None, n_cells: int | None = None) -> Iterator[EpisodeLoop]:
+def _opened(source: Source, n_cells: int | None = None) -> Iterator[EpisodeLoop]:
     world = build_world(source.campaign, n_cells)
-    loop = source.loop(world, black_box=black_box)
+    loop = source.loop(world)
     try:
         yield loop
     finally:
@@ -288,9 +286,9 @@ def _opened(source: Source, black_box: Path | None, n_cells: int | None = None) 
         world.close()
 
 
-def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -> tuple[Shard, Speed]:
+def _timed_run(source: Source, n_episodes: int) -> tuple[Shard, Speed]:
     """First run of the episodes, and the speed of the fastest of several."""
-    with _opened(source, black_box) as loop:
+    with _opened(source) as loop:
         loop.run(0, source.tests(0, min(CELLS, n_episodes)))  # compiles, and constructs for every cell
         tests = source.tests(0, n_episodes)
         began = time.perf_counter()
@@ -305,7 +303,7 @@ def _timed_run(source: Source, n_episodes: int, black_box: Path | None = None) -
     return shard, Speed(1e6 * elapsed_s / steps, n_episodes / elapsed_s, median_s, len(made_s))
 
 
-def _run_in_another_order(source: Source, n_episodes: int, black_box: Path | None) -> dict[int, Bits]:
+def _run_in_another_order(source: Source, n_episodes: int) -> dict[int, Bits]:
     """What every episode leaves when it is run in another cell, the second half first; a user's code elsewhere."""
     half = n_episodes // 2
     order = [*range(half, n_episodes), *range(half)]
@@ -313,27 +311,27 @@ def _run_in_another_order(source: Source, n_episodes: int, black_box: Path | Non
     halves = [Tests(part[0], source.tests(part[0], len(part))) for part in parts]
     if has_foreign_code(source.campaign.av):
         return dict(zip(order, run_elsewhere(source, halves, OTHER_CELLS).bits, strict=True))
-    with _opened(source, black_box, OTHER_CELLS) as loop:
+    with _opened(source, OTHER_CELLS) as loop:
         shards = [(loop.run(*tests), row) for tests in halves for row in range(len(tests.traffic))]
     return {i: bits_of(shard, row) for i, (shard, row) in zip(order, shards, strict=True)}
 
 
-def _moved_by_warm_up(source: Source, n: int, black_box: Path | None) -> dict[float, float]:
+def _moved_by_warm_up(source: Source, n: int) -> dict[float, float]:
     """By how much (m/s²) first answers move at most, by the length of the warm-up (s); empty where there is none."""
     av = source.campaign.av
     if not av.warm_up_steps:
         return {}
-    usual = _first_answers(source, av, n, black_box)
+    usual = _first_answers(source, av, n)
     moved = {}
     for seconds in (0.0, min(LONGER * av.warm_up_s, LONGEST_S)):
-        other = _first_answers(source, av.model_copy(update={"warm_up_s": seconds}), n, black_box)
+        other = _first_answers(source, av.model_copy(update={"warm_up_s": seconds}), n)
         moved[seconds] = max((abs(usual[i] - other[i]) for i in usual.keys() & other.keys()), default=0.0)
     return moved
 
 
-def _first_answers(source: Source, av: AutomatedVehicle, n: int, black_box: Path | None) -> dict[int, float]:
+def _first_answers(source: Source, av: AutomatedVehicle, n: int) -> dict[int, float]:
     """Of tests that did not fail."""
-    host = build_host(av, n_cells=1, seed=source.campaign.seed, black_box=black_box)
+    host = build_host(av, n_cells=1, seed=source.campaign.seed)
     answers: Any = FirstAnswers(host) if host is not None else None
     with closing(
         EpisodeLoop(TwinWorld(1, source.scenario.vehicles), source.scenario, source.records(), answers)
@@ -348,11 +346,11 @@ def _by_cause(causes: Iterable[str]) -> dict[str, int]:
     return dict(Counter(shown.setdefault(re.sub(r"\d[\d.]*(e[-+]?\d+)?", "0", cause), cause) for cause in causes))
 
 
-def _likely_cause(source: Source, episode: int, black_box: Path | None) -> str:
+def _likely_cause(source: Source, episode: int) -> str:
     """Why an episode is not the same again, by what it takes: a clock, nothing, another one before or beside it."""
 
     def bits(n_cells: int, begin: int, n_before: int) -> Bits:
-        with _opened(source, black_box, n_cells) as loop:
+        with _opened(source, n_cells) as loop:
             for each in range(begin, begin + n_before):
                 loop.run(each, source.tests(each, 1))
             n = min(n_cells, source.campaign.stop.episodes - episode)

@@ -26,7 +26,6 @@ from harness import cache
 from harness.campaign.sections import RaySettings
 from harness.compiled import source_hash
 from harness.controllers.find import require_controller
-from harness.controllers.hosts import Death
 from harness.errors import CampaignError, HarnessError
 from harness.processes import WorkerDeath, fit_to_travel, handlers_restored, usable_cpus
 from harness.resolved import Resolved
@@ -40,7 +39,6 @@ from harness.runner.workers import (
     Workers,
 )
 from harness.sampling import source_of
-from harness.sampling.protocol import ShardRequest
 
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""
@@ -87,16 +85,14 @@ class OnMachine:
         except Exception as error:  # noqa: BLE001 - see the class
             return fit_to_travel(error)
 
-    def run(
-        self, request: ShardRequest, fatal_episodes: Mapping[int, Death], baseline: Sequence[ray.ObjectRef[bytes]]
-    ) -> Result | WorkerDeath | Exception:
+    def run(self, work: tuple[Any, ...], baseline: Sequence[ray.ObjectRef[bytes]]) -> Result | WorkerDeath | Exception:
         """Run a shard; tests may follow from ``baseline`` runs, which lie in the object store."""
         try:
             if baseline and not self._follows:
                 self._workers.follow_from(ray.get(baseline[0]))
                 self._follows = True
             worker = self._worker or self._workers.new_worker()
-            worker.give(request, fatal_episodes)  # if it is dead, it has no answer either
+            worker.give(*work)  # if it is dead, it has no answer either
             answer: Result | WorkerDeath = self._workers.first_to_answer([worker]).answer()
         except Exception as error:  # noqa: BLE001 - see the class
             return fit_to_travel(error)
@@ -126,9 +122,9 @@ class RayWorker:
     def __init__(self, actor: Any, pending: ray.ObjectRef[Any], workers: RayWorkers) -> None:
         self._actor, self.pending, self._workers = actor, pending, workers
 
-    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
+    def give(self, *work: Any) -> bool:
         # That it is dead shows in its answer.
-        self.pending = self._actor.run.remote(request, dict(fatal_episodes), self._workers.baseline)
+        self.pending = self._actor.run.remote(work, self._workers.baseline)
         return True
 
     def answer(self) -> Result | WorkerDeath:

@@ -231,7 +231,6 @@ def _replay(
     stored: pa.Table,
     gui: bool,
     fcd: Path | None,
-    black_box: Path | None = None,
 ) -> dict[str, pa.Table]:
     """Row and trace of the episode, run again."""
     source = prepare(resolved)
@@ -241,7 +240,7 @@ def _replay(
     options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
     world = build_world(resolved.campaign, 1, in_sumo=gui or fcd is not None, gui=gui, options=options)
     try:
-        shard = source.run_again(source.loop(world, traces="all", black_box=black_box), episode, stored)
+        shard = source.run_again(source.loop(world, traces="all"), episode, stored)
     finally:
         world.close()
     tables = shard_tables(shard, resolved.campaign.seed, keep_traces=True)

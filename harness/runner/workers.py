@@ -6,7 +6,6 @@ Here workers are processes of this machine; `harness.runner.ray` makes those of 
 from __future__ import annotations
 
 import json
-import pickle
 import signal
 import sys
 from collections import Counter, deque
@@ -22,22 +21,20 @@ from typing import Any, TypeVar
 import pyarrow as pa
 from scipy.special import bdtrc
 
-from harness.controllers.hosts import Death, death_cause
+from harness.controllers.find import has_foreign_code
+from harness.controllers.hosts import death_cause
 from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.loop.loop import EpisodeLoop
 from harness.processes import (
-    CLOSED_PIPE_EXIT_CODE,
-    OF_EPISODE,
-    Apart,
-    Call,
+    Began,
+    Child,
     SharedFile,
     WorkerDeath,
     first_to_answer,
-    fork_server,
+    start_server,
     tell,
     usable_cpus,
-    worker_modules,
 )
 from harness.records.folder import Repeated, encoded, read_table
 from harness.records.schemas import ShardTables, shard_tables
@@ -53,8 +50,8 @@ ATTEMPTS = 3
 SURELY_TOO_MANY = 1e-4
 """Probability of so many deaths under the allowed share, below which a controller is refused: with the default share
 its third at the earliest, its seventh if it dies in all of 96 cells, some ten seconds into the run."""
-SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM)
-"""Ends that an operator or a shortage of memory brings: a controller is blamed only when its call is hit again."""
+SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, None)
+"""Ends that an operator or a shortage of memory brings: a controller is blamed only when its test is hit again."""
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
 REPEATED = b"harness.repeated"
@@ -83,22 +80,24 @@ Result = ShardResult | BaselineResult
 _Result = TypeVar("_Result", bound=Result)
 
 
-def serve(connection: Connection, resolved: Path, baseline: Path, black_box: Path) -> None:
-    """Prepare with the first shard, run shards until the parent is gone or has no more.
+def serve(connection: Connection, resolved: Resolved, baseline: Path) -> None:
+    """Prepare with the first shard, run shards until the parent has no more.
 
-    The file ``resolved`` holds the campaign, ``baseline`` the baseline runs that tests follow from, once there are any.
+    The file ``baseline`` holds the baseline runs that tests follow from, once there are any.
     """
     runner: ShardRunner | None = None
 
-    def run(request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> Result:
+    def run(request: ShardRequest, fatal: Mapping[int, str], alone: bool) -> Result:
         nonlocal runner
-        if runner is None:
-            runner = ShardRunner(pickle.loads(resolved.read_bytes()), baseline, black_box)  # noqa: S301 - our own
-        return runner.run(request, fatal_episodes)
+        if runner is not None and runner.alone != alone:
+            runner.close()
+            runner = None
+        runner = runner or ShardRunner(resolved, baseline, connection if alone else None)
+        return runner.run(request, fatal)
 
     with suppress(EOFError, OSError):
-        while tell(connection, partial(run, *connection.recv())):
-            pass
+        while True:
+            tell(connection, partial(run, *connection.recv()))
     if runner is not None:
         runner.close()
 
@@ -106,25 +105,31 @@ def serve(connection: Connection, resolved: Path, baseline: Path, black_box: Pat
 class ShardRunner:
     """Runs shards of one campaign in one world. It writes nothing: the process that runs the campaign does.
 
-    The file ``black_box`` tells that process in which call of a controller this one died.
+    With a ``connection`` it runs tests one at a time, and says of each that it has begun: then the parent knows which
+    test has ended the process.
     """
 
-    def __init__(self, resolved: Resolved, baseline: Path, black_box: Path | None = None) -> None:
-        self._fatal_episodes: dict[int, Death] = {}
+    def __init__(self, resolved: Resolved, baseline: Path, connection: Connection | None = None) -> None:
+        self._connection, self.alone, self._fatal = connection, connection is not None, dict[int, str]()
         self._baseline = baseline
         self._source = prepare(resolved)
         self._begun = False
-        world = build_world(resolved.campaign)
-        self._loop: EpisodeLoop = self._source.loop(world, black_box=black_box, fatal_episodes=self._fatal_episodes)
+        self._world = build_world(resolved.campaign, 1 if self.alone else None)
+        self._loop: EpisodeLoop = self._source.loop(self._world, before_test=self._before_test)
+
+    def _before_test(self, episode: int) -> str | None:
+        if self._connection is not None:
+            self._connection.send(Began(episode))
+        return self._fatal.get(episode)
 
     def close(self) -> None:
-        """Release the AV's controllers."""
+        """Release the AV's controllers, and the world."""
         self._loop.close()
+        self._world.close()
 
-    def run(self, request: ShardRequest, fatal_episodes: Mapping[int, Death] | None = None) -> Result:
-        """Run a shard; episodes in ``fatal_episodes`` fail before the call that ended a process."""
-        self._fatal_episodes.clear()  # a baseline run may have the number of a test
-        self._fatal_episodes.update(fatal_episodes or {})
+    def run(self, request: ShardRequest, fatal: Mapping[int, str] | None = None) -> Result:
+        """Run a shard; tests that are known to be ``fatal`` fail before they begin, with these causes."""
+        self._fatal = dict(fatal or {})
         source, paths = self._source, self._source.baseline_paths
         if paths is not None and request.baseline:
             return run_baseline(self._loop, paths, source.resolved, request)
@@ -171,13 +176,13 @@ class WorkerLostError(HarnessError):
     exit_code = 3
 
 
-class WorkerProcess(Apart):
+class WorkerProcess(Child):
     """A process that runs one shard after another: what any worker is, also one on another machine."""
 
-    def give(self, request: ShardRequest, fatal_episodes: Mapping[int, Death]) -> bool:
-        """Give it a shard to run, with the episodes known to end a process; False if it is dead."""
+    def give(self, *work: Any) -> bool:
+        """Give it a shard to run, see `serve`; False if it is dead."""
         try:
-            self.connection.send((request, dict(fatal_episodes)))
+            self.connection.send(work)
         except OSError:
             return False
         return True
@@ -189,13 +194,22 @@ class WorkerProcess(Apart):
 
 @dataclass
 class _Job:
-    """A shard that is wanted, with its result once there is one."""
+    """A shard that is wanted, with its result once there is one.
+
+    After a worker's death its tests are run one at a time (``alone``), and those that are ``fatal`` not at all.
+    """
 
     request: ShardRequest
     result: Result | None
     n_deaths: int = 0
-    suspected: Call | None = None
-    fatal_episodes: dict[int, Death] = field(default_factory=dict)
+    alone: bool = False
+    suspected: int | None = None
+    fatal: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def work(self) -> tuple[ShardRequest, dict[int, str], bool]:
+        """What a worker is given."""
+        return self.request, self.fatal, self.alone
 
 
 class Workers:
@@ -268,7 +282,7 @@ class Workers:
             worker = self._idle.pop() if self._idle else self.new_worker()
             if worker is None:
                 return
-            if worker.give(waiting[0].request, waiting[0].fatal_episodes):
+            if worker.give(*waiting[0].work):
                 self._busy[worker] = waiting.popleft()
             else:
                 worker.kill()  # it died while it was idle
@@ -289,40 +303,39 @@ class Workers:
 
     def _blame(self, job: _Job, death: WorkerDeath) -> None:
         """Say whose doing the death of a worker was: a test's that is run no more, or nobody's knows."""
-        call = death.call
-        first_time = call != job.suspected
-        job.suspected = call
-        cause = death_cause(death.exit_code, self._campaign.av.limits, call)
-        own = call is not None and not (death.exit_code in SENT_FROM_OUTSIDE and first_time)  # the controller's own
-        own |= death.exit_code == CLOSED_PIPE_EXIT_CODE
-        if own and call is not None and call.kind == OF_EPISODE:
-            job.fatal_episodes[call.episode] = Death(call.step, cause)
+        exit_code, episode = death
+        again = episode is not None and episode == job.suspected
+        if episode is not None and (again or exit_code not in SENT_FROM_OUTSIDE):
+            job.fatal[episode] = death_cause(exit_code, self._campaign.av.limits)
+            job.n_deaths = 0
             self._require_few_deaths(job)
             return
+        job.suspected, job.alone = episode, job.alone or exit_code is not None
         job.n_deaths += 1
-        if job.n_deaths == ATTEMPTS:
-            how = f"with {'its machine' if death.exit_code is None else f'exit code {death.exit_code}'}"
-            mend = "Look for a memory limit (fewer --workers), then continue with --resume."
-            if own:
-                how = f"because {cause}" + ("" if call is None else f", in {call}")
-                mend = "Mend the controller: look for os._exit or a crash of compiled code (`harness av-check`)."
-            raise WorkerLostError(
-                f"shard {job.request.index} (from episode {job.request.first_episode})",
-                f"{ATTEMPTS} worker processes that died, the last {how}",
-                "a worker that finishes the shard",
-                mend,
-            )
+        if job.n_deaths < ATTEMPTS:
+            return
+        how = f"with {'its machine' if exit_code is None else f'exit code {exit_code}'}"
+        mend = "Look for a memory limit (fewer --workers), then continue with --resume."
+        if exit_code not in SENT_FROM_OUTSIDE and has_foreign_code(self._campaign.av):
+            how = f"because {death_cause(exit_code, self._campaign.av.limits)}"
+            mend = "Mend the controller: look for os._exit or a crash of compiled code (`harness av-check`)."
+        raise WorkerLostError(
+            f"shard {job.request.index} (from episode {job.request.first_episode})",
+            f"{ATTEMPTS} worker processes that died, the last {how}",
+            "a worker that finishes the shard",
+            mend,
+        )
 
     def _require_few_deaths(self, job: _Job) -> None:
         """Each death costs a new process: a controller that dies too often is not run to the end of its shard."""
-        share, fatal = self._campaign.run.max_failed_share, job.fatal_episodes
-        episode, death = next(reversed(fatal.items()))
+        share, fatal = self._campaign.run.max_failed_share, job.fatal
+        episode, cause = next(reversed(fatal.items()))
         n_begun = max(fatal) - job.request.first_episode + 1
         if float(bdtrc(len(fatal) - 1, n_begun, share)) < SURELY_TOO_MANY:
             raise TooManyFailedError(
                 "run.max_failed_share",
                 f"{len(fatal)} of the first {n_begun} episodes of shard {job.request.index} ended their worker "
-                f"process, the last of them episode {episode}: {death.cause}",
+                f"process, the last of them episode {episode}: {cause}",
                 f"a share of at most {share:g}",
                 "Mend the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
             )
@@ -336,19 +349,14 @@ class LocalWorkers(Workers):
         super().__init__(resolved, n_workers or n_cpus)
         if self.n_workers > n_cpus:
             sys.stderr.write(f"note: {self.n_workers} workers share the {n_cpus} CPUs that this process may use.\n")
-        # As a file: what a pipe cannot hold is waited for until the new process has imported all that it needs.
-        self._resolved, self._baseline = SharedFile(pickle.dumps(resolved)), SharedFile()
-        self._server = fork_server(*worker_modules(resolved.campaign.world.engine))
+        start_server()
+        self._resolved, self._baseline = resolved, SharedFile()
 
     def new_worker(self) -> WorkerProcess:
-        return WorkerProcess(self._server, serve, self._resolved.path, self._baseline.path)
+        return WorkerProcess(serve, self._resolved, self._baseline.path)
 
     def follow_from(self, baseline: bytes) -> None:
         self._baseline.path.write_bytes(baseline)
 
     def first_to_answer(self, busy: Sequence[WorkerProcess]) -> WorkerProcess:
         return first_to_answer(busy)
-
-    def close(self) -> None:
-        super().close()
-        self._server.close()

@@ -7,7 +7,7 @@ from. The runner knows no more of a method than this.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, pairwise
 from pathlib import Path
@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
 from harness.controllers.find import build_host
-from harness.controllers.hosts import Death
+from harness.controllers.hosts import BeforeTest
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import Rule, StopRule
@@ -141,18 +141,11 @@ class Source:
         world: World,
         *,
         traces: str | None = None,
-        black_box: Path | None = None,
-        fatal_episodes: Mapping[int, Death] | None = None,
+        before_test: BeforeTest = lambda _: None,
     ) -> EpisodeLoop:
-        """Episode loop in a world, recording what the campaign asks for, or other ``traces``.
-
-        The file ``black_box`` tells in which episode's controller a process died; ``fatal_episodes`` are known to kill
-        it, and may grow between two runs.
-        """
+        """Episode loop in a world, recording what the campaign asks for, or other ``traces``."""
         campaign = self.campaign
-        av = build_host(
-            campaign.av, n_cells=world.n_cells, seed=campaign.seed, black_box=black_box, fatal_episodes=fatal_episodes
-        )
+        av = build_host(campaign.av, n_cells=world.n_cells, seed=campaign.seed, before_test=before_test)
         return EpisodeLoop(world, self.scenario, self.records(traces), av)
 
     def records(self, traces: str | None = None) -> RecordPolicy:

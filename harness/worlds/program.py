@@ -119,7 +119,7 @@ class ConnectedProgram:
         server += ["--remote-port", str(self._port), "--num-clients", "2"]
         quiet = subprocess.DEVNULL
         with ExitStack() as ending:
-            self._server = subprocess.Popen(server, stdout=quiet, stderr=quiet, start_new_session=True)  # noqa: S603
+            self._server = subprocess.Popen(server, stdout=quiet, stderr=quiet, process_group=0)  # noqa: S603
             ending.callback(end, self._server)
             self.connection = self._connect()
             ending.callback(self.connection.drop)
@@ -214,7 +214,7 @@ def _start_program(av: TraciProcess, port: int, n_cells: int) -> subprocess.Pope
     try:
         words = av.words(port, n_cells)
         # What it prints belongs on the terminal, but stdout is for the harness's results.
-        return subprocess.Popen(words, stdout=sys.stderr.fileno(), start_new_session=True)  # noqa: S603 - the user's own
+        return subprocess.Popen(words, stdout=sys.stderr.fileno(), process_group=0)  # noqa: S603 - the user's own
     except (OSError, ValueError) as error:  # a null character in a word is a ValueError
         found, mend = f"{av.command} ({error})", "Try it in a shell, in the folder in which you start the harness."
         raise CampaignError("av.traci.command", found, "a program that can be started", mend) from error

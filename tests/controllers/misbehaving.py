@@ -93,7 +93,6 @@ FAULTS = {
     "interrupts": lambda: raises(KeyboardInterrupt()),
     "copies_the_process": lambda: 0.0 * os.fork(),
     "copies_the_process_for_good": copies_the_process,
-    "copies_and_ends_the_process": lambda: os._exit(7 + int(copies_the_process())),
     "hangs": hangs,
     "hangs_and_swallows": hangs_and_swallows,
     "hangs_for_good": hangs_for_good,
@@ -127,15 +126,15 @@ class Misbehaving(IDM):
 
 
 class StartsPrograms(IDM):
-    """In sessions of their own; one is left to whoever adopts it."""
+    """One in a session of its own, and one that is left to whoever adopts it."""
 
     def __init__(self, note):
         super().__init__()
         daemon = f"sleep 600 & echo $! >> {note}"
-        apart = [["sleep", "600"], ["sh", "-c", daemon]]
-        started = [subprocess.Popen(words, start_new_session=True) for words in apart]
+        subprocess.Popen(["sh", "-c", daemon])
+        started = subprocess.Popen(["sleep", "600"], start_new_session=True)
         with Path(note).open("a") as file:
-            file.write(f"{started[0].pid}\n")
+            file.write(f"{started.pid}\n")
 
 
 class Always(IDM):

@@ -9,24 +9,18 @@ import time
 from pathlib import Path
 
 
-def dying(connection, resolved, baseline, black_box) -> None:
+def dying(connection, resolved, baseline) -> None:
     """Is killed by its first shard, every time."""
     connection.recv()
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def disobedient(connection, resolved, baseline, black_box) -> None:
+def disobedient(connection, resolved, baseline) -> None:
     """Finds SUMO disagreeing in its first shard."""
     from harness.errors import WorldDisagreementError
 
     connection.recv()
     connection.send(WorldDisagreementError("SUMO, BV3, m", found="0x1p0", expected="0x1p1", mend="Report it."))
-    connection.recv()
-
-
-def waiting(connection) -> None:
-    """Tells how many threads its parent has, and waits for a word."""
-    connection.send(len([*Path(f"/proc/{os.getppid()}/task").iterdir()]))
     connection.recv()
 
 

@@ -48,9 +48,9 @@ def driven(monkeypatch):
     """Episodes that were driven, not read."""
     n, run = [], ShardRunner.run
 
-    def counted(self, spec, fatal_episodes=None):
+    def counted(self, spec, fatal=None):
         n.append(spec.n_episodes)
-        return run(self, spec, fatal_episodes)
+        return run(self, spec, fatal)
 
     monkeypatch.setattr(ShardRunner, "run", counted)
     return n

@@ -19,6 +19,7 @@ import pytest
 from benchmarks.kills import descendants, orphans, started_by
 from harness.campaign.yaml_text import yaml_text
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
+from tests.in_process import workers_alive
 from tests.runner.conftest import SHELLS, TWIN
 from tests.runner.test_shadow_runs import FORCED, SHADOWS, of
 from tests.stored_runs import manifest, shard_files, unlike_columns
@@ -29,7 +30,7 @@ import harness.runner.ray as on_ray  # noqa: E402 - not without the extra
 from harness.processes import WorkerDeath  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
-ON_RAY = "run.executor=ray"
+ON_RAY, WORKER = "run.executor=ray", b"multiprocessing.forkserver"
 EARLY = "before_cut_in: controller, limits: {max_acceleration_mps2: 2}"
 
 
@@ -55,7 +56,7 @@ def test_a_run_begun_here_goes_on_there_with_the_same_records(run, run_here, cam
     assert unlike_columns(twin_run, tmp_path / "run") == []
     assert manifest(tmp_path / "run")["workers"] == 2  # the cluster's room
     assert manifest(tmp_path / "run")["cpu"] == manifest(twin_run)["cpu"]
-    assert below(b"harness.processes") == []
+    assert orphans(workers_alive(), 10.0) == []
 
 
 def test_shadow_runs_come_to_the_machines(run, campaign, tmp_path):
@@ -92,7 +93,7 @@ def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
     struck: list[int] = []
 
     def strike() -> None:
-        for victim, n_done in ((b"ray::OnMachine", 1), (b"harness.processes", 6)):
+        for victim, n_done in ((b"ray::OnMachine", 1), (WORKER, 6)):
             while len(shard_files(tmp_path / "ray")) < n_done:
                 time.sleep(0.02)
             struck.extend(below(victim)[:1])
@@ -106,9 +107,9 @@ def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
     assert unlike_columns(a.folder, b.folder) == []
 
 
-@pytest.mark.parametrize("struck", [b"", b"ray::OnMachine", b"harness.processes"], ids=["none", "actor", "its child"])
+@pytest.mark.parametrize("struck", [b"", b"ray::OnMachine", WORKER], ids=["none", "actor", "its child"])
 def test_what_a_controller_starts_ends_with_the_run_and_no_file_is_left(struck, run, campaign, tmp_path, monkeypatch):
-    """In sessions of their own, some adopted; the vehicle acts early, so that machines are handed baseline runs."""
+    """One in a session of its own, one adopted; the vehicle acts early, so that machines are handed baseline runs."""
     monkeypatch.chdir(ROOT)
     note, out, left = tmp_path / "started", tmp_path / "ray", set(Path(tempfile.gettempdir()).glob("harness-*"))
     acting = f"{{controller: 'tests.controllers.misbehaving:StartsPrograms', parameters: {{note: {note}}}, {EARLY}}}"

@@ -111,13 +111,12 @@ def test_errors_reach_the_parent(error, at, campaign, tmp_path, monkeypatch):
     strange.handle = lambda: None
     raising = Mock(side_effect=error or strange)
     monkeypatch.setattr(workers, "ShardRunner", raising if at == "__init__" else Mock(return_value=Mock(run=raising)))
-    (tmp_path / "resolved").write_bytes(pickle.dumps(campaign()))
     answers = []
     pipe = SimpleNamespace(
-        recv=Mock(side_effect=[(ShardRequest(0, 0, 10), {}), EOFError]),
+        recv=Mock(side_effect=[(ShardRequest(0, 0, 10), {}, False), EOFError]),
         send=lambda answer: answers.append(pickle.loads(pickle.dumps(answer))),
     )
-    workers.serve(pipe, tmp_path / "resolved", tmp_path, tmp_path / "black-box")
+    workers.serve(pipe, campaign(), tmp_path)
     (found,) = answers
     assert type(found) is (RuntimeError if error is None else type(error))
     assert str(error or "ValueError: of a strange kind") in str(found)
