@@ -388,8 +388,8 @@ def traces_table(shard: Shard) -> pa.Table:
 
 
 def _accelerations(trace: FloatArray) -> FloatArray:
-    """Of a motion (steps + 1, V, 3) in the step after each state, shape (steps + 1, V); NaN in the last."""
-    return np.diff(trace[:, :, 1], axis=0, append=math.nan) / STEP_S
+    """Of a motion (steps + 1, V, 3) in the step after each state, to 1e-9, shape (steps + 1, V); NaN in the last."""
+    return np.round(np.diff(trace[:, :, 1], axis=0, append=math.nan) / STEP_S, 9)
 
 
 def _came_over(episode: RecordArray, state: np.ndarray, distance_m: float) -> FloatArray:
