@@ -15,7 +15,7 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Point, Unavailable
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.severity import Impacts, Severity
-from harness.estimators.shells import Shells
+from harness.estimators.shells import SeenShells
 from harness.estimators.weighted import Moments, Nade, Nde
 from harness.vocabulary import BV_LV_CONTACT, ESTIMATORS, EstimatorName, Sampling
 
@@ -24,7 +24,7 @@ ACCUMULATORS: dict[EstimatorName, Callable[[], Accumulator]] = {
     "nade": Nade,
     "mixture_cv": MixtureCv,
     "scv": partial(Scv, leave_one_out=True),
-    "shells": Shells,
+    "shells": SeenShells,
 }
 SPACING = 1.01
 """Prefixes closer than 1 % are one dot on a logarithmic axis; thinning them keeps long campaigns' files small."""
@@ -131,7 +131,7 @@ def one_pass(
             refusals = {name: block.refusal(name) for name in (own, *names)}
             states = {name: accumulator(name) for name, reason in refusals.items() if reason is None}
             if "impact_mps" in block.columns:
-                empty = Shells if own == "shells" else partial(accumulator, own)
+                empty = SeenShells if own == "shells" else partial(accumulator, own)
                 impacts = Impacts(empty, block.drawn.counts_above_mps)
         n += len(block)
         diagnostics.add(block)

@@ -14,7 +14,7 @@ from harness.episode.path import empty_trajectory
 from harness.estimators.block import Block, Drawn, joined
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import SPEEDS_MPS, Impacts
-from harness.estimators.shells import Shells as SeenShells
+from harness.estimators.shells import SeenShells
 from harness.pool.build import campaign_pool
 from harness.pool.replay import StoredPaths
 from harness.pool.walk import Script
