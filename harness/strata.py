@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 
-from harness.vocabulary import BoolArray, FloatArray
+from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
@@ -31,6 +31,14 @@ Numbers = Annotated[
     PlainSerializer(lambda array: array.tolist()),
 ]
 """An array that a JSON file holds as a list of numbers."""
+
+
+def weight_of_a_test(p: FloatArray, tests: IntArray) -> FloatArray:
+    """What one test of each stratum stands for, p_s/n_s, shape (S,): crashes count so much in the rate.
+
+    A stratum without a test counts as one with a single test, which has not crashed.
+    """
+    return np.asarray(p / np.maximum(tests, 1))
 
 
 @dataclass(frozen=True)

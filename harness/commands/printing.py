@@ -76,7 +76,7 @@ def system_error(error: OSError) -> HarnessError | None:
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         mend = "Change its permissions, or choose another place."
         return HarnessError(where, f"no permission ({error.strerror})", "a place that may be read and written", mend)
-    if error.errno in (errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR):
+    if error.errno == errno.EISDIR:
         found = f"a path that leads to no file ({error.strerror})"
         return HarnessError(where, found, "a file, or a place for one", "Correct the path.")
     return None

@@ -165,13 +165,15 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
 
 
 def _bar(bar: dict[str, Any]) -> dict[str, str]:
+    from harness.report.words import bar_note  # noqa: PLC0415 - keeps --help fast
+
     def ends(of: list[float | None]) -> str:
         return "× " + " … ".join(number(end, 3) for end in of)
 
     values = "" if bar["values"] is None else " … ".join(map(plain, bar["values"]))
     told = {"number": bar["what"], "known": f"{bar['known']} {values}", "rate": ends(bar["rate"])}
     off = " … ".join(map(share, bar["off"])) if bar["off"] != [None, None] else ""
-    return {**told, "ratio": ends(bar["ratio"]), "off by": off, "remark": bar["note"]}
+    return {**told, "ratio": ends(bar["ratio"]), "off by": off, "remark": bar_note(bar)}
 
 
 @click.command(

@@ -20,7 +20,7 @@ from harness.estimators.stopping import RoundRule, Rule
 from harness.estimators.traffic import TrafficError
 from harness.numbers import two_digits_up
 from harness.records.folder import StoppedBy
-from harness.strata import Assumed
+from harness.strata import Assumed, weight_of_a_test
 from harness.vocabulary import ESTIMATORS, EstimatorName
 
 _PER_KM = 1e6
@@ -144,9 +144,9 @@ def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
     """By what the rate moves; without a crash it is the upper limit that does, which lies in one stratum."""
     times, shells = None, best.details.get("shells")
     if assumed.times is not None and shells:
-        p, n, share = np.array([(each["p"], max(each["n_episodes"], 1), each["crash_share"]) for each in shells]).T
+        p, n, share = np.array([(each["p"], each["n_episodes"], each["crash_share"]) for each in shells]).T
         of_strata = p * np.vstack([np.ones_like(p), *map(np.array, assumed.times)])
-        rates = of_strata @ share if best.n_crashes else (of_strata / n).max(1)
+        rates = of_strata @ share if best.n_crashes else weight_of_a_test(of_strata, n.astype(np.int64)).max(1)
         times = float(rates[1] / rates[0]), float(rates[2] / rates[0])
     return AssumedOfRate(assumed.where, assumed.highest, times)
 

@@ -15,7 +15,7 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Point, Unavailable
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.severity import Impacts, Severity
-from harness.estimators.shells import Shells
+from harness.estimators.shells import SeenShells
 from harness.estimators.weighted import Moments, Nade, Nde
 from harness.vocabulary import CONTACT, ESTIMATORS, EstimatorName, Sampling
 
@@ -24,18 +24,10 @@ ACCUMULATORS: dict[EstimatorName, Callable[[], Accumulator]] = {
     "nade": Nade,
     "mixture_cv": MixtureCv,
     "scv": partial(Scv, leave_one_out=True),
-    "shells": Shells,
+    "shells": SeenShells,
 }
 SPACING = 1.01
 """Prefixes closer than 1 % are one dot on a logarithmic axis; thinning them keeps long campaigns' files small."""
-NOTE = (
-    "Diagnostics, never tests: each mean is 1 in expectation, except that of W·1{cut-in}, which is P(cut-in). Under "
-    "the step mixture the mean of W is carried by weights that hardly ever occur: NADE with ε = 0.1 shows 0.03 at "
-    "4e5 episodes although it is unbiased. A mean far below 1 then means that the episodes that matter most have not "
-    "been met yet, not that a weight is wrong."
-)
-NOTE_SHELLS = "Every test within a shell stands for the same probability: there are no weights to be diagnosed."
-LOW_MEAN_WEIGHT = 0.5
 BEFORE_OVERLAP = ("took_over_early", "asked_to_speed_up")
 """What AVs do, or ask for in vain, while BV comes over; columns of blocks."""
 
@@ -70,19 +62,13 @@ class Diagnostics:
     def result(self, importance_names: tuple[str, ...] = ()) -> dict[str, Any]:
         """Means with standard errors; the M importance functions, in order, are numbered where names are left out."""
         names = importance_names or tuple(f"q_{j}" for j in range(len(self._ratios)))
-        result: dict[str, Any] = {
+        return {
             "mean_weight": self._mean(self._weight),
             "mean_weight_cut_in": self._mean(self._cut_in),
             "mean_ratio": {name: self._mean(sums) for name, sums in zip(names, self._ratios, strict=False)},
             "bv_lv_contact_share": self._mean(self._contact),
             **self.counts,
-            "note": NOTE_SHELLS if self._sampling.strata else NOTE,
         }
-        if not self._sampling.bounded and (mean := self._weight.mean(self.n)) < LOW_MEAN_WEIGHT:
-            result["heavy_tail"] = (
-                f"the mean weight is {mean:.3g} where 1 is expected: the episodes with large weights are still missing"
-            )
-        return result
 
     def _mean(self, sums: Moments) -> dict[str, float]:
         if self._sampling.strata:
@@ -131,7 +117,7 @@ def one_pass(
             refusals = {name: block.refusal(name) for name in (own, *names)}
             states = {name: accumulator(name) for name, reason in refusals.items() if reason is None}
             if "impact_mps" in block.columns:
-                empty = Shells if own == "shells" else partial(accumulator, own)
+                empty = SeenShells if own == "shells" else partial(accumulator, own)
                 impacts = Impacts(empty, block.drawn.counts_above_mps)
         n += len(block)
         diagnostics.add(block)

@@ -18,9 +18,9 @@ import numpy as np
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, FailureBounds, finite_json
 from harness.estimators.likelihood import Counts, Level, contrast_limit, ratio_limits, spread
-from harness.estimators.shells import Shells
+from harness.estimators.shells import SeenShells
 from harness.estimators.tally import Tally, mean_square
-from harness.strata import ShellDesign
+from harness.strata import ShellDesign, weight_of_a_test
 from harness.vocabulary import FloatArray, IntArray
 
 NO_CRASH, CRASH, FAILED = range(3)
@@ -116,7 +116,7 @@ class PairCounts:
 
     def rate(self, weights: FloatArray) -> float:
         """Weighted sum over outcomes (4,) and strata, as seen."""
-        return float((self.p / np.maximum(self.tests, 1)) @ (self.outcomes() @ weights))
+        return float(weight_of_a_test(self.p, self.tests) @ (self.outcomes() @ weights))
 
     @property
     def larger_rate(self) -> float:
@@ -137,7 +137,7 @@ class PairCounts:
         The mean square of a path's part in it is at most that of its outcomes of positive weight and that of those of
         negative weight together, as the product of the two only lowers it.
         """
-        scale, square, rate = self.p / np.maximum(self.tests, 1), 0.0, 0.0
+        scale, square, rate = weight_of_a_test(self.p, self.tests), 0.0, 0.0
         kinds = _kinds(failed_a, failed_b)
         for sign in (1.0, -1.0):
             part = np.maximum(sign * weights, 0.0)
@@ -291,5 +291,5 @@ def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
 
 def _own(pairs: PairCounts, side: int, confidence: float) -> Estimate:
     tally = pairs.tally(side)
-    worst = Shells.of(pairs.design, tally.failed_as_crashes())
-    return FailureBounds(Shells.of(pairs.design, tally), worst, int(tally.failed.sum())).result(confidence)
+    worst = SeenShells.of(pairs.design, tally.failed_as_crashes())
+    return FailureBounds(SeenShells.of(pairs.design, tally), worst, int(tally.failed.sum())).result(confidence)

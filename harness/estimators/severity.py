@@ -16,7 +16,7 @@ import numpy as np
 from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator, Number
 from harness.estimators.likelihood import Level
-from harness.estimators.shells import Shells, Unavoidable
+from harness.estimators.shells import SeenShells, Unavoidable
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import FloatArray
 
@@ -89,12 +89,12 @@ class Impacts:
             return None
         every, unavoidable, cut_off = self._above[self._first], None, np.concatenate(self._cut_off) / self._n
         limits: list[tuple[float, float] | None] = [None, None]
-        if isinstance(every, Shells):
+        if isinstance(every, SeenShells):
             level, each = Level.two_sided(confidence), every.weight_of_a_crash()
             weight, cut_off = each[weight.astype(np.int64)], each[np.concatenate(self._cut_off).astype(np.int64)]
             unavoidable = every.unavoidable(level)
             for k, (speed, softer) in enumerate(((TOUCH_MPS, True), (HARD_MPS, False))):
-                if isinstance(harder := self._above.get(speed), Shells):
+                if isinstance(harder := self._above.get(speed), SeenShells):
                     limits[k] = every.share_of_crashes(harder, level, of_the_others=softer)
         if not weight.any():  # too small for a number
             return None
@@ -106,7 +106,7 @@ class Impacts:
 
 
 def _exceedance(speed: float, state: Accumulator, confidence: float) -> Exceedance:
-    if not isinstance(state, Shells):
+    if not isinstance(state, SeenShells):
         of = state.result(confidence)
         return Exceedance(speed, of.crash_rate, of.ci_low, of.ci_high, of.upper_bound, of.n_crashes)
     n, n_crashes, _ = state.tally.totals

@@ -43,7 +43,7 @@ from harness.estimators.tally import (
     pool_variance,
 )
 from harness.numbers import share, two_digits_up
-from harness.strata import ShellDesign
+from harness.strata import ShellDesign, weight_of_a_test
 from harness.vocabulary import BoolArray, FloatArray
 
 GROWTH, MOST_TIMES = 1.1, 1e6
@@ -136,7 +136,7 @@ class ShellDetails:
     shells: tuple[Shell, ...]
 
 
-class Shells:
+class SeenShells:
     """Tests of a shells campaign, counted within the cells of strata.
 
     ``tally`` has the counts by stratum; of no strata before the first tests.
@@ -151,7 +151,7 @@ class Shells:
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
 
     @classmethod
-    def of(cls, design: ShellDesign, tally: Tally) -> Shells:
+    def of(cls, design: ShellDesign, tally: Tally) -> SeenShells:
         """From counts by stratum, which say nothing about reference drivers."""
         shells = cls()
         shells.count(design.without_references(), tally)
@@ -203,7 +203,7 @@ class Shells:
         tally, design = self.tally, self._design
         n, n_crashes, _ = tally.totals
         cautions = tuple(self._cautions())
-        free, y = self._limits(design.p.size, Level.two_sided(confidence)), design.p / tally.at_least_one
+        free, y = self._limits(design.p.size, Level.two_sided(confidence)), self.weight_of_a_crash()
         squares = float((tally.crashes * y * y).sum())
         return Estimate(
             crash_rate=free.rate,
@@ -238,12 +238,12 @@ class Shells:
     def std_error(self, n_strata: int | None = None) -> float:
         """Of the rate of the first strata, all by default, with the pool's own error."""
         tally, p = self.tally.part(slice(0, n_strata)), self._design.p[:n_strata]
-        of_tests = p * p * tally.share * (1.0 - tally.share) / tally.at_least_one
+        of_tests = p * weight_of_a_test(p, tally.tests) * tally.share * (1.0 - tally.share)
         return math.sqrt(float(of_tests.sum()) + pool_variance(p, tally, self._design.n_independent))
 
     def weight_of_a_crash(self) -> FloatArray:
         """What a crash in each stratum adds to the rate, p_s/n_s, shape (S,)."""
-        return np.asarray(self._design.p / self.tally.at_least_one)
+        return weight_of_a_test(self._design.p, self.tally.tests)
 
     def unavoidable(self, level: Level) -> Unavoidable | None:
         """See there; None without a crash, and where that driver crashes nowhere."""
@@ -254,7 +254,7 @@ class Shells:
         share, low, high = preventable_share(design.cell_p, self._cells, avoids, design.n_independent, level)
         return Unavoidable(design.strata[0], 1.0 - share, 1.0 - high, 1.0 - low)
 
-    def share_of_crashes(self, some: Shells, level: Level, *, of_the_others: bool) -> tuple[float, float]:
+    def share_of_crashes(self, some: SeenShells, level: Level, *, of_the_others: bool) -> tuple[float, float]:
         """Limits of the share of the rate that is of ``some`` of its crashes, or of the others, of the same tests.
 
         A path's parts in both are taken to exclude each other, which makes the variance no smaller.
@@ -357,21 +357,49 @@ class Shells:
         design, tally = self._design, self.tally
         n, level = design.n_inside, Level.two_sided(confidence)
         inside, outside = tally.part(slice(0, n)), tally.part(slice(n, None))
-        limits, (n_outside, n_crashes_outside, _) = self._limits(n, level), outside.totals
+        limits, (n_outside, n_crashes_outside, n_failed_outside) = self._limits(n, level), outside.totals
         bound = combined(design.p[n:], outside, design.n_independent, Level.of_bound(confidence, n_outside)).high
         crashed = sorted(episode for s, episodes in self._crashed.items() if s >= n for episode in episodes)
-        who = design.boundary, design.assumes, n
-        rate = limits.rate, limits.low, limits.high, limits.rhw, *limits.from_pool_relative()
-        if_failed = float(design.p[:n] @ inside.failed_as_crashes().share)
-        beyond = n_crashes_outside > 0, tuple(crashed[:MOST_NAMED]), bound
-        return Within(*who, *rate, *inside.totals, if_failed, *outside.totals, *beyond)
+        n_tests, n_crashes, n_failed = inside.totals
+        return Within(
+            boundary=design.boundary,
+            assumes=design.assumes,
+            n_shells=n,
+            crash_rate=limits.rate,
+            ci_low=limits.low,
+            ci_high=limits.high,
+            rhw=limits.rhw,
+            rhw_from_pool=limits.from_pool_relative()[0],
+            rhw_from_pool_at_least=limits.from_pool_relative()[1],
+            n_episodes=n_tests,
+            n_crashes=n_crashes,
+            n_failed=n_failed,
+            crash_rate_if_failed_had_crashed=float(design.p[:n] @ inside.failed_as_crashes().share),
+            n_episodes_outside=n_outside,
+            n_crashes_outside=n_crashes_outside,
+            n_failed_outside=n_failed_outside,
+            refuted=n_crashes_outside > 0,
+            refuted_by=tuple(crashed[:MOST_NAMED]),
+            upper_bound_outside=bound,
+        )
 
     def _shells(self, tally: Tally, tail: float) -> tuple[Shell, ...]:
-        p, inside = self._design.p, np.arange(self._design.p.size) < self._design.n_inside
-        low, high = clopper_pearson(tally.crashes, tally.tests, tail, tally.failed)
-        columns = [inside, p, *tally[:3], tally.share, low, high, p * tally.share]
-        rows = zip(self._design.strata, *(np.asarray(column).tolist() for column in columns), strict=True)
-        return tuple(Shell(*row) for row in rows)
+        design, (low, high) = self._design, clopper_pearson(tally.crashes, tally.tests, tail, tally.failed)
+        return tuple(
+            Shell(
+                shell=name,
+                inside=s < design.n_inside,
+                p=float(design.p[s]),
+                n_episodes=int(tally.tests[s]),
+                n_crashes=int(tally.crashes[s]),
+                n_failed=int(tally.failed[s]),
+                crash_share=float(tally.share[s]),
+                crash_share_low=float(low[s]),
+                crash_share_high=float(high[s]),
+                contribution=float(design.p[s] * tally.share[s]),
+            )
+            for s, name in enumerate(design.strata)
+        )
 
     def _warnings(self, tally: Tally, confidence: float) -> list[str]:
         design, found = self._design, []
@@ -455,7 +483,7 @@ def rate_ratio_limits(
     """
     rate, square = moments
     own, of_paths = float(p @ tally.share), pool_variance(p, tally, n_paths)
-    product = float((p / tally.at_least_one) @ with_reference)
+    product = float(weight_of_a_test(p, tally.tests) @ with_reference)
     covariance, of_reference = (product - own * rate) / n_paths, (square - rate * rate) / n_paths
 
     def variance(x: float) -> float:
@@ -481,7 +509,7 @@ def preventable_share(
 def _share_limits(
     p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: float, level: Level
 ) -> tuple[float, float]:
-    scale = p / cells.at_least_one
+    scale = weight_of_a_test(p, cells.tests)
     first, second = (crash_square(scale * part, cells) for part in (prevented, ~prevented))
     rates = p * cells.share
     of_prevented, of_others = float(rates[prevented].sum()), float(rates[~prevented].sum())

@@ -28,7 +28,7 @@ from harness.campaign.sections import Accept, Stop
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts, PairDecision, PairVerdict
-from harness.estimators.shells import Shells
+from harness.estimators.shells import SeenShells
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import SAMPLING, EstimatorName, Method
 
@@ -232,7 +232,7 @@ class RoundRule(Rule):
     that is continued is looked at where it would have been without the break, and once more where that was.
     """
 
-    seen: Shells
+    seen: SeenShells
     """All tests at the last look."""
     level_at = staticmethod(decision_level)
 
@@ -242,7 +242,7 @@ class RoundRule(Rule):
         self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
         self._below_reference = campaign.stop.below_reference
 
-    def observe(self, seen: Shells) -> bool:
+    def observe(self, seen: SeenShells) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
         self.seen = seen
         if self._accept is not None:
@@ -257,10 +257,10 @@ class RoundRule(Rule):
         return self.look.stopped or (enough and tally.tests.sum() >= self._held)
 
     def more_tests(self, target: float, more_runs: float) -> float:
-        """How many times as many tests are expected to reach a relative half-width, see `Shells.more_tests`."""
+        """How many times as many tests are expected to reach a relative half-width, see `SeenShells.more_tests`."""
         return self.seen.more_tests(self._statement, Level.two_sided(self._confidence), target, more_runs)
 
-    def _below(self, seen: Shells) -> Decision | None:
+    def _below(self, seen: SeenShells) -> Decision | None:
         """That the rate is below the asked multiple of a reference driver's, at the level of decisions."""
         limit, first = self._below_reference, seen.first_reference
         if limit is None or first is None:
@@ -272,14 +272,14 @@ class RoundRule(Rule):
         found = self._beside(seen, limit, driver)
         return found if found.verdict == "accepted" else None
 
-    def _beside(self, seen: Shells, limit: float, driver: str | None) -> Decision:
+    def _beside(self, seen: SeenShells, limit: float, driver: str | None) -> Decision:
         """What is known about a limit after these tests, at the level of decisions."""
         n, statement = int(seen.tally.tests.sum()), self._statement
         level = self.level_at(seen.expected(limit, driver, statement), self._confidence)
         ends = seen.limits_of(statement, level)[1:3] if driver is None else seen.beside(driver, statement, level)
         return Decision(limit, statement, (1.0 + self._confidence) / 2.0, *ends, n, driver=driver)
 
-    def _decided(self, seen: Shells, accept: Accept) -> bool:
+    def _decided(self, seen: SeenShells, accept: Accept) -> bool:
         """Look at a limit until it is decided; that answer stays, also while the folder holds further tests."""
         n, found = int(seen.tally.tests.sum()), self.look.decision
         if found is None or found.verdict == "undecided":

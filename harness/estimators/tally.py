@@ -15,6 +15,7 @@ from scipy.special import ndtr
 
 from harness.estimators.likelihood import Counts, Level, likelihood_limit
 from harness.estimators.limits import clopper_pearson
+from harness.strata import weight_of_a_test
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 FEWEST_PATHS = 40.0
@@ -106,12 +107,7 @@ class Tally(NamedTuple):
     @property
     def share(self) -> FloatArray:
         """Share of tests that crashed, shape (S,)."""
-        return np.asarray(self.crashes / self.at_least_one)
-
-    @property
-    def at_least_one(self) -> IntArray:
-        """Number of tests, 1 where there is none, shape (S,)."""
-        return np.maximum(self.tests, 1)
+        return weight_of_a_test(np.asarray(self.crashes, np.float64), self.tests)
 
 
 def empty_tally(n_strata: int) -> Tally:
@@ -207,7 +203,7 @@ def paths_that_count(p: FloatArray, tally: Tally, errors: float = 0.0) -> float:
     If nearly all crashes lie on a few paths, as those of a vehicle that gives way do, then paths which would matter
     most may well be missing, and nothing in the tests says so. ``errors`` see `OnRuns.square`.
     """
-    runs, scale = tally.runs, p / tally.at_least_one
+    runs, scale = tally.runs, weight_of_a_test(p, tally.tests)
     few = int(tally.crashes.sum()) < FEWEST_CRASHES
     if runs is None or (few and runs.n_pairs(p > 0.0) < FEWEST_PAIRS):
         return math.inf
@@ -223,7 +219,7 @@ def pool_variance(
     It is (Σ E[x_s x_t] - μ²)/n, see `crash_square`. A stratum in which no crash was seen adds nothing. ``factor`` (S,)
     says by how much crashes of each stratum are fewer than seen.
     """
-    scale = p / tally.at_least_one * factor
+    scale = weight_of_a_test(p, tally.tests) * factor
     rate = float(scale @ tally.crashes)
     return max(crash_square(scale, tally, errors) - rate * rate, 0.0) / n_paths
 

@@ -118,7 +118,8 @@ class Bar:
 
     ``values`` are its ends, of a block none. ``off`` is by how much a reference driver's rate comes out wrong at most,
     at each end.
-    A factor is NaN where the tests cannot answer it, and ``note`` says why.
+    A factor is NaN where the tests cannot answer it: of ``n`` environments ``no_laws`` have laws that give no
+    probabilities, and ``unlike`` are unlike what was tested.
     """
 
     what: str
@@ -127,7 +128,9 @@ class Bar:
     rate: tuple[Number, Number]
     ratio: tuple[Number, Number]
     off: tuple[Number, Number]
-    note: str = ""
+    n: int = 2
+    no_laws: int = 0
+    unlike: int = 0
 
     @property
     def span(self) -> float:

@@ -25,6 +25,7 @@ from harness.report.plots import WHO, pairs_plot
 from harness.report.summary import RunFolder, floats, read_run_folder
 from harness.report.words import deciding_words, pair_asked, pair_warnings, pair_words, short_answer
 from harness.runner.stored import replay_episode
+from harness.strata import weight_of_a_test
 from harness.vocabulary import COMPARISON, FloatArray, IntArray
 
 MEND = "Run `harness compare` again with the same --out."
@@ -99,7 +100,7 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
         episode = np.where(outcome == "failed", -1.0, values["episode"])
         found.append({**values, "episode": episode, "crash": (outcome == "crash") & hard})
     a, b = (each["crash"] for each in found)
-    weight = np.repeat([shell["p"] / max(n, 1) for shell, n in zip(shells, n_pairs, strict=True)], n_pairs)
+    weight = np.repeat(weight_of_a_test(np.array([shell["p"] for shell in shells]), np.array(n_pairs)), n_pairs)
     kept = a | b
     gap, rate = (np.where(a, found[0][name], found[1][name])[kept] for name in columns[-2:])
     episode, impact = (np.stack([of[name][kept] for of in found]) for name in ("episode", "impact_speed_mps"))

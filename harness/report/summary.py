@@ -28,7 +28,7 @@ from harness.estimators.shells import ShellDetails
 from harness.families import family_named
 from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_shards, stored_columns
-from harness.strata import ASSUMPTION_FREE
+from harness.strata import ASSUMPTION_FREE, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
 
@@ -46,6 +46,12 @@ class ShownShells(ShellDetails):
     """What the headline estimate of a shells run says about them."""
 
     rate: float
+
+    @property
+    def weight(self) -> FloatArray:
+        """What a test of each shell stands for, shape (S,)."""
+        p, tests = np.array([(shell.p, shell.n_episodes) for shell in self.shells]).T
+        return weight_of_a_test(p, tests.astype(np.int64))
 
     @property
     def pool_half_width(self) -> float:
@@ -206,7 +212,7 @@ def floats(column: pa.Array) -> FloatArray:
 
 def summarise(run: RunFolder) -> RunSummary:
     """One pass over all episodes of a run; a `RunFolderError` where one has an unknown outcome."""
-    count, causes, per_shell = np.zeros(len(OUTCOMES)), Counter[str](), Counter[int]()
+    count, causes = np.zeros(len(OUTCOMES)), Counter[str]()
     kept: list[dict[str, FloatArray]] = []
     of_family = [each.name for each in family_named(run.campaign.scenario).columns if not each.length]
     asked = (*COLUMNS, *of_family)
@@ -220,34 +226,17 @@ def summarise(run: RunFolder) -> RunSummary:
             if (cause := item["values"].as_py()) in causes or len(causes) < MOST_CAUSES:
                 causes[cause] += item["counts"].as_py()
         columns = {name: floats(batch.column(name)) for name in asked} | {"outcome": outcome.astype(np.float64)}
-        if run.shells is not None:
-            shells, tests = np.unique(columns["component"].astype(np.int64), return_counts=True)
-            per_shell.update(dict(zip(shells.tolist(), tests.tolist(), strict=True)))
         shown = np.isfinite(columns["cut_in_step"]) | (columns["log_weight"] != 0.0)
         kept.append({name: column[shown] for name, column in columns.items()})
     rows = {name: np.concatenate([part[name] for part in kept] or [np.zeros(0)]) for name in (*asked, "outcome")}
     outcome = rows["outcome"].astype(np.int64)
-    if run.shells is not None:
-        rows["log_weight"] = rows["log_weight"] - _log_tests(per_shell, run)[rows["component"].astype(np.int64)]
-    rows["weight"] = np.where(outcome == FAILED, 0.0, np.exp(rows["log_weight"]))
+    weight = np.exp(rows["log_weight"]) if run.shells is None else run.shells.weight[rows["component"].astype(np.int64)]
+    rows["weight"] = np.where(outcome == FAILED, 0.0, weight)
     left_out = count - np.bincount(outcome, minlength=len(OUTCOMES))  # those weigh 1 each
     weight = left_out + np.bincount(outcome, weights=rows["weight"], minlength=len(OUTCOMES))
     weight[FAILED] = 0.0
     all_one = not rows["log_weight"][outcome != FAILED].any()
     return RunSummary(count, weight, causes, rows, all_one, run.shells is not None)
-
-
-def _log_tests(per_shell: Counter[int], run: RunFolder) -> FloatArray:
-    """Logarithm of the number of tests n_s per shell, shape (S,).
-
-    A record carries log p_s, because it is written before anybody knows how many tests its shell will get. Weights
-    p_s/n_s add up to Σ p_s c_s; weights p_s would count a shell as often as it was tested.
-    """
-    if min(per_shell, default=0) < 0:
-        expected = "the shell that each test was drawn from"
-        mend = "The records are not those of a run with testing.method shells: run the campaign again."
-        raise RunFolderError(str(run.path / "episodes"), "a test without shell (component -1)", expected, mend)
-    return np.log([float(max(per_shell[shell], 1)) for shell in range(max(per_shell, default=-1) + 1)])
 
 
 def lateral_facts(run: RunFolder) -> dict[str, Any] | None:

@@ -363,6 +363,13 @@ def _few_replicates(found: TrafficError | None) -> tuple[str, ...]:
     return () if found is None else too_few(found.n_replicates, found.confidence)
 
 
+def bar_note(bar: Mapping[str, Any]) -> str:
+    """Why the tests do not answer some of the environments of a `Bar`."""
+    why = {"laws that give no probabilities": bar["no_laws"], "unlike what was tested": bar["unlike"]}
+    note = " and ".join(reason for reason, n in why.items() if n)
+    return f"{sum(why.values())} of {bar['n']}: {note}" if note and bar["values"] is None else note
+
+
 def too_few(n_replicates: int, confidence: float) -> tuple[str, ...]:
     """A warning of limits from few replicates; nothing where there are enough."""
     if n_replicates >= LEAST_REPLICATES:

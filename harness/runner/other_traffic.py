@@ -99,13 +99,14 @@ def traffic_error(moved: Elsewhere, content: Mapping[str, Any], progress: Progre
     sampling, held = (estimate["ci_low"], estimate["ci_high"]), tested.holds
     if not estimate["n_crashes"] or not held:
         sampling = 0.0, estimate["upper_bound"]
-    rate = found.uncertain(estimate["crash_rate"], sampling, 0, from_below=found.unseen is None and held, held=held)
-    known = {each["reference"]: each for each in estimate["details"]["references"]}
-    ratios = {
-        name: found.ratio(each["ratio"], _ends(each), np.array([one.references[r] for one in found.near[0]]), held=held)
-        for r, name in enumerate(each.name for each in tested.design.references)
-        if (each := known.get(name)) is not None
-    }
+    times, from_below = found.times(0), found.unseen is None and held
+    rate = found.uncertain(estimate["crash_rate"], sampling, times, from_below=from_below, held=held)
+    drivers, ratios = [each.name for each in tested.design.references], {}
+    for each in estimate["details"]["references"]:
+        moves = times / np.array([one.references[drivers.index(each["reference"])] for one in found.near[0]])
+        ratios[each["reference"]] = found.uncertain(
+            each["ratio"], _ends(each), moves, ONE_LAW, from_below=held, held=held
+        )
     return found.error(rate, ratios)
 
 
@@ -134,10 +135,14 @@ def compare_in_other_traffic(
         expected = "an environment that names replicates, as `harness fit` writes them"
         raise CampaignError(OPTION, f"{environment}, which names none", expected, "Compare in that environment.")
     a, b = (
-        found.uncertain(of["crash_rate"], (of["ci_low"], of["ci_high"]), side, from_below=found.unseen is None)
+        found.uncertain(
+            of["crash_rate"], (of["ci_low"], of["ci_high"]), found.times(side), from_below=found.unseen is None
+        )
         for side, of in enumerate((told["a"], told["b"]))
     )
-    ratios = {"B": found.ratio(told["ratio"], _ends(told), found.times(1))} if told["b"]["n_crashes"] else {}
+    moves, ratios = found.times(0) / found.times(1), {}
+    if told["b"]["n_crashes"]:
+        ratios["B"] = found.uncertain(told["ratio"], _ends(told), moves, ONE_LAW)
     error = found.error(a, ratios)
     return {"traffic": finite_json(error), "b": finite_json(b)}
 
@@ -156,23 +161,16 @@ class Replicated:
         """By what the rate of a run moves, (B,)."""
         return np.array([each.rate for each in self.near[side]])
 
-    @property
-    def off(self) -> FloatArray:
-        """By how much each may be off, (B,)."""
-        return np.array([each.off for each in self.near[0]])
-
-    def uncertain(self, value: float, sampling: Ends, side: int, **how: bool) -> Uncertain:
-        """A rate of a run, see `uncertain`."""
-        return uncertain(value, sampling, self.times(side), self.off, self.n_refused, self.confidence, **how)
-
-    def ratio(self, value: float, sampling: Ends, moves: FloatArray, *, held: bool = True) -> Uncertain:
-        """Of the first run to another rate, which ``moves`` by factors (B,)."""
-        about = self.times(0) / moves, self.off + ONE_LAW, self.n_refused, self.confidence
-        return uncertain(value, sampling, *about, from_below=held, held=held)
+    def uncertain(
+        self, value: float, sampling: Ends, factors: FloatArray, further: float = 0.0, **how: bool
+    ) -> Uncertain:
+        """Something that moves by ``factors`` (B,), which may be off by so much, and ``further``; see `uncertain`."""
+        off = np.array([each.off for each in self.near[0]]) + further
+        return uncertain(value, sampling, factors, off, self.n_refused, self.confidence, **how)
 
     def error(self, rate: Uncertain, ratios: Mapping[str, Uncertain]) -> TrafficError:
         """All of it."""
-        n, off = len(self.near[0]) + self.n_refused, float(self.off.mean())
+        n, off = len(self.near[0]) + self.n_refused, float(np.mean([each.off for each in self.near[0]]))
         return TrafficError(self.environment, self.confidence, n, self.n_refused, off, rate, ratios, self.unseen)
 
 

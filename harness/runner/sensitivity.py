@@ -40,7 +40,6 @@ BLOCKS = {
 N_REPLICATES = 50
 CONFIDENCE, QUANTILE = 0.9, 1.645
 _OPTION = "harness sensitivity"
-_WHY = {True: "laws that give no probabilities", False: "unlike what was tested"}
 
 
 @dataclass(frozen=True)
@@ -122,15 +121,23 @@ def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:
     nowhere = np.full((2, 2), np.nan)
     ends = np.array([nowhere[0] if each is None or each.refused else (each.rate, each.ratio) for each in results])
     off = np.array([np.nan if each is None else each.off for each in results])
-    note = " and ".join(sorted({_WHY[each is None] for each in results if each is None or each.refused}))
+    no_laws, unlike = results.count(None), sum(each is not None and each.refused for each in results)
     if move.values is None:
         tail, told = (1.0 - CONFIDENCE) / 2.0, ~np.isnan(ends[:, 0])
         known, enough = ends[told], 2 * np.count_nonzero(told) >= len(results)
         ends = np.quantile(known, [tail, 1.0 - tail], axis=0) if enough else nowhere
         nearest = [int(np.argmin(np.abs(known[:, 0] - end))) for end in ends[:, 0]] if enough else []
         off = off[told][nearest] if enough else nowhere[0]
-        note = note and f"{len(results) - len(known)} of {len(results)}: {note}"
     (rate_low, ratio_low), (rate_high, ratio_high) = ends.tolist()
     off_low, off_high = off.tolist()
-    offs = off_low, off_high
-    return Bar(move.what, move.known, move.values, (rate_low, rate_high), (ratio_low, ratio_high), offs, note)
+    return Bar(
+        what=move.what,
+        known=move.known,
+        values=move.values,
+        rate=(rate_low, rate_high),
+        ratio=(ratio_low, ratio_high),
+        off=(off_low, off_high),
+        n=len(results),
+        no_laws=no_laws,
+        unlike=unlike,
+    )

@@ -22,7 +22,7 @@ from harness.campaign.campaign import Campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.likelihood import Level, likelihood_limit
-from harness.estimators.shells import Shells as SeenShells
+from harness.estimators.shells import SeenShells
 from harness.families.cut_in.loading import load_parameters
 from harness.numbers import share
 from harness.pool.build import campaign_pool

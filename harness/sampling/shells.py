@@ -21,7 +21,7 @@ from harness.campaign.campaign import Campaign
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts
-from harness.estimators.shells import Shells as SeenShells
+from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
 from harness.families.cut_in.learned import Learned

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
 from harness.estimators.likelihood import Level
-from harness.estimators.one_pass import LOW_MEAN_WEIGHT
 from harness.vocabulary import FloatArray, Method
 
+LOW_MEAN_WEIGHT = 0.5
 Verdict = Literal["reproduced", "not reproduced", "cannot be told", "ours to choose"]
 
 

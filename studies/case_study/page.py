@@ -14,9 +14,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from harness import numbers
 from harness.errors import HarnessError
-from harness.estimators.one_pass import LOW_MEAN_WEIGHT
 from harness.records.folder import write_bytes
-from studies.case_study.figures import Verdict, is_settled, verdict
+from studies.case_study.figures import LOW_MEAN_WEIGHT, Verdict, is_settled, verdict
 from studies.case_study.plots import plots_of
 from studies.case_study.study import Made, Study
 

@@ -24,7 +24,7 @@ from harness.errors import CampaignError
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
-from harness.estimators.shells import Shells
+from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import CrashedTests, Tally, combined
 from harness.pool.cut_ins import CutIns, Pool
@@ -151,7 +151,7 @@ class DrawnPool:
         failed = [np.append(rows[:n], other) for rows, n, other in zip(paths, n_failed, others, strict=True)]
         return tests, crashed, failed
 
-    def count(self, added: IntArray, seen: Shells, rng: np.random.Generator) -> None:
+    def count(self, added: IntArray, seen: SeenShells, rng: np.random.Generator) -> None:
         """Draw so many more tests of each stratum (S,), and count what their records would say."""
         tests, *paths = self.tests_of(added, rng)
         known, on_runs = self.cut_ins, None
@@ -177,7 +177,7 @@ Draw = Callable[[np.random.Generator], Sequence[DrawnPool]]
 
 def looks(
     campaign: Campaign, drawn: DrawnPool, rng: np.random.Generator, budgets: Sequence[int] = ()
-) -> Iterator[tuple[Shells, ShellRounds, bool]]:
+) -> Iterator[tuple[SeenShells, ShellRounds, bool]]:
     """One campaign on a pool until nothing is left: all tests after each round, the planner, and its rule's answer.
 
     Its budget is raised from each of some smaller ones to the next. Such a budget ends in the midst of a round, with a
@@ -268,7 +268,7 @@ class ShellCampaign(_Drawn):
                 rules[factor, FORMER] = FormerRule(asked)
         known, left = dict[tuple[float, str], Row](), list(self.budgets)
 
-        def judged(seen: Shells, budget: int) -> Iterator[Row]:
+        def judged(seen: SeenShells, budget: int) -> Iterator[Row]:
             for (factor, by), rule in rules.items():
                 row = known.get((factor, by)) or self._decision(seen, replication, rule)
                 for name, wrong in limit_at(factor, budget).items():
@@ -285,7 +285,7 @@ class ShellCampaign(_Drawn):
         for budget in left:  # everything is decided, or nothing left to test
             yield from judged(seen, budget)
 
-    def _decision(self, seen: Shells, replication: int, rule: RoundRule) -> Row:
+    def _decision(self, seen: SeenShells, replication: int, rule: RoundRule) -> Row:
         """A verdict, for now with an interval that holds whatever is true."""
         verdict = "undecided" if rule.look.decision is None else rule.look.decision.verdict
         level, (n, n_crashes, _) = Level.two_sided(self.campaign.stop.confidence), seen.tally.totals
@@ -329,7 +329,7 @@ class ShellCampaign(_Drawn):
         for reference in design.references:
             yield from _reference_rows(estimate, reference.name, replication, reached=reached)
 
-    def _statement_row(self, seen: Shells, replication: int, *, reached: bool) -> Row:
+    def _statement_row(self, seen: SeenShells, replication: int, *, reached: bool) -> Row:
         found = seen.within(self.campaign.stop.confidence)
         error, refused = seen.std_error(found.n_shells), math.isinf(found.rhw_from_pool)
         numbers = found.n_episodes, found.n_crashes, found.crash_rate, error, found.ci_low, found.ci_high

@@ -13,7 +13,7 @@ from harness.compiled import unboxed
 from harness.estimators.block import Block, Drawn, joined
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import SPEEDS_MPS, Impacts
-from harness.estimators.shells import Shells as SeenShells
+from harness.estimators.shells import SeenShells
 from harness.families.cut_in.path import empty_trajectory
 from harness.families.cut_in.replay import StoredPaths
 from harness.families.cut_in.script import maneuvers_of, states_of

@@ -11,7 +11,7 @@ from harness.estimators.block import Drawn
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
-from harness.estimators.shells import Shells
+from harness.estimators.shells import SeenShells
 from harness.estimators.tally import (
     FEWEST_PATHS,
     ROOM,
@@ -141,7 +141,7 @@ def test_a_crash_outside_refutes_the_assumption():
 def test_shares_of_the_crashes_have_the_limits_of_a_binomial_share():
     """In one stratum, of a pool without error: Σ n KL(seen, limit) is a level's threshold."""
     one = replace(SHELLS, strata=("a",), cell_stratum=(0,), cell_references=(0,), cell_p=P[:1], n_inside=1)
-    every, some = (Shells.of(one, tally(0.0 * P[:1], (crashes,), (500,))) for crashes in (40, 10))
+    every, some = (SeenShells.of(one, tally(0.0 * P[:1], (crashes,), (500,))) for crashes in (40, 10))
     low, high = every.share_of_crashes(some, LEVEL, of_the_others=False)
     for limit in (low, high):
         distance = 10 * math.log(0.25 / limit) + 30 * math.log(0.75 / (1.0 - limit))
@@ -149,8 +149,9 @@ def test_shares_of_the_crashes_have_the_limits_of_a_binomial_share():
     others = every.share_of_crashes(some, LEVEL, of_the_others=True)
     assert others == pytest.approx((1.0 - high, 1.0 - low), rel=1e-6)
     assert every.share_of_crashes(every, LEVEL, of_the_others=False)[1] == 1.0
-    uncertain = Shells.of(replace(one, n_paths=30), tally(P[:1], (40,), (500,)))
-    assert uncertain.share_of_crashes(Shells.of(one, tally(P[:1], (10,), (500,))), LEVEL, of_the_others=False)[0] < low
+    uncertain = SeenShells.of(replace(one, n_paths=30), tally(P[:1], (40,), (500,)))
+    fewer = SeenShells.of(one, tally(P[:1], (10,), (500,)))
+    assert uncertain.share_of_crashes(fewer, LEVEL, of_the_others=False)[0] < low
 
 
 def test_it_has_its_own_inside_and_its_own_refutation():
@@ -269,7 +270,7 @@ def test_few_paths_end_nothing_while_another_stratum_is_to_be_tested(untested, a
     place = CrashedTests(np.array([1, 2] * 30), np.arange(60), np.full(60, 1e-4), np.zeros(60, np.int64))
     design = replace(SHELLS, strata=("careful", "outside"), cell_stratum=(0, 1), cell_references=(0, 0), n_paths=100)
     design = replace(design, cell_p=P[:2], available=(9_000, available), n_inside=1)
-    seen = Shells()
+    seen = SeenShells()
     seen.count(design, two, place)
     limits = seen.limits_of("assumption_free", LEVEL)
     assert (limits.from_pool, limits.from_pool_at_least) == (math.inf, math.inf if sure else 0.0)

@@ -16,7 +16,7 @@ from harness.estimators.answer import ended_by, expected_for
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import accumulator
 from harness.estimators.pairs import CRASH, NO_CRASH, no_pairs
-from harness.estimators.shells import Shells
+from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import LOOK_RATIO, Decision, RoundRule, StopRule, look_grid
 from harness.estimators.tally import Tally
 from harness.strata import ASSUMPTION_FREE, Reference
@@ -118,9 +118,9 @@ def rule(limit: float, held: int = 0) -> RoundRule:
     return RoundRule(Campaign.model_validate({**content, "accept": {"crash_rate_below": limit}}), held)
 
 
-def seen(tests, crashes) -> Shells:
+def seen(tests, crashes) -> SeenShells:
     none = np.zeros(3, np.int64)
-    return Shells.of(DESIGN, Tally(tests, crashes, none, np.outer(crashes, P), np.zeros((3, 3))))
+    return SeenShells.of(DESIGN, Tally(tests, crashes, none, np.outer(crashes, P), np.zeros((3, 3))))
 
 
 def decided(seed: int, limit: float) -> Decision:
@@ -162,7 +162,7 @@ def test_a_run_that_a_reference_driver_ends_is_held_to_the_level_of_decisions(n)
     content, stopped = {"name": "x", "testing": {"method": "shells"}}, []
     for rate in np.geomspace(1e-7, 1e-2, 40):
         design = replace(DESIGN, **known, reference_rate=np.array([rate]))
-        counted = Shells()
+        counted = SeenShells()
         counted.count(design, Tally(tests, crashes, 0 * tests, np.outer(crashes, P), np.zeros((3, 3))))
         asked = {"stop": {"rhw": 1e-3, "below_reference": 0.2}}
         gate = {"accept": {"times_reference": {"driver": "r157-cc", "at_most": 0.2}}}
@@ -186,7 +186,7 @@ def test_a_run_that_a_reference_driver_ends_is_held_to_the_level_of_decisions(n)
 def test_a_limits_threshold_follows_from_the_crashes_that_it_makes_expected(tests, statement, driver, expected):
     """Ten times the tests where ten times as much lies outside: cut-ins that take time are no rarer decided."""
     references = {"references": (Reference("r157-cc", "a driver"),), "reference_rate": np.array([2e-8])}
-    counted = Shells()
+    counted = SeenShells()
     none = np.zeros(3, np.int64)
     counted.count(
         replace(DESIGN, **references, reference_square=np.array([1e-15])),
@@ -221,7 +221,7 @@ def test_a_vehicle_that_always_crashes_may_have_a_rate_above_that_of_this_pool()
         mass = rng.lognormal(sigma=1.0, size=(n_paths, 3)) * P
         drawn = np.array([mass[rng.choice(n_paths, 400, p=of / of.sum())].sum(0) for of in mass.T])
         design = replace(DESIGN, cell_p=mass.mean(0), n_paths=n_paths)
-        found = Shells.of(design, Tally(tests, tests, none, drawn, np.zeros((3, 3))))
+        found = SeenShells.of(design, Tally(tests, tests, none, drawn, np.zeros((3, 3))))
         pairs = no_pairs(design)
         pairs.ends[:, CRASH, NO_CRASH], pairs.mass[:, CRASH, NO_CRASH] = tests, drawn
         free, alone = found.limits_of(ASSUMPTION_FREE, LEVEL), pairs.alone(0, LEVEL)

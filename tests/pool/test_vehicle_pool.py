@@ -17,6 +17,7 @@ from harness.pool.vehicle_pool import EVENLY, chances, vehicle_pool
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline, without_event
+from harness.strata import weight_of_a_test
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
@@ -125,7 +126,9 @@ def test_kept_cut_ins_know_the_error_of_the_runs_they_are_of(speeds, kept):
         crashes = np.bincount(pool.shell[crash], minlength=n.size)
         of_all = Tally(n, crashes, 0 * n, none, none, OnRuns.of(pool.n_paths, n.size, tests))
         square = pool.mu_covariance[d, d] * pool.n_paths + pool.mu[d] ** 2
-        assert of_all.runs.square(pool.shell_p / of_all.at_least_one, of_all) == pytest.approx(square, rel=0.025), name
+        assert of_all.runs.square(weight_of_a_test(pool.shell_p, of_all.tests), of_all) == pytest.approx(
+            square, rel=0.025
+        ), name
 
 
 def test_hashes_tell_motions_apart_from_the_first_step_that_differs_on():

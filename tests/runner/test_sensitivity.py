@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +15,7 @@ from harness.cli import main
 from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.pool import moved
+from harness.report.words import bar_note
 from harness.runner.sensitivity import Move, bar_of, moves, sensitivity
 from harness.runner.stored_shells import Nearby
 from tests.stored_runs import copy_of, edit, manifest
@@ -52,14 +54,14 @@ def test_a_number_whose_end_the_tests_say_nothing_of_has_one_end(folder):
     """There the AV closes in faster than in any test."""
     (bar,) = sensitivity(folder, ranges={"initial_state.r2dot_min_mps": (-16.0, -10.0)})["bars"]
     assert bar["rate"] == [None, pytest.approx(1.0)]
-    assert bar["note"] == "unlike what was tested"
+    assert bar_note(bar) == "unlike what was tested"
 
 
 def test_of_traffic_in_which_nobody_crashes_nothing_is_said(folder, capsys):
     """Tests too short for a crash: the reference driver's rate is 0, to which there is no ratio."""
     assert main(["sensitivity", str(folder), "--range", "scenario.duration_s=1:2", "--json"]) == 0
     (bar,) = (each for each in json.loads(capsys.readouterr().out)["bars"] if each["what"] == "scenario.duration_s")
-    assert (bar["rate"], bar["ratio"], bar["note"]) == ([None, None], [None, None], "unlike what was tested")
+    assert (bar["rate"], bar["ratio"], bar_note(bar)) == ([None, None], [None, None], "unlike what was tested")
 
 
 def test_the_page_shows_the_tornado_of_these_tests_and_of_no_others(folder):
@@ -120,7 +122,7 @@ def test_a_block_shows_what_is_answered_and_how_much_is_not(n, ends, off):
     bar = bar_of(Move("cut-in", "fitted", None, []), [*near, *wrong])
     assert [None if math.isnan(end) else pytest.approx(end) for end in bar.rate] == ends
     assert [None if math.isnan(end) else pytest.approx(end) for end in bar.off] == off
-    assert bar.note == f"{n} of 5: unlike what was tested"
+    assert bar_note(asdict(bar)) == f"{n} of 5: unlike what was tested"
 
 
 def test_each_end_of_a_number_is_off_by_its_own():
