@@ -21,7 +21,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.loop import loop
 from harness.loop.loop import Shard
-from harness.records.folder import encoded, write_shard
+from harness.records.folder import write_part
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
 from harness.runner.workers import LocalWorkers, ShardResult
@@ -91,7 +91,8 @@ class Recorded(Contender):
         return Work(n, int(shard.episode["n_steps"].sum()), written)
 
     def write(self, shard: Shard) -> None:
-        write_shard(self.folder, 0, encoded(shard_tables(shard, self.prepared.campaign.seed, keep_traces=False)))
+        tables = shard_tables(shard, self.prepared.campaign.seed, keep_traces=False)
+        write_part(self.folder, [tables], shard.first_episode, tables.episodes.num_rows)
 
     def rows(self, n: int) -> bytes:
         episode = self.loop.run(0, self.prepared.tests(0, n)).episode
@@ -220,7 +221,7 @@ class Workers(Contender):
         specs = [ShardRequest(i, first + i * SHARD, SHARD) for i in range(n_shards)]
         results: Iterator[ShardResult] = self._pool.run(iter(specs), lambda _: None)
         for done in results:
-            write_shard(self._folder, done.request.index, done.parquet)
+            write_part(self._folder, [done.tables], done.request.first_episode, done.request.n_episodes)
         return Work(n_shards * SHARD, 0)
 
     def rows(self, n: int) -> None:  # starts the workers; their rows are on disk

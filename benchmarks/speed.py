@@ -25,7 +25,7 @@ from typing import NamedTuple
 from benchmarks.contender_process import ContenderProcess, Measurement
 from benchmarks.contenders import CONTENDERS, NADE, TWIN_CELLS, campaign, missing
 from benchmarks.startup import Start, cold_and_warm
-from harness.runner.resume import cpu_name, versions
+from harness.runner.kept import cpu_name, versions
 
 STARTUP = "startup"
 HOW = f"""\

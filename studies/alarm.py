@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,8 +37,8 @@ from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
 from harness.processes import made_ahead
 from harness.progress import Progress
-from harness.records.folder import MEND_SHARD, read_manifest
-from harness.records.reader import read_shard
+from harness.records.folder import MEND_PART, Part, read_manifest
+from harness.records.reader import read_part
 from harness.resolved import Resolved, resolve
 from harness.vehicles.drivers import Followers
 from harness.vocabulary import CONTACT, FAILED, PASSED, RUNNING, BoolArray, FloatArray, IntArray
@@ -105,7 +104,7 @@ def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, follo
     if wrong >= 0:
         at, step = f"episodes, episode {stored.episode[wrong]}", stored.cut_step[wrong]
         expected = "the maneuvers that were driven: they determine the episode"
-        raise RunFolderError(at, f"maneuvers that do not lead to a cut-in in step {step}", expected, MEND_SHARD)
+        raise RunFolderError(at, f"maneuvers that do not lead to a cut-in in step {step}", expected, MEND_PART)
     found: BoolArray = ((bits[:, None] >> np.arange(followers.drivers.size)) & 1).astype(np.bool_)
     return found
 
@@ -235,13 +234,13 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
     lead = [LEAD] if resolved.environment.lateral.present else []
     columns = [*dict.fromkeys([*EPISODE_COLUMNS, *PATH_COLUMNS, *lead])]
 
-    def replayed(shard: Mapping[str, Any]) -> tuple[Block, BoolArray]:
-        episodes = read_shard(folder, shard, columns)
+    def replayed(part: Part) -> tuple[Block, BoolArray]:
+        episodes = read_part(folder, part, columns)
         block = block_from_tables(episodes, None, method=campaign.testing.method, alpha=alpha)
         return block, surrogates_crash(episodes, resolved, pool)
 
-    progress.stage("surrogates in the AV's place", sum(shard["n_episodes"] for shard in manifest["shards"]))
-    for block, crashes in made_ahead(replayed, manifest["shards"]):
+    progress.stage("surrogates in the AV's place", manifest["n_episodes"])
+    for block, crashes in made_ahead(replayed, manifest["parts"]):
         alarm.add(block, crashes)
         progress.advance(len(block))
     return finite_json({"run": str(folder), "pool": pool.key, **alarm.result()})

@@ -17,7 +17,7 @@ from benchmarks.kills import descendants, started_by
 from harness import run
 from harness.campaign.campaign import Campaign
 from harness.resolved import Resolved
-from harness.runner import workers
+from harness.runner import kept, workers
 from harness.runner.run import RunResult
 from harness.runner.workers import ShardResult, ShardRunner
 from harness.sampling.protocol import ShardRequest
@@ -61,6 +61,7 @@ def one_process() -> Iterator[None]:
         patch.setattr(workers, "WorkerProcess", WorkerInThisProcess)
         patch.setattr(workers.LocalWorkers, "first_to_answer", lambda _, busy: busy[0])
         patch.setattr(workers, "start_server", lambda: None)
+        patch.setattr(kept, "PART_TESTS", 80)  # several files of small runs
         yield
 
 

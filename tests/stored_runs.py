@@ -51,8 +51,10 @@ def edit(folder: Path, file: str = "manifest.json", **changes: Any) -> None:
 
 def unnoted(folder: Path) -> Path:
     """Let the manifest tell of no other file's checksum, as while a run is at it: a test may change them."""
-    edit(folder, shards=[shard | {"crc32": {}} for shard in manifest(folder)["shards"]], campaign_crc32=None)
-    edit(folder, baseline_crc32=[])
+    parts = manifest(folder)["parts"]
+    for file in (file for part in parts for file in part["files"].values()):
+        file["crc32"] = None
+    edit(folder, parts=parts, campaign_crc32=None, baseline_crc32=[])
     return folder
 
 
@@ -73,13 +75,13 @@ def answer_in(folder: Path) -> dict[str, Any]:
     return answer(estimates(folder), read_campaign(folder, manifest(folder)), manifest(folder))
 
 
-def shard_files(folder: Path, table: str = "episodes") -> list[Path]:
-    return sorted((folder / table).glob("shard-*.parquet"))
+def part_files(folder: Path, table: str = "episodes") -> list[Path]:
+    return sorted((folder / table).glob("*.parquet"))
 
 
 def stored_table(folder: Path, table: str) -> pa.Table:
     """All rows of a table, sorted; the vehicles of a step keep their order."""
-    rows = pa.concat_tables([pq.read_table(file, partitioning=None) for file in shard_files(folder, table)])
+    rows = pa.concat_tables([pq.read_table(file, partitioning=None) for file in part_files(folder, table)])
     return rows.take(pc.sort_indices(rows.select(TABLES[table]), [(key, "ascending") for key in TABLES[table]]))
 
 

@@ -296,7 +296,7 @@ class Run(Section):
 
     shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = Field(
         None,
-        description="episodes per file and per task; none: 5,000, and more in long runs",
+        description="episodes per task; none: 5,000, and more in long runs",
     )
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
     executor: Literal["local", "ray"] = Field(

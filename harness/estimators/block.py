@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from harness.errors import RunFolderError
-from harness.records.folder import MEND_SHARD
+from harness.records.folder import MEND_PART
 from harness.strata import ShellDesign
 from harness.vocabulary import (
     CRASH,
@@ -270,7 +270,7 @@ def block_from_tables(
 
 
 def _damaged(where: str, found: str, expected: str) -> RunFolderError:
-    return RunFolderError(where, found, expected, MEND_SHARD)
+    return RunFolderError(where, found, expected, MEND_PART)
 
 
 def _integers(table: pa.Table, name: str) -> IntArray:
@@ -299,7 +299,7 @@ def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
     values = np.asarray(column.flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
     if len(values) != table.num_rows * width:
         expected = f"{width} in each row, one per importance function of the campaign"
-        mend = "The records belong to another campaign or are damaged. " + MEND_SHARD
+        mend = "The records belong to another campaign or are damaged. " + MEND_PART
         raise RunFolderError(f"column {name}", f"{len(values)} numbers in {table.num_rows} rows", expected, mend)
     return values.reshape(table.num_rows, width)
 

@@ -6,7 +6,6 @@ Whatever reads raises a `RunFolderError` that names a file which is missing, dam
 from __future__ import annotations
 
 import fcntl
-import fnmatch
 import json
 import os
 import tempfile
@@ -34,35 +33,12 @@ SHELLS = "shells.json"
 SENSITIVITY = "sensitivity.json"
 """Strata of a shells campaign, as its estimates need them."""
 TABLES = ("episodes", "moments", "traces")
-MEND_SHARD = (
-    "Delete all files of this shard (in episodes/, moments/ and traces/) and run again with --resume: "
-    "the same episodes are made anew."
-)
-"""All files, because a missing traces file alone is not made again: whether traces are kept may change on --resume."""
+MEND_PART = "Delete this file and run again with --resume: the same tests are made anew."
 SEAL = "crc32"
 """Key of a JSON file's checksum."""
 ROWS_FOR_THREADS = 10_000
 """Of a file below this, handing columns to threads costs more than decoding them (measured: 1.8 against 1.4 ms)."""
 NO_RUN = "Give a folder that `harness run` has written."
-
-
-def shard_file(table: str, index: int) -> str:
-    """Path of a shard's table, relative to the run folder."""
-    return f"{table}/shard-{index:06d}.parquet"
-
-
-def shard_files(folder: Path, index: int) -> dict[str, str]:
-    """Paths of a shard's tables that are there, by table, relative to the run folder."""
-    files = {name: shard_file(name, index) for name in TABLES}
-    return {name: file for name, file in files.items() if os.path.exists(f"{folder}/{file}")}  # noqa: PTH110 - faster
-
-
-def shards_on_disk(folder: Path, table: str) -> list[Path]:
-    """Files of a table, whether they count or not."""
-    with suppress(FileNotFoundError):
-        names = fnmatch.filter(os.listdir(folder / table), "shard-*.parquet")  # noqa: PTH208 - glob takes three times as long
-        return [folder / table / name for name in sorted(names)]
-    return []
 
 
 def require_place(folder: Path, *, mend: str = "Choose another place, or change its permissions.") -> None:
@@ -151,14 +127,14 @@ def require_unchanged(path: Path, crc32: int | None, mend: str) -> None:
         found = None if crc32 is None else checksum(path)
     except OSError as error:
         raise damaged(path, error, mend) from error
-    if found != crc32:
+    require_sum(path, crc32, found, mend)
+
+
+def require_sum(path: Path, crc32: int | None, found: int | None, mend: str) -> None:
+    """Refuse (`RunFolderError`) a file that was ``found`` with another checksum than the manifest tells of, if any."""
+    if crc32 is not None and found != crc32:
         expected = f"{crc32:08x} (manifest.json): the file as the run has left it"
-        raise RunFolderError(str(path), f"a changed or damaged file: checksum {found:08x}", expected, mend)
-
-
-def encoded(tables: ShardTables) -> dict[str, bytes]:
-    """A shard's tables as Parquet files, by name: what a worker hands back."""
-    return {name: parquet(table) for name, table in tables._asdict().items() if table is not None}
+        raise RunFolderError(str(path), f"a changed or damaged file: checksum {found or 0:08x}", expected, mend)
 
 
 def parquet(table: pa.Table) -> bytes:
@@ -168,17 +144,25 @@ def parquet(table: pa.Table) -> bytes:
     return sink.getvalue().to_pybytes()  # type: ignore[no-any-return]
 
 
-def write_shard(folder: Path, index: int, shard: Mapping[str, bytes]) -> dict[str, str]:
-    """Write what `encoded` has made; ``episodes`` last, so that its presence means that the shard is complete.
+def write_part(folder: Path, shards: Sequence[ShardTables], first: int, n: int) -> Part:
+    """Write tables of consecutive tests, a file for each that has rows; they count once a manifest lists them."""
+    files = {}
+    for name in TABLES:
+        kept = [table for shard in shards if (table := getattr(shard, name)) is not None and table.num_rows]
+        if kept:
+            path = f"{name}/{first:09d}-{first + n:09d}.parquet"
+            content = parquet(concatenated(kept, folder))
+            write_bytes(folder / path, content)
+            files[name] = File(path, sum(table.num_rows for table in kept), len(content), zlib.crc32(content))
+    return Part(first, n, files)
 
-    What an earlier, shorter round has left of the shard goes first, for the same reason. Returns its `shard_files`.
-    """
-    for file in shard_files(folder, index).values():
-        (folder / file).unlink()
-    for name in reversed(TABLES):
-        if name in shard:
-            write_bytes(folder / shard_file(name, index), shard[name])
-    return shard_files(folder, index)
+
+def remove_unlisted(folder: Path, parts: Sequence[Part]) -> None:
+    """Remove files of tables that no part lists."""
+    listed = {folder / file.path for part in parts for file in part.files.values()}
+    for table in TABLES:
+        for path in set((folder / table).glob("*.parquet")) - listed:
+            path.unlink()
 
 
 def read_table(
@@ -187,19 +171,22 @@ def read_table(
     rows: pc.Expression | None = None,
     *,
     crc32: int | None = None,
-    mend: str = MEND_SHARD,
+    mend: str = MEND_PART,
 ) -> pa.Table:
-    """Read one Parquet file of a run; row groups that cannot hold one of the asked ``rows`` are skipped.
+    """Read one Parquet file of a run, all ``rows`` by default.
 
-    The file must have the checksum ``crc32``, if there is one; its pages are held against their own in any case.
+    It must have the checksum ``crc32``; where there is none yet its pages are held against their own. It is opened
+    once: what is decoded is what the checksum is of.
     """
-    require_unchanged(path, crc32, mend)
     try:
+        content = path.read_bytes()
+        require_sum(path, crc32, zlib.crc32(content), mend)
+        source = pa.BufferReader(content)
         if rows is not None:
-            return pq.read_table(
-                path, columns=columns, filters=rows, partitioning=None, page_checksum_verification=True
-            )
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:  # faster than read_table by a millisecond
+            return pq.read_table(source, columns=columns, filters=rows, partitioning=None)
+        with pq.ParquetFile(
+            source, page_checksum_verification=crc32 is None
+        ) as file:  # faster than read_table by a millisecond
             table = file.read(columns, use_threads=file.metadata.num_rows > ROWS_FOR_THREADS)
     except (OSError, pa.ArrowException, KeyError, UnicodeDecodeError) as error:
         raise damaged(path, error, mend) from error
@@ -210,31 +197,26 @@ def read_table(
 
 def read_kept(
     folder: Path,
-    shard: Mapping[str, Any],
+    part: Part,
     table: str,
     columns: list[str] | None = None,
     rows: pc.Expression | None = None,
 ) -> pa.Table:
-    """One table of a shard as the manifest lists it, its checksum included; see `read_table`."""
-    return read_table(folder / shard["files"][table], columns, rows, crc32=listed_crc32(shard, table))
-
-
-def listed_crc32(shard: Mapping[str, Any], table: str) -> int | None:
-    """Checksum of a shard's table; None of one that is being made anew."""
-    crc32: int | None = shard.get("crc32", {}).get(table)
-    return crc32
+    """One table of a part, as the manifest lists it; see `read_table`."""
+    file = part.files[table]
+    return read_table(folder / file.path, columns, rows, crc32=file.crc32)
 
 
 def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
-    """Tables of several shards of a run as one, in one chunk; refused where a column is not of one type."""
+    """Tables of consecutive tests of a run as one, in one chunk; refused where a column is not of one type."""
     try:
         return pa.concat_tables(tables).unify_dictionaries().combine_chunks()
     except pa.ArrowException as error:
-        found, expected = f"shards of different types: {error}", "records of one version of the harness"
+        found, expected = f"parts of different types: {error}", "records of one version of the harness"
         raise RunFolderError(str(folder), found, expected, "Run the campaign again into a new folder.") from error
 
 
-def damaged(path: Path, error: Exception, mend: str = MEND_SHARD) -> RunFolderError:
+def damaged(path: Path, error: Exception, mend: str = MEND_PART) -> RunFolderError:
     """What to say of a Parquet file of a run that cannot be read."""
     missing = isinstance(error, FileNotFoundError)
     found = "no such file" if missing else f"a file that cannot be read ({str(error).splitlines()[0]})"
@@ -251,7 +233,7 @@ StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "poo
 """The asked precision, a rate far enough below a reference driver's, a decision about the limit, the budget, the last
 cut-in that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that."""
 Count = Annotated[int, Field(ge=0, lt=2**63)]
-ShardPath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
+TablePath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
 
 
 class Stored(BaseModel):
@@ -260,22 +242,28 @@ class Stored(BaseModel):
     model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
 
 
-class Files(Stored):
-    """Files of a shard, by table."""
+@dataclass(frozen=True)
+class File:
+    """A file of a run folder, which counts as long as it has its checksum, where that is known."""
 
-    episodes: ShardPath
-    moments: ShardPath | None = None
-    traces: ShardPath | None = None
+    path: TablePath
+    n_rows: Count
+    n_bytes: Count
+    crc32: Count | None = None
 
 
-class StoredShard(Stored):
-    """A contiguous range of episodes."""
+@dataclass(frozen=True)
+class Part:
+    """Consecutive tests of a round, in one file per table that has rows."""
 
-    index: Count
     first_episode: Count
     n_episodes: Count
-    files: Files
-    crc32: dict[str, Count] = {}
+    files: dict[str, File]
+
+    @property
+    def end(self) -> int:
+        """Index of the test after the last."""
+        return self.first_episode + self.n_episodes
 
 
 @dataclass(frozen=True)
@@ -294,7 +282,7 @@ class StoredManifest(Stored):
 
     campaign_hash: str
     n_episodes: Count
-    shards: list[StoredShard]
+    parts: list[Part]
     campaign_crc32: Count | None = None
     versions: dict[str, str] = {}
     stopped_by: StoppedBy | None = None
@@ -313,7 +301,8 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
-    return read_as(StoredManifest, path, mend=mend).model_dump(exclude_unset=True)
+    found = read_as(StoredManifest, path, mend=mend)
+    return {**found.model_dump(exclude_unset=True, exclude={"parts"}), "parts": found.parts}
 
 
 def read_as(kind: type[T], path: Path, *, mend: str) -> T:

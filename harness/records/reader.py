@@ -1,4 +1,4 @@
-"""Read the shards that count, in index order: one at a time, or all as pandas frames with units and weights.
+"""Read the tests that count, in index order: part by part, or all as pandas frames with units and weights.
 
 Every function raises a `RunFolderError` that names a file which is missing or damaged.
 """
@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from harness.arguments import checked
 from harness.campaign.campaign import Campaign
@@ -26,12 +25,11 @@ from harness.families.protocol import Environment
 from harness.processes import made_ahead
 from harness.records.folder import (
     CAMPAIGN,
-    MEND_SHARD,
+    MEND_PART,
     SHELLS,
     TABLES,
+    Part,
     concatenated,
-    damaged,
-    listed_crc32,
     no_episodes,
     read_as,
     read_kept,
@@ -48,7 +46,7 @@ TableName = Literal["episodes", "moments", "traces"]
 _MOST_SHELLS = 128
 """More than an int8 counts."""
 _READERS = 2
-"""Threads; each holds a shard."""
+"""Threads; each holds a part."""
 _WEIGHT = pa.field(
     "weight", pa.float64(), metadata={"unit": "1", "doc": "the mean of weight times crash is the crash rate"}
 )
@@ -95,37 +93,37 @@ def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment |
     return family.traffic(campaign.environment, parameters) if known else None
 
 
-def read_shards(folder: Path, columns: list[str] | None = None) -> Iterator[pa.Table]:
-    """Episodes of every shard that the manifest lists, see `read_shard`."""
-    yield from made_ahead(partial(read_shard, folder, columns=columns), read_manifest(folder)["shards"], _READERS)
+def read_parts(folder: Path, columns: list[str] | None = None) -> Iterator[pa.Table]:
+    """Episodes of every part that the manifest lists, see `read_part`."""
+    yield from made_ahead(partial(read_part, folder, columns=columns), read_manifest(folder)["parts"], _READERS)
 
 
-def read_shard(folder: Path, shard: Mapping[str, Any], columns: list[str] | None = None) -> pa.Table:
-    """Episodes of one shard, which must be as long as the manifest says; all columns by default."""
-    episodes = read_kept(folder, shard, "episodes", columns)
-    if episodes.num_rows != shard["n_episodes"]:
-        expected = f"{shard['n_episodes']} rows (manifest.json)"
+def read_part(folder: Path, part: Part, columns: list[str] | None = None) -> pa.Table:
+    """Episodes of one part, which must be as many as the manifest says; all columns by default."""
+    episodes = read_kept(folder, part, "episodes", columns)
+    if episodes.num_rows != part.n_episodes:
+        expected = f"{part.n_episodes} rows (manifest.json)"
         found = f"{episodes.num_rows} rows"
-        raise RunFolderError(str(folder / shard["files"]["episodes"]), found, expected, MEND_SHARD)
+        raise RunFolderError(str(folder / part.files["episodes"].path), found, expected, MEND_PART)
     return episodes
 
 
 def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> pa.Table | None:
     """Trace rows of a few episodes; None where none of them was traced."""
     wanted = pc.field("episode").isin(sorted(episodes))
-    tables = []
-    for shard in read_manifest(folder)["shards"]:
-        held = range(shard["first_episode"], shard["first_episode"] + shard["n_episodes"])
-        if shard["files"].get("traces") and any(episode in held for episode in episodes):
-            tables.append(read_kept(folder, shard, "traces", columns, wanted))
+    tables = [
+        read_kept(folder, part, "traces", columns, wanted)
+        for part in read_manifest(folder)["parts"]
+        if "traces" in part.files and any(part.first_episode <= episode < part.end for episode in episodes)
+    ]
     found = [table for table in tables if table.num_rows]
     return concatenated(found, folder) if found else None
 
 
 def stored_columns(folder: Path) -> set[str]:
-    """Columns of the episodes table of a run; none if it has no shard."""
-    shards = read_manifest(folder)["shards"]
-    return set(footer(folder, shards[0], "episodes").schema.to_arrow_schema().names) if shards else set()
+    """Columns of the episodes table of a run; none if it has no test."""
+    parts = read_manifest(folder)["parts"]
+    return set(read_kept(folder, parts[0], "episodes").column_names) if parts else set()
 
 
 class TableSize(NamedTuple):
@@ -139,24 +137,12 @@ class TableSize(NamedTuple):
 
 def table_sizes(folder: Path) -> list[TableSize]:
     """Files, rows and bytes per table."""
-    shards = read_manifest(folder)["shards"]
-    sizes = []
-    for table in TABLES:
-        kept = [shard for shard in shards if shard["files"].get(table)]
-        n_rows = sum(footer(folder, shard, table).num_rows for shard in kept)
-        n_bytes = sum((folder / shard["files"][table]).stat().st_size for shard in kept)
-        sizes.append(TableSize(table, len(kept), n_rows, n_bytes))
-    return sizes
-
-
-def footer(folder: Path, shard: Mapping[str, Any], table: str) -> pq.FileMetaData:
-    """What the Parquet file of a shard's table says of itself."""
-    path = folder / shard["files"][table]
-    require_unchanged(path, listed_crc32(shard, table), MEND_SHARD)
-    try:
-        return pq.read_metadata(path)
-    except (OSError, pa.ArrowException) as error:
-        raise damaged(path, error) from error
+    parts = read_manifest(folder)["parts"]
+    kept = {table: [part.files[table] for part in parts if table in part.files] for table in TABLES}
+    return [
+        TableSize(table, len(files), sum(file.n_rows for file in files), sum(file.n_bytes for file in files))
+        for table, files in kept.items()
+    ]
 
 
 @dataclass(frozen=True)
@@ -204,16 +190,16 @@ class StoredRun:
 
     @checked("batches")
     def batches(self, name: TableName, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """`table` in consecutive pieces, one per shard: for what does not fit into memory."""
-        shards = [shard for shard in read_manifest(self.folder)["shards"] if shard["files"].get(name)]
-        if not shards and name == "episodes":
+        """`table` in consecutive pieces, one per part: for what does not fit into memory."""
+        parts = [part for part in read_manifest(self.folder)["parts"] if name in part.files]
+        if not parts and name == "episodes":
             raise no_episodes(self.folder)
-        if not shards:
+        if not parts:
             mend = f"Run it into another folder with --set records.{name}=all."
             raise RunFolderError(str(self.folder), f"no {name}", f"a run whose campaign kept {name}", mend)
-        kept = set(footer(self.folder, shards[0], name).schema.to_arrow_schema().names)
-        weighed = name == "episodes"
+        weighed, read = name == "episodes", partial(read_kept, self.folder, table=name)
         asked = None if columns is None else [column for column in columns if not (weighed and column == _WEIGHT.name)]
+        kept = set(read(parts[0]).column_names)
         if unknown := sorted(set(asked or ()) - kept):
             found = f"no column {unknown[0]!r} in {name}"
             raise RunFolderError(str(self.folder), found, f"one of {', '.join(sorted(kept))}", "Correct its name.")
@@ -221,9 +207,9 @@ class StoredRun:
         needed = None if asked is None else list(dict.fromkeys([*asked, *of_weight]))
         per_shell = None
         if weighed and (self.folder / SHELLS).is_file():
-            components = (read_kept(self.folder, shard, name, ["component"])["component"] for shard in shards)
+            components = (read(part, columns=["component"])["component"] for part in parts)
             per_shell = np.sum([np.bincount(shells, minlength=_MOST_SHELLS) for shells in components], axis=0)
-        for piece in made_ahead(lambda shard: read_kept(self.folder, shard, name, needed), shards, _READERS):
+        for piece in made_ahead(partial(read, columns=needed), parts, _READERS):
             if not weighed:
                 yield piece
                 continue

@@ -187,6 +187,11 @@ class ShardTables(NamedTuple):
     moments: pa.Table | None
     traces: pa.Table | None
 
+    @property
+    def n_rows(self) -> int:
+        """Of all tables."""
+        return sum(table.num_rows for table in self if table is not None)
+
 
 def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> ShardTables:
     """Tables of a shard, sorted by episode, step and vehicle."""

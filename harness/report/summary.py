@@ -27,7 +27,7 @@ from harness.estimators.estimate import Estimate, Unavailable
 from harness.estimators.shells import ShellDetails
 from harness.families import family_named
 from harness.records.folder import concatenated, read_as, read_manifest
-from harness.records.reader import read_campaign, read_shards, stored_columns
+from harness.records.reader import read_campaign, read_parts, stored_columns
 from harness.strata import ASSUMPTION_FREE, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
@@ -100,7 +100,7 @@ class RunFolder:
         """Columns of the tests that count, in index order; small shards come together."""
         counted = int(self.manifest["n_episodes"])
         together: list[pa.Table] = []
-        for table in read_shards(self.path, list(columns)):
+        for table in read_parts(self.path, list(columns)):
             together.append(table.slice(0, counted))
             counted -= together[-1].num_rows
             if sum(part.num_rows for part in together) >= ROWS_TOGETHER:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -33,10 +33,9 @@ from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, sole_use, write_sealed
 from harness.records.origin import require_trust
-from harness.records.reader import read_shards
 from harness.resolved import Resolved, require_ready
-from harness.runner.resume import require_own_folder
-from harness.runner.run import Run
+from harness.runner.kept import Earlier, require_own_folder
+from harness.runner.run import begun, finish, show, workers_of
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import PairRounds, Shells, round_requests
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
@@ -138,12 +137,12 @@ def _compared(
     """Rounds of pairs until the rule is content: what those say that it has seen."""
     campaign = sides[0].campaign
     with ExitStack() as held, ExitStack() as working:
-        runs, stored = [], []
+        runs, crews = [], []
         for resolved, folder in zip(sides, folders, strict=True):
             held.enter_context(sole_use(folder))
             earlier = require_own_folder(folder, resolved, resume=True)
-            stored.append(list(_stored_requests(folder, earlier)))
-            runs.append(working.enter_context(Run(resolved, folder, earlier, workers, progress, n_runs=2).under_way()))
+            crews.append(working.enter_context(closing(workers_of(resolved, workers, n_runs=2))))
+            runs.append(begun(folder, resolved, earlier, crews[-1], progress))
         source = runs[0].source  # the other's is the same: one environment and one library make one pool
         if not isinstance(source, Shells):
             raise TypeError("the campaigns do not draw from shells")
@@ -151,28 +150,37 @@ def _compared(
         rounds, pairs = PairRounds(campaign, design, available, rule), PairedShells(design)
 
         def drive(side: int, requests: Sequence[ShardRequest]) -> None:
-            for shard in runs[side].results(iter(requests)):
+            for shard in crews[side].run(iter(requests), runs[side].known):
+                runs[side] = runs[side].with_shard(shard)
                 pairs.add(side, shard.block)
-                runs[side].follow(rule, shard)
+                show(runs[side], shard, rule, progress)
 
-        progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
-        for side, requests in enumerate(stored):
-            drive(side, requests)
-        n_pairs = np.zeros_like(pairs.tests(0))
-        counts = pairs.first(n_pairs)
-        while (added := rounds.next_round(counts)).any():
-            n_pairs = n_pairs + added
-            for side, run in enumerate(runs):  # what is missing of the first cut-ins of each stratum
-                tested, done = pairs.tests(side), run.manifest
-                if (missing := np.maximum(n_pairs - tested, 0)).any():
-                    places = len(done.shards), done.n_episodes, campaign.run.smallest_shard
-                    drive(side, round_requests(tested, missing, *places))
+        try:
+            progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
+            for side, run in enumerate(runs):
+                for request in stored_requests(run.earlier):
+                    drive(side, [request])
+            n_pairs = np.zeros_like(pairs.tests(0))
             counts = pairs.first(n_pairs)
-            if rule.observe(counts):
-                break
+            while (added := rounds.next_round(counts)).any():
+                n_pairs = n_pairs + added
+                for side, run in enumerate(runs):  # what is missing of the first cut-ins of each stratum
+                    tested = pairs.tests(side)
+                    if (missing := np.maximum(n_pairs - tested, 0)).any():
+                        places = len(run.blocks), run.n_episodes, campaign.run.smallest_shard
+                        drive(side, round_requests(tested, missing, *places))
+                counts = pairs.first(n_pairs)
+                if rule.observe(counts):
+                    break
+            for run in runs:
+                run.require_few_failed()
+        except BaseException:
+            for run in runs:
+                run.written("interrupted")
+            raise
         working.close()
-        for run in runs:
-            run.finish(rule)
+        for run, crew in zip(runs, crews, strict=True):
+            finish(run, rule, crew.cpus(), progress)
     return rounds, counts
 
 
@@ -191,20 +199,21 @@ def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: PairCounts) -> dic
     return {"pairs": needed, "settings": settings, "new_folder": new_folder}
 
 
-def _stored_requests(folder: Path, earlier: Mapping[str, Any]) -> Iterator[ShardRequest]:
-    """Shards that a folder holds, as they were asked for."""
-    if not earlier["shards"]:
-        return
+def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:
+    """Tests that a folder holds, as they were asked for."""
     taken: dict[int, int] = {}
-    for shard, episodes in zip(earlier["shards"], read_shards(folder, ["component"]), strict=True):
-        stratum = episodes.column("component").to_numpy()
+    for index, part in enumerate(earlier.parts):
+        tables = earlier.tables(part.first_episode, part.n_episodes)
+        if tables is None:  # what is gone is driven anew, and so is all that follows
+            return
+        stratum = tables.episodes.column("component").to_numpy()
         edges = [0, *(np.flatnonzero(np.diff(stratum)) + 1).tolist(), stratum.size]
         draws = []
         for first, end in pairwise(edges):
             s, n = int(stratum[first]), end - first
             draws.append(Draw(s, taken.get(s, 0), n))
             taken[s] = taken.get(s, 0) + n
-        yield ShardRequest(shard["index"], shard["first_episode"], shard["n_episodes"], tuple(draws))
+        yield ShardRequest(index, part.first_episode, part.n_episodes, tuple(draws))
 
 
 def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:

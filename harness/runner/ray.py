@@ -29,7 +29,7 @@ from harness.controllers.find import require_controller
 from harness.errors import CampaignError, HarnessError
 from harness.processes import WorkerDeath, fit_to_travel, handlers_restored, usable_cpus
 from harness.resolved import Resolved
-from harness.runner.resume import cpu_name
+from harness.runner.kept import cpu_name
 from harness.runner.workers import (
     CLOSING_S,
     LocalWorkers,

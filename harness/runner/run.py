@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,35 +17,23 @@ from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
-from harness.estimators.answer import ended_by, expected_for, pool_remedy
+from harness.estimators.answer import ended_by, estimate_blocks, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
 from harness.files import checksum, remove_unfinished
 from harness.pool.moved import assumed_in
-from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
-from harness.records.folder import (
-    SHELLS,
-    TABLES,
-    StoppedBy,
-    parquet,
-    shards_on_disk,
-    sole_use,
-    write_bytes,
-    write_sealed,
-    write_shard,
-)
+from harness.records.folder import SHELLS, StoppedBy, parquet, sole_use, write_bytes, write_sealed
 from harness.resolved import Resolved, require_ready
-from harness.runner.resume import (
-    SMALLEST_FAILED_SAMPLE,
-    Manifest,
+from harness.runner.kept import (
+    Run,
     cpu_name,
     require_few_failed,
     require_no_fewer,
     require_own_folder,
     require_same_pool,
-    stored_shard,
+    take_over,
 )
-from harness.runner.stored import estimate_run
+from harness.runner.stored import even
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
 from harness.sampling.baseline import IN_MANIFEST, baseline_file, begin, stored_baseline
@@ -90,167 +77,130 @@ def run_campaign(
     Raises `HarnessError`: the campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
     resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign_of(campaign))
-    out = Path(out)
+    out, progress = Path(out), progress or Progress()
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)
         require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
-        with Run(resolved, out, earlier, workers, progress or Progress()).under_way() as run:
-            run.make_ready()
-            rounds = run.source.rounds(run.held)
-            run_rounds(run, rounds)
-        require_no_fewer(out, earlier, run.manifest.n_episodes)
-        return run.finish(rounds.rule)
+        with closing(workers_of(resolved, workers)) as crew:
+            run = begun(out, resolved, earlier, crew, progress)
+            run = with_baseline(run, crew, progress)
+            stop = resolved.campaign.stop
+            # Until a precision or a decision nobody knows how many.
+            most = stop.episodes if resolved.campaign.accept is None and stop.rhw is None else None
+            progress.stage(f"episodes{crew.where}", most, done=run.earlier.n_episodes)
+            rounds = run.source.rounds(run.earlier.n_episodes)
+            run = tested(run, rounds, crew, progress)
+        require_no_fewer(out, earlier, run.n_episodes)
+        return finish(run, rounds.rule, crew.cpus(), progress)
 
 
-def run_rounds(run: Run, rounds: Rounds) -> None:
-    """Run rounds of tests until there are enough."""
-    for requests in rounds:
-        for shard in run.results(requests):
-            enough = rounds.enough(shard.block)
-            run.follow(rounds.rule, shard)
-            if enough:
-                return
+def begun(out: Path, resolved: Resolved, earlier: dict[str, Any], crew: Workers, progress: Progress) -> Run:
+    """What tests are drawn from, and a folder that says so."""
+    began = time.monotonic()
+    remove_unfinished(out.rglob(".*.part"))
+    source = prepare(resolved, progress)
+    facts = {
+        "workers": crew.n_workers,
+        "cut_ins_take_time": resolved.family.shows(resolved.environment),
+        "distance_per_test_m": resolved.family.mean_distance_m(resolved.environment),
+    }
+    run = take_over(out, resolved, source, earlier, began, **facts)
+    try:
+        keep_design(run)
+        return run.noting(assumed=assumed_in(resolved, source.design, progress))
+    except BaseException:
+        run.written("interrupted")
+        raise
 
 
-class Run:
-    """A campaign on its way into a folder, in which nobody but this process writes.
+def tested(run: Run, rounds: Rounds, crew: Workers, progress: Progress) -> Run:
+    """The run with all its tests; the folder can be read wherever it is interrupted."""
+    try:
+        for requests in rounds:
+            for shard in crew.run(requests, run.known):
+                run = run.with_shard(shard)
+                enough = rounds.enough(shard.block)
+                show(run, shard, rounds.rule, progress)
+                if enough:
+                    run.require_few_failed()
+                    return run
+        run.require_few_failed()
+    except BaseException:
+        run.written("interrupted")
+        raise
+    return run
 
-    ``source`` is what its tests are drawn from, ``manifest`` tells what is finished, ``held`` how many tests the folder
-    held before.
-    """
 
-    def __init__(
-        self,
-        resolved: Resolved,
-        out: Path,
-        earlier: dict[str, Any],
-        n_workers: int | None,
-        progress: Progress,
-        *,
-        n_runs: int = 1,
-    ) -> None:
-        self.resolved, self.campaign, self.out, self._progress = resolved, resolved.campaign, out, progress
-        began = time.monotonic()
-        remove_unfinished(out.rglob(".*.part"))
-        self.source = prepare(resolved, progress)
-        self.held = int(earlier["n_episodes"])
-        self._workers = workers_of(resolved, n_workers, n_runs=n_runs)
-        with ExitStack() as refused:
-            refused.callback(self._workers.close)
-            facts = {
-                "workers": self._workers.n_workers,
-                "cut_ins_take_time": resolved.family.shows(resolved.environment),
-                "distance_per_test_m": resolved.family.mean_distance_m(resolved.environment),
-            }
-            self.manifest = Manifest(out, resolved, earlier, began=began, **facts)
-            refused.pop_all()
+def show(run: Run, shard: ShardResult, rule: Rule, progress: Progress) -> None:
+    """Say how far it is."""
+    progress.advance(min(max(run.n_episodes - run.earlier.n_episodes, 0), shard.request.n_episodes))
+    progress.status(crashes=run.n_crashes, rhw=rule.look.rhw)
 
-    @contextmanager
-    def under_way(self) -> Iterator[Run]:
-        """Tests are run within this: the manifest follows, so that an interrupted run can be read, and workers end."""
-        try:
-            self._keep_design()
-            self.manifest.note(assumed=assumed_in(self.resolved, self.source.design, self._progress))
-            yield self
-            self.manifest.require_few_failed()
-        except BaseException:
-            self.manifest.write("interrupted")
-            raise
-        finally:
-            self._workers.close()
 
-    def make_ready(self) -> None:
-        """Make baseline runs, if tests follow from some, and say how many tests there will be at most."""
-        if (paths := self.source.baseline_paths) is not None:
-            self._make_baseline(paths)
-            self._keep_design()
-        stop = self.campaign.stop
-        # Until a precision or a decision nobody knows how many.
-        most = stop.episodes if self.campaign.accept is None and stop.rhw is None else None
-        self._progress.stage(f"episodes{self._workers.where}", most, done=self.held)
+def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
+    """Drive the vehicle along all paths without a cut-in, and in pilot tests, if tests follow from some."""
+    if (paths := run.source.baseline_paths) is None:
+        return run
+    noted: dict[str, Any] = {}
 
-    def results(self, requests: Iterator[ShardRequest]) -> Iterator[ShardResult]:
-        """Finished shards in order, each in the folder and counted."""
-        for shard in self._workers.run(requests, self._known):
-            self._add(shard)
-            yield shard
-
-    def follow(self, rule: Rule, shard: ShardResult) -> None:
-        """Show how far it is, and let the manifest follow."""
-        self._progress.advance(min(max(self.manifest.n_episodes - self.held, 0), shard.request.n_episodes))
-        self._progress.status(crashes=self.manifest.n_crashes, rhw=rule.look.rhw)
-        self.manifest.follow()
-
-    def _known(self, request: ShardRequest) -> ShardResult | None:
-        """See `stored_shard`."""
-        return stored_shard(self.out, self.source, self.manifest.listed(request), request)
-
-    def _add(self, shard: ShardResult) -> None:
-        """Write a shard that is not there yet, and count it."""
-        if shard.parquet:
-            self.manifest.forget_replaced(shard.request)
-            files = write_shard(self.out, shard.request.index, shard.parquet)
-            crc32 = {name: zlib.crc32(content) for name, content in shard.parquet.items()}
-            shard = replace(shard, files=files, crc32=crc32)
-        self.manifest.add(shard)
-        self.manifest.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
-
-    def _make_baseline(self, paths: BaselinePaths) -> None:
-        """Drive the vehicle along all paths without a cut-in, and in pilot tests that it is learned from."""
-        table, runs = begin(self.source, partial(self._drive, paths))
-        self.manifest.note(distance_per_test_m=runs.mean_distance_m(paths.weight))
-        self._workers.follow_from(parquet(table))
-
-    def _drive(self, paths: BaselinePaths, what: str, requests: Sequence[ShardRequest]) -> pa.Table:
+    def drive(what: str, requests: Sequence[ShardRequest]) -> pa.Table:
         """What comes before tests that count, but for what an earlier run has done of it; the manifest follows."""
         n, (counted, listed) = sum(each.n_episodes for each in requests), IN_MANIFEST[what]
-        self._progress.stage(f"{what}{self._workers.where}", n)
+        progress.stage(f"{what}{crew.where}", n)
         tables, causes, crc32 = [], Counter[str](), []
-        known = partial(stored_baseline, self.out, paths, self.manifest.earlier(listed))
-        for result in self._workers.run(iter(requests), known):
-            file = baseline_file(self.out, result.request)
+        known = partial(stored_baseline, run.folder, paths, run.earlier.manifest.get(listed, ()))
+        for result in crew.run(iter(requests), known):
+            file = baseline_file(run.folder, result.request)
             if result.parquet:
                 write_bytes(file, result.parquet)
             crc32.append(checksum(file))
             tables.append(result.table)
             causes += result.failures
-            self._progress.advance(result.request.n_episodes)
-            counts = {"n_runs": sum(map(len, tables)), "n_failed": causes.total()}
-            self.manifest.note(**{counted: counts, listed: crc32})
-            self.manifest.follow()
-        most, where = self.campaign.run.max_failed_share, f"the run folder's {file.parent.name}/ tables"
+            progress.advance(result.request.n_episodes)
+        noted.update({counted: {"n_runs": sum(map(len, tables)), "n_failed": causes.total()}, listed: crc32})
+        most, where = run.resolved.campaign.run.max_failed_share, f"the run folder's {file.parent.name}/ tables"
         require_few_failed(causes.total(), n, causes, most, what, where)
         return pa.concat_tables(tables)
 
-    def _keep_design(self) -> None:
-        """Write the strata, without which nothing can be estimated, where the folder has no others."""
-        require_same_pool(self.out, self.source)
-        if self.source.design is not None:
-            write_sealed(self.out / SHELLS, STORED_DESIGN.dump_python(self.source.design, mode="json"))
+    try:
+        table, runs = begin(run.source, drive)
+    except BaseException:
+        run.noting(**noted).written("interrupted")
+        raise
+    crew.follow_from(parquet(table))
+    run = run.noting(**noted, distance_per_test_m=runs.mean_distance_m(paths.weight)).written()
+    keep_design(run)
+    return run
 
-    def finish(self, rule: Rule) -> RunResult:
-        """Write manifest, estimates and report once the rule has seen enough; no shard beyond the stop is left."""
-        manifest, decision, decided = self.manifest, rule.look.decision, dict[str, Any]()
-        counted = {self.out / file for shard in manifest.shards for file in shard["files"].values()}
-        for path in {path for table in TABLES for path in shards_on_disk(self.out, table)} - counted:
-            path.unlink()
-        stopped_by = ended_by(self.campaign, rule, manifest.n_episodes)
-        missed = self.campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference")
-        expected = expected_for(rule, self.campaign, manifest.n_episodes) if missed else None
-        code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
-        if decision is not None:
-            code = EXIT_OF[decision.verdict]
-            decided["decision"] = decision.to_json()
-        if others := self._workers.cpus():  # bits may have come from any of them
-            manifest.note(cpu=", ".join(sorted({cpu_name(), *others})))
-        decided |= {"expected": expected, "remedy": pool_remedy(rule, self.campaign, stopped_by)}
-        manifest.write("done", stopped_by=stopped_by, unmet=rule.look.unmet, **decided)
-        self._progress.stage("writing estimates and report", None)
-        estimates = estimate_run(self.out)
-        write_sealed(self.out / ESTIMATES, estimates)
-        from harness.report.page import write_report  # noqa: PLC0415
 
-        return RunResult(self.out, write_report(self.out), estimates, stopped_by, code)
+def keep_design(run: Run) -> None:
+    """Write the strata, without which nothing can be estimated, where the folder has no others."""
+    require_same_pool(run.folder, run.source)
+    if run.source.design is not None:
+        write_sealed(run.folder / SHELLS, STORED_DESIGN.dump_python(run.source.design, mode="json"))
+
+
+def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResult:
+    """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left."""
+    campaign, decision, decided = run.resolved.campaign, rule.look.decision, dict[str, Any]()
+    stopped_by = ended_by(campaign, rule, run.n_episodes)
+    missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference")
+    code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
+    if decision is not None:
+        code = EXIT_OF[decision.verdict]
+        decided["decision"] = decision.to_json()
+    decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
+    decided["remedy"] = pool_remedy(rule, campaign, stopped_by) or None
+    if cpus:  # bits may have come from any of them
+        run = run.noting(cpu=", ".join(sorted({cpu_name(), *cpus})))
+    ended = {"stopped_by": stopped_by, "unmet": rule.look.unmet, **decided}
+    run = run.written("done", **ended)
+    progress.stage("writing estimates and report", None)
+    estimates = estimate_blocks(even(run.blocks), campaign, run.content("done", **ended))
+    write_sealed(run.folder / ESTIMATES, estimates)
+    from harness.report.page import write_report  # noqa: PLC0415
+
+    return RunResult(run.folder, write_report(run.folder), estimates, stopped_by, code)
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:

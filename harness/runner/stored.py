@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,17 +18,17 @@ from harness.campaign.campaign import Campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block
+from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, joined
 from harness.estimators.one_pass import SPACING
 from harness.families.protocol import Environment
 from harness.files import write_atomically
 from harness.processes import SharedFile, made_ahead
-from harness.records.folder import CAMPAIGN, concatenated, no_episodes, read_kept, read_manifest
+from harness.records.folder import CAMPAIGN, Part, no_episodes, read_kept, read_manifest
 from harness.records.origin import require_trust
-from harness.records.reader import read_campaign, read_shard, require_campaign, traffic_of
-from harness.records.schemas import shard_tables
+from harness.records.reader import read_campaign, read_part, require_campaign, traffic_of
+from harness.records.schemas import moments_schema, shard_tables
 from harness.resolved import Resolved, require_world, resolve
-from harness.runner.resume import cpu_name, require_same_pool, versions
+from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
 from harness.sampling.protocol import block_of
@@ -36,11 +36,11 @@ from harness.vocabulary import ESTIMATORS, EstimatorName
 from harness.worlds import build_world
 from harness.worlds.system_libraries import require_libraries
 
-MOST_GROUPED = 5_000
-"""Tests of small shards that are read as one."""
-_FINISH = "Run `harness run` with --resume, which makes missing shards."
-
-_Shards = Sequence[Mapping[str, Any]]
+FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
+"""Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
+_READERS = 2
+"""Threads; each holds a part."""
+_FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
 @checked("harness.estimate")
@@ -61,7 +61,7 @@ def estimate_run(
     manifest = read_manifest(folder)
     campaign = read_campaign(folder, manifest)
     blocks = stored_blocks(folder, moments="scv" in (estimators or ESTIMATORS))
-    return estimate_blocks(blocks, campaign, manifest, estimators=estimators, confidence=confidence)
+    return estimate_blocks(even(blocks), campaign, manifest, estimators=estimators, confidence=confidence)
 
 
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
@@ -80,18 +80,17 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     needed += BASELINE_COLUMNS if design is not None and design.candidates else ()
     ratios = list(MOMENT_COLUMNS) if moments and campaign.sampling.mixes_steps else []
 
-    def read(group: _Shards) -> Block:
-        episodes = concatenated([read_shard(folder, shard, needed) for shard in group], folder)
-        kept = [
-            read_kept(folder, shard, "moments", ratios) for shard in group if ratios and "moments" in shard["files"]
-        ]
-        steps = concatenated(kept, folder) if kept else None
-        return block_of(campaign, episodes, steps, design)
+    keeps = ratios and campaign.records.moments != "none"
+    none = moments_schema((), len(campaign.surrogates)).empty_table().select(ratios) if keeps else None
+
+    def read(part: Part) -> Block:
+        steps = read_kept(folder, part, "moments", ratios) if ratios and "moments" in part.files else none
+        return block_of(campaign, read_part(folder, part, needed), steps, design)
 
     n = 0
-    for block in made_ahead(read, _groups(manifest["shards"])):
+    for block in made_ahead(read, manifest["parts"], _READERS):
         if block.first_episode != n:
-            raise _incomplete(folder, f"a shard that begins at episode {block.first_episode}", f"episode {n}")
+            raise _incomplete(folder, f"a part that begins at episode {block.first_episode}", f"episode {n}")
         counted = block.take(slice(0, n_counted - n))
         n += len(counted)
         if len(counted):
@@ -101,21 +100,20 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")
 
 
-def _groups(shards: _Shards) -> Iterator[_Shards]:
-    """Consecutive shards to be read as one: small ones cost more to hand over than to use.
-
-    A group brings as many tests as `one_pass` waits for until it looks again, or `MOST_GROUPED`.
-    """
-    n, begin = 0, 0
-    group: list[Mapping[str, Any]] = []
-    for shard in shards:
-        group.append(shard)
-        n += shard["n_episodes"]
-        if n >= min(begin * SPACING, begin + MOST_GROUPED):
-            yield group
-            group, begin = [], n
-    if group:
-        yield group
+def even(blocks: Iterable[Block]) -> Iterator[Block]:
+    """The same tests in blocks whose sizes follow from the tests before them alone, not from how they were run."""
+    waiting: list[Block] = []
+    n, size = 0, FEWEST_TOGETHER
+    for block in blocks:
+        waiting.append(block)
+        while sum(map(len, waiting)) >= size:
+            whole = joined(waiting)
+            waiting = [whole.take(slice(size, len(whole)))] if len(whole) > size else []
+            yield whole.take(slice(0, size))
+            n += size
+            size = min(max(FEWEST_TOGETHER, round(n * (SPACING - 1.0))), MOST_TOGETHER)
+    if waiting:
+        yield joined(waiting)
 
 
 def _incomplete(folder: Path, found: str, expected: str) -> RunFolderError:
@@ -284,9 +282,9 @@ def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:
 
 def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, pa.Table]:
     """Rows of the episode in the episodes and traces tables."""
-    for shard in manifest["shards"]:
-        if shard["first_episode"] <= episode < shard["first_episode"] + shard["n_episodes"]:
-            tables = {name: read_kept(folder, shard, name) for name in shard["files"] if name != "moments"}
+    for part in manifest["parts"]:
+        if part.first_episode <= episode < part.end:
+            tables = {name: read_kept(folder, part, name) for name in part.files if name != "moments"}
             return {name: table.filter(pc.equal(table["episode"], episode)) for name, table in tables.items()}
     if not manifest["n_episodes"]:
         raise no_episodes(folder)

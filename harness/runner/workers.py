@@ -11,7 +11,7 @@ import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection
@@ -36,7 +36,7 @@ from harness.processes import (
     tell,
     usable_cpus,
 )
-from harness.records.folder import Repeated, encoded, read_table
+from harness.records.folder import Repeated, read_table
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.runner.again import repeat
@@ -60,19 +60,17 @@ REPEATED = b"harness.repeated"
 
 @dataclass(frozen=True)
 class ShardResult:
-    """A finished shard: what the stop rule needs of it, and causes of failures.
+    """A finished shard: its tables, what the stop rule and estimates need of them, and causes of failures.
 
-    ``repeated`` is None where no test was run twice; ``parquet`` are its tables as files. Once they are on disk,
-    ``files`` are their paths and ``crc32`` their checksums, by table.
+    ``repeated`` is None where no test was run twice. One that ``is_new`` is not on disk.
     """
 
     request: ShardRequest
+    tables: ShardTables
     block: Block
     failures: Counter[str]
     repeated: Repeated | None
-    parquet: dict[str, bytes] = field(default_factory=dict)
-    files: dict[str, str] = field(default_factory=dict)
-    crc32: dict[str, int] = field(default_factory=dict)
+    is_new: bool = True
 
 
 Result = ShardResult | BaselineResult
@@ -147,14 +145,13 @@ class ShardRunner:
         # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
         if request.index == 0 and campaign.av.model is None and campaign.av.traci is None:
             tables = tables._replace(episodes=with_repeated(tables.episodes, repeat(self._loop, self._source, shard)))
-        return replace(finished(self._source, request, tables), parquet=encoded(tables))
+        return finished(self._source, request, tables)
 
 
 def finished(source: Source, request: ShardRequest, tables: ShardTables) -> ShardResult:
     """What is to be known of a shard's tables."""
-    block = source.block(tables.episodes)
     failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
-    return ShardResult(request, block, failures, repeated_of(tables.episodes))
+    return ShardResult(request, tables, source.block(tables), failures, repeated_of(tables.episodes))
 
 
 def with_repeated(episodes: pa.Table, repeated: Repeated) -> pa.Table:

@@ -31,6 +31,7 @@ from harness.pool.shells import Draw
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
 from harness.random_stream import INITIAL, uniforms
+from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
 from harness.strata import ShellDesign
 from harness.worlds import World
@@ -169,9 +170,10 @@ class Source:
         """Whether stored episodes are those that are asked for, and not the last shard of a smaller budget."""
         return bool(episodes.num_rows == request.n_episodes)
 
-    def block(self, episodes: pa.Table) -> Block:
-        """What the stop rule reads of a shard."""
-        return block_of(self.campaign, episodes, None, self.design)
+    def block(self, tables: ShardTables) -> Block:
+        """What the stop rule and estimates read of a shard."""
+        steps = tables.moments if self.campaign.sampling.mixes_steps else None
+        return block_of(self.campaign, tables.episodes, steps, self.design)
 
 
 def block_of(campaign: Campaign, episodes: pa.Table, moments: pa.Table | None, design: ShellDesign | None) -> Block:

@@ -20,12 +20,10 @@ import pytest
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
 from harness.records.folder import (
-    encoded,
     read_as,
-    shard_file,
     write_json,
+    write_part,
     write_sealed,
-    write_shard,
     write_together,
 )
 from harness.records.reader import read, table_sizes
@@ -34,7 +32,7 @@ from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
 from tests.golden.record import column_hash
 from tests.in_process import controllers_here, run_here
-from tests.stored_runs import copy_of, edit, golden, shard_files, stored_table, unlike_columns
+from tests.stored_runs import copy_of, edit, golden, part_files, stored_table, unlike_columns
 
 
 @pytest.fixture
@@ -114,32 +112,16 @@ def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, tables):
     resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
     try:
         with pytest.raises(OSError, match=r"[Ff]ile too large") as raised:
-            write_shard(tmp_path, 0, encoded(tables))
+            write_part(tmp_path, [tables], 0, 240)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
     assert files_below(tmp_path) == set()
-    assert raised.value.filename == str(tmp_path / shard_file("traces", 0))  # the kernel alone names no file
+    name = "episodes/000000000-000000240.parquet"  # the kernel alone names no file
+    assert raised.value.filename == str(tmp_path / name)
     sent = pickle.loads(pickle.dumps(raised.value))
     assert (sent.errno, sent.filename) == (errno.EFBIG, raised.value.filename)  # also from a worker
-    assert set(write_shard(tmp_path, 0, encoded(tables))) == {"episodes", "moments", "traces"}
-
-
-def test_episodes_come_last_so_that_they_say_that_a_shard_is_complete(tmp_path, tables, monkeypatch):
-    written = []
-    write = Path.write_bytes
-
-    def fail_at_third(path: Path, content: bytes) -> int:
-        written.append(path.parent.name)
-        if len(written) == 3:
-            half_then_fail(path)
-        return write(path, content)
-
-    monkeypatch.setattr(Path, "write_bytes", fail_at_third)
-    with pytest.raises(OSError, match="No space left"):
-        write_shard(tmp_path, 4, encoded(tables))
-    assert written == ["traces", "moments", "episodes"]
-    assert files_below(tmp_path) == {shard_file("traces", 4), shard_file("moments", 4)}
+    assert set(write_part(tmp_path, [tables], 0, 240).files) == {"episodes", "moments", "traces"}
 
 
 def test_json_is_strict(tmp_path):
@@ -213,7 +195,7 @@ def test_a_flipped_bit_of_a_baseline_run_changes_no_test(stored_run, tmp_path):
         for path in (folder / "shadow").iterdir():
             with flipped(path, chance), controllers_here():
                 begun = copy_of(folder, tmp_path / path.stem)
-                edit(begun, n_episodes=0, shards=[], status="running")
+                edit(begun, n_episodes=0, parts=[], status="running")
                 for table in ("episodes", "traces"):
                     shutil.rmtree(begun / table)
                 try:
@@ -228,17 +210,16 @@ def test_a_flipped_bit_of_a_baseline_run_changes_no_test(stored_run, tmp_path):
 
 
 @pytest.mark.parametrize("table", TABLES)
-def test_going_on_with_a_damaged_shard_names_it_and_its_mend_works(table, stored, stored_run):
-    damaged = shard_files(stored, table)[1]
+def test_going_on_with_a_damaged_file_names_it_and_its_mend_works(table, stored, stored_run):
+    damaged = part_files(stored, table)[1]
     content = bytearray(damaged.read_bytes())
     content[len(content) // 2] ^= 1
     damaged.write_bytes(content)
-    with pytest.raises(RunFolderError, match=f"{table}/{damaged.name}.*checksum.*Delete all files of this shard"):
+    with pytest.raises(RunFolderError, match=f"{table}/{damaged.name}.*checksum.*Delete this file"):
         run_here(golden(NAME), stored, resume=True)
-    for path in stored.glob(f"*/{damaged.name}"):
-        path.unlink()
+    damaged.unlink()
     with pytest.raises(RunFolderError, match=damaged.name):  # it stays in the manifest: nobody passes over it
-        estimate_run(stored)
+        read(stored).table(table)
     run_here(golden(NAME), stored, resume=True)
     assert unlike_columns(stored_run(NAME), stored) == []
     assert told(stored) == told(stored_run(NAME))

@@ -170,8 +170,8 @@ def test_arrow_tables_and_batches_are_what_the_frames_are(name, stored_run):
 
 def test_what_is_not_there_is_one_error(stored_run, tmp_path):
     folder = copy_of(stored_run("mixture-twin"), tmp_path / "run")
-    run, shards = harness.read(folder), manifest(folder)["shards"]
-    edit(folder, shards=[{**shard, "files": {"episodes": shard["files"]["episodes"]}} for shard in shards])
+    run, parts = harness.read(folder), manifest(folder)["parts"]
+    edit(folder, parts=[{**part, "files": {"episodes": part["files"]["episodes"]}} for part in parts])
     for table in (run.moments, run.traces):
         with pytest.raises(RunFolderError, match=f"no {table.__name__}.*records.{table.__name__}=all"):
             table()

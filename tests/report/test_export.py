@@ -13,7 +13,7 @@ import harness
 from harness.cli import main
 from harness.report.player import LANE_M
 from harness.vocabulary import VEHICLES
-from tests.stored_runs import copy_of, shard_files, truncate
+from tests.stored_runs import copy_of, part_files, truncate
 
 
 def complaints(file):
@@ -84,7 +84,7 @@ def test_what_cannot_be_written_is_said_and_nothing_is_left(stored_run, tmp_path
         assert main(["replay", str(folder), "0", "--out", str(tmp_path / name)]) == 2
         assert "a.html" in capsys.readouterr().err
     damaged = copy_of(folder, tmp_path / "damaged")
-    truncate(shard_files(damaged)[0])
+    truncate(part_files(damaged)[0])
     assert main(["replay", str(damaged), "0", "--out", str(tmp_path / "a.csv")]) == 2
     monkeypatch.setitem(sys.modules, "scenariogeneration", None)
     monkeypatch.delitem(sys.modules, "harness.report.openscenario", raising=False)

@@ -140,14 +140,14 @@ def edited(**changes):
     return lambda path: edit(path, **changes)
 
 
-EPISODES, MOMENTS, TRACES = (f"{table}/shard-000001.parquet" for table in ("episodes", "moments", "traces"))
+EPISODES, TRACES = (f"{table}/000001000-000002000.parquet" for table in ("episodes", "traces"))
 POINT_WITHOUT_RATE = {"n": 1, "ci_low": 0, "ci_high": 1, "rhw": 1}  # which must not be drawn as zero
 
 
 @pytest.mark.parametrize(
     ("file", "damage", "said"),
     [
-        *((shard, truncate, shard) for shard in (MOMENTS, TRACES)),
+        (TRACES, truncate, TRACES),
         (EPISODES, rewritten(lambda table: table.slice(0, 990)), "found 990 rows; expected 1000 rows"),
         (EPISODES, rewritten(lambda table: table.drop_columns(["log_weight"])), "no column 'log_weight'"),
         *(("estimates.json", lambda path, text=text: path.write_text(text), "estimates.json") for text in ("{", "[]")),

@@ -180,10 +180,10 @@ def test_worst_crashes_are_the_worst(summary, table, ranking, key):
     assert kept.tolist() == crash.episode.head(CANDIDATES).tolist()
 
 
-@pytest.mark.parametrize(("n_episodes", "n_shards"), [(1_234, 3), (2_000, 2)])
-def test_only_the_prefix_that_counts_and_listed_shards_are_read(run_folder, n_episodes, n_shards):
-    shards = edit(run_folder / "manifest.json")["shards"]
-    edit(run_folder / "manifest.json", n_episodes=n_episodes, shards=shards[:n_shards])
+@pytest.mark.parametrize(("n_episodes", "n_parts"), [(1_234, 3), (2_000, 2)])
+def test_only_the_prefix_that_counts_and_listed_parts_are_read(run_folder, n_episodes, n_parts):
+    parts = edit(run_folder / "manifest.json")["parts"]
+    edit(run_folder / "manifest.json", n_episodes=n_episodes, parts=parts[:n_parts])
     assert summarise(read_run_folder(run_folder)).n_episodes == n_episodes
 
 

@@ -10,11 +10,10 @@ import pytest
 
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
-from harness.records.reader import read_shards
+from harness.records.reader import read_parts
 from harness.report.words import pair_words
 from harness.runner.compare import compare_campaigns
-from harness.runner.run import Run
-from harness.runner.workers import ShardRunner
+from harness.runner.workers import ShardRunner, Workers
 from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.conftest import MIXTURE_FILE
@@ -59,7 +58,7 @@ def driven(monkeypatch):
 def by_stratum(folder):
     """Cut-in, initial range and outcome of each test, in order, by stratum."""
     found = defaultdict(list)
-    for episodes in read_shards(folder, ["component", "pool_cut_in", "r2_m", "outcome"]):
+    for episodes in read_parts(folder, ["component", "pool_cut_in", "r2_m", "outcome"]):
         for row in episodes.to_pylist():
             found[row["component"]].append((row["pool_cut_in"], row["r2_m"], row["outcome"]))
     return found
@@ -97,15 +96,15 @@ def test_a_stored_run_of_a_is_taken_over(done, campaigns, run_here, campaign, tm
 
 
 def test_an_interrupted_comparison_goes_on(done, campaigns, tmp_path, monkeypatch, driven):
-    results, calls = Run.results, []
+    run, calls = Workers.run, []
 
-    def interrupted(self, specs):
+    def interrupted(self, requests, known):
         calls.append(1)
         if len(calls) == 8:
             raise KeyboardInterrupt
-        return results(self, specs)
+        return run(self, requests, known)
 
-    monkeypatch.setattr(Run, "results", interrupted)
+    monkeypatch.setattr(Workers, "run", interrupted)
     with pytest.raises(KeyboardInterrupt):
         compare_campaigns(*campaigns, tmp_path, workers=1, rhw=0.15)
     assert manifest(tmp_path / "a")["status"] == manifest(tmp_path / "b")["status"] == "interrupted"

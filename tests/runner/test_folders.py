@@ -11,10 +11,10 @@ from harness.cli import main
 from harness.errors import RunFolderError
 from harness.records.folder import read_manifest, require_place, sole_use
 from harness.resolved import resolve
-from harness.runner.resume import require_own_folder
+from harness.runner.kept import require_own_folder
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import run_here
-from tests.stored_runs import copy_of, edit, golden, manifest, sets, shard_files, truncate, unlike_columns, unnoted
+from tests.stored_runs import copy_of, edit, golden, manifest, part_files, sets, truncate, unlike_columns, unnoted
 
 NAME = "mixture-twin"
 RUN = ("run", BASE, *sets(*RUNS[NAME]), "--out")
@@ -118,6 +118,7 @@ def test_another_version_of_the_controller_is_refused(tmp_path, monkeypatch):
 
 # -- records that are not as they were left --
 
+SECOND = "000000080-000000160.parquet"
 READERS = ("estimate",), ("report",), ("replay", 100)
 
 
@@ -130,20 +131,20 @@ def written(file: str, text: str | None):
     [
         (lambda run: run.rename(run.parent / "gone"), READERS, "run"),
         (lambda run: None, [("replay", 400)], "from 0 to 239"),
-        (lambda run: truncate(shard_files(run)[1]), READERS, "episodes/shard-000001.parquet"),
+        (lambda run: truncate(part_files(run)[1]), READERS, f"episodes/{SECOND}"),
         (
-            lambda run: truncate(shard_files(unnoted(run))[1]),
+            lambda run: truncate(part_files(unnoted(run))[1]),
             READERS,
-            "shard-000001.parquet found: a file that cannot",
+            f"{SECOND} found: a file that cannot",
         ),
-        (lambda run: shard_files(run)[1].unlink(), READERS, "episodes/shard-000001.parquet found: no such file"),
-        (lambda run: shard_files(run, "traces")[1].unlink(), READERS[1:], "traces/shard-000001.parquet found: no such"),
+        (lambda run: part_files(run)[1].unlink(), READERS, f"episodes/{SECOND} found: no such file"),
+        (lambda run: part_files(run, "traces")[1].unlink(), READERS[1:], f"traces/{SECOND} found"),
         (lambda run: (run / "estimates.json").unlink(), READERS[1:2], "harness estimate"),
-        (lambda run: edit(run, n_episodes=0, shards=[]), READERS[::2], "has not finished an episode yet"),
+        (lambda run: edit(run, n_episodes=0, parts=[]), READERS[::2], "has not finished an episode yet"),
         (lambda run: edit(run, n_episodes=500), READERS[:1], "240 episodes"),
-        (lambda run: edit(run, shards=manifest(run)["shards"][::2]), READERS[:1], "begins at episode 160"),
+        (lambda run: edit(run, parts=manifest(run)["parts"][::2]), READERS[:1], "begins at episode 160"),
         (lambda run: edit(run, campaign_hash="0" * 16), READERS[2:], "campaign.yaml"),
-        *((written("manifest.json", text), READERS, "manifest.json") for text in (None, "{", "[]", '{"shards": 5}')),
+        *((written("manifest.json", text), READERS, "manifest.json") for text in (None, "{", "[]", '{"parts": 5}')),
         *((written("campaign.yaml", text), READERS, "campaign.yaml") for text in (None, "{", "{}")),
     ],
 )
@@ -166,16 +167,17 @@ def test_a_manifest_cut_anywhere_is_named_and_nothing_is_touched(stored):
                 read(stored)
             assert raised.value.where == str(path)
     path.write_bytes(content.rstrip())
-    assert require_own_folder(stored, resolved, resume=True) == json.loads(content)
+    assert require_own_folder(stored, resolved, resume=True)["n_episodes"] == json.loads(content)["n_episodes"]
     assert sorted(stored.rglob("*")) == files
 
 
 def test_values_that_no_run_has_written_are_refused(stored):
-    shard = manifest(stored)["shards"][0]
-    of_no_shard = {"index": "0"}, {"files": {"episodes": "../../etc/passwd"}}
+    part = manifest(stored)["parts"][0]
+    file = part["files"]["episodes"]
+    of_no_part = {"first_episode": "0"}, {"files": {"episodes": {**file, "path": "../../etc/passwd"}}}
     for key, wrong in (
         *(("n_episodes", wrong) for wrong in (-1, 0.5, 10**400, True, "240", [240])),
-        *(("shards", wrong) for wrong in (None, {}, *([{**shard, **changed}] for changed in of_no_shard))),
+        *(("parts", wrong) for wrong in (None, {}, *([{**part, **changed}] for changed in of_no_part))),
         *(("campaign_hash", 5), ("stopped_by", "the moon"), ("distance_per_test_m", "far"), ("versions", ["x"])),
     ):
         content = (stored / "manifest.json").read_text()

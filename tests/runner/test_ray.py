@@ -22,7 +22,7 @@ from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from tests.in_process import workers_alive
 from tests.runner.conftest import SHELLS, TWIN
 from tests.runner.test_shadow_runs import FORCED, SHADOWS, of
-from tests.stored_runs import manifest, shard_files, unlike_columns
+from tests.stored_runs import manifest, part_files, unlike_columns
 from tests.traffic.tables import tabled
 
 ray = pytest.importorskip("ray")
@@ -39,6 +39,7 @@ def _cluster():
     """One for all tests of this file: runs use the cluster that their process is connected to."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(ROOT))
+        patch.setattr("harness.runner.kept.PART_TESTS", 80)  # files tell how far it is
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         ray.init(address="local", num_cpus=2, include_dashboard=False, logging_level="ERROR", log_to_driver=False)
         yield
@@ -94,7 +95,7 @@ def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
 
     def strike() -> None:
         for victim, n_done in ((b"ray::OnMachine", 1), (WORKER, 6)):
-            while len(shard_files(tmp_path / "ray")) < n_done:
+            while len(part_files(tmp_path / "ray")) < n_done:
                 time.sleep(0.02)
             struck.extend(below(victim)[:1])
             os.kill(struck[-1], signal.SIGKILL)
@@ -116,7 +117,7 @@ def test_what_a_controller_starts_ends_with_the_run_and_no_file_is_left(struck, 
     settings = (*FORCED, SHADOWS, TWIN[0], f"av={acting}", "world.cells=8", "stop.episodes=3000")
 
     def strike() -> None:
-        while len(shard_files(out)) < 2:
+        while len(part_files(out)) < 2:
             time.sleep(0.02)
         for pid in below(struck)[:1] if struck else []:
             os.kill(pid, signal.SIGKILL)

@@ -26,9 +26,9 @@ from harness.sampling.protocol import ShardRequest
 from tests.in_process import workers_alive
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
-from tests.stored_runs import copy_of, golden, manifest, sets, shard_files, unlike_columns
+from tests.stored_runs import copy_of, golden, manifest, part_files, sets, unlike_columns
 
-SHARDS_BEFORE_FAILURE = 3
+PARTS_BEFORE_FAILURE = 3
 
 
 def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
@@ -65,19 +65,20 @@ def test_a_full_disk_is_told_and_the_run_can_be_resumed(run_here, campaign, twin
     write = Path.write_bytes
 
     def write_or_fail(path: Path, content: bytes) -> int:
-        if path.parent.name == "moments" and len(shard_files(out)) == SHARDS_BEFORE_FAILURE:
+        if path.parent.name == "moments" and len(part_files(out)) == PARTS_BEFORE_FAILURE + 1:
             write(path, b"PAR1, and then the disk was full")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         return write(path, content)
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", write_or_fail)
+        patch.setattr("harness.runner.kept.PART_TESTS", 80)
         assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *sets(*SMALL, *TWIN)]) == 2
     complaint = capsys.readouterr().err
     assert "no space left" in complaint
     assert "--resume" in complaint
-    assert len(shard_files(out)) == SHARDS_BEFORE_FAILURE
-    assert manifest(out)["n_episodes"] == 80 * SHARDS_BEFORE_FAILURE
+    assert len(part_files(out)) == PARTS_BEFORE_FAILURE
+    assert manifest(out)["n_episodes"] == 80 * PARTS_BEFORE_FAILURE
     assert manifest(out)["status"] == "interrupted"
     assert not list(out.rglob("*.part"))
     run_here(campaign(*TWIN), out, resume=True)

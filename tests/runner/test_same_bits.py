@@ -16,7 +16,7 @@ from harness.resolved import resolve
 from harness.runner import workers
 from tests.golden.campaigns import BASE, IN_BOTH_WORLDS
 from tests.in_process import run_here, run_with_workers, workers_alive
-from tests.stored_runs import MORE, ROOT, golden, manifest, sets, shard_files, stored_table, unlike_columns
+from tests.stored_runs import MORE, ROOT, golden, manifest, part_files, sets, stored_table, unlike_columns
 
 PATIENCE_S, POLL_S = 300.0, 0.01
 SEVEN = "mixture-seven"
@@ -77,13 +77,15 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from harness.cli import main
+from harness.runner import kept
 
+kept.PART_TESTS = 80
 n_writes, write = 0, Path.write_bytes
 
 def half_then_killed(path, content):
     global n_writes
-    n_writes += (of_shard := path.parent.name == "moments")
-    if of_shard and n_writes == 4:
+    n_writes += (of_part := path.parent.name == "moments")
+    if of_part and n_writes == 4:
         write(path, content[: len(content) // 2])
         os.kill(os.getpid(), signal.SIGKILL)
     return write(path, content)
@@ -102,7 +104,7 @@ def test_killed_while_it_writes_then_resumed(stored_run, tmp_path):
     assert killed.returncode == -signal.SIGKILL
     assert [path.name[:5] for path in temporary.iterdir()] == ["pymp-"]  # where the fork server has listened
     assert manifest(out)["status"] != "done"
-    assert (len(shard_files(out)), len(list(out.rglob("*.part")))) == (3, 1)
+    assert (manifest(out)["n_episodes"], len(list(out.rglob("*.part")))) == (240, 1)
 
     run_here(golden(SEVEN), out, resume=True)
     assert manifest(out)["status"] == "done"
@@ -151,10 +153,10 @@ def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in
         stderr=subprocess.PIPE,
         text=True,
     )
-    wait_for(process, lambda: len(shard_files(out)) >= 1)
+    wait_for(process, lambda: part_files(out))
     os.killpg(process.pid, signal.SIGHUP)
-    n = len(shard_files(out))
-    wait_for(process, lambda: len(shard_files(out)) >= n + 2)  # one of them has been counted then
+    n = manifest(out)["n_episodes"]
+    wait_for(process, lambda: manifest(out)["n_episodes"] > n)
     os.killpg(process.pid, signal.SIGINT)
     code, complaints = finished(process)
     assert code == 128 + signal.SIGINT

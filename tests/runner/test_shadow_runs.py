@@ -25,7 +25,7 @@ from tests.stored_runs import (
     estimates,
     golden,
     manifest,
-    shard_files,
+    part_files,
     stored_table,
     unlike_columns,
 )
@@ -56,11 +56,11 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(stored_run, tmp_path):
         shutil.rmtree(out / table)
     files_of(out)[1].unlink()
     kept = files_of(out)[0].stat().st_mtime_ns
-    edit(out, n_episodes=0, shards=[], status="interrupted")
+    edit(out, n_episodes=0, parts=[], status="interrupted")
     run_golden(golden(ACTS), out, resume=True)
     assert unlike_columns(stored_run(ACTS), out) == []
     assert files_of(out)[0].stat().st_mtime_ns == kept
-    shard_files(out)[-1].unlink()
+    part_files(out)[-1].unlink()
     run_golden(golden(ACTS), out, resume=True)
     assert unlike_columns(stored_run(ACTS), out) == []
 
@@ -83,7 +83,7 @@ def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_
     for table in ("episodes", "traces"):
         shutil.rmtree(other / table)
     (other / "pilot" / pilot[-1].name).unlink()
-    edit(other, n_episodes=0, shards=[], status="interrupted")
+    edit(other, n_episodes=0, parts=[], status="interrupted")
     run_golden(campaign, other, resume=True)
     assert unlike_columns(out, other) == []
 

@@ -11,14 +11,14 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import RunFolderError
-from harness.runner.resume import Manifest
+from harness.runner.kept import Run
 from harness.sampling.allocation import GROWTH, Allocation, first_tests
 from harness.sampling.shells import round_requests
 from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import tally as counted
 from tests.in_process import run_here as run_golden
 from tests.runner.conftest import SHELLS
-from tests.stored_runs import answer_in, copy_of, edit, golden, manifest, shard_files
+from tests.stored_runs import answer_in, copy_of, edit, golden, manifest, part_files, stored_table
 
 
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
@@ -49,45 +49,34 @@ SPENT, MORE = "stop.episodes=150", "stop.episodes=400"
 """A budget that ends within a round: its last shards are not those of a run that goes on."""
 
 
-def test_a_shard_made_anew_keeps_no_file_of_the_old_one(campaign, run_here, tmp_path):
+def test_what_is_traced_may_change_when_a_run_goes_on(campaign, run_here, tmp_path):
     traced, untraced = ("records.traces=all",), ("records.traces=none", "records.trace_share=0")
     out = tmp_path / "run"
     run_here(campaign(*SHELLS, "world.engine=twin", SPENT, *traced), out)
-    before = {path.name: path.read_bytes() for path in shard_files(out)}
-    for _ in range(2):  # the second time all shards are taken over
+    for _ in range(2):  # the second time all tests are taken over
         run_here(campaign(*SHELLS, "world.engine=twin", MORE, *untraced), out, resume=True)
-    changed = [name for name, content in before.items() if (out / "episodes" / name).read_bytes() != content]
-    assert changed
-    assert {path.name for path in shard_files(out, "traces")} == set(before) - set(changed)
+    traced_tests = set(stored_table(out, "traces")["episode"].to_pylist())
+    assert 0 in traced_tests
+    assert len(traced_tests) < manifest(out)["n_episodes"]
     assert replay(out, 0).bit_equal
 
 
-def test_a_continuation_that_dies_leaves_a_manifest_that_is_true(campaign, run_here, tmp_path, monkeypatch):
-    """It dies just after it has put another shard in the place of an earlier one."""
+def test_a_continuation_that_dies_leaves_what_was_there(campaign, run_here, tmp_path, monkeypatch):
     out = tmp_path / "run"
     run_here(campaign(*SHELLS, "world.engine=twin", SPENT), out)
-    before = {path.name: path.read_bytes() for path in shard_files(out)}
+    before = {path: path.read_bytes() for path in (*part_files(out), out / "manifest.json")}
+    add = Run.with_shard
 
-    add = Manifest.add
-
-    def add_or_die(manifest, done):
-        if done.parquet:
+    def add_or_die(run, shard):
+        if shard.is_new:
             raise KeyboardInterrupt
-        add(manifest, done)
+        return add(run, shard)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Manifest, "add", add_or_die)
-        patch.setattr(Manifest, "write", lambda *arguments, **options: None)  # a killed process writes no last word
-        with pytest.raises(KeyboardInterrupt):
-            run_here(campaign(*SHELLS, "world.engine=twin", MORE), out, resume=True)
-    assert any((out / "episodes" / name).read_bytes() != content for name, content in before.items())
-    shards = manifest(out)["shards"]
-    assert 0 < sum(shard["n_episodes"] for shard in shards) == manifest(out)["n_episodes"] < 150
-    assert all(
-        (out / shard["files"]["episodes"]).read_bytes() == before[f"shard-{shard['index']:06d}.parquet"]
-        for shard in shards
-    )
-    assert estimate(out)["n_episodes"] == manifest(out)["n_episodes"]
+    monkeypatch.setattr(Run, "with_shard", add_or_die)
+    with pytest.raises(KeyboardInterrupt):
+        run_here(campaign(*SHELLS, "world.engine=twin", MORE), out, resume=True)
+    assert {path: path.read_bytes() for path in before} == before
+    assert estimate(out)["n_episodes"] == 150
 
 
 def test_shells_of_another_pool_or_that_are_none_are_refused(stored_run, tmp_path):

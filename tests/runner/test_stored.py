@@ -14,16 +14,14 @@ import pytest
 
 import harness
 from harness.cli import main
-from harness.errors import RunFolderError
 from harness.estimators.block import joined
 from harness.resolved import resolve
-from harness.runner import stored
-from harness.runner.stored import estimate_run, replay_episode, stored_blocks
+from harness.runner.stored import estimate_run, even, replay_episode, stored_blocks
 from studies.alarm import alarm_of_run
 from tests.golden.record import column_hash
 from tests.in_process import run_here
 from tests.retracing import retraced
-from tests.stored_runs import ROOT, copy_of, edit, estimates, golden, manifest, shard_files, stored_table, unnoted
+from tests.stored_runs import ROOT, copy_of, edit, estimates, golden, part_files, stored_table, unnoted
 
 ESTIMATOR = {"shells-twin": "shells", "nde-twin": "nde"}
 RECORDS = (ROOT / "docs/records.md").read_text()
@@ -40,10 +38,9 @@ def test_estimating_again_gives_the_same_content_and_another_confidence_the_same
     assert wider["estimates"][headline]["ci_high"] > stored["estimates"][headline]["ci_high"]
 
 
-def test_of_the_prefix_that_counts_what_is_asked_and_the_headline_are_estimated(stored_run, tmp_path):
-    folder = copy_of(stored_run("step-recursive-twin"), tmp_path / "run")
-    shards = [{**shard, "files": {"episodes": shard["files"]["episodes"]}} for shard in manifest(folder)["shards"]]
-    edit(folder, n_episodes=200, shards=shards)
+def test_of_the_prefix_that_counts_what_is_asked_and_the_headline_are_estimated(tmp_path):
+    folder = run_here(golden("step-recursive-twin", "records.moments=none"), tmp_path / "run").folder
+    edit(folder, n_episodes=200)
     content, asked = estimate_run(folder), estimate_run(folder, estimators=["scv"])
     assert content["n_episodes"] == content["convergence"][-1]["n"] == 200
     assert asked["estimates"] == {name: content["estimates"][name] for name in ("nade", "scv")}
@@ -51,29 +48,16 @@ def test_of_the_prefix_that_counts_what_is_asked_and_the_headline_are_estimated(
     assert "records.moments" in content["estimates"]["scv"]["reason"]
 
 
-@pytest.mark.parametrize(("most", "sizes"), [(90, [80, 160, 160]), (170, [80, 240, 80]), (5_000, [80, 320])])
-def test_shards_are_read_in_groups_without_changing_a_bit(most, sizes, twin_run, monkeypatch):
-    """Five shards of 80 tests, as one block of several tables."""
-    one_by_one = list(stored_blocks(twin_run, moments=False))
-    monkeypatch.setattr(stored, "SPACING", 100.0)
-    monkeypatch.setattr(stored, "MOST_GROUPED", most)
-    grouped = list(stored_blocks(twin_run, moments=False))
-    assert ([len(block) for block in one_by_one], [len(block) for block in grouped]) == ([80] * 5, sizes)
-    whole, again = joined(one_by_one), joined(grouped)
-    assert whole.columns.keys() == again.columns.keys()
+@pytest.mark.parametrize("size", [1, 79, 400])
+def test_blocks_that_are_estimated_follow_from_tests_alone(size, twin_run):
+    blocks = list(stored_blocks(twin_run, moments=False))
+    whole = joined(blocks)
+    cut = [whole.take(slice(first, first + size)) for first in range(0, len(whole), size)]
+    evened = list(even(cut))
+    assert [len(block) for block in evened] == [len(block) for block in even(blocks)] == [64] * 6 + [16]
+    again = joined(evened)
     assert all(column.tobytes() == again.columns[name].tobytes() for name, column in whole.columns.items())
-    np.testing.assert_array_equal(whole.outcome, again.outcome)
     np.testing.assert_array_equal(whole.log_weight, again.log_weight)
-
-
-def test_shards_with_columns_of_other_types_are_refused(twin_run, tmp_path, monkeypatch):
-    folder = unnoted(copy_of(twin_run, tmp_path / "run"))
-    table = pq.read_table(path := shard_files(folder)[2])
-    column = table.schema.get_field_index("cut_in_step")
-    pq.write_table(table.set_column(column, "cut_in_step", table.column(column).cast("float64")), path)
-    monkeypatch.setattr(stored, "SPACING", 100.0)
-    with pytest.raises(RunFolderError, match=r"shards of different types: [^…]*cut_in_step: int16"):
-        list(stored_blocks(folder, moments=False))
 
 
 @pytest.mark.parametrize("name", ["shells-twin", "forced-twin", "nde-twin", "step-recursive-twin", "mixture-twin"])
@@ -141,7 +125,7 @@ def one_bit(value: float) -> float:
 def test_a_record_that_was_tampered_with_is_noticed(table, column, twin_run, tmp_path, capsys):
     """By one unit in the last place."""
     folder = unnoted(copy_of(twin_run, tmp_path / "run"))
-    path = shard_files(folder, table)[1]
+    path = part_files(folder, table)[1]
     rows = pq.read_table(path, partitioning=None)
     pq.write_table(with_value(rows, column, 30, one_bit), path)
     episode = rows["episode"][30].as_py()

@@ -1,0 +1,334 @@
+"""What a run's folder holds of a run, and what the next write will add: one record, made anew with each shard.
+
+Tests come in order, whoever has run them, and lie in one file per table; beyond `PART_TESTS` in another. A file that
+may still grow is written again every few seconds, with all that there is by then and under a new name, so that a kill
+loses no more than that. What the manifest lists is there, and nothing else counts.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+import zlib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from harness.campaign.files import dump_campaign
+from harness.errors import RunFolderError, TooManyFailedError
+from harness.estimators.block import Block
+from harness.records.folder import (
+    CAMPAIGN,
+    MANIFEST,
+    SHELLS,
+    TABLES,
+    Part,
+    Repeated,
+    read_as,
+    read_kept,
+    read_manifest,
+    remove_unlisted,
+    require_place,
+    write_bytes,
+    write_part,
+    write_sealed,
+)
+from harness.records.origin import signature
+from harness.records.schemas import ShardTables
+from harness.resolved import Resolved
+from harness.runner.workers import ShardResult, finished
+from harness.sampling.protocol import ShardRequest, Source
+
+SMALLEST_FAILED_SAMPLE = 200
+"""Episodes before the share of failures can end a campaign."""
+_PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
+_INTERVAL_S, _SHARE = 5.0, 0.05
+"""Time between two writes, and the share of the time that they may take."""
+PART_TESTS, PART_ROWS = 50_000, 2_000_000
+"""Tests, or rows of all tables, from which on they go on in other files: so many are kept in memory."""
+
+
+class Earlier:
+    """What an earlier run has left in a folder: its manifest, and its tests by their index, one part read at a time."""
+
+    def __init__(self, folder: Path, manifest: Mapping[str, Any]) -> None:
+        self.manifest, self._folder = manifest, folder
+        self._read: tuple[Part, dict[str, pa.Table] | None] | None = None
+
+    @property
+    def n_episodes(self) -> int:
+        """How many tests it has left."""
+        return int(self.manifest["n_episodes"])
+
+    @property
+    def parts(self) -> list[Part]:
+        """Their files, in order."""
+        found: list[Part] = self.manifest["parts"]
+        return found
+
+    def tables(self, first: int, n: int) -> ShardTables | None:
+        """Tables of consecutive tests; None where there are not so many, or one of their files is gone.
+
+        Raises `RunFolderError`: one of the files is damaged.
+        """
+        found = [self._tables(part) for part in self.parts if part.first_episode < first + n and part.end > first]
+        if first + n > self.n_episodes or not found or None in found:
+            return None
+        tables: dict[str, pa.Table | None] = dict.fromkeys(TABLES)
+        for name in TABLES:
+            if kept := [_between(part[name], first, first + n) for part in found if part is not None and name in part]:
+                tables[name] = pa.concat_tables(kept)
+        return ShardTables(**tables)
+
+    def _tables(self, part: Part) -> dict[str, pa.Table] | None:
+        if self._read is None or self._read[0] is not part:
+            there = all((self._folder / file.path).exists() for file in part.files.values())
+            self._read = part, {name: read_kept(self._folder, part, name) for name in part.files} if there else None
+        return self._read[1]
+
+
+def _between(table: pa.Table, first: int, end: int) -> pa.Table:
+    low, high = np.searchsorted(table.column("episode").to_numpy(), (first, end)).tolist()
+    return table.slice(low, high - low)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A campaign on its way into a folder, in which nobody but this process writes.
+
+    ``parts`` are written; ``open`` are shards that will make up the next one, of which the last may hold some.
+    ``blocks`` are of all tests, in order, ``failures`` counts causes, and ``facts`` are more keys of the manifest.
+    """
+
+    folder: Path
+    resolved: Resolved
+    source: Source
+    earlier: Earlier
+    began: float
+    facts: Mapping[str, Any]
+    parts: tuple[Part, ...] = ()
+    open: tuple[ShardResult, ...] = ()
+    blocks: tuple[Block, ...] = ()
+    n_rows: int = 0
+    """Of all tables of those that are open."""
+    n_crashes: int = 0
+    failures: Counter[str] = field(default_factory=Counter)
+    repeated: Repeated | None = None
+    wrote: tuple[float, float] = (0.0, 0.0)
+    """When it was written last, and how long that took (s)."""
+    is_named: bool = False
+    """Whether ``campaign.yaml`` is this campaign's, and no earlier run's with another stop rule."""
+
+    @property
+    def n_episodes(self) -> int:
+        """How many tests there are."""
+        return self.blocks[-1].first_episode + len(self.blocks[-1]) if self.blocks else 0
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether it has not come as far yet as an earlier run: what that has left stays true so long."""
+        return self.n_episodes < self.earlier.n_episodes
+
+    def known(self, request: ShardRequest) -> ShardResult | None:
+        """A shard that needs not be run again, or None: as many tests and, of shells, the cut-ins that are drawn now.
+
+        Raises `RunFolderError`: one of its files is damaged.
+        """
+        tables = self.earlier.tables(request.first_episode, request.n_episodes)
+        if tables is None or not self.source.is_shard(request, tables.episodes):
+            return None
+        return replace(finished(self.source, request, tables), is_new=False)
+
+    def noting(self, **facts: Any) -> Run:
+        """More keys of the manifest."""
+        return replace(self, facts={**self.facts, **facts})
+
+    def with_shard(self, shard: ShardResult) -> Run:
+        """The next tests; what there is by then is written every few seconds."""
+        drawn = self.blocks[0].drawn if self.blocks else shard.block.drawn  # each from a worker has brought its own
+        run = replace(
+            self,
+            open=(*self.open, shard),
+            blocks=(*self.blocks, replace(shard.block, drawn=drawn)),
+            n_rows=self.n_rows + shard.tables.n_rows,
+            n_crashes=self.n_crashes + int(shard.block.crash.sum()),
+            failures=self.failures + shard.failures,
+            repeated=self.repeated or shard.repeated,
+        )
+        run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
+        if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or run.n_rows >= PART_ROWS:
+            return replace(run.written(), open=(), n_rows=0)
+        when, took = self.wrote
+        if run.is_behind or time.monotonic() - when < max(_INTERVAL_S, took / _SHARE):
+            return run
+        return run.written()
+
+    def written(self, status: str = "running", **of_the_end: Any) -> Run:
+        """All that there is, and the manifest with it."""
+        began = time.monotonic()
+        run = self._kept()
+        if status == "done" or not run.is_behind:
+            run._write_manifest(run.content(status, **of_the_end))
+            remove_unlisted(run.folder, run.parts)
+            run = replace(run, is_named=True)
+        return replace(run, wrote=(time.monotonic(), time.monotonic() - began))
+
+    def _kept(self) -> Run:
+        """The last part as far as it goes, in the place of one that held less of it."""
+        if not self.open:
+            return self
+        first = self.open[0].request.first_episode
+        listed = [part for part in self.earlier.parts if (part.first_episode, part.end) == (first, self.n_episodes)]
+        if any(shard.is_new for shard in self.open) or not listed:
+            listed = [write_part(self.folder, [shard.tables for shard in self.open], first, self.n_episodes - first)]
+        return replace(self, parts=(*(part for part in self.parts if part.first_episode < first), *listed))
+
+    def require_few_failed(self, *, at_least: int = 0) -> None:
+        """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many."""
+        if self.n_episodes >= at_least:
+            most = self.resolved.campaign.run.max_failed_share
+            require_few_failed(self.failures.total(), self.n_episodes, self.failures, most)
+
+    def content(self, status: str, **of_the_end: Any) -> dict[str, Any]:
+        """What the manifest says."""
+        repeated, campaign = self.repeated, self.resolved.campaign
+        return {
+            **self.facts,
+            "status": status,
+            "stopped_by": None,
+            "unmet": [],
+            **of_the_end,
+            "reproducible": campaign.av.reproducible and not (repeated and repeated.differing),
+            "repeated": None if repeated is None else asdict(repeated),
+            "wall_time_s": round(time.monotonic() - self.began, 3),
+            "n_episodes": self.n_episodes,
+            "parts": self.parts,
+        }
+
+    def _write_manifest(self, content: dict[str, Any]) -> None:
+        content = {**content, "parts": [asdict(part) for part in self.parts]}
+        if not self.is_named:
+            # Until it is there no checksum is told: not of the old one, nor of this.
+            write_sealed(self.folder / MANIFEST, {**content, "campaign_crc32": None})
+            write_bytes(self.folder / CAMPAIGN, dump_campaign(self.resolved.campaign).encode())
+        write_sealed(self.folder / MANIFEST, content)
+
+
+def take_over(
+    folder: Path, resolved: Resolved, source: Source, earlier: Mapping[str, Any], began: float, **facts: Any
+) -> Run:
+    """A run that begins in a folder, or goes on there; see `require_own_folder`."""
+    campaign = resolved.campaign
+    yaml = dump_campaign(campaign).encode()
+    of_run = {
+        "format": 1,
+        "name": campaign.name,
+        "campaign_hash": resolved.content_hash,
+        "campaign_crc32": zlib.crc32(yaml),
+        "signature": signature(yaml),
+        "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
+        "seed": campaign.seed,
+        "engine": campaign.world.engine,
+        "versions": versions(),
+        "cpu": cpu_name(),
+        "controller_sha256": resolved.controller_sha256,
+        **facts,
+    }
+    began -= float(earlier.get("wall_time_s") or 0.0)
+    return Run(folder, resolved, source, Earlier(folder, earlier), began, of_run).written()
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on."""
+    return {"python": platform.python_version(), **{package: metadata.version(package) for package in _PACKAGES}}
+
+
+def cpu_name() -> str:
+    """Model name of the processor: bits are promised for one CPU family."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def require_few_failed(
+    n_failed: int, n: int, causes: Counter[str], most: float, what: str = "episodes", where: str = "the episodes table"
+) -> None:
+    """Refuse (`TooManyFailedError`) an answer where more than the share ``most`` of tests, or ``what`` else, failed."""
+    if n_failed > most * n:
+        cause = "".join(f", {n_such} of them with: {why}" for why, n_such in causes.most_common(1))
+        raise TooManyFailedError(
+            "run.max_failed_share",
+            f"{n_failed} of {n} {what} failed{cause}",
+            f"a share of at most {most:g}",
+            "Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
+            f"are in the column 'failure' of {where}.",
+        )
+
+
+def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:
+    """Refuse a folder that holds something else; return the manifest of a run to be continued, or one without tests.
+
+    Raises `RunFolderError`: the folder cannot be written to, holds another campaign, this one without ``--resume`` or
+    with another controller (one file may not mix two versions of it), or files that are no run.
+    """
+
+    def refusal(found: str, expected: str, mend: str) -> RunFolderError:
+        return RunFolderError(str(folder), found, expected, mend)
+
+    require_place(folder)
+    if not folder.exists() or not any(folder.iterdir()):
+        return {"n_episodes": 0, "parts": []}
+    elsewhere = "Choose another folder with --out."
+    if not (folder / MANIFEST).exists():
+        expected = "a new or empty folder, or one that a run has left"
+        raise refusal("a folder with other files", expected, elsewhere)
+    manifest = read_manifest(folder, mend=elsewhere)
+    if manifest["campaign_hash"] != resolved.content_hash:
+        raise refusal(
+            f"another campaign ({manifest.get('name')}, {manifest['campaign_hash']})",
+            f"a folder for this one ({resolved.content_hash})",
+            "Choose another folder with --out, or run the campaign.yaml that it holds.",
+        )
+    if not resume:
+        mend = "Continue it with --resume, or choose another folder with --out."
+        raise refusal("this campaign, already begun", "a new or empty folder", mend)
+    if manifest.get("controller_sha256") != resolved.controller_sha256:
+        raise refusal(
+            "tests of this campaign whose controller's source file has been changed since",
+            "the same controller for all tests of a run",
+            "Restore the file, or test the new controller in another folder with --out.",
+        )
+    return manifest
+
+
+def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> None:
+    """Refuse (`RunFolderError`) to throw away finished tests, which the stop rule asked for now would not keep."""
+    if n_episodes < (held := earlier["n_episodes"]):
+        found = f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n_episodes:,}"
+        expected = "a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there"
+        mend = "Repeat the --set options of the earlier run or ask for more; `harness estimate` reads what is there."
+        raise RunFolderError(str(folder), found, expected, mend)
+
+
+def require_same_pool(folder: Path, source: Source) -> None:
+    """Refuse (`RunFolderError`) to go on with a run whose cut-ins came from another pool.
+
+    Its library, or the harness itself, has changed since.
+    """
+    path, design = folder / SHELLS, source.design
+    if design is None or not path.exists():
+        return
+    found = read_as(dict[str, object], path, mend="Run the campaign into a new folder.").get("pool")
+    if found != design.pool:
+        expected = f"those of pool {design.pool}, which this campaign now has"
+        mend = "Restore the surrogate library, or the version of the harness (manifest.json), or use a new folder."
+        raise RunFolderError(str(path), f"cut-ins of pool {found}", expected, mend)
