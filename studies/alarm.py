@@ -30,15 +30,18 @@ from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, Drawn, block_from_tables
 from harness.estimators.estimate import finite_json
+from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import Trajectory, empty_trajectory, end_in, walk, who_crashes
-from harness.families.cut_in.replay import LEAD, PATH_COLUMNS, StoredPaths, leave_stored, recall, stored_paths
+from harness.families.cut_in.replay import StoredPaths, leave_stored, recall
+from harness.families.cut_in.script import maneuvers_of, states_of
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
 from harness.processes import made_ahead
 from harness.progress import Progress
 from harness.records.folder import MEND_PART, Part, read_manifest
 from harness.records.reader import read_part
+from harness.records.schemas import LEAD, chosen_from, path_columns
 from harness.resolved import Resolved, resolve
 from harness.vehicles.drivers import Followers
 from harness.vocabulary import CONTACT, FAILED, PASSED, RUNNING, BoolArray, FloatArray, IntArray
@@ -91,10 +94,17 @@ def replay_surrogates(
     return -1
 
 
+def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
+    """Initial states and maneuvers of rows of the episodes table; needs `path_columns`."""
+    chosen = chosen_from(episodes, CUT_IN)
+    index, n_steps = (np.asarray(episodes.column(name)).astype(np.int64) for name in ("episode", "n_steps"))
+    return StoredPaths(seed, index, states_of(chosen.facts), n_steps, chosen.at, maneuvers_of(chosen))
+
+
 def drivers_crash(episodes: pa.Table, seed: int, environment: Environment, followers: Followers) -> BoolArray:
     """Which drivers (D,) would have crashed in the place of the AV, shape (n, D).
 
-    ``episodes`` are consecutive rows of the episodes table, with `PATH_COLUMNS`; ``seed`` is that of the campaign.
+    ``episodes`` are consecutive rows of the episodes table, with `path_columns`; ``seed`` is that of the campaign.
 
     Raises `RunFolderError`: an episode's maneuvers do not fit its steps.
     """
@@ -232,7 +242,7 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
     pool = campaign_pool(resolved, progress)
     alarm, alpha = Alarm(KnownRates.of(pool)), campaign.mixture_weights
     lead = [LEAD] if resolved.environment.lateral.present else []
-    columns = [*dict.fromkeys([*EPISODE_COLUMNS, *PATH_COLUMNS, *lead])]
+    columns = [*dict.fromkeys([*EPISODE_COLUMNS, *path_columns(CUT_IN), *lead])]
 
     def replayed(part: Part) -> tuple[Block, BoolArray]:
         episodes = read_part(folder, part, columns)

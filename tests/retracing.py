@@ -11,13 +11,13 @@ import pyarrow.compute as pc
 from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import NO_CRASH, WAS_AHEAD, Trajectory, empty_trajectory, follow, state_of, take_over
-from harness.families.cut_in.replay import StoredPaths, leave_stored, stored_paths
+from harness.families.cut_in.replay import StoredPaths, leave_stored
 from harness.resolved import Resolved
 from harness.vehicles.kinematics import STEP_S
 from harness.vehicles.references import reaction_steps
 from harness.vehicles.sideways import onset_of
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, PASSED, RUNNING, TIMEOUT, Record, RecordArray
-from studies.alarm import approach, approach_cut_in
+from studies.alarm import approach, approach_cut_in, stored_paths
 
 RETRACED_DTYPE = np.dtype(
     [(name, np.int64) for name in ("outcome", "n_steps")]

@@ -8,7 +8,6 @@ import pytest
 from harness.compiled import unboxed
 from harness.families.cut_in.loading import load_environment
 from harness.families.cut_in.path import empty_trajectory
-from harness.families.cut_in.replay import stored_paths
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
@@ -16,7 +15,7 @@ from harness.vehicles.drivers import Followers
 from harness.vehicles.library import load_library
 from harness.vocabulary import CONTACT, CRASH, STATE_DTYPE, TIMEOUT
 from harness.worlds.twin import TwinWorld
-from studies.alarm import replay_surrogates
+from studies.alarm import replay_surrogates, stored_paths
 from tests.episode.test_lateral import BESIDE, at_once, beside
 from tests.retracing import retraced
 from tests.worlds.running import smoke

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 
 from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.families.cut_in.events import Maneuvers
@@ -27,24 +26,17 @@ from harness.families.cut_in.path import (
 )
 from harness.families.cut_in.script import facts_of, maneuvers_of, states_of
 from harness.families.protocol import Chosen, Driven
-from harness.records.schemas import padded
 from harness.vehicles.sideways import onset_of
 from harness.vocabulary import (
     ACCELERATIONS_MPS2,
     AV,
     CUT_IN,
-    STATE_COLUMNS,
     BoolArray,
     FloatArray,
     IntArray,
     RecordArray,
     states_from,
 )
-
-PATH_COLUMNS = ("episode", *STATE_COLUMNS, "n_steps", "cut_in_step", "lv_maneuvers", "bv_maneuvers")
-"""What of the episodes table determines LV's and BV's motion."""
-LEAD = "lead_steps"
-"""And since when BV shows what it will do, where cut-ins take time."""
 
 
 class StoredPaths(NamedTuple):
@@ -60,25 +52,6 @@ class StoredPaths(NamedTuple):
     n_steps: IntArray
     cut_step: IntArray
     script: Maneuvers
-
-
-def stored_paths(episodes: pa.Table, seed: int) -> StoredPaths:
-    """Initial states and maneuvers of rows of the episodes table; needs `PATH_COLUMNS`."""
-    n = int(episodes.num_rows)
-    lead = _whole(episodes, LEAD, 0) if LEAD in episodes.column_names else np.zeros(n, np.int64)
-    (lv, n_lv), (bv, n_bv) = (padded(episodes.column(name)) for name in ("lv_maneuvers", "bv_maneuvers"))
-    return StoredPaths(
-        seed,
-        np.asarray(episodes.column("episode")).astype(np.int64),
-        states_from(np.asarray(episodes.column(name)) for name in STATE_COLUMNS),
-        _whole(episodes, "n_steps", 0),
-        _whole(episodes, "cut_in_step", -1),
-        Maneuvers(lv, bv, n_lv, n_bv, lead),
-    )
-
-
-def _whole(episodes: pa.Table, name: str, null: int) -> IntArray:
-    return np.asarray(episodes.column(name).fill_null(null)).astype(np.int64)
 
 
 @compiled_inline
