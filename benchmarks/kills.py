@@ -220,7 +220,7 @@ def struck_command(name: str, folder: Path, run: Path, chance: random.Random, ki
                 break
         if cache:
             shutil.copytree(folder / side / "cache" / "pools", work / "pools")
-        wrong += [str(path) for path in temporary.iterdir()]
+        wrong += [str(path) for path in temporary.iterdir() if path.name[:5] != "pymp-"]  # multiprocessing's own
     of_time = ("manifest.json", "report.html") if name == "compare" else ()
     return wrong + differing_files(folder / "undisturbed" / "work", folder / "killed" / "work", of_time)
 

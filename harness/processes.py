@@ -18,6 +18,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -25,8 +26,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from io import TextIOWrapper
-from multiprocessing import Pipe, forkserver, get_context, parent_process
+from multiprocessing import Pipe, forkserver, parent_process
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import FrameType, ModuleType
@@ -44,8 +46,9 @@ CLOSED_PIPE_EXIT_CODE = 76
 """Exit code of a process whose controller has closed its pipe."""
 PRINTED_BYTES = 65_536
 """Of what a process prints first, and of what it prints last, that is passed on."""
+_ATTEMPTS = 3
 _LOOK_S, _DYING_S = 0.5, 1.0
-"""Time between two looks for the end of what prints, and how long a process may take to end once its pipe has."""
+"""Time between two looks, and how long a process may take to end once its pipe has."""
 _LEFT_TO_US = (signal.SIG_DFL, signal.default_int_handler)
 """How Python begins: nobody else has asked for the signal."""
 _PRELOADED = "harness.runner.preloaded"
@@ -201,12 +204,8 @@ class Child:
         self.connection, theirs = Pipe()
         self._printed, self._episode, self._answer = Printed(), None, None  # type: Printed, int | None, Any
         work = theirs, self._printed.pipe, dict(os.environ), target, arguments
-        self._process = get_context("forkserver").Process(target=_begin, args=work)
         with theirs, self._printed.pipe, _server():  # or its death would not end the pipes
-            try:
-                self._process.start()
-            except EOFError as error:
-                raise ChildProcessError("the process that starts workers has ended") from error
+            self._process = _started(work)
         atexit.register(self.kill)
 
     @property
@@ -302,6 +301,16 @@ def _server() -> Iterator[None]:
         yield
     finally:
         sys.modules["__main__"] = main
+
+
+def _started(work: tuple[Any, ...]) -> ForkServerProcess:
+    for _ in range(_ATTEMPTS):
+        process = ForkServerProcess(target=_begin, args=work)
+        with suppress(EOFError, OSError):  # the server was killed: the next attempt starts another
+            process.start()
+            return process
+        time.sleep(_LOOK_S)  # until it is gone
+    raise ChildProcessError("the process that starts workers ended again and again")
 
 
 def _begin(

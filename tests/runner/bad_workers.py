@@ -24,6 +24,11 @@ def disobedient(connection, resolved, baseline) -> None:
     connection.recv()
 
 
+def answering(connection) -> None:
+    """Says who it is."""
+    connection.send(os.getpid())
+
+
 def abandoned(connection, note) -> None:
     """Starts a program, another in a session of its own, and writes down who they are; then it is busy."""
     helpers = [subprocess.Popen(["/bin/sleep", "600"], start_new_session=apart).pid for apart in (False, True)]

@@ -7,15 +7,18 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
 
+from harness.processes import Child, first_to_answer, start_server
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner import workers
 from tests.golden.campaigns import BASE, IN_BOTH_WORLDS
 from tests.in_process import run_here, run_with_workers, workers_alive
+from tests.runner import bad_workers
 from tests.stored_runs import MORE, ROOT, golden, manifest, part_files, sets, stored_table, unlike_columns
 
 PATIENCE_S, POLL_S = 300.0, 0.01
@@ -188,6 +191,16 @@ def test_a_busy_worker_does_not_outlive_a_killed_parent_nor_does_what_it_has_sta
     assert finished(process) == (-signal.SIGKILL, "")
     for pid in map(int, (tmp_path / "pids.done").read_text().split()):
         wait_until_gone(Path(f"/proc/{pid}/stat"))
+
+
+def test_workers_begin_where_the_process_was_killed_that_they_are_copies_of():
+    for delay_s in (0.0, 0.3, 0.0):
+        start_server()
+        time.sleep(delay_s)
+        os.kill(forkserver._forkserver._forkserver_pid, signal.SIGKILL)
+        child = Child(bad_workers.answering)
+        assert first_to_answer([child]).answer() == child._process.pid
+        child.kill()
 
 
 def wait_until_gone(state: Path) -> None:
