@@ -34,6 +34,7 @@ from harness.numbers import (
     two_digits_up,
     words,
 )
+from harness.report.notes import note_words
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
 CUT_OFF_SHARE = 0.2
@@ -256,7 +257,7 @@ def within(found: Mapping[str, Any]) -> Row:
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[str]:
     """What changes the meaning of the rows, a line each."""
     best, severity, assumed = told.best, told.severity, told.assumed
-    yield from best.cautions
+    yield from map(note_words, best.cautions)
     repeated = manifest.get("repeated") or {}
     if n := len(repeated.get("differing", ())):
         yield f"NOT REPRODUCIBLE: {count(n)} of {count(repeated['n_episodes'])} tests that ran twice came out otherwise"
@@ -434,7 +435,7 @@ def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
         if n := of["details"]["n_failed"]:
             yield f"{count(n)} tests of {name} FAILED"
     for name, of in sides.items():
-        yield from (f"{name}: {text}" for text in of["warnings"])
+        yield from (f"{name}: {note_words(each)}" for each in of["warnings"])
     if where := content.get("unseen"):
         yield unseen_words(where)
 
