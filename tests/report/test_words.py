@@ -12,8 +12,9 @@ from harness.campaign.files import load_campaign
 from harness.estimators.answer import estimate_blocks
 from harness.records.folder import read_manifest
 from harness.report.lines import LINES, WIDTH, lines, pair_lines
+from harness.report.pair_words import deciding_words
 from harness.report.summary import read_run_folder
-from harness.report.words import _whence, answer_of, deciding_words, remedy_words, short_answer, vehicle_words
+from harness.report.words import _whence, answer_of, remedy_words, short_answer, vehicle_words
 from harness.runner.stored import stored_blocks
 from tests.golden.campaigns import BASE, RUNS
 from tests.stored_runs import answer_in, estimates, golden
