@@ -23,6 +23,7 @@ from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooMany
 from harness.numbers import interval, words
 from harness.progress import Progress
 from harness.report.lines import lines
+from harness.report.notes import note_words
 from harness.report.words import answer_of
 from harness.runner.stored import estimate_run
 from harness.vehicles.library import OF_TRAFFIC
@@ -224,7 +225,9 @@ def test_estimate_prints_a_table_and_closes_with_what_was_asked(stored_run, caps
     row = next(line for line in out.splitlines() if "mixture_cv *" in line)
     shown = words(found["crash_rate"], 4), interval(found["ci_low"], found["ci_high"])
     assert [text for text in shown if text not in row] == []
-    assert [text for text in (f"mixture_cv: {found['warnings'][0]}", f"nde: {reason}") if text not in out] == []
+    assert [
+        text for text in (f"mixture_cv: {note_words(found['warnings'][0])}", f"nde: {reason}") if text not in out
+    ] == []
     assert main(command) == EXIT_BAD_INPUT  # these records do not allow it
     out = capsys.readouterr().out
     assert out.splitlines()[-1] == f"nde: {reason}"

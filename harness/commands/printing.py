@@ -113,6 +113,8 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
     """Print the estimators of ``estimates.json`` that are asked for as a table, with warnings and reasons below."""
+    from harness.report.notes import note_words  # noqa: PLC0415 - keeps --help fast
+
     shown = {name: entry for name, entry in content["estimates"].items() if name in asked}
     rows = [
         {
@@ -127,7 +129,7 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
     ]
     print_table(f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests", rows)
     for name, entry in shown.items():
-        for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("reason")])]:
+        for remark in [*map(note_words, entry.get("warnings", ())), *filter(None, [entry.get("reason")])]:
             say(f"{name}: {remark}")
     if shells := shown.get("shells", {}).get("details", {}).get("shells"):
         names = ("shell", "inside", "p", "n_episodes", "n_crashes", "contribution")

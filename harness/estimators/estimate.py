@@ -25,6 +25,19 @@ it noticeably."""
 
 
 @dataclass(frozen=True)
+class Note:
+    """Something that a reader must know: its kind, by a ``key`` of `harness.report.notes`, and the numbers in it."""
+
+    key: str
+    numbers: dict[str, Any] = field(default_factory=dict)
+
+
+def note(key: str, **numbers: Any) -> Note:
+    """A note of some kind."""
+    return Note(key, numbers)
+
+
+@dataclass(frozen=True)
 class Estimate:
     """A crash rate per test, how sure it is, and what a reader must know to trust it.
 
@@ -51,8 +64,8 @@ class Estimate:
     largest_weight_share: Number
     method: str
     weight_cap: Number = math.inf
-    warnings: tuple[str, ...] = ()
-    cautions: tuple[str, ...] = ()
+    warnings: tuple[Note, ...] = ()
+    cautions: tuple[Note, ...] = ()
     details: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -146,15 +159,11 @@ class FailureBounds:
         if not self._n_failed:
             return seen
         high = max(seen.ci_high, worst.ci_high)
-        warning = (
-            f"{self._n_failed} of {seen.n_episodes} episodes failed; the rate and the lower limit count them as no "
-            "crash, the upper limits as crashes"
-        )
         return replace(
             seen,
             ci_high=high,
             upper_bound=max(seen.upper_bound, worst.upper_bound),
             rhw=(high - seen.ci_low) / 2.0 / seen.crash_rate if seen.crash_rate > 0.0 else math.inf,
             weight_cap=max(seen.weight_cap, worst.weight_cap),
-            warnings=(*seen.warnings, warning),
+            warnings=(*seen.warnings, note("failed", n=self._n_failed, of=seen.n_episodes)),
         )

@@ -31,16 +31,11 @@ import numpy as np
 from numba.extending import get_cython_function_address
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-from harness.estimators.estimate import Estimate
+from harness.estimators.estimate import Estimate, Note, note
 from harness.estimators.weighted import FEW_FOR_RESIDUALS, Nade
 from harness.processes import side_by_side
 from harness.vocabulary import FloatArray
 
-WARNING = (
-    "this interval is known to be too narrow; use nade's (docs/scv-defect.md). The published variance is not that of "
-    "this estimator: columns centred by their sample means leave the estimate equal to nade's, and var(Z) leaves out "
-    "the error of those means"
-)
 MOST_NAMED = 12
 MAX_COLUMNS = 729
 """Most columns of one stratum: J = 3 reaches 2^9 = 512, J = 4 3^6 = 729 at six steps, and uses no more steps then."""
@@ -91,10 +86,7 @@ class MixtureCv(Nade):
         plain, warnings = y.std_error(n), []
         if self.n_crashes and y.n_effective < FEW_FOR_RESIDUALS and residual < plain:
             std_error, third_moment = plain, y.third_moment(n)
-            warnings.append(
-                f"fewer than {FEW_FOR_RESIDUALS:.0f} effective crashes: the interval is as wide as that of the plain "
-                "mean of weighted crashes"
-            )
+            warnings.append(note("plain_width", least=FEW_FOR_RESIDUALS))
         return self.estimate(
             float(coefficients[0]),
             std_error,
@@ -171,7 +163,7 @@ class Scv(Nade):
             None,
             confidence,
             method="sparse control variates as published (Algorithm 1)",
-            cautions=[WARNING],
+            cautions=[note("published_scv")],
             warnings=_overfitted(gain),
             details={
                 "var_z": var_z,
@@ -255,17 +247,13 @@ def _ratio(before: float, after: float) -> float | None:
     return before / after if before > 0.0 and after > 0.0 else None
 
 
-def _overfitted(gain: Mapping[str, Any]) -> list[str]:
+def _overfitted(gain: Mapping[str, Any]) -> list[Note]:
     """Warn of strata in which a gain is claimed whatever the results are."""
     if not (saturated := gain["saturated"]):
         return []
-    shown = ", ".join(map(str, saturated[:MOST_NAMED])) + ", …" * (len(saturated) > MOST_NAMED)
-    claimed, corrected = (gain[key] or math.nan for key in ("claimed", "degrees_of_freedom"))
-    return [
-        f"{len(saturated)} of {len(gain['strata'])} strata are saturated (l = {shown}): with as many independent "
-        f"columns as tests, less one, any results are fitted. The gain claimed in all is {claimed:.3g}, and "
-        f"{corrected:.3g} with degrees of freedom"
-    ]
+    levels = [*saturated[:MOST_NAMED], *["…"] * (len(saturated) > MOST_NAMED)]
+    gains = {"claimed": gain["claimed"], "corrected": gain["degrees_of_freedom"]}
+    return [note("saturated", n=len(saturated), of=len(gain["strata"]), levels=levels, **gains)]
 
 
 class Stratum:

@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate, Number
+from harness.estimators.estimate import Estimate, Note, Number, note
 from harness.estimators.likelihood import CRASH, Counts, Level, likelihood_limit, ratio_limits
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.tally import (
@@ -42,7 +42,7 @@ from harness.estimators.tally import (
     paths_that_count,
     pool_variance,
 )
-from harness.numbers import share, two_digits_up
+from harness.numbers import two_digits_up
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vocabulary import BoolArray, FloatArray
 
@@ -343,14 +343,12 @@ class SeenShells:
             self._known[n_strata, level] = found
         return self._known[n_strata, level]
 
-    def _cautions(self) -> list[str]:
-        if (n := paths_that_count(self._design.p, self.tally)) >= FEWEST_PATHS:
+    def _cautions(self) -> list[Note]:
+        n_paths, n = self._design.n_paths, paths_that_count(self._design.p, self.tally)
+        if n >= FEWEST_PATHS:
             return []
-        return [
-            f"no interval: nearly all crashes lie on some {max(n, 1.0):.0f} of the {self._design.n_paths:,} paths that "
-            f"the vehicle was driven along, and {FEWEST_PATHS:.0f} are needed; raise pool.shadow_paths, to some "
-            f"{two_digits_up(self._design.n_paths * FEWEST_PATHS / max(n, 1.0)):,} or more, and run into a new folder"
-        ]
+        needed = two_digits_up(n_paths * FEWEST_PATHS / max(n, 1.0))
+        return [note("few_paths", n=max(n, 1.0), of=n_paths, least=FEWEST_PATHS, needed=needed)]
 
     def within(self, confidence: float) -> Within:
         """What holds of a vehicle that crashes only inside the boundary."""
@@ -401,23 +399,19 @@ class SeenShells:
             for s, name in enumerate(design.strata)
         )
 
-    def _warnings(self, tally: Tally, confidence: float) -> list[str]:
+    def _warnings(self, tally: Tally, confidence: float) -> list[Note]:
         design, found = self._design, []
-        if empty := ", ".join(name for name, n in zip(design.strata, tally.tests, strict=True) if n == 0):
-            found.append(f"no test in {empty}: the interval allows for any share of crashes there")
+        if empty := [name for name, n in zip(design.strata, tally.tests, strict=True) if n == 0]:
+            found.append(note("untested", shells=empty))
         kept = zip(design.strata, tally.tests, design.available, strict=False)
         free = self._limits(design.p.size, Level.two_sided(confidence))
         if design.shadow_runs and tally.crashes.any() and free.low <= 0.0 and free.from_pool < math.inf:
-            found.append(
-                f"the lower limit is 0 in spite of {int(tally.crashes.sum()):,} crashes: {design.n_paths:,} baseline "
-                f"runs alone leave ±{share(free.from_pool_relative()[0])} of the rate, as far as these can tell"
-            )
-        if used_up := ", ".join(name for name, n, available in kept if n >= available > 0):
-            found.append(f"all cut-ins that the pool has kept of {used_up} were tested")
+            n, alone = int(tally.crashes.sum()), free.from_pool_relative()[0]
+            found.append(note("runs_leave_nothing", n=n, runs=design.n_paths, alone=alone))
+        if used_up := [name for name, n, available in kept if n >= available > 0]:
+            found.append(note("used_up", shells=used_up))
         if crashes := int(tally.crashes[design.n_inside :].sum()):
-            found.append(
-                f"{crashes:,} crashes beyond {design.boundary}: statement library does not hold for this vehicle"
-            )
+            found.append(note("refuted", n=crashes, boundary=design.boundary))
         return found
 
 

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate
+from harness.estimators.estimate import Estimate, Note, note
 from harness.estimators.limits import capped_mean_upper, clopper_pearson, skewed_distances
-from harness.numbers import number
 from harness.vocabulary import FloatArray
 
 FEW_CRASHES = 50
@@ -31,8 +30,6 @@ single test could double the rate. Default IDM under forced cut-ins, nominal 0.9
 (500 and 2,000 tests) intervals cover 0.73 and 0.87, where nearly all are below (25,000) 0.91 (docs/estimators.md)."""
 LARGEST_LOG = 700.0
 """Of a number that is still one, and not infinite."""
-MAY_BE_ABOVE = "the true rate may lie far above this interval"
-UNBOUNDED = f"{MAY_BE_ABOVE}: the weights of these tests are unbounded"
 
 
 @dataclass(frozen=True)
@@ -159,37 +156,32 @@ class Nade:
         """Whether there are enough crashes for limits from moments to mean what they say."""
         return self.n_crashes >= FEW_CRASHES and self.y.n_effective >= FEW_EFFECTIVE
 
-    def cautions(self) -> list[str]:
+    def cautions(self) -> list[Note]:
         """Why an interval around a mean of these Y may be wrong."""
         found = []
         if math.isfinite(self._design_cap) and self._largest_y > self._design_cap * (1.0 + 1e-9):
-            found.append(
-                f"the records contradict the campaign: a crash weighs {self._largest_y:.6g}, more than the design's "
-                f"{self._design_cap:.6g}"
+            found.append(note("contradicts_design", weight=self._largest_y, cap=self._design_cap))
+        cap = self.known_cap()
+        if not math.isfinite(cap):
+            found.append(note("unbounded"))
+        elif self.n_crashes and (times := cap / self.y.total) > OVERTURNS:
+            more = (
+                note("one_may_weigh", cap=cap, seen=self.y.total) if cap > 1.0 else note("one_more_adds", times=times)
             )
-        if not math.isfinite(self.known_cap()):
-            found.append(UNBOUNDED)
-        elif self.n_crashes and (times := self.known_cap() / self.y.total) > OVERTURNS:
-            more = f"one more crash might add {number(times)} times it"
-            if (cap := self.known_cap()) > 1.0:
-                more = f"a crash may weigh {number(cap)}, and all that were seen together weigh {number(self.y.total)}"
-            found.append(f"{MAY_BE_ABOVE}: {more}")
+            found.append(more)
         return found
 
-    def warnings(self, half_width: float) -> list[str]:
+    def warnings(self, half_width: float) -> list[Note]:
         """What else a reader of a mean of these Y should know, beside an interval of this half-width."""
         found, effective, cap = count_warnings(self.n_crashes), self.y.n_effective, self.known_cap()
         if 0.0 < effective < FEW_EFFECTIVE:
-            found.append(f"effective sample size {effective:.3g} is below 30: few weights carry the estimate")
+            found.append(note("few_effective", n=effective, least=FEW_EFFECTIVE))
         if self.largest_share() > LARGE_SHARE:
-            found.append(f"one crash carries {self.largest_share():.0%} of the estimate")
+            found.append(note("one_carries", share=self.largest_share()))
         if not math.isfinite(self._design_cap) and not self.is_settled():
-            found.append(f"the upper bound rests on {self.cap()[1]}, not on a cap guaranteed by design")
+            found.append(note("bound_rests", origin=self.cap()[1]))
         if 0.0 < half_width < cap / self.n <= OVERTURNS * self.y.mean(self.n):  # beyond that there is a caution
-            found.append(
-                f"one more crash of the largest weight that the design allows ({cap:.3g}) would move the estimate by "
-                f"{cap / self.n:.3g}, farther than the interval reaches: only more tests can rule that out"
-            )
+            found.append(note("one_more_moves", cap=cap, by=cap / self.n))
         return found
 
     def result(self, confidence: float) -> Estimate:
@@ -206,8 +198,8 @@ class Nade:
         *,
         method: str,
         details: Mapping[str, Any] | None = None,
-        warnings: Sequence[str] = (),
-        cautions: Sequence[str] = (),
+        warnings: Sequence[Note] = (),
+        cautions: Sequence[Note] = (),
     ) -> Estimate:
         """Estimate with an interval around `rate` that is as skewed as its error, and a one-sided upper bound.
 
@@ -228,7 +220,7 @@ class Nade:
             upper = min(1.0, rate + skewed_distances(std_error, third_moment or 0.0, 1.0 - confidence)[1])
             bound = "the same, one-sided"
         interval = "normal interval" if third_moment is None else "normal interval, widened for skewness (Hall)"
-        negative = () if rate >= 0.0 else ("the rate is negative: too few crashes for control variates, use nade",)
+        negative = () if rate >= 0.0 else (note("negative"),)
         cautions = (*cautions, *negative, *self.cautions())
         return Estimate(
             crash_rate=rate,
@@ -250,11 +242,11 @@ class Nade:
         )
 
 
-def count_warnings(n_crashes: int) -> list[str]:
+def count_warnings(n_crashes: int) -> list[Note]:
     """Warn of too few crashes, which matters to any estimator."""
     if n_crashes >= FEW_CRASHES:
         return []
-    return [f"only {n_crashes} crashes were sampled (below {FEW_CRASHES}): the interval is rough"]
+    return [note("few_crashes", n=n_crashes, least=FEW_CRASHES)]
 
 
 class Nde(Nade):

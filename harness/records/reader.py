@@ -157,7 +157,7 @@ class StoredRun:
 
     @property
     def estimates(self) -> dict[str, Any]:
-        """Content of ``estimates.json``: estimates, the ``answer`` in rows, and the ``severity`` of crashes."""
+        """Content of ``estimates.json``: estimates, and the ``severity`` of crashes."""
         again = f"Make it again with `harness estimate {self.folder} --write`."
         return read_as(dict[str, Any], self.folder / "estimates.json", mend=again)
 

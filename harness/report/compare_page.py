@@ -20,10 +20,11 @@ from harness.records.folder import read_as, write_bytes
 from harness.records.reader import read_traces, stored_columns
 from harness.records.schemas import LEAD, path_columns
 from harness.report.page import sentence
+from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
 from harness.report.player import TRACE_COLUMNS, Scene, Scenes, beside_other, templates
 from harness.report.plots import WHO, pairs_plot
 from harness.report.summary import RunFolder, floats, read_run_folder
-from harness.report.words import deciding_words, pair_asked, pair_warnings, pair_words, short_answer
+from harness.report.words import short_answer
 from harness.runner.stored import replay_episode
 from harness.strata import weight_of_a_test
 from harness.vocabulary import COMPARISON, FloatArray, IntArray

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from harness.numbers import count, duration, interval, number, plain, ratio, share
-from harness.report.words import ENDED, ShortAnswer, deciding_words, pair_asked, pair_warnings, pair_words
+from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
+from harness.report.words import ENDED, ShortAnswer
 
 WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3

@@ -20,6 +20,7 @@ from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.records.reader import table_sizes, traffic_of
 from harness.report.crashes import crash_gallery
 from harness.report.drawing import Plot
+from harness.report.notes import note_words
 from harness.report.player import templates
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
@@ -46,7 +47,7 @@ def write_report(folder: str | Path) -> Path:
     plots = _plots(run, summary, traffic)
     gallery, scenes = crash_gallery(run, summary, traffic)
     environment, answer = templates(), short_answer(run.campaign, run.manifest, run.estimates)
-    environment.filters.update(getmembers(numbers, isfunction), verdict=verdict, sentence=sentence)
+    environment.filters.update(getmembers(numbers, isfunction), verdict=verdict, sentence=sentence, note=note_words)
     page = environment.get_template("report.html.j2").render(
         run=run,
         answer=answer,

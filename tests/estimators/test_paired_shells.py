@@ -19,7 +19,7 @@ from harness.estimators.pairs import (
     no_pairs,
     paired_estimate,
 )
-from harness.report.words import pair_warnings, pair_words
+from harness.report.pair_words import pair_warnings, pair_words
 from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import SHELLS, in_shells
 

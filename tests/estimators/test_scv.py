@@ -17,6 +17,7 @@ from harness.estimators.scv import (
     steps_used,
 )
 from harness.estimators.weighted import Nade
+from harness.report.notes import note_words
 from studies.chains.chain import DECISIVE, PANEL, overtaking
 from studies.chains.sampler import blocks, draw
 from tests.chains.seed import SEED
@@ -202,7 +203,7 @@ def test_saturated_strata_are_warned_of_and_deficient_ones_named():
     gain = estimate.details["gain"]
     expected = [s["n_control_steps"] for s in estimate.details["strata"] if 0 < s["rank"] >= s["n"] - 1]
     assert gain["saturated"] == expected != []
-    assert any("saturated (l = " in warning for warning in estimate.warnings)
+    assert any("saturated (l = " in note_words(warning) for warning in estimate.warnings)
     short = [s for s in estimate.details["strata"] if s["rank"] < min(s["columns"], s["n"] - 1)]
     assert gain["rank_deficient"] == [s["n_control_steps"] for s in short]
     assert gain["claimed"] == pytest.approx(estimate.details["var_y"] / estimate.details["var_z"], rel=1e-9)

@@ -12,6 +12,7 @@ from scipy.stats import binom, binomtest
 from harness.estimators.likelihood import Level
 from harness.estimators.limits import _hall, capped_mean_upper, clopper_pearson, skewed_distances
 from harness.estimators.weighted import Moments, Nade
+from harness.report.notes import note_words
 from tests.estimators.small_blocks import block, fed
 
 
@@ -48,9 +49,9 @@ def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
     assert driven.cap()[0] == pytest.approx(2e-3)
     assert mixed.cap()[0] == pytest.approx(2e-3 / 0.1)  # over the defensive share
     assert seen.cap()[0] == pytest.approx(math.exp(-7.0))
-    assert not any("upper bound rests" in w for w in known.result(0.9).warnings)
+    assert not any("upper bound rests" in note_words(w) for w in known.result(0.9).warnings)
     for unknown in (driven, seen):
-        assert any("upper bound rests" in w for w in unknown.result(0.9).warnings)
+        assert any("upper bound rests" in note_words(w) for w in unknown.result(0.9).warnings)
         assert unknown.cap()[1] in unknown.result(0.9).method
 
 
@@ -66,7 +67,7 @@ def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
 def test_what_a_user_must_be_told(weights, cap, told):
     method = "step_mixture" if cap is None else "forced"
     estimate = nade(block([True] * len(weights), weights, method=method, weight_cap=cap)).result(0.9)
-    assert all(any(part in warning for warning in estimate.warnings) for part in told)
+    assert all(any(part in note_words(warning) for warning in estimate.warnings) for part in told)
     assert bool(estimate.warnings) == bool(told)
     assert list(estimate.warnings[: len(estimate.cautions)]) == list(estimate.cautions)
     assert (estimate.precision == math.inf) == (cap != 1.0)
@@ -87,7 +88,7 @@ def test_a_step_mixture_has_the_cap_that_its_share_of_natural_driving_gives(epsi
     some = block([True] * n, [log_weight] * n, epsilon=epsilon, n_steps=np.array([20] * (n - 1) + [200]))
     found = nade(some).result(0.9)
     assert found.weight_cap == pytest.approx(cap)
-    assert [each.partition(": ")[2] for each in found.cautions] == [told] * bool(told)
+    assert [note_words(each).partition(": ")[2] for each in found.cautions] == [told] * bool(told)
 
 
 # -- running moments: exact, whatever the blocks, and of the zeros that were never added --

@@ -29,8 +29,10 @@ GOLDEN = Path(__file__).parent / "golden.json"
 TABLES = {"episodes": ["episode"], "moments": ["episode", "step"], "traces": ["episode", "step"], "shadow": ["shadow"]}
 """By what each is sorted; vehicles of a step keep their order."""
 LEFT_OUT = {"diagnostics.alarm", "severity", "crc32", "traffic", "estimates.scv.details.gain"}
+NOTES = {"warnings", "cautions"}
 """Of estimates.json: what features of earlier and later days wrote; its checksum, which is of words, too; and what few
-degrees of freedom leave of a variance, which rounding shows in (tests/estimators/test_scv.py has it)."""
+degrees of freedom leave of a variance, which rounding shows in (tests/estimators/test_scv.py has it). Notes repeat
+numbers that are compared."""
 WORDLESS_TYPES = bool, int, float, type(None)
 
 
@@ -86,7 +88,7 @@ def numbers_of(content: Any, path: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in items:
         here = f"{path}.{key}" if path else str(key)
-        if here in LEFT_OUT:
+        if here in LEFT_OUT or key in NOTES:
             continue
         if isinstance(value, dict | list):
             found |= numbers_of(value, here)

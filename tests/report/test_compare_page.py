@@ -13,9 +13,9 @@ from harness.cli import main
 from harness.errors import RunFolderError
 from harness.numbers import interval, number, ratio
 from harness.report.compare_page import crashing_pairs, write_comparison
+from harness.report.pair_words import deciding_words
 from harness.report.plots import WHO
 from harness.report.summary import read_run_folder
-from harness.report.words import deciding_words
 from tests.golden.campaigns import SHELLS
 from tests.golden.record import load
 from tests.in_process import controllers_here, one_process, without_page

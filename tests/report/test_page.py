@@ -94,7 +94,16 @@ def test_hostile_texts_are_escaped_and_no_formula(folders, tmp_path):
     (folder / "campaign.yaml").write_text(described)
     path = folder / "estimates.json"
     estimates = edit(path, campaign=hostile, headline=hostile)["estimates"]
-    edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": [hostile]}})
+    edit(
+        path,
+        estimates=estimates
+        | {
+            hostile: {
+                **estimates["nade"],
+                "warnings": [{"key": hostile}, {"key": "untested", "numbers": {"shells": [hostile]}}],
+            }
+        },
+    )
     write_report(folder)
     page = Page(folder)
     assert hostile not in page.html

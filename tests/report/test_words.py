@@ -12,8 +12,9 @@ from harness.campaign.files import load_campaign
 from harness.estimators.answer import estimate_blocks
 from harness.records.folder import read_manifest
 from harness.report.lines import LINES, WIDTH, lines, pair_lines
+from harness.report.pair_words import deciding_words
 from harness.report.summary import read_run_folder
-from harness.report.words import _whence, answer_of, deciding_words, remedy_words, short_answer, vehicle_words
+from harness.report.words import _whence, answer_of, remedy_words, short_answer, vehicle_words
 from harness.runner.stored import stored_blocks
 from tests.golden.campaigns import BASE, RUNS
 from tests.stored_runs import answer_in, estimates, golden
@@ -268,7 +269,7 @@ def test_only_what_the_hardest_brakes_do_not_avoid_is_called_unavoidable(driver,
 def test_a_comparison_is_as_short():
     """With what makes it long: names, far limits, warnings, a margin."""
     side = {"crash_rate": 1.4e-7, "ci_low": 1e-10, "ci_high": 2e-7, "n_crashes": 93, "upper_bound": 1e-6}
-    side |= {"warnings": ["w" * 120] * 2, "details": {"n_failed": 0}}
+    side |= {"warnings": [{"key": "w" * 120}] * 2, "details": {"n_failed": 0}}
     inside = {
         "ratio": 138.0, "ratio_low": 0.1, "ratio_high": None, "difference": -2e-7, "ci_low": -3e-7, "ci_high": -1e-7,
         "n_only_a": 31, "n_only_b": 1000, "boundary": "brakes-2-late-1s",

@@ -11,7 +11,7 @@ import pytest
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.records.reader import read_parts
-from harness.report.words import pair_words
+from harness.report.pair_words import pair_words
 from harness.runner.compare import compare_campaigns
 from harness.runner.workers import ShardRunner, Workers
 from tests.in_process import one_process, without_page

@@ -19,7 +19,8 @@ from harness.estimators.traffic import ONE_LAW, uncertain
 from harness.pool import moved
 from harness.pool.moved import assumed
 from harness.progress import Progress
-from harness.report.words import pair_warnings, too_few
+from harness.report.pair_words import pair_warnings
+from harness.report.words import too_few
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns

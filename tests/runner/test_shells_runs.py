@@ -11,6 +11,7 @@ import pytest
 
 from harness import estimate, replay
 from harness.errors import RunFolderError
+from harness.report.notes import note_words
 from harness.runner.kept import Run
 from harness.sampling.allocation import GROWTH, Allocation, first_tests
 from harness.sampling.shells import round_requests
@@ -42,7 +43,7 @@ def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
     assert found["rhw"] > found["details"]["rhw_from_pool"] > 0.05
     scope = answer_in(fresh.folder)["scope"]
     assert re.search(r"; lower pool\.relative_error to 0\.0\d+(?: and [^;]+)?$", scope)
-    assert "pool." not in "".join(found["warnings"])
+    assert "pool." not in "".join(map(note_words, found["warnings"]))
 
 
 SPENT, MORE = "stop.episodes=150", "stop.episodes=400"
