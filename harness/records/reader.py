@@ -36,6 +36,7 @@ from harness.records.folder import (
     read_manifest,
     require_unchanged,
 )
+from harness.records.schemas import traces_schema
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
@@ -191,7 +192,11 @@ class StoredRun:
     @checked("batches")
     def batches(self, name: TableName, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
         """`table` in consecutive pieces, one per part: for what does not fit into memory."""
-        parts = [part for part in read_manifest(self.folder)["parts"] if name in part.files]
+        manifest = read_manifest(self.folder)
+        parts = [part for part in manifest["parts"] if name in part.files]
+        if not parts and name == "traces" and read_campaign(self.folder, manifest).records.traces != "none":
+            yield traces_schema(takes_time=bool(manifest["cut_ins_take_time"])).empty_table()
+            return
         if not parts and name == "episodes":
             raise no_episodes(self.folder)
         if not parts:

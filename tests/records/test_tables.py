@@ -144,18 +144,30 @@ def test_frames_have_all_rows_and_say_what_columns_mean(stored_run):
     assert tests.attrs["unit"]["r1_m"] == "m"
     assert tests.attrs["unit"].keys() == tests.attrs["doc"].keys() == set(tests.columns)
     assert tests.weight.to_numpy() == pytest.approx([math.exp(log_weight) for log_weight in tests.log_weight])
-    assert run.moments().attrs["unit"]["q_sampled"] == "1"
     traces = run.traces()
     assert list(traces.columns) == traces_schema().names
     assert set(traces.vehicle) == {"LV", "BV", "AV"}
     assert len(traces) == 3 * (tests.n_steps + 1).sum()
     some = run.episodes(["outcome"])
     assert list(some.columns) == list(some.attrs["unit"]) == ["outcome", "weight"]
-    assert list(run.moments(["p", "episode"]).columns) == ["p", "episode"]
     assert list(run.traces(["v_mps"]).columns) == ["v_mps"]
+
+
+def test_frames_of_moments_are_of_methods_that_draw_in_the_loop(stored_run):
+    run = harness.read(stored_run("mixture-twin"))
+    assert run.moments().attrs["unit"]["q_sampled"] == "1"
+    assert list(run.moments(["p", "episode"]).columns) == ["p", "episode"]
     with pytest.raises(RunFolderError, match="no column 'weight' in moments"):
         run.moments(["weight"])
-    assert list(harness.read(stored_run("mixture-twin")).moments().columns) == moments_schema(STATE_FACTS, 3).names
+    assert list(run.moments().columns) == moments_schema(STATE_FACTS, 3).names
+
+
+def test_traces_of_a_run_without_crashes_are_an_empty_table(tmp_path):
+    campaign = golden(
+        "forced-twin", "stop.episodes=20", "run.shard_size=20", "records.traces=crash", "av={model: r157-cc}"
+    )
+    run_here(campaign, tmp_path / "run")
+    assert list(harness.read(tmp_path / "run").traces().columns) == traces_schema().names
 
 
 @pytest.mark.parametrize("name", ["mixture-twin", "shells-twin"])
@@ -172,9 +184,8 @@ def test_what_is_not_there_is_one_error(stored_run, tmp_path):
     folder = copy_of(stored_run("mixture-twin"), tmp_path / "run")
     run, parts = harness.read(folder), manifest(folder)["parts"]
     edit(folder, parts=[{**part, "files": {"episodes": part["files"]["episodes"]}} for part in parts])
-    for table in (run.moments, run.traces):
-        with pytest.raises(RunFolderError, match=f"no {table.__name__}.*records.{table.__name__}=all"):
-            table()
+    with pytest.raises(RunFolderError, match="no moments.*records.moments=all"):
+        run.moments()
     with pytest.raises(RunFolderError, match="no column 'nothing' in episodes"):
         run.episodes(["nothing"])
     with pytest.raises(RunFolderError, match="no run folder"):
