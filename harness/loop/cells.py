@@ -95,9 +95,9 @@ class Cells(NamedTuple):
     """The K running tests, of V vehicles each, the AV last.
 
     ``cell`` (K,) are `CELL_DTYPE` records. ``speed`` (K, V) and ``lane`` (K, V) are the commands for the coming step,
-    ``lane_before`` (K, V) the lanes before it, ``acceleration`` (K,) the AV's. ``trace`` (K, steps + 1, V, 3: x, v,
-    lane) is (K, 1, V, 3) when not kept. ``placed`` (K,) begins with the cells that have been refilled for the coming
-    step, ``ended`` and ``ended_row`` (K,) with those whose test has ended, and its row.
+    ``lane_before`` (K, V) the lanes before it, ``acceleration`` (K,) the AV's. ``trace`` (K, steps + 1, V, 4: x, v,
+    acceleration, lane) is (K, 1, V, 4) when not kept. ``placed`` (K,) begins with the cells that have been refilled for
+    the coming step, ``ended`` and ``ended_row`` (K,) with those whose test has ended, and its row.
     """
 
     cell: RecordArray
@@ -116,7 +116,7 @@ def idle_cells(n_cells: int, n_vehicles: int, max_steps: int, *, keep_traces: bo
     cell = np.zeros(n_cells, CELL_DTYPE)
     cell["row"] = -1
     lane, lane_before = np.zeros((2, n_cells, n_vehicles), np.int8)
-    trace = np.full((n_cells, max_steps + 1 if keep_traces else 1, n_vehicles, 3), math.nan)
+    trace = np.full((n_cells, max_steps + 1 if keep_traces else 1, n_vehicles, 4), math.nan)
     placed, ended, ended_row = np.zeros((3, n_cells), np.int64)
     speed = np.zeros((n_cells, n_vehicles))
     return Cells(cell, np.zeros(n_cells), speed, lane, lane_before, trace, placed, ended, ended_row)

@@ -149,4 +149,6 @@ def command(kernel: KernelState) -> None:
         if kernel.keep_traces:
             for vehicle in range(av + 1):
                 here = cells.trace[k, cells.cell[k].step, vehicle]
-                here[0], here[1], here[2] = x[k, vehicle], v[k, vehicle], cells.lane_before[k, vehicle]
+                here[0], here[1], here[3] = x[k, vehicle], v[k, vehicle], cells.lane_before[k, vehicle]
+                here[2] = (cells.speed[k, vehicle] - v[k, vehicle]) / STEP_S
+            cells.trace[k, cells.cell[k].step, av, 2] = cells.acceleration[k]

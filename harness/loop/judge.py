@@ -141,7 +141,8 @@ def end_test(k: int, outcome: int, n: int, kernel: KernelState) -> None:
     if kernel.keep_traces:
         for vehicle in range(av + 1):
             here = cells.trace[k, cell.step, vehicle]
-            here[0], here[1], here[2] = kernel.x[k, vehicle], v[k, vehicle], cells.lane[k, vehicle]
+            here[0], here[1], here[2] = kernel.x[k, vehicle], v[k, vehicle], math.nan
+            here[3] = cells.lane[k, vehicle]
     cells.ended[n], cells.ended_row[n] = k, cell.row
     cell.row = -1
 

@@ -16,6 +16,7 @@ from harness.loop.cells import EPISODE_DTYPE, KernelState, PrescribedEvents, idl
 from harness.loop.drive import Past, command, drive, empty_observation, first, hold_cruising, observe
 from harness.loop.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
 from harness.loop.repeat import Traffic, refill
+from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
 from harness.worlds import AVLostError, World
 
@@ -70,7 +71,7 @@ class Shard:
 
     ``episode`` (n,) are their results, `harness.loop.cells.EPISODE_DTYPE`; ``traffic`` is what the others did, and
     ``events`` are those of the pool that were prescribed, if any were. ``traces`` maps a test's row to its
-    (steps + 1, V, 3: x, v, lane) motion, ``failures`` to the cause.
+    (steps + 1, V, 4: x, v, a, lane) motion, ``failures`` to the cause.
     """
 
     first_episode: int
@@ -256,7 +257,9 @@ class EpisodeLoop:
         for k, row in self._ended(n):
             episode = shard.episode[row]
             if shard.traced[row] or self._keep.wants(int(episode["outcome"]), int(episode["n_control_steps"])):
-                shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
+                trace = shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
+                if self._world.drives_av:  # nobody commanded what the AV did: its speeds say it
+                    trace[:-1, -1, 2] = np.diff(trace[:, -1, 1]) / STEP_S
 
 
 def _disagreement(cell: np.void, contact: bool) -> WorldDisagreementError:

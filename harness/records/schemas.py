@@ -6,7 +6,6 @@ first, then the surrogates; for the others the surrogates alone. Values are from
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any, NamedTuple
@@ -16,7 +15,6 @@ import pyarrow as pa
 
 from harness.families.protocol import Chosen, Column, Family
 from harness.loop.loop import Shard
-from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, OUTCOMES, FloatArray, Int8Array, IntArray, RecordArray
 
 _F8, _I1, _I2, _I8 = pa.float64(), pa.int8(), pa.int16(), pa.int64()
@@ -137,7 +135,7 @@ def traces_schema(*, takes_time: bool = False) -> pa.Schema:
             _field("lane", _I1, "1", "0 right, 1 left"),
             _field("x_m", _F8, "m", "position of the front bumper along the road"),
             _field("v_mps", _F8, "m/s", "speed"),
-            _or_null("a_mps2", _F8, "m/s2", "acceleration in the next step"),
+            _or_null("a_mps2", _F8, "m/s2", "acceleration in the next step: of the AV what was commanded"),
             *([_field("lateral_m", _F8, "m", over)] if takes_time else ()),
         ]
     )
@@ -377,7 +375,7 @@ def traces_table(shard: Shard) -> pa.Table:
     row = np.repeat(rows, n_vehicles * np.array(n_states))
     step = np.repeat(np.concatenate([np.arange(n, dtype=np.int16) for n in n_states]), n_vehicles)
     vehicle = np.tile(np.arange(n_vehicles, dtype=np.int8), sum(n_states))
-    x, v, lane = np.concatenate([shard.traces[each].reshape(-1, 3) for each in rows]).T
+    x, v, a, lane = np.concatenate([shard.traces[each].reshape(-1, 4) for each in rows]).T
     over = _came_over(shard.episode[row], step, scenario.sideways_m)
     columns = {
         "episode": shard.first_episode + row,
@@ -386,15 +384,10 @@ def traces_table(shard: Shard) -> pa.Table:
         "lane": lane.astype(np.int8),
         "x_m": x,
         "v_mps": v,
-        "a_mps2": np.concatenate([_accelerations(shard.traces[each]).ravel() for each in rows]),
+        "a_mps2": np.where(vehicle == n_vehicles - 1, a, np.round(a, 9)),  # the others are told speeds
         "lateral_m": np.where(vehicle == scenario.principal, over, 0.0),
     }
     return _table(schema, columns)
-
-
-def _accelerations(trace: FloatArray) -> FloatArray:
-    """Of a motion (steps + 1, V, 3) in the step after each state, to 1e-9, shape (steps + 1, V); NaN in the last."""
-    return np.round(np.diff(trace[:, :, 1], axis=0, append=math.nan) / STEP_S, 9)
 
 
 def _came_over(episode: RecordArray, state: np.ndarray, distance_m: float) -> FloatArray:

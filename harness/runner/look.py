@@ -394,7 +394,7 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         cut, onset = int(episode["event_step"][row]), int(episode["onset_step"][row])
         if episode["outcome"][row] == FAILED:
             continue
-        commanded = np.diff(trace[:, AV, 1]) / STEP_S
+        commanded = trace[:-1, AV, 2]  # the last row commands nothing
         if early or cut >= 0:
             acted.append(commanded[0 if early else onset + 1 :])
         if cut >= 0:

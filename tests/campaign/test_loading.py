@@ -15,7 +15,6 @@ from harness.campaign.drivers import IDMParameters, Surrogate
 from harness.campaign.files import (
     QUICK,
     SHIPPED_PANEL,
-    SHIPPED_PARAMETERS,
     load_campaign,
     load_panel,
     read_model,
@@ -24,7 +23,7 @@ from harness.campaign.files import (
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT, CampaignError
-from harness.families.cut_in.parameters import EnvironmentParameters
+from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 
 
 @pytest.fixture
@@ -117,7 +116,7 @@ def test_name_is_asked_for_and_explained(tmp_path):
 
 
 def test_parameter_files_are_read_with_the_place_of_every_problem(tmp_path):
-    text = (SHIPPED_PARAMETERS / "ndd-overtaking-1.yaml").read_text()
+    text = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
     text = text.replace("r2_min_m: {value: 20.0,", "r2_min_m: {value: '20',")
     text = text.replace("r2_max_m: {value: 100.0, source: paper}", "r2_max_m: {value: 100.0, sourse: paper}")
     (tmp_path / "mine.yaml").write_text(text)
@@ -151,7 +150,7 @@ def test_how_a_number_is_written_does_not_change_the_hash(load):
 
 def test_files_are_relative_to_the_campaign(load, tmp_path, monkeypatch):
     (tmp_path / "deep").mkdir()
-    shutil.copy(SHIPPED_PARAMETERS / "ndd-overtaking-1.yaml", tmp_path / "deep" / "mine.yaml")
+    shutil.copy(SHIPPED_FOLDER / "ndd-overtaking-1.yaml", tmp_path / "deep" / "mine.yaml")
     monkeypatch.chdir("/")
     ray = "run: {ray: {runtime_env: {working_dir: src, py_modules: [a, 's3://b'], pip: [x]}}}"
     campaign = load("environment: {parameters: deep/mine.yaml}\n" + ray)

@@ -51,7 +51,7 @@ def test_the_av_keeps_its_speed_until_it_may_act_and_acts_then():
     shard = run("forced", n=N, lead_s=1.0, av="sees the onset", traces="all").shard
     acted = 0
     for row, trace in list(shard.traces.items())[:500]:
-        commanded, onset = np.diff(trace[:, AV, 1]), int(shard.episode["onset_step"][row])
+        commanded, onset = trace[:-1, AV, 2], int(shard.episode["onset_step"][row])
         assert (commanded[: onset + 1] == 0.0).all()
         acted += commanded.size > onset + 1 and commanded[onset + 1] != 0.0
     assert acted > 450

@@ -55,7 +55,7 @@ def replayed(state, lv_path, bv_path, hold):
         if outcome is not None:
             break
     else:
-        outcome = STATE_COLUMNS, TIMEOUT
+        outcome = TIMEOUT
     motion.append(list(zip(x, v, [math.nan] * 3, strict=True)))
     return np.array(motion), outcome, cut_step
 
@@ -92,6 +92,7 @@ def test_replay_in_plain_python(method, hold_s):
         motion, outcome, cut_step = replay(done, row, round(hold_s * 10))
         trace = done.shard.traces[row]
         np.testing.assert_array_equal(trace[:, :, :2], motion[:, :, :2])
+        np.testing.assert_array_equal(trace[:, 2, 2], motion[:, 2, 2])
         assert outcome == done.episode["outcome"][row]
         assert cut_step == done.episode["event_step"][row]
         assert len(motion) == done.episode["n_steps"][row] + 1

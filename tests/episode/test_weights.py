@@ -51,7 +51,7 @@ def fully_recorded(done):
     In the others the forced cut-in, which acts in every step, changes the weight in steps that are no control steps.
     """
     before = done.moment["maneuver"] >= CUT_IN
-    steps = np.where(done.cut_in, done.episode["cut_in_step"] + 1, done.episode["n_steps"])
+    steps = np.where(done.cut_in, done.episode["event_step"] + 1, done.episode["n_steps"])
     return np.bincount(done.moment["row"][before], minlength=len(steps)) == steps
 
 

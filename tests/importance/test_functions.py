@@ -34,8 +34,8 @@ steps = st.integers(0, 19).map(lambda second: 10 * second)
 
 def policy_of(challenge, epsilon):
     """Environment and importance functions, at a level where cutting in is not always negligible."""
-    policy = prepared("step_mixture", challenge, level=1e4, surrogates=CHALLENGES[challenge]).policy
-    return policy.environment, policy.importance._replace(epsilon=epsilon)
+    source = prepared("step_mixture", challenge, level=1e4, surrogates=CHALLENGES[challenge])
+    return source.resolved.environment, source.importance._replace(epsilon=epsilon)
 
 
 def recorded(challenge):
@@ -49,7 +49,7 @@ def recorded(challenge):
 
 def held(done, moment):
     """BV's maneuver at a redraw time before the cut-in."""
-    return done.shard.results.bv_path[moment["row"], moment["step"] // 10]
+    return done.shard.traffic.drawn.bv_path[moment["row"], moment["step"] // 10]
 
 
 def require_identities(proposals, epsilon):
@@ -84,16 +84,16 @@ def test_identities_anywhere(challenge, epsilon, situations):
 def test_records_hold_what_was_drawn_from(challenge):
     """p, V_j and q_j of the maneuver taken, recomputed from the recorded state alone: equal in every bit."""
     done, state, before, after = recorded(challenge)
-    policy = done.prepared.policy
+    environment, importance = done.prepared.resolved.environment, done.prepared.importance
     rows = done.moment[before]
-    found = before_cut_in(state[before], held(done, rows), rows["step"], policy.environment, policy.importance)
+    found = before_cut_in(state[before], held(done, rows), rows["step"], environment, importance)
     taken = (rows["maneuver"] == STAY).astype(int)
     each = np.arange(len(rows))
     np.testing.assert_array_equal(done.moment_v[before], found.v)
     np.testing.assert_array_equal(done.moment_q[before], found.q[each, :, taken])
     np.testing.assert_array_equal(rows["p"], found.p[each, taken])
     rows, each = done.moment[after], np.arange(after.sum())
-    found = after_cut_in(state[after], policy.environment, policy.importance, rows["step"])
+    found = after_cut_in(state[after], environment, importance, rows["step"])
     np.testing.assert_array_equal(done.moment_v[after], found.v)
     np.testing.assert_array_equal(done.moment_q[after], found.q[each, :, rows["maneuver"]])
     np.testing.assert_array_equal(rows["p"], found.p[each, rows["maneuver"]])
@@ -103,8 +103,8 @@ def test_records_hold_what_was_drawn_from(challenge):
 @pytest.mark.parametrize("component", [1, 2, 3])
 def test_draws_follow_the_mixture_or_the_component(component):
     """Equal steps of the uniform give every acceleration its probability to within one step."""
-    policy = prepared("step_mixture", "recursive").policy
-    found = after_cut_in([(30.0, 40.0, 0.0, 11.0, -8.0)], policy.environment, policy.importance)
+    source = prepared("step_mixture", "recursive")
+    found = after_cut_in([(30.0, 40.0, 0.0, 11.0, -8.0)], source.resolved.environment, source.importance)
     q, alpha = found.q[0], np.array([0.5, 0.3, 0.2])
     assert found.critical[0]
     u = (np.arange(100_000) + 0.5) / 100_000

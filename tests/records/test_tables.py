@@ -184,7 +184,7 @@ def test_what_is_not_there_is_one_error(stored_run, tmp_path):
     folder = copy_of(stored_run("mixture-twin"), tmp_path / "run")
     run, parts = harness.read(folder), manifest(folder)["parts"]
     edit(folder, parts=[{**part, "files": {"episodes": part["files"]["episodes"]}} for part in parts])
-    with pytest.raises(RunFolderError, match="no moments.*records.moments=all"):
+    with pytest.raises(RunFolderError, match=r"no moments.*records\.moments=all"):
         run.moments()
     with pytest.raises(RunFolderError, match="no column 'nothing' in episodes"):
         run.episodes(["nothing"])

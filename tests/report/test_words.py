@@ -191,8 +191,10 @@ def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time
 
 @pytest.mark.parametrize(("name", "said"), [("shells-controller-sumo", True), ("shells-lateral-twin", False)])
 def test_only_of_a_vehicle_of_the_users_own_it_is_said_that_it_was_held(name, said, stored_run):
-    best, counts = read_run_folder(stored_run(name)).headline, {"n_asked_to_speed_up": 1234}
-    answer = short_answer(golden(name), best, None, {"cut_ins_take_time": True}, None, counts)
+    run = read_run_folder(stored_run(name))
+    diagnostics = {**run.estimates.diagnostics, "n_asked_to_speed_up": 1234}
+    told = replace(run.estimates, diagnostics=diagnostics)
+    answer = short_answer(golden(name), {"cut_ins_take_time": True}, told)
     assert any("1,234 tests it asked to speed up" in each for each in answer.warnings) == said
 
 

@@ -54,7 +54,7 @@ def test_one_that_is_interrupted_before_its_first_test_says_so(run_here, tmp_pat
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(running, "assumed", interrupted)
+    monkeypatch.setattr(running, "assumed_in", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_here(golden("shells-twin"), tmp_path)
     assert manifest(tmp_path)["status"] == "interrupted"
@@ -156,6 +156,8 @@ def test_an_interrupted_first_run_does_not_build_its_pool_to_the_end(monkeypatch
 
     def interrupted(_resolved):
         raise KeyboardInterrupt
+
+    build.kernel = None
 
     monkeypatch.setattr(sampling, "source_of", lambda _campaign: build)
     monkeypatch.setattr(sampling, "is_cached", lambda _kernel: False)

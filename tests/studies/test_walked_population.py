@@ -53,7 +53,7 @@ def walk():
     paths = choose_paths(campaign("examples.acting:Holds"), 5, PATHS, Progress(), 2048)
 
     def walked(of: Campaign, n_paths: int):
-        columns = {name: getattr(paths, name)[:n_paths] for name in ("index", "state", "weight")}
+        columns = {name: getattr(paths, name)[:n_paths] for name in ("index", "start", "weight")}
         return walk_paths(of, replace(paths, **columns), Here(), Progress())
 
     return walked

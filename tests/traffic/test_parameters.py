@@ -10,9 +10,10 @@ import yaml
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError
 from harness.families.cut_in import lateral as of_lateral
-from harness.families.cut_in.lateral import constant_lead, lateral_position, log_normal_speed, perceived_in
+from harness.families.cut_in.lateral import constant_lead, log_normal_speed
 from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.families.cut_in.parameters import EnvironmentParameters
+from harness.vehicles.sideways import lateral_position, perceived_in
 from tests.kernels import alone, cut_in_terms
 from tests.traffic.tables import DATA, SHIPPED, of, tabled
 

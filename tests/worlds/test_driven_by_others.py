@@ -84,7 +84,8 @@ def test_lv_and_bv_move_as_with_any_other_av_and_the_av_holds_its_speed_until_th
         cut = shard.episode["event_step"][row]
         assert np.array_equal(mine[: cut + 2, AV, :2], theirs[: cut + 2, AV, :2])
         assert (mine[: cut + 2, AV, 1] == mine[0, AV, 1]).all()
-        x, v, _ = mine[:, AV].T
+        x, v, a, _ = mine[:, AV].T
+        assert np.allclose(np.diff(v), 0.1 * a[:-1], atol=1e-12)
         assert np.allclose(np.diff(x), 0.05 * (v[1:] + v[:-1]), atol=1e-9)
         responded += mine[min(cut + 3, len(mine) - 1), AV, 1] != mine[0, AV, 1]
     assert responded > 12

@@ -115,7 +115,7 @@ def motions_computed(shard: Shard) -> list[Motion]:
     """Episodes of a shard that was run without SUMO, in index order; contact by the formula's verdict."""
     motions = []
     for row, result in enumerate(shard.episode):
-        x, v, lane = np.moveaxis(shard.traces[row], 2, 0)
+        x, v, _, lane = np.moveaxis(shard.traces[row], 2, 0)
         ended_by_contact = result["outcome"] in (CRASH, CONTACT)
         contact = ended_by_contact & (np.arange(len(x)) == result["n_steps"])
         motions.append(Motion(x, v, lane.astype(int), contact))
