@@ -17,6 +17,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import traceback
@@ -297,10 +298,17 @@ def _server() -> Iterator[None]:
     """The fork server as workers need it: nobody's main script runs again, neither there nor in them."""
     forkserver.set_forkserver_preload([_PRELOADED])
     main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+    before, tempfile.tempdir = tempfile.tempdir, _in_short(tempfile.gettempdir())
     try:
         yield
     finally:
-        sys.modules["__main__"] = main
+        sys.modules["__main__"], tempfile.tempdir = main, before
+
+
+@cache
+def _in_short(folder: str) -> str:
+    """A folder by a short path while this process lives: the server's socket there may have one of 107 bytes."""
+    return f"/proc/{os.getpid()}/fd/{os.open(folder, os.O_DIRECTORY)}"
 
 
 def _started(work: tuple[Any, ...]) -> ForkServerProcess:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from harness.compiled import compiled, compiled_inline
 from harness.loop.cells import KernelState, Script
 from harness.vehicles.kinematics import gap
@@ -112,7 +110,7 @@ def repeat(kernel: KernelState) -> None:
         note_onset(k, kernel)
         if cell.step == script.at[cell.row]:
             note_event(k, kernel)
-            cell.n_control += cell.component >= 0 or cell.log_weight != 0.0
+            cell.n_control += cell.component >= 0 or cell.log_weight != 0.0  # drawn otherwise than traffic would
 
 
 @compiled_inline
@@ -138,8 +136,3 @@ def gap_and_rate(k: int, kernel: KernelState) -> tuple[float, float]:
     """Gap (m) from the AV to the principal vehicle, bumper to bumper, and its rate (m/s)."""
     x, v, av, principal = kernel.x, kernel.v, kernel.x.shape[1] - 1, kernel.principal
     return gap(x[k, principal], x[k, av]), v[k, principal] - v[k, av]
-
-
-def nothing_known(n: int) -> RecordArray:
-    """Facts of tests of which nothing is to be kept, shape (n,)."""
-    return np.zeros(n, np.dtype([]))

@@ -42,5 +42,5 @@ def enumerated(library, environment: Environment, n: int, *, enclosed=True, stri
         followers.drivers["cruises"][followers.envelope] = 0
         followers = Followers(followers.drivers)
     paths = Paths(np.arange(n), states)
-    found = enumerate_cut_ins(SEED, paths, environment, followers, stride=stride, offset=offsets)
+    found = enumerate_cut_ins(environment, SEED, paths, followers, stride=stride, offset=offsets)
     return found.probability, found.crashes

@@ -58,7 +58,7 @@ def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
     shard = without_event(loop, ready.resolved, seed, paths, 0)
     some = Recorded._make(values[rows] for values in runs)
     nobody = Followers(driver_records([]))
-    probability = enumerate_cut_ins(seed, paths, ready.resolved.environment, nobody, some).probability
+    probability = enumerate_cut_ins(ready.resolved.environment, seed, paths, nobody, some).probability
     for row in range(10):
         trace, stays = shard.traces[row], 1.0
         for step in range(len(trace) - 1):

@@ -99,7 +99,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_killed_while_it_writes_then_resumed(stored_run, tmp_path):
-    out, temporary = tmp_path / "run", tmp_path / "tmp"
+    out, temporary = tmp_path / "run", tmp_path / ("t" * 100)  # longer than the path of a socket may be
     temporary.mkdir()
     command = [sys.executable, "-c", KILLED, "run", BASE, "--out", out, *sets(*MORE[SEVEN]), "--workers", "1"]
     environment = {**os.environ, "TMPDIR": str(temporary)}

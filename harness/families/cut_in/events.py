@@ -43,9 +43,9 @@ class Maneuvers(NamedTuple):
 
 
 def enumerate_cut_ins(
+    environment: Environment,
     seed: int,
     paths: Paths,
-    environment: Environment,
     followers: Followers,
     recorded: Recorded = HOLDING,
     stride: int = 1,

@@ -21,9 +21,7 @@ from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
 from harness.families.cut_in.unseen import left_open
-from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, LeftOpen, Paths, Recorded
-from harness.loop.cells import Script
-from harness.vehicles.drivers import Followers
+from harness.families.protocol import Chosen, Column, Paths
 from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
 
 _STATE_DOCS = (
@@ -60,11 +58,12 @@ class CutIn:
     shipped = SHIPPED_FOLDER
     ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-2", True: "ladder-lateral-1"})
 
-    def parameters(self, settings: EnvironmentSettings) -> EnvironmentParameters:
-        return load_parameters(settings)
-
-    def traffic(self, settings: EnvironmentSettings, parameters: EnvironmentParameters | None = None) -> Environment:
-        return load_environment(settings, parameters)
+    parameters = staticmethod(load_parameters)
+    traffic = staticmethod(load_environment)
+    left_open = staticmethod(left_open)
+    events = staticmethod(enumerate_cut_ins)
+    script = staticmethod(script_of)
+    drive = staticmethod(drive_along)
 
     def traffic_with(
         self, settings: EnvironmentSettings, parameters: EnvironmentParameters, values: Mapping[str, float]
@@ -75,9 +74,6 @@ class CutIn:
         except (CampaignError, ValueError):
             return None
         return environment
-
-    def left_open(self, parameters: EnvironmentParameters) -> LeftOpen | None:
-        return left_open(parameters)
 
     def digest(self, traffic: Environment) -> str:
         numbers = traffic.content()
@@ -107,29 +103,9 @@ class CutIn:
     def start(self, traffic: Environment, u: FloatArray) -> RecordArray:
         return InitialStates(traffic.numbers).from_uniforms(u)
 
-    def events(
-        self,
-        traffic: Environment,
-        seed: int,
-        paths: Paths,
-        drivers: Followers,
-        recorded: Recorded = HOLDING,
-        stride: int = 1,
-        offset: IntArray | None = None,
-    ) -> Events:
-        return enumerate_cut_ins(seed, paths, traffic, drivers, recorded, stride, offset)
-
     def choose(self, traffic: Environment, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
         maneuvers = write_maneuvers(seed, paths, event, traffic, FREE_DRAWS_PER_CUT_IN if of_pool else 0)
         return Chosen(facts_of(paths.start, maneuvers), event, maneuvers.lead)
-
-    def script(self, traffic: Environment, chosen: Chosen) -> Script:
-        return script_of(traffic, chosen)
-
-    def drive(
-        self, traffic: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
-    ) -> Driven:
-        return drive_along(traffic, chosen, start, drivers, last=last)
 
     def avoidable(
         self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray

@@ -121,7 +121,7 @@ def drive_others(
 
 
 def drive_along(
-    environment: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool
+    environment: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
 ) -> Driven:
     """See `harness.families.protocol.Family.drive`."""
     n, steps = len(chosen.facts), int(environment.numbers["max_steps"])

@@ -21,7 +21,7 @@ from harness.families.cut_in.nade.decide import decide, finish
 from harness.families.cut_in.nade.functions import Importance
 from harness.families.cut_in.script import beginning, facts_of
 from harness.loop.cells import KernelState, natural_script
-from harness.loop.repeat import Traffic, nothing_known
+from harness.loop.repeat import Traffic
 from harness.vocabulary import BV, RecordArray
 
 
@@ -36,7 +36,7 @@ class DrawnInLoop(Traffic):
     ) -> None:
         n, nowhere = len(states), np.full(len(states), -1)
         nothing = np.zeros((n, 0, BV + 1)), np.zeros((n, 0, BV + 1), np.int8)
-        super().__init__(natural_script(*beginning(states), *nothing, nowhere, np.zeros(n, np.int64)), nothing_known(n))
+        super().__init__(natural_script(*beginning(states), *nothing, nowhere, np.zeros(n, np.int64)), states)
         self._given = states, environment, importance, moment_limit
 
     def rows(self, rows: slice) -> DrawnInLoop:
