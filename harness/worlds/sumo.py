@@ -108,6 +108,8 @@ class SumoCells(World):
 
     def _changes(self, lane: Int8Array) -> list[tuple[int, int]]:
         """Cell and place of those who change to other lanes (K, V) in this step."""
+        if lane.tobytes() == self.lane.tobytes():  # in most steps, and ten times faster to see
+            return []
         return [(k, vehicle) for k, vehicle in np.argwhere(lane != self.lane).tolist()]
 
     def _contacts(self, get_collisions: Callable[[], Iterable[Any]]) -> BoolArray:
