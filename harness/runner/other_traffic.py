@@ -72,7 +72,7 @@ def estimate_in_other_traffic(
         "campaign_hash": there.content_hash,
         "distance_per_test_m": there.family.mean_distance_m(there.environment),
     }
-    parameters = load_parameters(there.campaign.environment)
+    parameters = there.family.parameters(there.campaign.environment)
     if parameters.replicates is not None and parameters.unseen:
         told.pop("assumed", None)  # replicates say it better
     elif not moved.is_same:

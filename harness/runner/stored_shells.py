@@ -23,7 +23,6 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.shells import SeenShells
-from harness.families.cut_in.loading import load_parameters
 from harness.numbers import share
 from harness.pool.build import campaign_pool
 from harness.pool.cut_ins import Pool
@@ -194,7 +193,7 @@ class Elsewhere:
 
         Of a vehicle whose shares may change with it, the factor is that of its upper limit.
         """
-        parameters = load_parameters(self.traffic.campaign.environment)
+        parameters = self.traffic.family.parameters(self.traffic.campaign.environment)
         traffic = [environment_with(self.traffic, parameters, row) for row in rows]
         known = [each for each in traffic if each is not None]
         progress.stage("other traffic", len(known))
