@@ -127,7 +127,7 @@ class EpisodeLoop:
         shard = Shard(first_episode, self._scenario, traffic, np.zeros(n, EPISODE_DTYPE), traced)
         self._cells.cell["row"] = -1
         kernel, given, ended = self._kernel_state(shard), 0, 0
-        traffic.begin(self._world.n_cells, first_episode)
+        traffic.begin(self._world.n_cells)
         while True:
             placed = refill(kernel, given)
             traffic.move(kernel, placed)

@@ -36,7 +36,7 @@ class Traffic:
         """That of some tests alone."""
         return Traffic(self.script.rows(rows), self._facts[rows])
 
-    def begin(self, n_cells: int, first_episode: int) -> None:
+    def begin(self, n_cells: int) -> None:
         """Make room for the tests of a shard, which run in K cells."""
 
     def move(self, kernel: KernelState, placed: int) -> None:  # noqa: ARG002 - a script begins with the test

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from tests.families.fake import FAKE, P_EVENT, RATE
 from tests.in_process import run_here
 from tests.stored_runs import ROOT
 
+INSTALLED = families.families.__wrapped__
 SMOKE = ROOT / "scenarios" / "smoke.yaml"
 SMALL = (
     "scenario=fake",
@@ -70,6 +72,13 @@ def test_the_pool_knows_the_rate_and_a_run_of_shells_finds_it(tmp_path):
     assert set(crashed["gap_m"]) == {8.0}
     again = harness.replay(tmp_path / "run", int(crashed["episode"].iloc[0]))
     assert again.row["outcome"] == "crash"
+
+
+def test_an_installed_package_brings_a_family_by_an_entry_point(monkeypatch):
+    entry = EntryPoint("fake", "tests.families.fake:FAKE", families.GROUP)
+    monkeypatch.setattr(families, "entry_points", lambda *, group: [entry] if group == families.GROUP else [])
+    assert set(INSTALLED()) == {"cut_in", "fake"}
+    assert INSTALLED()["fake"] is FAKE
 
 
 def test_an_unknown_family_is_refused_by_name():

@@ -43,7 +43,7 @@ class DrawnInLoop(Traffic):
         states, environment, importance, limit = self._given
         return DrawnInLoop(states[rows], environment, importance, limit)
 
-    def begin(self, n_cells: int, first_episode: int) -> None:  # noqa: ARG002 - indices are the loop's
+    def begin(self, n_cells: int) -> None:
         states, environment, importance, limit = self._given
         room = CONTROL_STEPS * len(states) + n_cells
         self.drawn = nothing_drawn(len(states), environment, importance, moment_limit=limit, capacity=room)
