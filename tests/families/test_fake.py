@@ -60,12 +60,13 @@ def test_naturalistic_and_forced_tests_have_the_exact_rate(method, engine, tmp_p
     assert set(episodes["event"]) <= {-1, 0, 1}
 
 
-def test_the_pool_knows_the_rate_and_a_run_of_shells_finds_it(tmp_path):
+@pytest.mark.parametrize("engine", ["twin", "sumo"])
+def test_the_pool_knows_the_rate_and_a_run_of_shells_finds_it(engine, tmp_path):
     resolved = resolve(load_campaign(SMOKE, [*SMALL, "testing.method=shells"]))
     source = prepare(resolved)
     assert source.design.p_cut_in == pytest.approx(P_EVENT, rel=0.1)
     assert source.design.p.sum() == pytest.approx(RATE, rel=0.1)  # on the others nobody could crash
-    found, run = estimate(tmp_path / "run", "testing.method=shells", "world.engine=twin", "stop.rhw=0.1")
+    found, run = estimate(tmp_path / "run", "testing.method=shells", f"world.engine={engine}", "stop.rhw=0.1")
     assert found["shells"]["ci_low"] < RATE < found["shells"]["ci_high"]
     assert found["shells"]["crash_rate"] == pytest.approx(RATE, rel=0.1)
     crashed = run.episodes().query("outcome == 'crash'")
