@@ -96,7 +96,7 @@ class Recorded(Contender):
 
     def rows(self, n: int) -> bytes:
         episode = self.loop.run(0, self.prepared.tests(0, n)).episode
-        return b"".join(episode[name].tobytes() for name in ("outcome", "n_steps", "cut_in_step", "log_weight"))
+        return b"".join(episode[name].tobytes() for name in ("outcome", "n_steps", "event_step", "log_weight"))
 
     def close(self) -> None:
         self.world.close()

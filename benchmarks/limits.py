@@ -45,7 +45,7 @@ def of_rate(tests: pd.DataFrame, share: Any) -> list[float]:
 
 def shares_of_rate(tests: pd.DataFrame, numbers: Any) -> dict[str, list[float]]:
     """What the crashes are like."""
-    r2, closing = tests.cut_in_r2_m, np.maximum(-tests.cut_in_r2dot_mps, 1e-9)
+    r2, closing = tests.event_gap_m, np.maximum(-tests.event_rate_mps, 1e-9)
     accept = special.expit((r2 / closing - numbers["cut_in__accept_ttc_s"]) / numbers["cut_in__accept_scale_s"])
     ignore = numbers["cut_in__ignore_share"]
     return {
@@ -55,7 +55,7 @@ def shares_of_rate(tests: pd.DataFrame, numbers: Any) -> dict[str, list[float]]:
         "ttc_below_1.5_s": of_rate(tests, r2 / closing < 1.5),
         "ttc_at_onset_below_2_s": of_rate(tests, tests.onset_ttc_s < 2.0),
         "lead_at_most_1.5_s": of_rate(tests, tests.lead_steps <= SHORT_LEAD),
-        "crash_within_1_s": of_rate(tests, tests.crash_time_s - 0.1 * tests.cut_in_step <= 1.0),
+        "crash_within_1_s": of_rate(tests, tests.crash_time_s - 0.1 * tests.event_step <= 1.0),
         "av_above_144_kmph": of_rate(tests, tests.v_bv_mps - tests.r2dot_mps > FAST_MPS),
         "cut_in_ignores_the_av": of_rate(tests, ignore / (ignore + (1.0 - ignore) * accept)),
     }

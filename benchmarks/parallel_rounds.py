@@ -48,7 +48,7 @@ def drawn_pool(campaign: Campaign) -> DrawnPool:
 
 def rounds_of(campaign: Campaign, pool: DrawnPool, rng: np.random.Generator) -> list[list[int]]:
     """Tests of each shard of each round until the stop rule is content."""
-    available = np.full(pool.design.p.size, campaign.pool.cut_ins_per_shell, np.int64)
+    available = np.full(pool.design.p.size, campaign.pool.events_per_shell, np.int64)
     planner = ShellRounds(campaign, pool.design, available)
     rounds, enough = [], False
     while not enough and (added := planner.next_round()).any():

@@ -71,7 +71,7 @@ def reference(path: str, overrides: Sequence[str], episodes: int, workers: int) 
         "relvar": (y2 / n - rate * rate) / (rate * rate) if rate else math.nan,
         "n_episodes": int(n),
         "n_crashes": int(crashes),
-        "mean_weight_cut_in": cut / n,
+        "mean_weight_event": cut / n,
         "mean_weight_contact": contact / n,
     }
 

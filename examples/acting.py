@@ -1,4 +1,4 @@
-"""Vehicles that act before the cut-in: `av: {controller: "examples.acting:Speeds", before_cut_in: controller}`.
+"""Vehicles that act before the cut-in: `av: {controller: "examples.acting:Speeds", before_event: controller}`.
 
 After the cut-in all are the intelligent driver model of `examples.idm_batch`.
 """

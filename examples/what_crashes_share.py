@@ -17,14 +17,14 @@ BINS, RELABELINGS = 20, 199
 
 def conditions(tests: pd.DataFrame) -> pd.DataFrame:
     """Quantities at the cut-in; an AV that keeps its speed until then has the initial one."""
-    closing = (-tests["cut_in_r2dot_mps"]).clip(lower=0.0)
+    closing = (-tests["event_rate_mps"]).clip(lower=0.0)
     return pd.DataFrame(
         {
             "AV speed, m/s": tests["v_bv_mps"] - tests["r2dot_mps"],
-            "gap R2, m": tests["cut_in_r2_m"],
+            "gap R2, m": tests["event_gap_m"],
             "closing speed, m/s": closing,
-            "needed braking, m/s²": closing**2 / (2.0 * tests["cut_in_r2_m"]),
-            "time of the cut-in, s": 0.1 * tests["cut_in_step"],
+            "needed braking, m/s²": closing**2 / (2.0 * tests["event_gap_m"]),
+            "time of the cut-in, s": 0.1 * tests["event_step"],
         }
     )
 
@@ -32,7 +32,7 @@ def conditions(tests: pd.DataFrame) -> pd.DataFrame:
 def what_crashes_share(folder: str | Path) -> pd.DataFrame:
     """The band of each quantity that crashes share most, with a p-value over all bands and quantities."""
     tests = harness.read(folder).episodes()
-    tests = tests[tests["cut_in_step"].notna() & (tests["outcome"] != "failed")]
+    tests = tests[tests["event_step"].notna() & (tests["outcome"] != "failed")]
     if harness.load_campaign(Path(folder) / "campaign.yaml").testing.method == "shells":
         tests = tests[tests["component"] == tests["component"].max()]  # outside: one stratum, where all count the same
     values, crash, weight = conditions(tests), (tests["outcome"] == "crash").to_numpy(), tests["weight"].to_numpy()

@@ -90,7 +90,7 @@ class ShellDesign:
         there: the end of a sentence that begins with "If this vehicle".
     n_inside : int
         Strata up to the boundary, which are shells.
-    p_cut_in, p_unreachable : float
+    p_event, p_unreachable : float
         Probability of a cut-in, and the part of it on which no vehicle within the envelope's acceleration can crash,
         and which is not tested.
     available : tuple of int, length S
@@ -111,7 +111,7 @@ class ShellDesign:
     boundary: str
     assumes: str
     n_inside: int
-    p_cut_in: float
+    p_event: float
     p_unreachable: float
     cell_references: tuple[int, ...] = ()
     references: tuple[Reference, ...] = ()

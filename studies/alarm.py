@@ -36,7 +36,7 @@ from harness.families.cut_in.path import Trajectory, empty_trajectory, end_in, w
 from harness.families.cut_in.replay import StoredPaths, leave_stored, recall
 from harness.families.cut_in.script import maneuvers_of, states_of
 from harness.pool.build import campaign_pool
-from harness.pool.cut_ins import Pool
+from harness.pool.kept import Pool
 from harness.processes import made_ahead
 from harness.progress import Progress
 from harness.records.folder import MEND_PART, Part, read_manifest
@@ -138,19 +138,19 @@ _UNBOUNDED = "weights of the step mixture are not bounded: rare large ones may b
 class KnownRates(NamedTuple):
     """Crash rates ``mu`` (D,) of surrogates as a pool knows them, from conservative to aggressive.
 
-    ``std_error`` (D,) is that of ``mu``; ``p_cut_in_at_crash`` (D,) the mean P(cut-in | path) of the cut-ins on which
+    ``std_error`` (D,) is that of ``mu``; ``p_event_at_crash`` (D,) the mean P(cut-in | path) of the cut-ins on which
     each crashes, at most.
     """
 
     names: tuple[str, ...]
     mu: FloatArray
     std_error: FloatArray
-    p_cut_in_at_crash: FloatArray
+    p_event_at_crash: FloatArray
 
     @classmethod
     def of(cls, pool: Pool) -> KnownRates:
         """Those of a pool."""
-        return cls(pool.names, pool.mu, np.sqrt(np.diag(pool.mu_covariance)), pool.p_cut_in_at_crash)
+        return cls(pool.names, pool.mu, np.sqrt(np.diag(pool.mu_covariance)), pool.p_event_at_crash)
 
 
 class Alarm:
@@ -210,7 +210,7 @@ class Alarm:
         """
         n, unit, bets, known, drawn = self._n, self._unit, BETS[:, None], self._known, self._drawn
         # Mean square of W f_k over its mean, at most; infinite where nothing bounds W.
-        at_crash = known.p_cut_in_at_crash / drawn.forced_share if drawn.forced_share else np.inf
+        at_crash = known.p_event_at_crash / drawn.forced_share if drawn.forced_share else np.inf
         heavy = np.maximum((at_crash if drawn.weight_cap is None else drawn.weight_cap) / unit, 1.0)
         error = known.std_error / unit
         many, few = bets, np.expm1(-bets * heavy) / heavy  # mean factors are 1 + these, their errors these times μ_k's
@@ -234,7 +234,7 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
     progress, manifest = progress or Progress(), read_manifest(folder)
     resolved = resolve(load_campaign(folder / "campaign.yaml", check_files=False))
     campaign = resolved.campaign
-    if (shells := campaign.testing.method == "shells") or campaign.av.acts_before_cut_in:
+    if (shells := campaign.testing.method == "shells") or campaign.av.acts_before_event:
         found = "tests drawn from shells" if shells else "an AV that acted before the cut-in"
         expected = "weighted tests of an AV that keeps its speed until the cut-in: pools know rates of surrogates then"
         mend = "Choose another run; SUMO's positions are held against the twin's in each step."

@@ -242,7 +242,7 @@ def after_cut_in(states, environment, importance, steps=None) -> Proposals:
     return out
 
 
-def before_cut_in(states, maneuvers, steps, environment, importance) -> Proposals:
+def before_event(states, maneuvers, steps, environment, importance) -> Proposals:
     """Proposals at redraw times before the cut-in, BV having drawn ``maneuvers`` (n,) in ``steps`` (n,)."""
     n, j, hold = len(states), importance.value.shape[0], int(environment.numbers["hold_steps"])
     p, q, v, critical = np.empty(n), np.empty((n, j)), np.empty((n, j)), np.empty(n, np.bool_)

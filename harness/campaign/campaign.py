@@ -79,7 +79,7 @@ class Campaign(Section):
     @property
     def has_baseline_runs(self) -> bool:
         """Whether the AV is first driven along its paths without a cut-in."""
-        return self.av.acts_before_cut_in and self.sampling.baseline_runs
+        return self.av.acts_before_event and self.sampling.baseline_runs
 
     @property
     def min_crashes(self) -> int:
@@ -116,7 +116,7 @@ class Campaign(Section):
         smaller RHW or with other resources.
         """
         others = {} if self.scenario == "cut_in" else {"scenario": self.scenario}
-        unused = set() if self.av.acts_before_cut_in else {"shadow_paths", "pilot_tests"}
+        unused = set() if self.av.acts_before_event else {"shadow_paths", "pilot_tests"}
         content = others | {
             "crash": self.crash.model_dump(),
             "seed": self.seed,
@@ -171,17 +171,17 @@ REFUSED = (
     ),
     # -- vehicles that act before the cut-in --
     Combination(
-        "av.before_cut_in",
+        "av.before_event",
         lambda c, use: (
-            c.av.acts_before_cut_in and (c.sampling.holds_speed or (use.takes_time and not c.sampling.baseline_runs))
+            c.av.acts_before_event and (c.sampling.holds_speed or (use.takes_time and not c.sampling.baseline_runs))
         ),
         "controller, with testing.method {testing.method}",
         "hold_speed: the method draws the cut-in, or its onset, ahead, which needs to know the AV's path",
         "Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths first.",
     ),
     Combination(
-        "av.before_cut_in",
-        lambda c, _: c.av.acts_before_cut_in and c.av.model is not None,
+        "av.before_event",
+        lambda c, _: c.av.acts_before_event and c.av.model is not None,
         "controller, with the built-in model {av.model}",
         "hold_speed: a built-in model has nothing to follow before the cut-in",
         "Delete the key, or bring a controller of your own.",
@@ -242,7 +242,7 @@ REFUSED = (
         "Write --set accept=null, and --margin if something is to be decided.",
     ),
     Combination(
-        "av.before_cut_in",
+        "av.before_event",
         lambda c, use: use.command == "compare" and c.has_baseline_runs,
         "controller: a vehicle that acts before the cut-in has cut-ins of its own",
         "hold_speed in A and B: pairs need the same cut-ins",

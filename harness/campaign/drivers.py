@@ -110,7 +110,7 @@ class Reference(Following):
         return 10.0 * self.evaluated_at_m / self.lateral_speed_mps
 
     @property
-    def delay_after_cut_in_s(self) -> float:
+    def delay_after_event_s(self) -> float:
         """How long after the cut-in it begins to brake (s); not before it, however slowly BV comes over."""
         return max(0.0, 10.0 * self.reaction_time_s - self.used_up_steps) / 10.0
 

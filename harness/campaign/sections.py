@@ -176,7 +176,7 @@ class PoolSettings(Section):
         le=0.2,
         description="relative standard error of the surrogates' crash rates; four times that beyond the boundary",
     )
-    cut_ins_per_shell: Whole = Field(
+    events_per_shell: Whole = Field(
         25_000, ge=100, le=MOST_CUT_INS, description="cut-ins kept of each shell: its most tests"
     )
     shadow_paths: Whole = Field(

@@ -40,7 +40,7 @@ def with_another_driver(data: dict[str, Any], source: str, value: Any) -> dict[s
     last = next((name for name in AV_SOURCES if av.get(name) is not None), "model")
     av = {key: each for key, each in av.items() if key == source or key not in AV_SOURCES}
     if source != last:
-        lost = {"parameters", "reaction"} | ({"before_cut_in"} if source == "model" else set())
+        lost = {"parameters", "reaction"} | ({"before_event"} if source == "model" else set())
         lost |= {"takes_over"} if source in ("sumo", "traci") else set()
         av = {key: each for key, each in av.items() if key not in lost}
     elif source == "model" and isinstance(parameters := av.get("parameters"), dict) and value in PARAMETERS:
@@ -140,7 +140,7 @@ class AutomatedVehicle(Section):
         description="of the built-in model or of the controller",
     )
     reaction: Reaction = Reaction()
-    before_cut_in: Literal["hold_speed", "controller"] = Field(
+    before_event: Literal["hold_speed", "controller"] = Field(
         "hold_speed",
         description="hold_speed until the cut-in [itsc], or controller: it acts from the start",
     )
@@ -162,14 +162,14 @@ class AutomatedVehicle(Section):
         return next(name for name in AV_SOURCES if getattr(self, name) is not None)
 
     @property
-    def acts_before_cut_in(self) -> bool:
+    def acts_before_event(self) -> bool:
         """Whether its controller acts from the start of a test."""
-        return self.before_cut_in == "controller"
+        return self.before_event == "controller"
 
     @property
     def warm_up_steps(self) -> int:
         """Steps before the cut-in that its controller is shown; 0 for what is not asked by the harness, or always."""
-        warms_up = self.source in ("controller", "fmu") and not self.acts_before_cut_in
+        warms_up = self.source in ("controller", "fmu") and not self.acts_before_event
         return round(10.0 * self.warm_up_s) if warms_up else 0
 
     @property
@@ -181,7 +181,7 @@ class AutomatedVehicle(Section):
         """What the AV is, for the campaign's hash: an FMU counts by its content, wherever it lies."""
         content = self.model_dump()
         del content["limits"]["construction_time_s"]  # changes no test
-        if self.acts_before_cut_in:
+        if self.acts_before_event:
             del content["takes_over"]
         if not self.warm_up_steps:  # nobody is shown it
             del content["warm_up_s"]
@@ -217,8 +217,8 @@ class AutomatedVehicle(Section):
         if self.source in READS_NO_PARAMETERS and self.parameters:
             found = f"{listed(dict(self.parameters))}, which nothing reads"
             raise broken_rule("parameters", found, f"no parameters {beside}", READS_NO_PARAMETERS[self.source])
-        if self.takes_over == "onset" and (self.source in ("sumo", "traci") or self.acts_before_cut_in):
-            beside = f"beside before_cut_in: {self.before_cut_in}" if self.acts_before_cut_in else beside
+        if self.takes_over == "onset" and (self.source in ("sumo", "traci") or self.acts_before_event):
+            beside = f"beside before_event: {self.before_event}" if self.acts_before_event else beside
             mend = "Leave it out. SUMO hands over at the overlap; who acts before the cut-in drives from the start."
             raise broken_rule("takes_over", f"onset {beside}", "a vehicle that is asked from the onset on", mend)
         if self.model is None and self.reaction != Reaction():

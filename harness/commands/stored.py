@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 FCD = ".xml"
 """Suffix of SUMO's floating car data."""
-LATERAL = ("lead_steps", "onset_step", "onset_r2_m", "onset_ttc_s", "overlap_ttc_s", "contact")
+LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_ttc_s", "contact")
 """What a replay tells of a cut-in that takes time."""
 
 

@@ -241,7 +241,7 @@ class _Host:
     """What both hosts are told: the campaign's seed, who makes the calls, and when the loop asks."""
 
     def __init__(self, av: AutomatedVehicle, seed: int, guard: Guard, before_test: BeforeTest) -> None:
-        self.acts_before_cut_in, self.warm_up_steps = av.acts_before_cut_in, av.warm_up_steps
+        self.acts_before_event, self.warm_up_steps = av.acts_before_event, av.warm_up_steps
         self.cruises = av.takes_over == "first_braking"
         self._seed, self._guard, self._before_test = seed, guard, before_test
         self.require_untouched, self.construction_s = guard.require_untouched, guard.construction_s

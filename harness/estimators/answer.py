@@ -179,16 +179,16 @@ def pool_remedy(rule: Rule, campaign: Campaign, stopped_by: StoppedBy) -> dict[s
     pool, target, from_pool = campaign.pool, campaign.stop.rhw, rule.look.rhw_from_pool
     if campaign.has_baseline_runs or target is None or not isinstance(rule, RoundRule) or math.isinf(rule.look.rhw):
         paths = "pool.shadow_paths" if campaign.has_baseline_runs else "pool.relative_error"
-        return {paths if stopped_by == "pool_error" else "pool.cut_ins_per_shell": None}
+        return {paths if stopped_by == "pool_error" else "pool.events_per_shell": None}
     finer = max(2.0 * (from_pool / target) ** 2, 1.0)
-    times = rule.seen.cut_ins_for(rule.more_tests(target, finer) * ROOM)
+    times = rule.seen.events_for(rule.more_tests(target, finer) * ROOM)
     own = target / math.sqrt(2.0) / Level.two_sided(campaign.stop.confidence).z  # a pool has some paths in any case
     error = min(pool.relative_error / math.sqrt(finer), own)
-    kept = two_digits_up(min(pool.cut_ins_per_shell * times, 1e9))
+    kept = two_digits_up(min(pool.events_per_shell * times, 1e9))
     if error < LEAST_POOL_ERROR or kept > MOST_CUT_INS:
         return {}
     changes: dict[str, float | None] = {"pool.relative_error": math.floor(error * 1e4) / 1e4} if finer > 1.0 else {}
-    return changes | ({"pool.cut_ins_per_shell": kept} if times > 1.0 else {})
+    return changes | ({"pool.events_per_shell": kept} if times > 1.0 else {})
 
 
 def expected_for(rule: Rule, campaign: Campaign, n_tests: int) -> dict[str, int] | None:

@@ -37,11 +37,11 @@ from harness.vocabulary import (
 MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
 EPISODE_COLUMNS = (
-    "episode", "outcome", "cut_in_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_cut_in",
+    "episode", "outcome", "event_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_event",
     "n_steps", "min_ttc_s", "took_over_step", "asked_to_speed_up",
 )  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass")
-BASELINE_COLUMNS = ("shadow", "cut_in_mass")
+BASELINE_COLUMNS = ("shadow", "event_mass")
 """Of vehicles that act before the cut-in, where `ShellDesign.candidates` says that they are on record."""
 DANGER_TTC_S = 4.0
 """A test whose time was up counts as cut off where it came closer to a collision than this (s).
@@ -105,7 +105,7 @@ class Block:
     ``cut_off`` (n,) bool: see `CUT_OFF_STEPS`. ``log_q`` (n, M): per importance function, the sum over control steps of
     log(q_j/p), -inf where q_j cannot draw the episode. ``n_control_steps`` (n,): stratum l of each episode.
     ``first_ratios`` (n, 9, J): q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one.
-    ``log_p_cut_in`` (n,): log P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode
+    ``log_p_event`` (n,): log P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode
     alone. Of shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C): its path's probability of a cut-in of each
     cell; and `BASELINE_COLUMNS`, with ``step`` (n,) of the cut-in, below 0 where a failed test has come to none.
     """
@@ -166,9 +166,9 @@ class Block:
         """
         if self.drawn.sampling.mixes_steps and self.drawn.epsilon > 0.0 and "n_steps" in self.columns:
             return -math.log(self.drawn.epsilon) * int(self.n_steps.max())
-        if "log_p_cut_in" not in self.columns or not (share := self.drawn.forced_share):
+        if "log_p_event" not in self.columns or not (share := self.drawn.forced_share):
             return math.inf
-        return float(np.max(self.log_p_cut_in, initial=-math.inf)) - math.log(share)
+        return float(np.max(self.log_p_event, initial=-math.inf)) - math.log(share)
 
     def ending(self, rows: BoolArray, outcome: int) -> Block:
         """The same episodes, had some of them ended otherwise, each with the weight that it has on record."""
@@ -236,7 +236,7 @@ def block_from_tables(
     outcome = outcome_places(episodes.column("outcome"), "episodes")
     failed, n_control_steps = outcome == FAILED, _integers(episodes, "n_control_steps")
     columns: dict[str, Column] = {
-        "cut_in": _known(episodes, "cut_in_step"),
+        "cut_in": _known(episodes, "event_step"),
         "n_control_steps": n_control_steps,
     }
     if SAMPLING[method].mixes:
@@ -245,23 +245,23 @@ def block_from_tables(
         columns["impact_mps"] = np.asarray(episodes.column("impact_speed_mps").to_numpy(), dtype=np.float64)
     if "n_steps" in episodes.column_names:
         columns["n_steps"] = _integers(episodes, "n_steps")
-        left = pc.subtract(episodes.column("n_steps"), episodes.column("cut_in_step"))
+        left = pc.subtract(episodes.column("n_steps"), episodes.column("event_step"))
         close = pc.and_(pc.less(left, CUT_OFF_STEPS), pc.less(episodes.column("min_ttc_s"), DANGER_TTC_S))
         columns["cut_off"] = (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy()
     if "took_over_step" in episodes.column_names:
-        early = pc.less_equal(episodes.column("took_over_step"), episodes.column("cut_in_step"))
+        early = pc.less_equal(episodes.column("took_over_step"), episodes.column("event_step"))
         columns["took_over_early"] = pc.fill_null(early, fill_value=False).to_numpy()
         columns["asked_to_speed_up"] = episodes.column("asked_to_speed_up").to_numpy()
     if moments is not None and SAMPLING[method].mixes_steps:
         columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
-    if np.all(_known(episodes, "log_p_cut_in") | failed):
-        columns["log_p_cut_in"] = np.asarray(pc.fill_null(episodes.column("log_p_cut_in"), -np.inf).to_numpy())
+    if np.all(_known(episodes, "log_p_event") | failed):
+        columns["log_p_event"] = np.asarray(pc.fill_null(episodes.column("log_p_event"), -np.inf).to_numpy())
     if shells is not None:
         columns["stratum"], columns["cell"] = _integers(episodes, "component"), _integers(episodes, "cell")
         columns["cell_mass"] = _nested(episodes, "cell_mass", len(shells.cell_stratum))
         if shells.candidates:
             columns |= {name: episodes.column(name).to_numpy() for name in BASELINE_COLUMNS}
-            step = pc.fill_null(episodes.column("cut_in_step"), -1).to_numpy()
+            step = pc.fill_null(episodes.column("event_step"), -1).to_numpy()
             columns["step"] = np.where(columns["cut_in"], step, -1 - index).astype(np.int64)
     cap = None if SAMPLING[method].controlled else 1.0
     drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), cap, shells, counts_above_mps, epsilon)

@@ -47,7 +47,7 @@ class Diagnostics:
         weights, contact = block.weights(), block.outcome == CONTACT
         self._sampling = block.drawn.sampling
         self.n += len(block)
-        counted = {"n_cut_ins": block.cut_in, "n_bv_lv_contacts": contact, "n_failed": block.failed}
+        counted = {"n_events": block.cut_in, "n_bv_lv_contacts": contact, "n_failed": block.failed}
         counted |= {f"n_{name}": block.columns[name] for name in BEFORE_OVERLAP if name in block.columns}
         self.counts.update({name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
         self._weight += Moments.of(weights)
@@ -64,7 +64,7 @@ class Diagnostics:
         names = importance_names or tuple(f"q_{j}" for j in range(len(self._ratios)))
         return {
             "mean_weight": self._mean(self._weight),
-            "mean_weight_cut_in": self._mean(self._cut_in),
+            "mean_weight_event": self._mean(self._cut_in),
             "mean_ratio": {name: self._mean(sums) for name, sums in zip(names, self._ratios, strict=False)},
             "bv_lv_contact_share": self._mean(self._contact),
             **self.counts,

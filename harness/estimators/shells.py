@@ -128,7 +128,7 @@ class ShellDetails:
     pool: str
     rhw_from_pool: Number
     rhw_from_pool_at_least: Number
-    p_cut_in: float
+    p_event: float
     p_unreachable: float
     learned: str
     references: tuple[BesideReference, ...]
@@ -191,7 +191,7 @@ class SeenShells:
         if design.candidates:
             rows = crash | block.failed
             place = cell[rows] + design.cell_p.size * block.failed[rows]
-            self._on_runs.append(CrashedTests(block.shadow[rows], block.step[rows], block.cut_in_mass[rows], place))
+            self._on_runs.append(CrashedTests(block.shadow[rows], block.step[rows], block.event_mass[rows], place))
         for s in np.unique(stratum[crash]).tolist():
             named = self._crashed.setdefault(s, [])
             episodes = block.first_episode + np.flatnonzero(crash & (stratum == s))
@@ -225,7 +225,7 @@ class SeenShells:
                 ShellDetails(
                     design.pool,
                     *free.from_pool_relative(),
-                    design.p_cut_in,
+                    design.p_event,
                     design.p_unreachable,
                     design.learned,
                     references=() if cautions else compared(design, self._cells, Level.two_sided(confidence)),
@@ -323,7 +323,7 @@ class SeenShells:
                 return math.inf
         return times
 
-    def cut_ins_for(self, times: float) -> float:
+    def events_for(self, times: float) -> float:
         """How many times the cut-ins that the pool keeps so many times the tests would need; at least 1."""
         kept = np.array(self._design.available or [math.inf])
         return max(float(np.max(self.tally.tests[kept > 0] * times / kept[kept > 0], initial=1.0)), 1.0)

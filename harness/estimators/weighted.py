@@ -112,7 +112,7 @@ class Nade:
         self.n = self.n_crashes = 0
         self.y = Moments()
         self._largest_y = self._design_cap = self._log_cap = -math.inf
-        self._largest_log_weight = self._largest_cut_in_log_weight = -math.inf
+        self._largest_log_weight = self._largest_event_log_weight = -math.inf
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""
@@ -123,7 +123,7 @@ class Nade:
         self._largest_y = float(np.max(weights, initial=self._largest_y))
         self._largest_log_weight = float(np.max(block.log_weight, initial=self._largest_log_weight))
         of_cut_ins = block.log_weight[block.cut_in]
-        self._largest_cut_in_log_weight = float(np.max(of_cut_ins, initial=self._largest_cut_in_log_weight))
+        self._largest_event_log_weight = float(np.max(of_cut_ins, initial=self._largest_event_log_weight))
         self._design_cap = max(self._design_cap, math.inf if (cap := block.drawn.weight_cap) is None else cap)
         self._log_cap = max(self._log_cap, block.log_cap())
 
@@ -147,7 +147,7 @@ class Nade:
             return known, "the weight cap known by design"
         if math.isfinite(known):
             return known, "the largest weight that the tests driven could have had"
-        seen, among = self._largest_cut_in_log_weight, " among episodes with a cut-in"
+        seen, among = self._largest_event_log_weight, " among episodes with a cut-in"
         if not math.isfinite(seen):
             seen, among = self._largest_log_weight, ""
         return math.exp(seen) if seen < LARGEST_LOG else math.inf, f"the largest weight seen{among} (no cap is known)"

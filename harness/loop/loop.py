@@ -157,7 +157,7 @@ class EpisodeLoop:
 
     def _kernel_state(self, shard: Shard) -> KernelState:
         """All that kernels need for a shard, in the form that they need it in."""
-        scenario, early = self._scenario, (self._av or self._world).acts_before_cut_in
+        scenario, early = self._scenario, (self._av or self._world).acts_before_event
         cruises = scenario.driver["cruises"].all() if self._av is None else self._av.cruises
         return unboxed(
             KernelState(

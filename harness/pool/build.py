@@ -15,7 +15,7 @@ from harness.campaign.sections import PoolSettings
 from harness.compiled import WORLD_SOURCES, source_hash
 from harness.families.protocol import Environment, Family, Paths
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, Enumerator
-from harness.pool.cut_ins import FORMAT, CutIns, Pool, pool_content, pool_from
+from harness.pool.kept import FORMAT, KeptEvents, Pool, pool_content, pool_from
 from harness.pool.shells import cells_of, conservative_first, shells_of
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
@@ -36,7 +36,7 @@ POOL_SEED = 0x706F6F6C
 """Keeps a pool's random numbers apart from those of a campaign with the same seed."""
 KEEP_DRAW = 1
 """Draw of a shell within the diagnostic stream."""
-_MADE_BY = ("aim.py", "build.py", "cut_ins.py", "shells.py")
+_MADE_BY = ("aim.py", "build.py", "kept.py", "shells.py")
 """Code that decides what is in a pool, beside the kernels."""
 
 
@@ -182,7 +182,7 @@ def pool_of(
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
     mass_kept = by_path[path].astype(np.float32)
-    sample = CutIns(PILOT_PATHS + path, step, cell[path, step], *chosen, crashes, mass_kept)
+    sample = KeptEvents(PILOT_PATHS + path, step, cell[path, step], *chosen, crashes, mass_kept)
     return Pool(
         key=key,
         family=family.name,
@@ -190,17 +190,17 @@ def pool_of(
         library=library,
         names=tuple(names[order].tolist()),
         n_paths=n,
-        p_cut_in=float(rates[:, -1].mean()),
-        p_cut_in_se=float(rates[:, -1].std() / np.sqrt(n)),
+        p_event=float(rates[:, -1].mean()),
+        p_event_se=float(rates[:, -1].std() / np.sqrt(n)),
         mu=mu,
         mu_covariance=np.atleast_2d(np.cov(ordered.T, bias=True)) / n,
-        p_cut_in_at_crash=np.divide(at_most, mu, out=np.ones_like(mu), where=mu > 0.0),
+        p_event_at_crash=np.divide(at_most, mu, out=np.ones_like(mu), where=mu > 0.0),
         cell_shell=cell_shell,
         cell_references=cell_references,
         cell_p=by_path.mean(0),
         reference_rate=by_reference.mean(0),
         reference_square=(by_reference * by_reference).mean(0),
-        cut_ins=sample,
+        events=sample,
     )
 
 
@@ -216,7 +216,7 @@ def _keep(mass: FloatArray, shell: Int8Array, n_shells: int, settings: PoolSetti
             continue
         cumulative = np.cumsum(mass.ravel()[places])
         offset = uniforms(settings.seed, s, 1, DIAGNOSTIC, KEEP_DRAW + 1)[0, KEEP_DRAW]
-        wanted = (offset + np.arange(settings.cut_ins_per_shell)) * (cumulative[-1] / settings.cut_ins_per_shell)
+        wanted = (offset + np.arange(settings.events_per_shell)) * (cumulative[-1] / settings.events_per_shell)
         chosen = places[np.minimum(np.searchsorted(cumulative, wanted, side="right"), places.size - 1)]
         kept.append((chosen // mass.shape[1], chosen % mass.shape[1]))
     path, step = (np.concatenate(column) for column in zip(*kept, strict=True))

@@ -20,7 +20,7 @@ from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import campaign_pool, take_aim
-from harness.pool.cut_ins import Pool
+from harness.pool.kept import Pool
 from harness.pool.shells import acceleration_limit, shells_in_strata, shells_of
 from harness.progress import Progress
 from harness.resolved import Resolved
@@ -118,7 +118,7 @@ def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
     for name in numbers:
         low, high = np.full(n, -np.inf), np.full(n, np.inf)  # of a shell without cut-ins nothing is known
         for s in np.unique(shell):
-            values = pool.cut_ins.facts[name][shell == s]
+            values = pool.events.facts[name][shell == s]
             low[s], high[s] = values.min(), values.max()
             margin = MARGIN * (high[s] - low[s])
             low[s], high[s] = low[s] - margin, high[s] + margin

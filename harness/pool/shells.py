@@ -20,7 +20,7 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.families.protocol import Chosen
 from harness.loop.cells import PrescribedEvents
 from harness.loop.repeat import Traffic
-from harness.pool.cut_ins import Pool
+from harness.pool.kept import Pool
 from harness.resolved import Resolved
 from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign
 from harness.vocabulary import FloatArray, Int8Array, IntArray
@@ -102,7 +102,7 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
     groups = shells_in_strata(pool, limit_mps2)
     boundary = pool.library.boundary
     cells, stratum, references = cells_in_strata(pool, groups)
-    takes_time = bool(pool.cut_ins.lead.any())
+    takes_time = bool(pool.events.lead.any())
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
     design = ShellDesign(
         pool=pool.key,
@@ -111,9 +111,7 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         cell_p=p,
         cell_references=tuple(references.tolist()),
         references=tuple(
-            Reference(
-                name, _REFERENCES.get(each.model, "the driver"), None if takes_time else each.delay_after_cut_in_s
-            )
+            Reference(name, _REFERENCES.get(each.model, "the driver"), None if takes_time else each.delay_after_event_s)
             for name, each in pool.library.references.items()
         ),
         reference_rate=pool.reference_rate,
@@ -122,9 +120,9 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         boundary=boundary,
         assumes=pool.library.assumes or f"crashes only where the surrogate {boundary} or a more careful one crashes",
         n_inside=sum(group[-1] <= boundary_shell(pool) for group in groups),
-        p_cut_in=pool.p_cut_in,
-        p_unreachable=pool.p_cut_in - float(p.sum()),
-        shadow_runs=(acts := pool.cut_ins.motion.size > 0),
+        p_event=pool.p_event,
+        p_unreachable=pool.p_event - float(p.sum()),
+        shadow_runs=(acts := pool.events.motion.size > 0),
         candidates=CANDIDATES if acts else 0,
     )
     if pool.p_after_failure == 0.0:
@@ -171,7 +169,7 @@ class PrescribedEpisodes:
         campaign, self._resolved = resolved.campaign, resolved
         limit = acceleration_limit(campaign.av)
         design, groups = design_shells(pool, limit), shells_in_strata(pool, limit)
-        self._cut_ins, self._shell, self._shell_p = pool.cut_ins, pool.shell, pool.shell_p
+        self._cut_ins, self._shell, self._shell_p = pool.events, pool.shell, pool.shell_p
         self._n_inside = boundary_shell(pool) + 1
         self._cells = cells_in_strata(pool, groups)[0]
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]

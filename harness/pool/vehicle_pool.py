@@ -28,7 +28,7 @@ from harness.families.protocol import Environment, Family, Paths, Recorded
 from harness.loop.judge import motion_hashes
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, contributions
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
-from harness.pool.cut_ins import Pool
+from harness.pool.kept import Pool
 from harness.pool.shells import CANDIDATES, conservative_first, shells_of
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
@@ -182,8 +182,8 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded, learn
     made_of = environment, library, resolved.campaign.pool, key, more
     pool = pool_of(resolved.family, enumerated, paths.seed, order, *made_of)
     hashes = motion_hashes(runs.x_m, runs.v_mps)
-    row, step, onset = pool.cut_ins.row, pool.cut_ins.step, pool.cut_ins.onset
+    row, step, onset = pool.events.row, pool.events.step, pool.events.onset
     # A kept cut-in stands for its like nearby, too, where these are too improbable to be kept one by one.
     least = pool.shell_p[pool.shell] * (len(paths) / np.bincount(pool.shell)[pool.shell])
-    cut_ins = replace(pool.cut_ins, motion=hashes[row, onset], mass=np.maximum(mass[row, step], least))
-    return replace(pool, cut_ins=cut_ins, p_after_failure=float((found.after_failure * paths.weight).mean()))
+    events = replace(pool.events, motion=hashes[row, onset], mass=np.maximum(mass[row, step], least))
+    return replace(pool, events=events, p_after_failure=float((found.after_failure * paths.weight).mean()))

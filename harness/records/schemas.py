@@ -41,7 +41,7 @@ def _per(n: int) -> pa.DataType:
 _OF_BASELINE_RUNS = (
     _or_null("shadow", _I8, "1", "baseline run that the test repeats (method shells, vehicles that act before)"),
     _or_null(
-        "cut_in_mass", _F8, "1", "P of the test's own cut-in, or of those it stands for, in the measure of cell_mass"
+        "event_mass", _F8, "1", "P of the test's own cut-in, or of those it stands for, in the measure of cell_mass"
     ),
 )
 
@@ -71,9 +71,9 @@ def episodes_schema(
             *_facts(columns),
             _field("outcome", _NAME, "", "crash, passed, timeout, bv_lv_contact or failed"),
             _field("n_steps", _I2, "0.1 s", "steps simulated until the episode ended"),
-            _or_null("cut_in_step", _I2, "0.1 s", "step in which BV cut in, null without one"),
-            _or_null("cut_in_r2_m", _F8, "m", "R2 at the cut-in decision"),
-            _or_null("cut_in_r2dot_mps", _F8, "m/s", "R2dot at the cut-in decision"),
+            _or_null("event_step", _I2, "0.1 s", "step in which BV cut in, null without one"),
+            _or_null("event_gap_m", _F8, "m", "R2 at the cut-in decision"),
+            _or_null("event_rate_mps", _F8, "m/s", "R2dot at the cut-in decision"),
             _or_null("took_over_step", _I2, "0.1 s", "first step in which the AV did what its vehicle asked for"),
             _field("asked_to_speed_up", pa.bool_(), "", "whether it asked to speed up while it was held at its speed"),
             _or_null("crash_time_s", _F8, "s", "time of the crash"),
@@ -83,10 +83,10 @@ def episodes_schema(
             _field("n_control_steps", _I2, "1", "stratum l: steps drawn from an importance function"),
             _field("component", _I1, "1", "importance function drawn (episode mixture), or shell, else -1"),
             _field("log_weight", _F8, "1", "log p(x_c) - log q_sampled(x_c), 0 without control; of shells log p_s"),
-            _or_null("log_p_cut_in", _F8, "1", "log P(cut-in | path), where the method draws the path ahead"),
+            _or_null("log_p_event", _F8, "1", "log P(cut-in | path), where the method draws the path ahead"),
             _field("log_q", _per(n_importance), "1", "per importance function: sum of log(q_j/p)"),
             _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_(t-1) V_j (q_j,t/q_alpha,t - 1)"),
-            _or_null("pool_cut_in", _I8, "1", "row of the pool's cut-in (method shells), else null"),
+            _or_null("pool_row", _I8, "1", "row of the pool's cut-in (method shells), else null"),
             *(of_shells if n_cells else ()),
             *(_OF_BASELINE_RUNS if acts else ()),
             *(_lateral_fields() if takes_time else ()),
@@ -100,8 +100,8 @@ def _lateral_fields() -> list[pa.Field]:
     return [
         _or_null("lead_steps", _I2, "0.1 s", f"from the onset of lateral motion to overlap ({about})"),
         _or_null("onset_step", _I2, "0.1 s", "step at whose end BV began to move sideways"),
-        _or_null("onset_r2_m", _F8, "m", "R2 at the onset"),
-        _or_null("onset_r2dot_mps", _F8, "m/s", "R2dot at the onset"),
+        _or_null("onset_gap_m", _F8, "m", "R2 at the onset"),
+        _or_null("onset_rate_mps", _F8, "m/s", "R2dot at the onset"),
         _or_null("onset_ttc_s", _F8, "s", "R2/-R2dot at the onset, null where the AV does not close in"),
         _or_null("overlap_ttc_s", _F8, "s", "the same at the cut-in decision, the last state before overlap"),
         _or_null("contact", pa.string(), "", "of a crash: side, in the first state of overlap, or rear"),
@@ -279,7 +279,7 @@ LEAD = "lead_steps"
 
 def path_columns(family: Family) -> tuple[str, ...]:
     """What of the episodes table determines the others' motion, `LEAD` beside it."""
-    return ("episode", "n_steps", "cut_in_step", *(column.name for column in family.columns))
+    return ("episode", "n_steps", "event_step", *(column.name for column in family.columns))
 
 
 def chosen_from(rows: pa.Table, family: Family) -> Chosen:
@@ -289,7 +289,7 @@ def chosen_from(rows: pa.Table, family: Family) -> Chosen:
         return np.asarray(rows.column(name).fill_null(null)).astype(np.int64)
 
     lead = whole(LEAD, 0) if LEAD in rows.column_names else np.zeros(rows.num_rows, np.int64)
-    return Chosen(facts_from(rows, family.columns), whole("cut_in_step", -1), lead)
+    return Chosen(facts_from(rows, family.columns), whole("event_step", -1), lead)
 
 
 def _driven(shard: Shard) -> dict[str, Any]:
@@ -301,33 +301,21 @@ def _driven(shard: Shard) -> dict[str, Any]:
     }
 
 
-_CALLED = {
-    "cut_in_step": "event_step",
-    "cut_in_r2_m": "event_gap_m",
-    "cut_in_r2dot_mps": "event_rate_mps",
-    "onset_r2_m": "onset_gap_m",
-    "onset_r2dot_mps": "onset_rate_mps",
-    "log_p_cut_in": "log_p_event",
-}
-"""Columns that have another name in the loop."""
-
-
 def episodes_table(shard: Shard, seed: int) -> pa.Table:
     """One row per episode, in index order."""
     e, n, prescribed, drawn = shard.episode, shard.episode.size, shard.events, shard.traffic.drawn
     log_q, martingale = (np.zeros((n, 0)),) * 2 if drawn is None else (drawn.log_q, drawn.martingale)
-    columns = _driven(shard) | {name: e[own] for name, own in _CALLED.items()}
-    columns |= {
+    columns = _driven(shard) | {
         "episode": shard.first_episode + np.arange(n),
         "seed": np.full(n, seed, np.int64),
         "log_q": rows(log_q),
         "martingale": rows(martingale),
         "asked_to_speed_up": e["asked_to_speed_up"] > 0,
-        "pool_cut_in": pa.nulls(n, pa.int64()) if prescribed is None else prescribed.row,
+        "pool_row": pa.nulls(n, pa.int64()) if prescribed is None else prescribed.row,
     }
     if prescribed is not None:
         columns |= {"cell": prescribed.cell.astype(np.int16), "cell_mass": rows(prescribed.cell_mass)}
-        columns |= {"shadow": prescribed.shadow, "cut_in_mass": prescribed.mass}
+        columns |= {"shadow": prescribed.shadow, "event_mass": prescribed.mass}
     if shard.scenario.shows:
         columns |= _lateral_columns(e)
     of_all = log_q.shape[1], martingale.shape[1], 0 if prescribed is None else prescribed.cell_mass.shape[1]

@@ -85,7 +85,7 @@ class Pairs(NamedTuple):
 
 def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> Pairs:
     """Pairs on which A or B crashes, by the records: the i-th test of a shell of A and of B."""
-    columns = ("episode", "component", "impact_speed_mps", "cut_in_r2_m", "cut_in_r2dot_mps")
+    columns = ("episode", "component", "impact_speed_mps", "event_gap_m", "event_rate_mps")
     n_pairs, found = [shell["n_pairs"] for shell in shells], []
     for run in runs:
         rows = pa.Table.from_batches(run.episodes(*columns, "outcome"))

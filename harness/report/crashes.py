@@ -23,7 +23,7 @@ CANDIDATES, SHOWN = 50, 3
 """Crashes considered and shown per ranking: with a share of traces only some of the worst have one."""
 MOST_JUDGED, MOST_TRACED = 20_000, 1_000
 """Hardest crashes of which it is asked who would have avoided them; of vehicles whose motion the traces must tell."""
-SHOWN_COLUMNS = ("impact_speed_mps", "crash_time_s", "weight", "cut_in_s", "cut_in_r2_m", "cut_in_r2dot_mps")
+SHOWN_COLUMNS = ("impact_speed_mps", "crash_time_s", "weight", "cut_in_s", "event_gap_m", "event_rate_mps")
 """Of a crash in the table, beside its episode; as in `RunSummary`."""
 
 
@@ -102,7 +102,7 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
 def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArray) -> IntArray:
     """After which step `OTHERS` crash where the AV has (n, D), below zero for never."""
     ends = np.full((episode.size, len(OTHERS)), UNKNOWN, np.int64)
-    acts = run.campaign.av.acts_before_cut_in
+    acts = run.campaign.av.acts_before_event
     judged = np.sort(np.argsort(-impact, kind="stable")[: MOST_TRACED if acts else MOST_JUDGED])
     asked = {int(each) for each in episode[judged]}
     if asked:

@@ -24,7 +24,7 @@ from harness.errors import printable
 from harness.families import family_named
 from harness.families.protocol import Driven, Environment
 from harness.numbers import tenths
-from harness.pool.cut_ins import onset_steps
+from harness.pool.kept import onset_steps
 from harness.records.folder import write_bytes
 from harness.records.schemas import chosen_from
 from harness.report.summary import floats
@@ -63,7 +63,7 @@ class Scenes:
     """
 
     def __init__(self, campaign: Campaign, environment: Environment | None) -> None:
-        self._name, self._acts = campaign.name, campaign.av.acts_before_cut_in
+        self._name, self._acts = campaign.name, campaign.av.acts_before_event
         self._family, self._environment = family_named(campaign.scenario), environment
 
     def ends(self, rows: pa.Table, traces: pa.Table | None) -> IntArray:
@@ -90,7 +90,7 @@ class Scenes:
 
     def scene(self, row: pa.Table, trace: pa.Table, *, why: str = "") -> Scene:
         """One episode, given its row and its trace, from shortly before the cut-in on; all of one without."""
-        episode, outcome, cut = (row.column(name)[0].as_py() for name in ("episode", "outcome", "cut_in_step"))
+        episode, outcome, cut = (row.column(name)[0].as_py() for name in ("episode", "outcome", "event_step"))
         tracks = [{"name": name, **_states(_of(trace, name)), "crash": None} for name in self._family.vehicles]
         bv, av = tracks[self._family.principal], tracks[-1]
         last, over = av["x"].size - 1, share_over(_of(trace, bv["name"]))

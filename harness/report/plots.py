@@ -212,10 +212,10 @@ def where_plot(summary: RunSummary, family: Family, environment: Environment | N
     ``environment`` is that in which others can be driven, None where that is not known any more.
     """
     rows = summary.rows
-    cut_in = np.isfinite(rows["cut_in_r2_m"]) & np.isfinite(rows["cut_in_r2dot_mps"]) & (rows["outcome"] != FAILED)
+    cut_in = np.isfinite(rows["event_gap_m"]) & np.isfinite(rows["event_rate_mps"]) & (rows["outcome"] != FAILED)
     if not cut_in.any():
         return None
-    gap, closing = rows["cut_in_r2_m"][cut_in], np.maximum(-rows["cut_in_r2dot_mps"][cut_in], 0.0)
+    gap, closing = rows["event_gap_m"][cut_in], np.maximum(-rows["event_rate_mps"][cut_in], 0.0)
     weight, crash = rows["weight"][cut_in], rows["outcome"][cut_in] == CRASH
     of = crash if crash.any() else np.ones_like(crash)
     far, fast = 1.4 * float(np.quantile(gap[of], 0.98)) + 1.0, 1.15 * float(np.quantile(closing[of], 0.98)) + 1.0

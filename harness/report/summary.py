@@ -36,8 +36,8 @@ ROWS_TOGETHER = 5_000
 """Of small shards: each batch costs a millisecond."""
 MOST_CAUSES = 1_000
 COLUMNS = (
-    "episode", "component", "log_weight", "impact_speed_mps", "crash_time_s", "cut_in_step",
-    "cut_in_r2_m", "cut_in_r2dot_mps",
+    "episode", "component", "log_weight", "impact_speed_mps", "crash_time_s", "event_step",
+    "event_gap_m", "event_rate_mps",
 )  # fmt: skip
 
 
@@ -197,7 +197,7 @@ class RunSummary:
     def crashes(self) -> dict[str, FloatArray]:
         """`rows` of the crashes alone, and when they were: ``cut_in_s`` and ``response_s`` (s)."""
         crashes = {name: column[self.rows["outcome"] == CRASH] for name, column in self.rows.items()}
-        cut_in_s = STEP_S * crashes["cut_in_step"]
+        cut_in_s = STEP_S * crashes["event_step"]
         return {**crashes, "cut_in_s": cut_in_s, "response_s": crashes["crash_time_s"] - cut_in_s}
 
     def per_test(self, weight: float) -> float:
@@ -226,7 +226,7 @@ def summarise(run: RunFolder) -> RunSummary:
             if (cause := item["values"].as_py()) in causes or len(causes) < MOST_CAUSES:
                 causes[cause] += item["counts"].as_py()
         columns = {name: floats(batch.column(name)) for name in asked} | {"outcome": outcome.astype(np.float64)}
-        shown = np.isfinite(columns["cut_in_step"]) | (columns["log_weight"] != 0.0)
+        shown = np.isfinite(columns["event_step"]) | (columns["log_weight"] != 0.0)
         kept.append({name: column[shown] for name, column in columns.items()})
     rows = {name: np.concatenate([part[name] for part in kept] or [np.zeros(0)]) for name in (*asked, "outcome")}
     outcome = rows["outcome"].astype(np.int64)
@@ -242,16 +242,16 @@ def summarise(run: RunFolder) -> RunSummary:
 def lateral_facts(run: RunFolder) -> dict[str, Any] | None:
     """How cut-ins of the tests showed themselves, as sampled; None where they are one step.
 
-    ``lead_s`` are 5 %, 50 % and 95 % quantiles of the leads of ``n_cut_ins``; ``n_side`` of ``n_crashes`` were side
+    ``lead_s`` are 5 %, 50 % and 95 % quantiles of the leads of ``n_events``; ``n_side`` of ``n_crashes`` were side
     contacts.
     """
     if "lead_steps" not in stored_columns(run.path):
         return None
     leads, contacts = [np.zeros(0)], Counter[str]()
-    for batch in run.episodes("lead_steps", "cut_in_step", "contact"):
-        leads.append(floats(batch.filter(pc.is_valid(batch.column("cut_in_step"))).column("lead_steps")))
+    for batch in run.episodes("lead_steps", "event_step", "contact"):
+        leads.append(floats(batch.filter(pc.is_valid(batch.column("event_step"))).column("lead_steps")))
         contacts.update(batch.column("contact").drop_null().to_pylist())
     lead_s = STEP_S * np.concatenate(leads)
     quantiles = np.quantile(lead_s, (0.05, 0.5, 0.95)).tolist() if lead_s.size else [math.nan] * 3
     crashes = {"n_crashes": contacts.total(), "n_side": contacts["side"]}
-    return {"n_cut_ins": lead_s.size, "lead_s": quantiles, **crashes}
+    return {"n_events": lead_s.size, "lead_s": quantiles, **crashes}

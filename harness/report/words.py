@@ -157,7 +157,7 @@ def _rows(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> I
     so_far = " so far" if best.untested and best.n_crashes else ""
     rows = [Row("rate", f"{counted}{so_far}", f"{less}{number(shown)} per test", ends, remark)]
     beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
-    acts = campaign.av.acts_before_cut_in
+    acts = campaign.av.acts_before_event
     rows += [_beside(each, acts=acts, wide=wide, from_below=from_below) for each in beside]
     # Where little else is known of the rate than a limit, what is known comes first: the ratio.
     yield from reversed(rows) if unseen or (wide and beside and _end(beside[0]["ratio_high"]) < 1.0) else rows
@@ -279,11 +279,11 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
 
 def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> Iterator[str]:
     """What the vehicle did while BV came over, a line each."""
-    if not manifest.get("cut_ins_take_time") or campaign.av.acts_before_cut_in:
+    if not manifest.get("events_take_time") or campaign.av.acts_before_event:
         return
     if campaign.av.source in ("sumo", "traci"):
         yield "SUMO switches lanes in one step: this vehicle cannot see BV come over, as other drivers do"
-    elif counts.get("n_cut_ins") and not counts.get("n_took_over_early"):
+    elif counts.get("n_events") and not counts.get("n_took_over_early"):
         yield "it did nothing until BV was on its lane, though it can see it come over some 2 s before: bv_lateral_m"
     if (n := counts.get("n_asked_to_speed_up")) and campaign.av.model is None:  # of our own it is known
         yield f"in {count(n)} tests it asked to speed up before BV was on its lane, and was held (av.takes_over)"

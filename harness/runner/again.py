@@ -85,7 +85,7 @@ def _run_here(
 
 def repeat(loop: EpisodeLoop, source: Source, shard: Shard) -> Repeated:
     """Run some tests of a loop's shard again, each alone: a user's code elsewhere, what SUMO drives after the shard."""
-    rows = _rows_to_repeat(shard, source.campaign.seed, acts_early=source.campaign.av.acts_before_cut_in)
+    rows = _rows_to_repeat(shard, source.campaign.seed, acts_early=source.campaign.av.acts_before_event)
     tests = [_test_of(shard, row) for row in rows]
     if has_foreign_code(source.campaign.av):
         again = _each_elsewhere(source, tests)

@@ -192,10 +192,10 @@ def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: PairCounts) -> dic
     needed = two_digits_up(int(pairs.tests.sum()) * times)
     settings = {"stop.episodes": needed} if needed > campaign.stop.episodes else {}
     if new_folder := (more := rounds.used_of_pool(pairs) * times) > 1.0:
-        kept = two_digits_up(campaign.pool.cut_ins_per_shell * more)
+        kept = two_digits_up(campaign.pool.events_per_shell * more)
         if kept > MOST_CUT_INS:
             return None
-        settings["pool.cut_ins_per_shell"] = kept
+        settings["pool.events_per_shell"] = kept
     return {"pairs": needed, "settings": settings, "new_folder": new_folder}
 
 

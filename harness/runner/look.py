@@ -63,7 +63,7 @@ class Behaviour:
     share_at_max: float
     reaction_s: float
     braking_share: float
-    n_cut_ins: int
+    n_events: int
     n_crashes: int
 
 
@@ -75,7 +75,7 @@ IN_WORDS = {
     "share_at_max": "share of steps at its hardest allowed acceleration",
     "reaction_s": "from the onset of a cut-in to the first braking, median, s",
     "braking_share": "share of cut-ins after which it braked",
-    "n_cut_ins": "cut-ins",
+    "n_events": "cut-ins",
     "n_crashes": "crashes (no rate: cut-ins are forced)",
     "us_per_step": "time per step, µs",
     "episodes_per_s": "tests per second",
@@ -135,8 +135,8 @@ class AvCheck:
             return f"NOT READY: {sum(self.failures.values())} of {n} tests failed: {next(iter(self.failures))}."
         if self.differing:
             return f"NOT REPRODUCIBLE: {len(self.differing)} of {n} tests came out otherwise. {self.likely_cause}"
-        if not seen.n_cut_ins or not seen.braking_share > 0.0:
-            return f"LOOK AGAIN: it braked after none of {seen.n_cut_ins} cut-ins. Does it see BV?"
+        if not seen.n_events or not seen.braking_share > 0.0:
+            return f"LOOK AGAIN: it braked after none of {seen.n_events} cut-ins. Does it see BV?"
         longest, moved = max(self.moved_mps2.items(), default=(0.0, 0.0))
         if longest and moved > MOVES_MPS2:
             return (
@@ -146,7 +146,7 @@ class AvCheck:
             )
         slower = self.speed.us_per_step / self.idm_speed.us_per_step
         return (
-            f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_cut_ins} "
+            f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
             f"cut-ins, {seen.reaction_s:.1f} s after they began (median, also where it had no need to brake sooner); "
             f"a step takes {slower:.1f} times that of IDM.{self._advice}"
         )
@@ -210,12 +210,12 @@ def check_av(
     if own_speed.constructions > 1:  # one for each cell
         own_speed = replace(own_speed, constructions=asked.world.cells)
     again = _run_in_another_order(source, n_episodes)
-    idm = tested.model_copy(update={"av": AutomatedVehicle(before_cut_in=tested.av.before_cut_in)})
+    idm = tested.model_copy(update={"av": AutomatedVehicle(before_event=tested.av.before_event)})
     of_idm, idm_speed = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
     own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
     limits = own.min_acceleration_mps2, own.max_acceleration_mps2
     differing = tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i])
-    early = tested.av.acts_before_cut_in
+    early = tested.av.acts_before_event
     return AvCheck(
         source=tested.av.source,
         engine=tested.world.engine,
@@ -246,7 +246,7 @@ def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
 
 def _as_checked(campaign: Campaign) -> Campaign:
     """The campaign with cut-ins in (nearly) every episode, all motion kept, and the twin where it can drive the AV."""
-    holds = campaign.av.before_cut_in == "hold_speed"
+    holds = campaign.av.before_event == "hold_speed"
     method = "forced" if holds else "step_mixture"
     environment = campaign.environment if holds else campaign.environment.replaced(("cut_in_lead_s",), 0.0)
     testing = campaign.testing.model_copy(update={"method": method})
@@ -412,6 +412,6 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         share_at_max=float(np.mean(some >= limits[1] - AT_LIMIT_MPS2)),
         reaction_s=float(np.median(reaction[braked])) if braked.any() else np.nan,
         braking_share=float(braked.mean()) if reaction.size else np.nan,
-        n_cut_ins=len(reactions),
+        n_events=len(reactions),
         n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
     )

@@ -25,7 +25,7 @@ from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.shells import SeenShells
 from harness.numbers import share
 from harness.pool.build import campaign_pool
-from harness.pool.cut_ins import Pool
+from harness.pool.kept import Pool
 from harness.pool.moved import FewPaths, OnPaths, environment_with, ranges, ratio_of
 from harness.pool.shells import acceleration_limit, design_shells
 from harness.progress import Progress
@@ -289,7 +289,7 @@ def moved_design(tested: ShellDesign, new: ShellDesign, environment: str) -> She
         pool=new.pool,
         cell_p=p,
         n_paths=new.n_paths,
-        p_cut_in=new.p_cut_in,
+        p_event=new.p_event,
         p_unreachable=new.p_unreachable,
         reference_rate=new.reference_rate,
         reference_square=new.reference_square,
@@ -313,7 +313,7 @@ def _share_beyond(tested: StoredShells, new: Pool) -> float:
     design, old, weight = tested.design, tested.pool, tested.design.p * tested.seen.tally.share
     outside = np.zeros(new.shell.size, np.bool_)
     for name, (low, high) in ranges(old).items():
-        outside |= (new.cut_ins.facts[name] < low[new.shell]) | (new.cut_ins.facts[name] > high[new.shell])
+        outside |= (new.events.facts[name] < low[new.shell]) | (new.events.facts[name] > high[new.shell])
     beyond = {name: float(outside[rows].mean()) for s, name in enumerate(old.names) if (rows := new.shell == s).any()}
     shares: FloatArray = np.array([beyond.get(name, 0.0) for name in design.strata])
     return float(weight @ shares / weight.sum()) if weight.any() else float(shares.max(initial=0.0))

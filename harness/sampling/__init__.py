@@ -38,7 +38,7 @@ def source_of(campaign: Campaign) -> type[Source]:
     """How the tests of a campaign are drawn."""
     method = campaign.testing.method
     own = family_named(campaign.scenario).sources()
-    if method == "nde" and campaign.av.acts_before_cut_in:  # where its events are depends on what it does
+    if method == "nde" and campaign.av.acts_before_event:  # where its events are depends on what it does
         return own[method]
     return _SOURCES.get(method) or own[method]
 

@@ -30,7 +30,7 @@ from harness.loop.loop import EpisodeLoop, Shard
 from harness.loop.repeat import Traffic
 from harness.numbers import plain
 from harness.pool.build import campaign_pool, campaign_pool_key, pool_name
-from harness.pool.cut_ins import Pool
+from harness.pool.kept import Pool
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_paths, vehicle_pool
 from harness.progress import Progress
@@ -97,15 +97,15 @@ class Shells(Source):
         return shard
 
     def run_again(self, loop: EpisodeLoop, episode: int, stored: pa.Table) -> Shard:
-        row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_cut_in", "component"))
+        row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_row", "component"))
         shard = loop.run(episode, self.prescribed.of_rows(row, stratum))
         shard.events = self.prescribed.events(row)
         return shard
 
     def is_shard(self, request: ShardRequest, episodes: pa.Table) -> bool:
         """See `Source`: nor of the last round of a smaller budget."""
-        cut_ins, wanted = episodes.column("pool_cut_in"), self.prescribed.rows(request.draws)[0]
-        return super().is_shard(request, episodes) and not cut_ins.null_count and np.array_equal(cut_ins, wanted)
+        events, wanted = episodes.column("pool_row"), self.prescribed.rows(request.draws)[0]
+        return super().is_shard(request, episodes) and not events.null_count and np.array_equal(events, wanted)
 
 
 class ShellRounds(Rounds):

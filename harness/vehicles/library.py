@@ -29,11 +29,11 @@ class LibraryDriver(Driver):
     reaction: Reflexes = Reflexes()
 
     @property
-    def delay_after_cut_in_s(self) -> float | None:
+    def delay_after_event_s(self) -> float | None:
         """How long after a dangerous cut-in a reference driver begins to brake (s); None for any other driver."""
         if not isinstance(self.parameters, Reference):
             return None
-        return self.parameters.delay_after_cut_in_s + self.reaction.delay_s
+        return self.parameters.delay_after_event_s + self.reaction.delay_s
 
 
 def library_records(models: Sequence[LibraryDriver], see_onset: bool) -> RecordArray:

@@ -22,10 +22,10 @@ class World:
 
     ``x``, ``v``, ``lane`` (K, V) are front bumpers' positions (m), speeds (m/s) and lanes (0 right, 1 left), as the
     world reports them. One that ``drives_av`` itself (SUMO's own models, or a program connected to SUMO) does so from
-    the start of an episode if it ``acts_before_cut_in``, else from the step after the cut-in.
+    the start of an episode if it ``acts_before_event``, else from the step after the cut-in.
     """
 
-    drives_av = acts_before_cut_in = False
+    drives_av = acts_before_event = False
 
     def __init__(self, n_cells: int, vehicles: Sequence[str] = VEHICLES) -> None:
         self.vehicles = tuple(vehicles)
@@ -88,11 +88,11 @@ def build_world(
         from harness.worlds.twin import TwinWorld  # noqa: PLC0415
 
         return TwinWorld(cells, vehicles)
-    cells, early = min(cells, MOST_SUMO_CELLS), av.acts_before_cut_in
+    cells, early = min(cells, MOST_SUMO_CELLS), av.acts_before_event
     if av.traci is not None:
         from harness.worlds.program import TraciWorld  # noqa: PLC0415
 
-        return TraciWorld(cells, av.traci, av.limits.step_time_s, vehicles, acts_before_cut_in=early)
+        return TraciWorld(cells, av.traci, av.limits.step_time_s, vehicles, acts_before_event=early)
     from harness.worlds.sumo import SumoWorld  # noqa: PLC0415
     from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld, recyclable  # noqa: PLC0415
 
@@ -100,4 +100,4 @@ def build_world(
         return SumoWorld(cells, vehicles, gui=gui, options=options)
     if recyclable(av.sumo) and not early:  # one that is released at the start remembers the last episode's cut-in
         return SumoAvWorld(cells, av.sumo, vehicles, gui=gui, options=options)
-    return FreshWorld(av.sumo, campaign.seed, vehicles, acts_before_cut_in=early, gui=gui, options=options)
+    return FreshWorld(av.sumo, campaign.seed, vehicles, acts_before_event=early, gui=gui, options=options)

@@ -245,10 +245,10 @@ class TraciWorld(SumoCells):
         step_time_s: float,
         vehicles: Sequence[str] = VEHICLES,
         *,
-        acts_before_cut_in: bool = False,
+        acts_before_event: bool = False,
     ) -> None:
         super().__init__(n_cells, vehicles)
-        self.acts_before_cut_in = acts_before_cut_in
+        self.acts_before_event = acts_before_event
         self._av, self._step_time_s, self._restarts_left = av, step_time_s, av.restarts
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._program: ConnectedProgram | None = None
@@ -293,7 +293,7 @@ class TraciWorld(SumoCells):
                 there = float(x[k, vehicle]), float(v[k, vehicle]), int(lane[k, vehicle])
                 program.answer(partial(self._move, to, k, vehicle, *there))
         self.x[cells], self.v[cells], self.lane[cells] = x[cells], v[cells], lane[cells]
-        self._released[cells] = self.acts_before_cut_in
+        self._released[cells] = self.acts_before_event
 
     def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
         """Speeds of released AVs are ignored.

@@ -143,10 +143,10 @@ class SumoAvWorld(SumoWorld):
         av: Mapping[str, str | float],
         vehicles: Sequence[str] = VEHICLES,
         *,
-        acts_before_cut_in: bool = False,
+        acts_before_event: bool = False,
         **options: Any,
     ) -> None:
-        self.acts_before_cut_in = acts_before_cut_in
+        self.acts_before_event = acts_before_event
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._wanted: FloatArray = np.zeros((n_cells, len(vehicles)))
         attributes = av_type(av)
@@ -178,7 +178,7 @@ class SumoAvWorld(SumoWorld):
             self._api.vehicle.setSpeedMode(self._names[k][-1], OBEY)
         super().place(cells, x, v, lane)
         self._released[cells] = False
-        if self.acts_before_cut_in:
+        if self.acts_before_event:
             self._let_go(cells)
 
     def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:

@@ -84,7 +84,7 @@ class Sampler:
         if self.method == "step_mixture":
             columns["first_ratios"] = self.ratios
         if self.method in ("forced", "episode_mixture"):
-            columns["log_p_cut_in"] = self.log_p_cut
+            columns["log_p_event"] = self.log_p_cut
             log_weight = -logsumexp(log_q + np.log(self.alpha), axis=1)
             log_weight[np.isinf(log_weight)] = 0.0  # a forced cut-in that could not be
         outcome = np.where(self.after == self.chain.crashed, CRASH, TIMEOUT).astype(np.int8)

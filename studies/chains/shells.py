@@ -67,7 +67,7 @@ class ChainShells:
             boundary=names[-2],
             assumes="crashes only inside",
             n_inside=chain.n_surrogates,
-            p_cut_in=float(p.sum()),
+            p_event=float(p.sum()),
             p_unreachable=0.0,
         )
         return [DrawnPool(design, mass, crash_mass)]

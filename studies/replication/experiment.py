@@ -125,12 +125,12 @@ class Experiment(Section):
     @property
     def acting(self) -> list[str]:
         """Vehicles that act before the cut-in."""
-        return [name for name, av in self.avs.items() if av.acts_before_cut_in]
+        return [name for name, av in self.avs.items() if av.acts_before_event]
 
     @property
     def holding(self) -> dict[str, AutomatedVehicle]:
         """Vehicles that keep their speed until the cut-in."""
-        return {name: av for name, av in self.avs.items() if not av.acts_before_cut_in}
+        return {name: av for name, av in self.avs.items() if not av.acts_before_event}
 
     def seed_of(self, place: int) -> int:
         """Seed of a subject's own, by its place in the file."""
@@ -165,11 +165,11 @@ class Experiment(Section):
         names += [("beside", "none", ["a reference driver, for verdicts"])] * bool(self.verdicts and not self.beside)
         for name, av in self.avs.items():
             driven = "a built-in model" if isinstance(av.parameters, BuiltInParameters) else f"av.{av.source}"
-            if av.acts_before_cut_in and method == "shells":  # it walks the paths of its pools first
+            if av.acts_before_event and method == "shells":  # it walks the paths of its pools first
                 names.append((f"avs.{name}", driven, ["av.controller", "av.fmu"]))
             else:
-                found = f"{driven} with before_cut_in {av.before_cut_in}"
-                names.append((f"avs.{name}", found, ["a built-in model with before_cut_in hold_speed"]))
+                found = f"{driven} with before_event {av.before_event}"
+                names.append((f"avs.{name}", found, ["a built-in model with before_event hold_speed"]))
         for key, name, known in names:
             if name not in known:
                 mend = "Change it, or leave it out; what has no twin can be tested in SUMO with `harness run`."

@@ -34,7 +34,7 @@ from harness.loop.judge import motion_hashes
 from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.loop.repeat import Traffic
 from harness.pool.aim import PILOT_PATHS, STRIDE, Enumerator
-from harness.pool.cut_ins import onset_steps
+from harness.pool.kept import onset_steps
 from harness.pool.shells import CANDIDATES, PrescribedEpisodes, acceleration_limit
 from harness.pool.vehicle_pool import BaselinePaths, vehicle_pool, walk_candidates
 from harness.progress import Progress
@@ -281,7 +281,7 @@ def learn_vehicle(campaign: Campaign, paths: BaselinePaths) -> list[Learned]:
 
     Each has as many baseline runs as the campaign, and as many pilot tests.
     """
-    few = campaign.pool.model_copy(update={"cut_ins_per_shell": FEW_CUT_INS})
+    few = campaign.pool.model_copy(update={"events_per_shell": FEW_CUT_INS})
     resolved, loop = _ready(campaign.model_copy(update={"pool": few}))
     found, n_tests = list[Learned](), campaign.pool.pilot_tests
     for k in range(LEARNERS * (n_tests > 0)):

@@ -27,7 +27,7 @@ from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import CrashedTests, Tally, combined
-from harness.pool.cut_ins import CutIns, Pool
+from harness.pool.kept import KeptEvents, Pool
 from harness.pool.shells import boundary_shell, cells_in_strata, design_shells, shells_in_strata, shells_of
 from harness.pool.vehicle_pool import LEAST_LEARNED
 from harness.sampling.allocation import Allocation
@@ -99,7 +99,7 @@ class DrawnPool:
 
     ``mass`` and ``crash_mass`` (n, C) are each path's probability of a cut-in of each cell of the design, and of a
     crash in it; ``failing`` is the share of crashes that end as failed tests, ``failing_tests`` that of all tests. Of
-    paths that the vehicle has walked ``cut_ins`` are those on which it crashes, and tests fail on no others.
+    paths that the vehicle has walked ``events`` are those on which it crashes, and tests fail on no others.
     """
 
     design: ShellDesign
@@ -107,7 +107,7 @@ class DrawnPool:
     crash_mass: FloatArray
     failing: float = 0.0
     failing_tests: float = 0.0
-    cut_ins: CrashingCutIns | None = None
+    events: CrashingCutIns | None = None
 
     @cached_property
     def share(self) -> FloatArray:
@@ -126,13 +126,13 @@ class DrawnPool:
     def _cumulative(self) -> tuple[FloatArray, FloatArray]:
         """Sums of mass, and of crash mass, up to each path, by cell, shape (C, n)."""
         crash_mass = self.crash_mass
-        if (known := self.cut_ins) is not None:
+        if (known := self.events) is not None:
             crash_mass = np.where(known.cell[:, None] == np.arange(self.mass.shape[1]), known.crash_mass[:, None], 0.0)
         mass, crash_mass = (np.cumsum(np.ascontiguousarray(each.T), axis=1) for each in (self.mass, crash_mass))
         return mass, crash_mass
 
     def paths_of(self, n_by_cell: IntArray, rng: np.random.Generator, *, crashed: bool = True) -> list[IntArray]:
-        """Paths of so many crashed tests of each cell (C,), or of any; of crashed ones places in ``cut_ins``."""
+        """Paths of so many crashed tests of each cell (C,), or of any; of crashed ones places in ``events``."""
         return [
             np.searchsorted(up_to, rng.random(n) * up_to[-1:].sum(), side="right")
             for up_to, n in zip(self._cumulative[int(crashed)], n_by_cell.tolist(), strict=True)
@@ -154,7 +154,7 @@ class DrawnPool:
     def count(self, added: IntArray, seen: SeenShells, rng: np.random.Generator) -> None:
         """Draw so many more tests of each stratum (S,), and count what their records would say."""
         tests, *paths = self.tests_of(added, rng)
-        known, on_runs = self.cut_ins, None
+        known, on_runs = self.events, None
         if known is not None:
             place = np.repeat(np.arange(2 * tests.size), [rows.size for cells in paths for rows in cells])
             rows = np.concatenate([rows for cells in paths for rows in cells])
@@ -168,7 +168,7 @@ class DrawnPool:
 
     def available(self, campaign: Campaign) -> IntArray:
         """The most tests of each stratum, shape (S,)."""
-        return np.full(self.design.p.size, campaign.pool.cut_ins_per_shell, np.int64)
+        return np.full(self.design.p.size, campaign.pool.events_per_shell, np.int64)
 
 
 Draw = Callable[[np.random.Generator], Sequence[DrawnPool]]
@@ -397,7 +397,7 @@ class OvertakingShells:
     The ``template`` is a pool without cut-ins, whose probabilities each draw replaces; ``left_out`` are surrogates that
     are equals of a vehicle, ``limit_mps2`` is the hardest acceleration of the vehicles, and ``mass`` (n, C) the
     probability of a cut-in of each cell, by path of the super-population. ``crashing`` are the parts of it on which the
-    vehicle crashes, or both of two, only A, only B; ``failing``, ``failing_tests`` and ``cut_ins`` see `DrawnPool`.
+    vehicle crashes, or both of two, only A, only B; ``failing``, ``failing_tests`` and ``events`` see `DrawnPool`.
     """
 
     template: Pool
@@ -407,7 +407,7 @@ class OvertakingShells:
     crashing: tuple[FloatArray, ...] = ()
     failing: float = 0.0
     failing_tests: float = 0.0
-    cut_ins: CrashingCutIns | None = None
+    events: CrashingCutIns | None = None
 
     @property
     def crash_rate(self) -> float:
@@ -436,7 +436,7 @@ class OvertakingShells:
         pool = replace(
             of,
             cell_p=drawn.mean(0),
-            p_cut_in=float(drawn.sum(1).mean()),
+            p_event=float(drawn.sum(1).mean()),
             reference_rate=by_reference.mean(0),
             reference_square=(by_reference * by_reference).mean(0),
         )
@@ -444,8 +444,8 @@ class OvertakingShells:
         cells = cells_in_strata(pool, shells_in_strata(pool, limit))[0]
         joined = np.eye(design.cell_p.size + 1)[cells, :-1]  # the last row is for what is not tested
         mass, failing = drawn @ joined, (self.failing, self.failing_tests)
-        cut_ins = self.cut_ins and self.cut_ins.of_paths(rows, cells)
-        return [DrawnPool(design, mass, each[rows] @ joined, *failing, cut_ins) for each in self.crashing]
+        events = self.events and self.events.of_paths(rows, cells)
+        return [DrawnPool(design, mass, each[rows] @ joined, *failing, events) for each in self.crashing]
 
 
 def draw_of(sources: Sequence[OvertakingShells], rng: np.random.Generator) -> list[DrawnPool]:
@@ -498,9 +498,9 @@ class Division:
             "cell_shell": kinds >> n_references,
             "cell_references": kinds & each_reference,
             "cell_p": mass.mean(0),
-            "p_cut_in": float(mass.sum(1).mean()),
-            "cut_ins": CutIns(
-                **dict.fromkeys(CutIns.__dataclass_fields__, unknown) | {"motion": np.zeros(int(shadow_runs))}
+            "p_event": float(mass.sum(1).mean()),
+            "events": KeptEvents(
+                **dict.fromkeys(KeptEvents.__dataclass_fields__, unknown) | {"motion": np.zeros(int(shadow_runs))}
             ),
             "p_after_failure": 0.0,
         }
@@ -517,11 +517,11 @@ class Division:
         """Pools of a vehicle that crashes on this mass of cut-ins (m,), and fails as an adversary does."""
         failing, failing_tests = (0.0, 0.0) if made is None else (made.failing, made.failing_tests)
         found = replace(self._shells, crashing=(self.by_cell(crashing),), failing=failing, failing_tests=failing_tests)
-        if not found.template.cut_ins.motion.size:
+        if not found.template.events.motion.size:
             return found
         on, population = np.flatnonzero(crashing > 0.0), self._population
-        cut_ins = CrashingCutIns(population.path[on], on, self._cell[on], population.mass[on], crashing[on])
-        return replace(found, cut_ins=cut_ins)
+        events = CrashingCutIns(population.path[on], on, self._cell[on], population.mass[on], crashing[on])
+        return replace(found, events=events)
 
     def of_pair(self, a: FloatArray, b: FloatArray) -> OvertakingShells:
         """Pools of two vehicles that crash on these masses of cut-ins (m,).

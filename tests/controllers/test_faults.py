@@ -110,8 +110,8 @@ def test_a_fault_ends_its_episode_and_changes_no_other(faults, tmp_path, undistu
             fault = bad[row["episode"]]
             assert (row["outcome"], without_place(row["failure"])) == ("failed", faults[fault])
             assert fault not in ("raises", "hangs_and_swallows") or re.search(r"misbehaving\.py:\d+\)$", row["failure"])
-            assert row["n_steps"] == (0 if faults[fault].startswith("start") else without["cut_in_step"] + 3)
-            assert row["log_weight"] == row["log_p_cut_in"] == without["log_p_cut_in"]  # in start as well
+            assert row["n_steps"] == (0 if faults[fault].startswith("start") else without["event_step"] + 3)
+            assert row["log_weight"] == row["log_p_event"] == without["log_p_event"]  # in start as well
         else:
             assert row == without
     assert not list((tmp_path / "run").glob(".*"))

@@ -115,7 +115,7 @@ def test_a_built_in_model_is_held_by_the_same_rule(takes_over):
 # -- one that acts from the start meets the methods that do not need to know the AV's speed --
 
 
-EARLY = "av={controller: 'tests.controllers.test_forms:Faster', before_cut_in: controller}"
+EARLY = "av={controller: 'tests.controllers.test_forms:Faster', before_event: controller}"
 
 
 class Faster(IDM):

@@ -118,7 +118,7 @@ def test_a_state_that_starts_empty_is_filled_when_the_controller_acts(form, fill
 
 
 def test_a_command_of_the_warm_up_begins_anew_at_the_hand_over():
-    runs = [drive(av("SlowsDownOnce", warm_up_s=s), "av.before_cut_in=hold_speed", n=12) for s in (0.0, 2.0, 20.0)]
+    runs = [drive(av("SlowsDownOnce", warm_up_s=s), "av.before_event=hold_speed", n=12) for s in (0.0, 2.0, 20.0)]
     for row, trace in runs[0].traces.items():
         onset = int(runs[0].episode["onset_step"][row])
         assert trace[onset + 1, 2, 2] == pytest.approx(-0.3)
@@ -163,7 +163,7 @@ def test_it_counts_where_it_is_shown():
         changes = [[f"av={{{source}}}", f"av.warm_up_s={s}"] for s in (0, 1, 2)]
         return len({load_campaign(ROOT / "scenarios/smoke.yaml", each).content_hash("p") for each in changes})
 
-    assert [hashes(f"controller: 'a:B', before_cut_in: {when}") for when in ("hold_speed", "controller")] == [3, 1]
+    assert [hashes(f"controller: 'a:B', before_event: {when}") for when in ("hold_speed", "controller")] == [3, 1]
     assert [hashes(source) for source in ("model: idm", "sumo: {tau: 1}", "traci: {command: x}")] == [1, 1, 1]
 
 

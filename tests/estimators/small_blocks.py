@@ -14,12 +14,12 @@ State = TypeVar("State")
 SHELLS = ShellDesign(
     pool="0" * 24, strata=("careful", "careless", "outside"), cell_stratum=(0, 1, 2), cell_references=(0, 0, 0),
     cell_p=np.array([1e-4, 3e-4, 2e-2]), n_paths=10**9,
-    boundary="careless", assumes="keeps to careless", n_inside=2, p_cut_in=0.03, p_unreachable=0.0096,
+    boundary="careless", assumes="keeps to careless", n_inside=2, p_event=0.03, p_unreachable=0.0096,
 )  # fmt: skip
 """Shells of a pool that is known exactly."""
 RARE = ShellDesign(
     pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=np.array([1e-7, 2e-7, 3e-5]),
-    n_paths=10**9, boundary="b", assumes="keeps to b", n_inside=2, p_cut_in=4e-5, p_unreachable=0.0,
+    n_paths=10**9, boundary="b", assumes="keeps to b", n_inside=2, p_event=4e-5, p_unreachable=0.0,
 )  # fmt: skip
 """Others, of rare cut-ins."""
 EXACT = 10**12

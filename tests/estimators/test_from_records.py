@@ -42,13 +42,13 @@ def test_a_block_holds_what_the_rows_say(name, stored_run):
     rows, found = episodes.to_pandas(), read(episodes, name=name)
     assert found.first_episode == 40
     assert [OUTCOMES[k] for k in found.outcome] == rows.outcome.tolist()
-    np.testing.assert_array_equal(found.cut_in, rows.cut_in_step.notna())
+    np.testing.assert_array_equal(found.cut_in, rows.event_step.notna())
     if name in (NAME, "mixture-twin"):
         np.testing.assert_array_equal(found.log_q, np.stack(rows.log_q))
     for column in ("log_weight", "n_control_steps"):
         np.testing.assert_array_equal(getattr(found, column), rows[column])
-    if "log_p_cut_in" in found.columns:
-        np.testing.assert_array_equal(found.columns["log_p_cut_in"], rows.log_p_cut_in.fillna(-np.inf))
+    if "log_p_event" in found.columns:
+        np.testing.assert_array_equal(found.columns["log_p_event"], rows.log_p_event.fillna(-np.inf))
     assert found.drawn.weight_cap == (1.0 if name == "nde-twin" else None)
 
 

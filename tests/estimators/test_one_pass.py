@@ -54,7 +54,7 @@ def test_unbounded_weights_lead_the_warnings_and_claim_no_precision():
 @pytest.mark.parametrize(("n", "doubts"), [(2_000, True), (20_000, False)])
 def test_one_crash_that_could_double_the_rate_leads_the_warnings(n, doubts):
     """Three tests in a hundred crash, with weight 0.001; the largest weight, 0.1, counts as much as 100 of them."""
-    some = block([k % 100 < 3 for k in range(n)], [-6.9] * n, method="forced", log_p_cut_in=np.full(n, np.log(0.1)))
+    some = block([k % 100 < 3 for k in range(n)], [-6.9] * n, method="forced", log_p_event=np.full(n, np.log(0.1)))
     content, told = answered([some])
     said = told["warnings"][0]
     assert said.startswith("the true rate may lie far above this interval: one more crash") == doubts

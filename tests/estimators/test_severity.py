@@ -49,7 +49,7 @@ def test_it_is_the_rate_of_harder_crashes_by_the_same_estimator(name, stored_run
     order = np.argsort(crashes.impact_speed_mps.to_numpy())
     impact, share = crashes.impact_speed_mps.to_numpy()[order], np.cumsum(weight[order]) / weight.sum()
     severity = content["severity"]
-    late = (rows.outcome == "timeout") & (rows.n_steps - rows.cut_in_step < 40) & (rows.min_ttc_s < 4.0)
+    late = (rows.outcome == "timeout") & (rows.n_steps - rows.event_step < 40) & (rows.min_ttc_s < 4.0)
     tests = rows.groupby("component").size()[rows.component].to_numpy() if own == "shells" else len(rows)
     assert severity["cut_off"] == pytest.approx((np.exp(rows.log_weight) / tests)[late].sum(), rel=1e-12)
     assert severity["median_mps"] == impact[np.searchsorted(share, 0.5)]
@@ -94,10 +94,10 @@ def source():
 def driven(source, name):
     """Whether the vehicle crashes on each cut-in of the pool, and how hard; one only touches but for one in fifty."""
     campaign = golden("shells-twin", VEHICLES[name])
-    cut_ins = source.prescribed._cut_ins
-    n, environment = cut_ins.step.size, source.resolved.environment
-    script = maneuvers_of(Chosen(cut_ins.facts, cut_ins.at, cut_ins.lead))
-    stored = StoredPaths(1, np.arange(n), states_of(cut_ins.facts), np.full(n, 200), cut_ins.step, script)
+    events = source.prescribed._cut_ins
+    n, environment = events.step.size, source.resolved.environment
+    script = maneuvers_of(Chosen(events.facts, events.at, events.lead))
+    stored = StoredPaths(1, np.arange(n), states_of(events.facts), np.full(n, 200), events.step, script)
     twin, scratch = np.zeros(n, RETRACED_DTYPE), empty_trajectory(environment)
     retrace(unboxed(stored), unboxed(environment), resolve(campaign).av, unboxed(scratch), twin)
     impact = twin["impact"]
@@ -141,7 +141,7 @@ def test_drivers_of_the_pool_are_judged_by_the_speed_that_counts(harder, source)
     pool, before = campaign_pool(resolved), campaign_pool(resolve(golden("shells-twin")))
     place = {name: pool.names.index(name) for name in ("brakes-8", "full-throttle-2")}
     assert 0 < counts.sum() < crashed.sum()
-    assert np.array_equal(pool.cut_ins.crashes[:, place["brakes-8"]], counts)
+    assert np.array_equal(pool.events.crashes[:, place["brakes-8"]], counts)
     mu = {name: (pool.mu[of], before.mu[before.names.index(name)]) for name, of in place.items()}
     assert mu["brakes-8"][0] < 0.7 * mu["brakes-8"][1]
     assert mu["full-throttle-2"][0] == pytest.approx(mu["full-throttle-2"][1], rel=0.2)
@@ -169,8 +169,8 @@ def held(source, name, n_campaigns):
 
     def rate(above):
         return sum(
-            p * np.mean(crashed[cut_ins] & ((impact[cut_ins] > above) | (above == 0.0)))
-            for p, cut_ins in zip(source.design.p, rows, strict=True)
+            p * np.mean(crashed[events] & ((impact[events] > above) | (above == 0.0)))
+            for p, events in zip(source.design.p, rows, strict=True)
         )
 
     truth, rng, found = {above: rate(above) for above in ABOVE_MPS}, np.random.default_rng(20), []

@@ -22,7 +22,7 @@ N = int(os.environ.get("HARNESS_REPLICATIONS", "50"))
 P = np.array([7.3e-9, 2.5e-8, 4.9e-8, 6.7e-8, 7.5e-8, 2.1e-7, 5.4e-5])
 DESIGN = ShellDesign(
     pool="0" * 24, strata=(*"abcdef", "outside"), cell_stratum=tuple(range(7)), cell_p=P, n_paths=10**12,
-    cell_references=(0,) * 7, boundary="e", assumes="keeps to e", n_inside=5, p_cut_in=6e-5, p_unreachable=0,
+    cell_references=(0,) * 7, boundary="e", assumes="keeps to e", n_inside=5, p_event=6e-5, p_unreachable=0,
     references=(Reference("r157-cc", "a competent driver"),), reference_rate=np.array([1e-7]),
     reference_square=np.array([1e-14]),
 )  # fmt: skip

@@ -250,7 +250,7 @@ def test_tests_that_are_missing_are_those_that_would_do():
     ("from_pool", "outside", "runs"), [(0.1, 400, 500), (0.4, 400, 1_800), (math.inf, 400, None), (0.1, 0, None)]
 )
 def test_what_is_missing_is_counted(from_pool, outside, runs):
-    av = {"controller": "examples.acting:Holds", "before_cut_in": "controller", "limits": {"max_acceleration_mps2": 2}}
+    av = {"controller": "examples.acting:Holds", "before_event": "controller", "limits": {"max_acceleration_mps2": 2}}
     content = {"name": "x", "testing": {"method": "shells"}, "stop": {"rhw": 0.3, "episodes": 500}, "av": av}
     campaign = Campaign.model_validate(content)
     looking = RoundRule(campaign)

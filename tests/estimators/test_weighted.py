@@ -41,9 +41,9 @@ def test_no_crash_still_gives_an_upper_bound_and_an_interval():
 
 def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
     some, paths = ([True, False], [-7.0, 0.0]), np.log([1e-3, 2e-3])
-    known = nade(block(*some, method="forced", weight_cap=5e-3, log_p_cut_in=paths))
-    driven = nade(block(*some, method="forced", log_p_cut_in=paths))
-    mixed = nade(block(*some, method="episode_mixture", alpha=np.array([0.1, 0.9]), log_p_cut_in=paths))
+    known = nade(block(*some, method="forced", weight_cap=5e-3, log_p_event=paths))
+    driven = nade(block(*some, method="forced", log_p_event=paths))
+    mixed = nade(block(*some, method="episode_mixture", alpha=np.array([0.1, 0.9]), log_p_event=paths))
     seen = nade(block(*some, method="step_mixture"))
     assert known.cap() == (5e-3, "the weight cap known by design")
     assert driven.cap()[0] == pytest.approx(2e-3)

@@ -25,7 +25,7 @@ SMALL = (
     "environment.parameters=two-events",
     "run.shard_size=500",
     "pool.relative_error=0.02",
-    "pool.cut_ins_per_shell=4000",
+    "pool.events_per_shell=4000",
 )
 
 
@@ -52,7 +52,7 @@ def test_naturalistic_and_forced_tests_have_the_exact_rate(method, engine, tmp_p
     episodes = run.episodes()
     share = 1.0 if method == "forced" else P_EVENT
     spread = np.sqrt(share * (1.0 - share) / n) if share < 1.0 else 1e-12
-    assert abs(episodes["cut_in_step"].notna().mean() - share) < 4.0 * spread
+    assert abs(episodes["event_step"].notna().mean() - share) < 4.0 * spread
     weighed = np.where(episodes["outcome"] == "crash", np.exp(episodes["log_weight"]), 0.0)
     assert abs(weighed.mean() - RATE) < 4.0 * weighed.std() / np.sqrt(n)
     headline = found["nde" if method == "nde" else "nade"]
@@ -64,7 +64,7 @@ def test_naturalistic_and_forced_tests_have_the_exact_rate(method, engine, tmp_p
 def test_the_pool_knows_the_rate_and_a_run_of_shells_finds_it(engine, tmp_path):
     resolved = resolve(load_campaign(SMOKE, [*SMALL, "testing.method=shells"]))
     source = prepare(resolved)
-    assert source.design.p_cut_in == pytest.approx(P_EVENT, rel=0.1)
+    assert source.design.p_event == pytest.approx(P_EVENT, rel=0.1)
     assert source.design.p.sum() == pytest.approx(RATE, rel=0.1)  # on the others nobody could crash
     found, run = estimate(tmp_path / "run", "testing.method=shells", f"world.engine={engine}", "stop.rhw=0.1")
     assert found["shells"]["ci_low"] < RATE < found["shells"]["ci_high"]

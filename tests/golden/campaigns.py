@@ -6,7 +6,7 @@ from pathlib import Path
 
 BASE = Path(__file__).parent / "base.yaml"
 SHELLS = ("testing.method=shells", "environment.lane_change_level=1")
-SPEEDS = "{controller: 'tests.golden.vehicles:Speeds', before_cut_in: controller, limits: {max_acceleration_mps2: 2}}"
+SPEEDS = "{controller: 'tests.golden.vehicles:Speeds', before_event: controller, limits: {max_acceleration_mps2: 2}}"
 ACTING, FAILING = f"av={SPEEDS}", "av.controller=tests.golden.vehicles:Fails"
 BRAKES_LITTLE = "av.parameters.min_acceleration_mps2=-1.5"
 LATERAL = "environment.parameters=ndd-overtaking-1-lateral"

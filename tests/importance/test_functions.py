@@ -17,7 +17,7 @@ from harness.families.cut_in.nade.tables import Tables
 from harness.vehicles.kinematics import CONTACT_M
 from harness.vocabulary import CUT_IN, STATE_COLUMNS, STAY
 from tests.episode.twin_runs import prepared, run
-from tests.kernels import accumulated, after_cut_in, before_cut_in, drawn
+from tests.kernels import accumulated, after_cut_in, before_event, drawn
 
 CHALLENGES = {"immediate": "two", "recursive": "default"}  # and the surrogates
 EPSILONS = (0.0, 0.1, 1.0)
@@ -76,7 +76,7 @@ def require_identities(proposals, epsilon):
 def test_identities_anywhere(challenge, epsilon, situations):
     environment, importance = policy_of(challenge, epsilon)
     state, maneuver, step = (np.array(column) for column in zip(*situations, strict=True))
-    require_identities(before_cut_in(state, maneuver, step, environment, importance), epsilon)
+    require_identities(before_event(state, maneuver, step, environment, importance), epsilon)
     require_identities(after_cut_in(state, environment, importance, step), epsilon)
 
 
@@ -86,7 +86,7 @@ def test_records_hold_what_was_drawn_from(challenge):
     done, state, before, after = recorded(challenge)
     environment, importance = done.prepared.resolved.environment, done.prepared.importance
     rows = done.moment[before]
-    found = before_cut_in(state[before], held(done, rows), rows["step"], environment, importance)
+    found = before_event(state[before], held(done, rows), rows["step"], environment, importance)
     taken = (rows["maneuver"] == STAY).astype(int)
     each = np.arange(len(rows))
     np.testing.assert_array_equal(done.moment_v[before], found.v)

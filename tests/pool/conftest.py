@@ -10,13 +10,13 @@ from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import load_environment
 from harness.families.protocol import Paths
 from harness.pool.build import campaign_pool
-from harness.pool.cut_ins import Pool
+from harness.pool.kept import Pool
 from harness.resolved import resolve
 from harness.vehicles.drivers import Followers
 from tests.chains.seed import SEED
 from tests.stored_runs import MIXTURE_FILE
 
-SMALL_POOL = ("pool.relative_error=0.03", "pool.cut_ins_per_shell=1500")
+SMALL_POOL = ("pool.relative_error=0.03", "pool.events_per_shell=1500")
 
 
 @pytest.fixture(scope="session")

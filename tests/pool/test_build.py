@@ -34,14 +34,14 @@ def test_surrogates_are_ordered_by_crash_rates_that_lie_around_the_reference(poo
 
 
 def test_shells_divide_all_cut_ins(pool):
-    assert pool.shell_p.sum() == pytest.approx(pool.p_cut_in, rel=1e-12)
+    assert pool.shell_p.sum() == pytest.approx(pool.p_event, rel=1e-12)
     assert pool.shell_p[0] == pytest.approx(pool.mu[0], rel=1e-12)
     assert np.all(np.cumsum(pool.shell_p[:-1]) >= pool.mu * (1.0 - 1e-12))  # crashes of one may lie in another's shell
 
 
 def test_kept_cut_ins_stand_for_their_shell(pool):
     """Crash shares among the kept reproduce the crash rates: 1,500 of each shell, four standard errors."""
-    c = pool.cut_ins
+    c = pool.events
     for s in range(pool.shell_p.size - 1):
         assert c.crashes[pool.shell == s, s].all()
         assert not c.crashes[pool.shell == s, :s].any()
@@ -87,8 +87,8 @@ def test_a_pool_that_is_damaged_is_built_again(campaign, pool, tmp_path, monkeyp
     assert campaign_pool(resolve(campaign)) is pool
     again = cached_pool(resolve(campaign))
     assert (again.key, again.names, again.library) == (pool.key, pool.names, pool.library)
-    for field in dataclasses.fields(pool.cut_ins):
-        assert np.array_equal(getattr(again.cut_ins, field.name), getattr(pool.cut_ins, field.name))
+    for field in dataclasses.fields(pool.events):
+        assert np.array_equal(getattr(again.events, field.name), getattr(pool.events, field.name))
     assert np.array_equal(again.mu_covariance, pool.mu_covariance)
     assert again.to_json() == pool.to_json()
 
@@ -112,7 +112,7 @@ def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside
 
 def test_how_many_paths_a_pool_has_does_not_depend_on_them(environment, monkeypatch):
     """One that ends where its paths look alike has the rates of paths that look alike, which are too low."""
-    settings, run = PoolSettings(relative_error=0.015, cut_ins_per_shell=100), Enumerator.run
+    settings, run = PoolSettings(relative_error=0.015, events_per_shell=100), Enumerator.run
 
     def alike(self, first, n, progress):
         paths = run(self, first, n, progress)

@@ -9,7 +9,7 @@ from harness.families.cut_in.loading import load_environment
 from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.loop.repeat import Traffic
 from harness.pool.build import campaign_pool
-from harness.pool.cut_ins import pool_content, pool_from
+from harness.pool.kept import pool_content, pool_from
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import vehicle_pool, walk_candidates
 from harness.resolved import resolve
@@ -63,8 +63,8 @@ def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name)
     """Sixty cut-ins of each stratum."""
     resolved = resolve(lateral)
     prescribed = PrescribedEpisodes(resolved, lateral_pool)
-    traffic, cut_ins = prescribed.tests(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
-    environment, rows = resolved.environment, cut_ins.row
+    traffic, events = prescribed.tests(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
+    environment, rows = resolved.environment, events.row
     driver = (
         LIBRARY.followers(environment.lateral.present).drivers[[*NAMES, *LIBRARY.references].index(name)][None].copy()
     )
@@ -76,15 +76,15 @@ def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name)
     if name == LIBRARY.envelope:
         reached |= episode["outcome"] == PASSED
     column = [*lateral_pool.names, *LIBRARY.references].index(name)
-    assert np.array_equal(reached, lateral_pool.cut_ins.crashes[rows, column])
-    assert np.array_equal(episode["lead_steps"], lateral_pool.cut_ins.lead[rows])
-    assert np.array_equal(episode["onset_step"], lateral_pool.cut_ins.onset[rows])
+    assert np.array_equal(reached, lateral_pool.events.crashes[rows, column])
+    assert np.array_equal(episode["lead_steps"], lateral_pool.events.lead[rows])
+    assert np.array_equal(episode["onset_step"], lateral_pool.events.onset[rows])
 
 
 def test_leads_are_kept_with_the_pool(lateral_pool, pool):
-    assert np.unique(lateral_pool.cut_ins.lead).size > 15
-    assert np.array_equal(pool_from(pool_content(lateral_pool)).cut_ins.lead, lateral_pool.cut_ins.lead)
-    assert not pool_from(pool_content(pool)).cut_ins.lead.any()
+    assert np.unique(lateral_pool.events.lead).size > 15
+    assert np.array_equal(pool_from(pool_content(lateral_pool)).events.lead, lateral_pool.events.lead)
+    assert not pool_from(pool_content(pool)).events.lead.any()
 
 
 def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow():
@@ -97,14 +97,14 @@ def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow(
         TwinWorld(32), resolved.scenario, RecordPolicy("none", 0.0), build_host(acts.av, n_cells=32, seed=1)
     )
     pool = vehicle_pool(resolved, paths, recorded(without_event(loop, resolved, paths.seed, paths.paths, 0)))
-    rows = np.unique(np.linspace(0, len(pool.cut_ins.path) - 1, 800).astype(np.int64))
+    rows = np.unique(np.linspace(0, len(pool.events.path) - 1, 800).astype(np.int64))
     traffic = PrescribedEpisodes(resolved, pool).of_rows(rows, np.zeros(rows.size, np.int64))
     shard = loop.run(10**6, traffic)
     assert shard.failures == {}
     episode = shard.episode
     assert np.unique(episode["lead_steps"]).size > 10
     crashed = episode["outcome"] == CRASH
-    enclosed = pool.cut_ins.crashes[rows, pool.names.index(library.envelope)]
+    enclosed = pool.events.crashes[rows, pool.names.index(library.envelope)]
     assert 50 < crashed.sum() < rows.size - 50
     assert np.all(enclosed[crashed])
     script = traffic.script

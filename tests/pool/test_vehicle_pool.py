@@ -25,7 +25,7 @@ from tests.kernels import cut_in_terms
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 
 N = 256
-ACTING = "{{controller: 'tests.controllers.early:{}', before_cut_in: controller, limits: {{max_acceleration_mps2: 2}}}}"
+ACTING = "{{controller: 'tests.controllers.early:{}', before_event: controller, limits: {{max_acceleration_mps2: 2}}}}"
 
 
 def acting(name: str, *more: str):
@@ -76,12 +76,12 @@ def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one
     pool = vehicle_pool(ready.resolved, ready.baseline_paths, speeds[2])
     brakes = "av.parameters={min_acceleration_mps2: -3.0}"
     loop = prepare(resolve(acting("Speeds", brakes))).loop(TwinWorld(64))
-    rows = np.unique(np.linspace(0, len(pool.cut_ins.path) - 1, 1500).astype(np.int64))
+    rows = np.unique(np.linspace(0, len(pool.events.path) - 1, 1500).astype(np.int64))
     rows = rows[pool.shell[rows] < pool.shell_p.size - 1]
     shard = loop.run(10**6, ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
     assert shard.failures == {}
     crashed = shard.episode["outcome"] == CRASH
-    expected = pool.cut_ins.crashes[rows, pool.names.index("brakes-3")]
+    expected = pool.events.crashes[rows, pool.names.index("brakes-3")]
     assert 300 < expected.sum() < rows.size - 300
     np.testing.assert_array_equal(crashed, expected)
 
@@ -108,7 +108,7 @@ def test_shells_of_a_holder_on_few_chosen_paths_are_those_of_the_large_pool(camp
     assert np.all(error < 0.13 * pool.mu)
     assert np.median(error / pool.mu) < 0.05
     assert np.all(np.abs(own.mu[order] - pool.mu) < 4.0 * error)
-    assert abs(own.p_cut_in - pool.p_cut_in) < 4.0 * np.hypot(own.p_cut_in_se, pool.p_cut_in_se)
+    assert abs(own.p_event - pool.p_event) < 4.0 * np.hypot(own.p_event_se, pool.p_event_se)
 
 
 @pytest.mark.parametrize("kept", [500, 5_000])
@@ -116,10 +116,10 @@ def test_kept_cut_ins_know_the_error_of_the_runs_they_are_of(speeds, kept):
     """All of them tested, on which surrogates crash: the pool knows E[G²] of those. Own masses alone, without what a
     kept one stands for, would be up to 9 % too small at 500 a shell: more than the whole variance."""
     ready, _, runs = speeds
-    settings = ready.campaign.pool.model_copy(update={"cut_ins_per_shell": kept})
+    settings = ready.campaign.pool.model_copy(update={"events_per_shell": kept})
     asked = replace(ready.resolved, campaign=ready.campaign.model_copy(update={"pool": settings}))
     pool = vehicle_pool(asked, ready.baseline_paths, runs)
-    c, none, n = pool.cut_ins, np.zeros((0, 0)), np.bincount(pool.shell, minlength=pool.shell_p.size)
+    c, none, n = pool.events, np.zeros((0, 0)), np.bincount(pool.shell, minlength=pool.shell_p.size)
     for d, name in enumerate(pool.names):
         crash = c.crashes[:, d]
         tests = CrashedTests(c.row[crash], c.step[crash], c.mass[crash], pool.shell[crash])

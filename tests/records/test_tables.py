@@ -19,7 +19,7 @@ from tests.stored_runs import copy_of, edit, golden, manifest, stored_table
 
 UNITS = {"mps": b"m/s", "m": b"m", "s": b"s", "mps2": b"m/s2"}
 """Of names that end in it."""
-LATERAL = ["lead_steps", "onset_step", "onset_r2_m", "onset_r2dot_mps", "onset_ttc_s", "overlap_ttc_s", "contact"]
+LATERAL = ["lead_steps", "onset_step", "onset_gap_m", "onset_rate_mps", "onset_ttc_s", "overlap_ttc_s", "contact"]
 """Columns where cut-ins take time."""
 
 
@@ -37,8 +37,8 @@ def test_every_column_says_its_unit_and_what_it_is(schema):
 @pytest.mark.parametrize("name", ["mixture-twin", "nde-twin", "forced-inattentive", "forced-failing-twin"])
 def test_null_stands_for_what_there_is_none_of(name, stored_run):
     for row in stored_table(stored_run(name), "episodes").to_pylist():
-        cut_in, crash = row["cut_in_step"] is not None, row["outcome"] == "crash"
-        there = {"cut_in_r2_m": cut_in, "cut_in_r2dot_mps": cut_in, "crash_time_s": crash, "impact_speed_mps": crash}
+        cut_in, crash = row["event_step"] is not None, row["outcome"] == "crash"
+        there = {"event_gap_m": cut_in, "event_rate_mps": cut_in, "crash_time_s": crash, "impact_speed_mps": crash}
         assert {column: row[column] is not None for column in there} == there
         assert (row["failure"] is not None) == (row["outcome"] == "failed")
         assert row["min_ttc_s"] is None or (cut_in and row["min_ttc_s"] >= 0.0)
@@ -111,8 +111,8 @@ def test_a_trace_tells_the_same_story_as_its_row(stored_run):
         if row["outcome"] == "crash":
             assert x[-1, 1] - 5.0 - x[-1, 2] < -0.001 <= x[-2, 1] - 5.0 - x[-2, 2]
             assert v[-1, 2] - v[-1, 1] == row["impact_speed_mps"]
-        cut = row["cut_in_step"]
-        assert x[cut, 1] - 5.0 - x[cut, 2] == row["cut_in_r2_m"]
+        cut = row["event_step"]
+        assert x[cut, 1] - 5.0 - x[cut, 2] == row["event_gap_m"]
         assert lane.tolist() == [[1, 1, 0]] * (cut + 1) + [[1, 0, 0]] * (row["n_steps"] - cut)
 
 
@@ -122,9 +122,9 @@ def test_records_say_when_it_began_and_how_it_ended(stored_run):
     assert episodes.column_names[-8:-1] == LATERAL
     rows = episodes.to_pylist()
     assert len({row["lead_steps"] for row in rows}) > 1
-    assert all(row["onset_step"] == max(row["cut_in_step"] - row["lead_steps"], 0) for row in rows)
+    assert all(row["onset_step"] == max(row["event_step"] - row["lead_steps"], 0) for row in rows)
     for row in rows:
-        side = row["outcome"] == "crash" and row["n_steps"] == row["cut_in_step"] + 1
+        side = row["outcome"] == "crash" and row["n_steps"] == row["event_step"] + 1
         assert row["contact"] == ("side" if side else "rear" if row["outcome"] == "crash" else None)
     traces = stored_table(folder, "traces").to_pandas()
     bv = traces[traces.vehicle == "BV"]

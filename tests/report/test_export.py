@@ -30,7 +30,7 @@ def complaints(file):
 @pytest.mark.parametrize("name", ["shells-twin", "forced-lateral-sumo"])
 def test_openscenario_moves_everybody_as_the_trace_does(name, stored_run, tmp_path, capsys):
     folder, file = stored_run(name), tmp_path / "out" / "crash.xosc"
-    tests = harness.read(folder).episodes(["episode", "outcome", "cut_in_step"])
+    tests = harness.read(folder).episodes(["episode", "outcome", "event_step"])
     crash = tests[tests.outcome == "crash"].iloc[0]
     assert main(["replay", str(folder), str(crash.episode), "--out", str(file)]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [str(file), str(file.with_suffix(".xodr"))]

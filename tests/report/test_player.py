@@ -52,7 +52,7 @@ def test_a_page_holds_the_motion_to_the_last_bit(name, stored_run, tmp_path):
         assert [track["name"] for track in scene["tracks"] if len(track["x"]) > n - first] in ([], ["BV"])
         crash = n - 1 if result.outcome == "crash" else None
         assert [track["crash"] for track in scene["tracks"]] == [None, None, crash]
-        cut_in = result.row["cut_in_step"]
+        cut_in = result.row["event_step"]
         assert scene["cut_in"] == cut_in
         assert scene["onset"] == result.row.get("onset_step", cut_in)
         assert len(scene["ghosts"]) == (0 if cut_in is None else 2)
@@ -196,8 +196,8 @@ def test_replay_says_what_happens_and_writes_the_page(stored_run, tmp_path, caps
     row = harness.replay(folder, episode).row
     assert f"crashes at {row['crash_time_s']:.1f} s" in told["AV"]
     assert f"impact {row['impact_speed_mps']:.1f} m/s" in told["AV"]
-    assert f"{row['cut_in_r2_m']:.1f} m ahead and {-row['cut_in_r2dot_mps']:.1f} m/s slower" in told["BV cuts in"]
-    assert f"{row['onset_r2_m']:.1f} m ahead" in told["BV comes over"]
+    assert f"{row['event_gap_m']:.1f} m ahead and {-row['event_rate_mps']:.1f} m/s slower" in told["BV cuts in"]
+    assert f"{row['onset_gap_m']:.1f} m ahead" in told["BV comes over"]
     assert scenes_in(file.read_text(encoding="utf-8"))[0]["episode"] == episode
 
 

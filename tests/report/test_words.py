@@ -171,11 +171,11 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
     best = run.headline
     best = replace(best, n_crashes=0, rhw=math.inf, cautions=(), details={**best.details, "references": []})
     campaign = golden("shells-acting-twin", "stop.rhw=0.3")
-    manifest = {"remedy": {"pool.cut_ins_per_shell": 3200}}
+    manifest = {"remedy": {"pool.events_per_shell": 3200}}
     answer = said(run, best, campaign, severity=None, stopped_by="pool", manifest=manifest)
     [row] = [row for row in answer.rows if row.key == "ratio"]
     assert (row.value, row.remark) == ("no ratio", "such drivers never crash here")
-    assert answer.scope.endswith("would narrow it, no crash seen, asked: ± 30 %; raise pool.cut_ins_per_shell to 3,200")
+    assert answer.scope.endswith("would narrow it, no crash seen, asked: ± 30 %; raise pool.events_per_shell to 3,200")
     run = read_run_folder(stored_run("forced-acting-twin"))
     answer = said(run, replace(run.headline, cautions=()))  # asks no other driver
     assert "ratio" not in {row.key for row in answer.rows}
@@ -185,7 +185,7 @@ def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time
     for name, takes_time, warned in (
         ("forced-krauss", True, True), ("forced-krauss", False, False), ("forced-twin", True, False)
     ):  # fmt: skip
-        answer = said(read_run_folder(stored_run(name)), manifest={"cut_ins_take_time": takes_time})
+        answer = said(read_run_folder(stored_run(name)), manifest={"events_take_time": takes_time})
         assert any("cannot see BV come over" in each for each in answer.warnings) == warned
 
 
@@ -194,7 +194,7 @@ def test_only_of_a_vehicle_of_the_users_own_it_is_said_that_it_was_held(name, sa
     run = read_run_folder(stored_run(name))
     diagnostics = {**run.estimates.diagnostics, "n_asked_to_speed_up": 1234}
     told = replace(run.estimates, diagnostics=diagnostics)
-    answer = short_answer(golden(name), {"cut_ins_take_time": True}, told)
+    answer = short_answer(golden(name), {"events_take_time": True}, told)
     assert any("1,234 tests it asked to speed up" in each for each in answer.warnings) == said
 
 
@@ -321,8 +321,8 @@ def test_what_would_decide(verdict, needed, said):
         ({}, "; no pool gives as much: ask for a wider stop.rhw"),
         ({"pool.shadow_paths": None}, "; raise pool.shadow_paths"),
         (
-            {"pool.relative_error": 0.0123, "pool.cut_ins_per_shell": 12000},
-            "; lower pool.relative_error to 0.0123 and raise pool.cut_ins_per_shell to 12,000",
+            {"pool.relative_error": 0.0123, "pool.events_per_shell": 12000},
+            "; lower pool.relative_error to 0.0123 and raise pool.events_per_shell to 12,000",
         ),
     ],
 )

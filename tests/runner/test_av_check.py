@@ -147,7 +147,7 @@ def check(name, *overrides):
 def test_the_built_in_idm_is_fine():
     found = check_av(load_campaign(MIXTURE_FILE), 24)
     assert (found.exit_code, found.engine, found.method) == (0, "twin", "forced")
-    assert found.behaviour.n_cut_ins == 24
+    assert found.behaviour.n_events == 24
     assert found.behaviour.min_acceleration_mps2 == found.limits_mps2[0] == -4.0
     assert 0.0 < found.behaviour.share_at_min < 1.0
 
@@ -181,7 +181,7 @@ def test_a_controller_that_is_not_reproduced_is_found_out(name, cause):
     [
         ((), {0.0: 0.0, 20.0: 1.0}),
         (("av.parameters.bound=1",), {}),
-        (("av.before_cut_in=controller", "testing.method=nde"), None),
+        (("av.before_event=controller", "testing.method=nde"), None),
     ],
     ids=["winds up", "is bounded", "acts early"],
 )
@@ -209,7 +209,7 @@ def test_failures_that_differ_in_digits_are_one_and_name_line_and_what_was_meant
 
 
 def test_a_controller_that_acts_early_is_checked_without_forcing():
-    found = check("Steady", "av.before_cut_in=controller", "testing.method=nde")
+    found = check("Steady", "av.before_event=controller", "testing.method=nde")
     assert (found.method, found.exit_code) == ("step_mixture", 0)
 
 
@@ -250,7 +250,7 @@ def test_it_sees_that_each_form_brakes_and_is_deterministic_or_fails(av, code):
     found = check_av(load_campaign(FORCED, [f"av={av}"]), 6)
     assert (found.exit_code, sum(found.failures.values())) == (code, 6 * bool(code))
     if code == 0:
-        assert found.behaviour.n_cut_ins == 6
+        assert found.behaviour.n_events == 6
         assert found.behaviour.min_acceleration_mps2 < -1.0
 
 

@@ -58,9 +58,9 @@ def driven(monkeypatch):
 def by_stratum(folder):
     """Cut-in, initial range and outcome of each test, in order, by stratum."""
     found = defaultdict(list)
-    for episodes in read_parts(folder, ["component", "pool_cut_in", "r2_m", "outcome"]):
+    for episodes in read_parts(folder, ["component", "pool_row", "r2_m", "outcome"]):
         for row in episodes.to_pylist():
-            found[row["component"]].append((row["pool_cut_in"], row["r2_m"], row["outcome"]))
+            found[row["component"]].append((row["pool_row"], row["r2_m"], row["outcome"]))
     return found
 
 
@@ -153,7 +153,7 @@ def test_a_margin_that_the_budget_leaves_open(campaign, tmp_path):
         ),
         ((*SHELLS, "world.engine=sumo"), "av={sumo: {carFollowModel: ACC}}", "Nothing in the harness limits"),
         ((*SHELLS, "accept.crash_rate_below=1e-7"), HARDER, "a limit of one crash rate"),
-        (SHELLS, "av={controller: 'tests.controllers.early:Speeds', before_cut_in: controller}", "cut-ins of its own"),
+        (SHELLS, "av={controller: 'tests.controllers.early:Speeds', before_event: controller}", "cut-ins of its own"),
         (SHELLS, "seed=5", "^seed"),
         (SHELLS, "testing.epsilon=0.2", r"^testing\.epsilon"),
         (SHELLS, "surrogates={A: {model: idm}}", "^surrogates"),

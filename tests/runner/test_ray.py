@@ -31,7 +31,7 @@ from harness.processes import WorkerDeath  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 ON_RAY, WORKER = "run.executor=ray", b"multiprocessing.forkserver"
-EARLY = "before_cut_in: controller, limits: {max_acceleration_mps2: 2}"
+EARLY = "before_event: controller, limits: {max_acceleration_mps2: 2}"
 
 
 @pytest.fixture(scope="module", autouse=True)

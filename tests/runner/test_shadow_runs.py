@@ -110,12 +110,12 @@ def test_a_vehicle_that_acts_is_tested_in_the_default_traffic(campaign, run_here
     traffic = "environment.parameters=ndd-overtaking-2", "stop.episodes=80", "pool.pilot_tests=0"
     folder = run_here(campaign(*SHELLS, SHADOWS, TWIN, *traffic, f"av={of('Yields')}"), tmp_path / "run").folder
     tests = stored_table(folder, "episodes").to_pandas()
-    assert manifest(folder)["cut_ins_take_time"]
+    assert manifest(folder)["events_take_time"]
     assert tests.failure.isna().all()
     assert (tests.lead_steps > 0).all()
-    assert (tests.onset_step == np.maximum(tests.cut_in_step - tests.lead_steps, 0)).all()
+    assert (tests.onset_step == np.maximum(tests.event_step - tests.lead_steps, 0)).all()
     # It has made room by then: at the cut-in it closes in more slowly than when the test began.
-    assert (tests.cut_in_r2dot_mps > tests.r2dot_mps).mean() > 0.5
+    assert (tests.event_rate_mps > tests.r2dot_mps).mean() > 0.5
     assert replay(folder, 17).bit_equal
 
 
@@ -154,9 +154,9 @@ def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(camp
     plain = run_here(campaign(*FORCED, TWIN, "av={controller: 'tests.controllers.early:HoldsThenIdm'}"), tmp_path / "a")
     walked = run_here(campaign(*FORCED, TWIN, f"av={of('HoldsThenIdm')}"), tmp_path / "b")
     a, b = (stored_table(result.folder, "episodes") for result in (plain, walked))
-    for name in ("outcome", "cut_in_step", "n_steps", "crash_time_s", "impact_speed_mps", "cut_in_r2_m"):
+    for name in ("outcome", "event_step", "n_steps", "crash_time_s", "impact_speed_mps", "event_gap_m"):
         assert a.column(name).to_pylist() == b.column(name).to_pylist(), name
-    for name in ("log_weight", "log_p_cut_in"):
+    for name in ("log_weight", "log_p_event"):
         np.testing.assert_allclose(a.column(name).to_numpy(), b.column(name).to_numpy(), rtol=1e-9)
     one, other = (result.estimates["estimates"]["nade"] for result in (plain, walked))
     assert one["crash_rate"] == pytest.approx(other["crash_rate"], rel=1e-9)

@@ -23,20 +23,20 @@ from tests.stored_runs import answer_in, copy_of, edit, golden, manifest, part_f
 
 
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
-    small = ("stop.rhw=0.1", "stop.episodes=100000", "pool.cut_ins_per_shell=100")
+    small = ("stop.rhw=0.1", "stop.episodes=100000", "pool.events_per_shell=100")
     result = run_here(campaign(*SHELLS, *small, "world.engine=twin"), tmp_path / "run")
     assert (result.exit_code, result.stopped_by) == (4, "pool")
     tests = [shell["n_episodes"] for shell in result.estimates["estimates"]["shells"]["details"]["shells"]]
     assert tests[-1] >= 100
     assert result.estimates["n_episodes"] < 1000
-    assert set(re.findall(r"pool\.[a-z_]+", json.dumps(answer_in(result.folder)))) == {"pool.cut_ins_per_shell"}
-    assert re.search(r"; raise pool\.cut_ins_per_shell to \d,?\d+$", answer_in(result.folder)["scope"])
+    assert set(re.findall(r"pool\.[a-z_]+", json.dumps(answer_in(result.folder)))) == {"pool.events_per_shell"}
+    assert re.search(r"; raise pool\.events_per_shell to \d,?\d+$", answer_in(result.folder)["scope"])
 
 
 def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
     """A vehicle that crashes often: after some thousand tests the pool's own error is most of the interval."""
     often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin")
-    settings = (*SHELLS, *often, "stop.episodes=100000", "pool.cut_ins_per_shell=5000")
+    settings = (*SHELLS, *often, "stop.episodes=100000", "pool.events_per_shell=5000")
     fresh = run_here(campaign(*settings, "stop.rhw=0.05"), tmp_path / "fresh")
     assert (fresh.exit_code, fresh.stopped_by) == (4, "pool_error")
     found = fresh.estimates["estimates"]["shells"]

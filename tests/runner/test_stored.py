@@ -91,7 +91,7 @@ def rows_of(table: pa.Table, episode: int) -> pa.Table:
 def test_stored_rows_and_traces_come_out_again(name, stored_run):
     """The first and the last test, a crash, one that ended well, one without cut-in if there is one, a traced one."""
     rows, traces = (stored_table(stored_run(name), table) for table in ("episodes", "traces"))
-    outcome, cut_in = rows["outcome"].to_pylist(), rows["cut_in_step"].to_pylist()
+    outcome, cut_in = rows["outcome"].to_pylist(), rows["event_step"].to_pylist()
     chosen = {0, len(outcome) - 1, outcome.index("timeout")}
     chosen |= {
         next((i for i, value in enumerate(values) if value == of), 0)
@@ -177,11 +177,11 @@ def test_every_episode_is_retraced(name, stored_run):
 @pytest.mark.parametrize(
     ("column", "value", "named"),
     [
-        ("cut_in_r2_m", one_bit, "cut_in_r2_m"),
+        ("event_gap_m", one_bit, "event_gap_m"),
         ("impact_speed_mps", one_bit, "impact_speed_mps"),
         ("outcome", lambda _: "timeout", "outcome"),
         ("n_steps", lambda n: n - 1, "outcome"),
-        ("bv_maneuvers", lambda path: [30 - path[0], *path[1:]], "cut_in_r2_m"),
+        ("bv_maneuvers", lambda path: [30 - path[0], *path[1:]], "event_gap_m"),
     ],
 )
 def test_one_changed_value_is_seen(stored_run, column, value, named):

@@ -20,7 +20,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.estimators.block import Block, block_from_tables
 from harness.pool.build import campaign_pool
-from harness.pool.cut_ins import Pool
+from harness.pool.kept import Pool
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.sampling import prepare
@@ -118,16 +118,16 @@ def test_weights_that_are_all_wrong_raise_the_alarm_and_so_does_one_wrong_rate(f
 
 
 def weighted(
-    h: list[float], mu: float, *, cap: float | None = None, p_cut_in: float | None = None, error: float = 0.0
+    h: list[float], mu: float, *, cap: float | None = None, p_event: float | None = None, error: float = 0.0
 ) -> dict[str, Any]:
     """What the alarm says where one surrogate, of a rate known with an error, crashes with weights ``h``, 0 for none.
 
-    They are bounded by a ``cap``, or are those of forced cut-ins with a mean ``p_cut_in`` where it crashes.
+    They are bounded by a ``cap``, or are those of forced cut-ins with a mean ``p_event`` where it crashes.
     """
     crashes, one = np.array(h) > 0.0, {"log_q": np.zeros((len(h), 1)), "alpha": np.zeros(1), "weight_cap": cap}
-    method = "episode_mixture" if p_cut_in is None else "forced"
+    method = "episode_mixture" if p_event is None else "forced"
     tests = block_of([False] * len(h), np.log(np.where(crashes, h, 1.0)), method=method, **one)
-    rates = np.array([mu]), np.array([error]), np.array([1.0 if p_cut_in is None else p_cut_in])
+    rates = np.array([mu]), np.array([error]), np.array([1.0 if p_event is None else p_event])
     return told(KnownRates(("one",), *rates), tests, crashes[:, None])
 
 
@@ -204,7 +204,7 @@ def paths_missed(rare: float, times: float, told_share: float = 1.0) -> float:
     mu = (1.0 - rare) * light + rare * heavy
     at_crash = told_share * ((1.0 - rare) * light**2 + rare * heavy**2) / mu
     return sum(
-        probability * weighted([heavy] * n_rare + [light] * (n - n_rare), mu, p_cut_in=at_crash)["raised"]
+        probability * weighted([heavy] * n_rare + [light] * (n - n_rare), mu, p_event=at_crash)["raised"]
         for n_rare, probability in enumerate(binom.pmf(np.arange(n + 1), n, rare))
     )
 

@@ -106,7 +106,7 @@ def known_pool(_rng):
     """A pool without error of its own."""
     design = ShellDesign(
         pool="0" * 24, strata=("a", "b", "outside"), cell_stratum=(0, 1, 2), cell_p=P, n_paths=10**12,
-        boundary="b", assumes="keeps to b", n_inside=2, p_cut_in=float(P.sum()), p_unreachable=0.0,
+        boundary="b", assumes="keeps to b", n_inside=2, p_event=float(P.sum()), p_unreachable=0.0,
     )  # fmt: skip
     mass = np.diag(P)
     return [DrawnPool(design, mass, mass * share) for share in (BOTH, ONLY_A, ONLY_B)]

@@ -134,7 +134,7 @@ def test_cells_divide_strata_by_what_references_do(with_references):
 def as_block(drawn, tests, crashed, failed, first) -> Block:
     """The same tests as rows of records, those of a cell one after the other, in any order."""
     ends = zip(tests.tolist(), crashed, failed, strict=True)
-    known = drawn.cut_ins
+    known = drawn.events
     rows = [
         (cell, outcome, path)
         for cell, (n, *bad) in enumerate(ends)
@@ -146,7 +146,7 @@ def as_block(drawn, tests, crashed, failed, first) -> Block:
     mass = np.where((place >= 0)[:, None], drawn.mass[path], 0.0)
     columns = {"stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
     if known is not None:
-        columns |= {"shadow": path, "step": known.number[place], "cut_in_mass": known.mass[place]}
+        columns |= {"shadow": path, "step": known.number[place], "event_mass": known.mass[place]}
     return Block(first, outcome, np.zeros(cell.size), columns, Drawn("shells", shells=drawn.design))
 
 

@@ -165,7 +165,7 @@ def test_an_interrupted_experiment_does_not_wait_for_its_workers():
 
 HEAD = "format: validation-experiment\nversion: 1\nname: x\n"
 SHELLS, FORCED = (f"campaign: {{testing: {{method: {method}}}}}\n" for method in ("shells", "forced"))
-ACTS = "avs: {c: {controller: 'a.b:C', before_cut_in: controller}}\n"
+ACTS = "avs: {c: {controller: 'a.b:C', before_event: controller}}\n"
 
 
 def written(tmp_path, text: str) -> Path:
@@ -191,13 +191,13 @@ def test_budgets_end_with_that_of_the_campaign(tmp_path):
     ("text", "where", "found"),
     [
         ("avs: {acc: {sumo: {carFollowModel: ACC}}}\n" + SHELLS, "avs.acc", "av.sumo"),
-        ("avs: {mine: {controller: 'a.b:C'}}\n" + SHELLS, "avs.mine", "av.controller with before_cut_in hold_speed"),
+        ("avs: {mine: {controller: 'a.b:C'}}\n" + SHELLS, "avs.mine", "av.controller with before_event hold_speed"),
         (ACTS + FORCED, "avs.c", "controller"),
         (ACTS + "pairs: {p: {a: c, b: c}}\n" + SHELLS, "pairs.p", "'c'"),
         ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\n" + FORCED, "campaign.testing.method", "forced"),
         ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\nlimits: [1]\n" + SHELLS, "limits", "pairs"),
         ("avs: {a: {}}\nverdicts: [1]\n" + SHELLS, "beside", "none"),
-        ("avs: {a: {before_cut_in: controller}}\n" + SHELLS, "avs.a", "a built-in model"),
+        ("avs: {a: {before_event: controller}}\n" + SHELLS, "avs.a", "a built-in model"),
         (SHELLS, "avs", "neither"),
         ("avs: {a: {}}\nchains: [rare]\n" + SHELLS, "avs", "both"),
         ("chains: [rare]\ncampaign: {world: {engine: sumo}}\n", "campaign.world.engine", "sumo"),

@@ -34,7 +34,7 @@ def campaign(controller: str, **parameters) -> Campaign:
     av = {
         "controller": controller,
         "parameters": parameters,
-        "before_cut_in": "controller",
+        "before_event": "controller",
         "limits": {"max_acceleration_mps2": 2.0},
     }
     content = {

@@ -144,8 +144,8 @@ def test_the_delay_stated_is_the_one_kept(section, lateral_speed):
     driver = section(lateral_speed_mps=lateral_speed)
     found = driven(driver, (20, (30.0, 20.0, 5.0)))
     idle = -0.4 if section is CarefulCompetentParameters else 0.0
-    assert driver.delay_after_cut_in_s == pytest.approx(max(0.75 - 0.505 / lateral_speed, 0.0), abs=1e-12)
-    whole, part = divmod(10.0 * driver.delay_after_cut_in_s, 1.0)
+    assert driver.delay_after_event_s == pytest.approx(max(0.75 - 0.505 / lateral_speed, 0.0), abs=1e-12)
+    whole, part = divmod(10.0 * driver.delay_after_event_s, 1.0)
     assert found[: int(whole)] == pytest.approx(idle)
     assert found[int(whole)] == pytest.approx(idle - (1.0 - part) * JERK)
     assert found[int(whole) + 1] == pytest.approx(found[int(whole)] - JERK)

@@ -168,7 +168,7 @@ def test_commands_to_an_av_that_must_hold_its_speed_are_overruled_and_connecting
 
 def test_with_before_cut_in_controller_the_program_drives_from_the_start():
     av = program(MISBEHAVING, "pushes_held_avs")
-    (shard,) = run_in(TraciWorld(2, av.traci, 60.0, acts_before_cut_in=True), av, [(0, 2)])
+    (shard,) = run_in(TraciWorld(2, av.traci, 60.0, acts_before_event=True), av, [(0, 2)])
     assert not shard.failures
     assert shard.traces[0][3, AV, 1] < shard.traces[0][0, AV, 1] - 1.0
 
@@ -263,7 +263,7 @@ def test_only_port_and_cells_stand_in_braces(command):
 
 
 SHOWN = 60
-EARLY = ", before_cut_in: controller}"
+EARLY = ", before_event: controller}"
 
 
 def acting(av: str, engine: str):
@@ -317,7 +317,7 @@ def test_models_that_are_recycled_otherwise_remember_the_last_cut_in():
     world = build_world(campaign)
     assert isinstance(world, FreshWorld)
     world.close()
-    _, shard, _ = driven_in(SumoAvWorld(8, campaign.av.sumo, acts_before_cut_in=True), campaign)
+    _, shard, _ = driven_in(SumoAvWorld(8, campaign.av.sumo, acts_before_event=True), campaign)
     assert len(shard.failures) > 5
 
 

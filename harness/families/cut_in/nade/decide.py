@@ -163,10 +163,10 @@ def begin(k: int, kernel: KernelState, nade: Nade) -> None:
     steps = walk(nade.states[cell.row], kernel.seed, cell.episode, 0, max_steps, True, environment, path)
     hazard_total = weigh_cut_ins(steps, environment, path)
     if importance.n_forced == 1:
-        p_cut_in = -math.expm1(-hazard_total)
-        draws.hazard_total, cell.log_p_event = hazard_total, math.log(p_cut_in)
+        p_event = -math.expm1(-hazard_total)
+        draws.hazard_total, cell.log_p_event = hazard_total, math.log(p_event)
         if forced:
-            draws.target = min(-math.log1p(-u * p_cut_in), hazard_total)
+            draws.target = min(-math.log1p(-u * p_event), hazard_total)
     if may_show(nade):
         look_for_cut_in(k, steps, kernel, nade)
 

@@ -32,7 +32,7 @@ def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class CutIns:
+class KeptEvents:
     """A weighted sample of cut-ins, each with what has to be known to repeat it.
 
     Within a shell all have the same probability. ``path``, ``step``, ``cell`` (n,): which path of the pool, which of
@@ -73,8 +73,8 @@ class Pool:
     ``key`` is the hash of all that it was made from, ``family`` names the kind of its events, ``environment`` is
     the hash of its environment. ``names`` (D) are
     the surrogates, the most conservative first, ``mu`` (D,) their crash rates per test from ``n_paths`` paths, and
-    ``mu_covariance`` (D, D) of their errors. ``p_cut_in`` is the probability that BV cuts in in a test, ``p_cut_in_se``
-    its standard error, and ``p_cut_in_at_crash`` (D,) the mean P(cut-in | path) of the cut-ins on which each surrogate
+    ``mu_covariance`` (D, D) of their errors. ``p_event`` is the probability that BV cuts in in a test, ``p_event_se``
+    its standard error, and ``p_event_at_crash`` (D,) the mean P(cut-in | path) of the cut-ins on which each surrogate
     crashes, three standard errors on top. Cells divide shells by which references crash: ``cell_shell``,
     ``cell_references`` (C,) are the shell of each and one bit per reference, ``cell_p`` (C,) its probability.
     ``reference_rate``, ``reference_square`` (R,) are crash rates of the references, and mean squares of a path's
@@ -88,17 +88,17 @@ class Pool:
     library: Library
     names: tuple[str, ...]
     n_paths: int
-    p_cut_in: float
-    p_cut_in_se: float
+    p_event: float
+    p_event_se: float
     mu: FloatArray
     mu_covariance: FloatArray
-    p_cut_in_at_crash: FloatArray
+    p_event_at_crash: FloatArray
     cell_shell: IntArray
     cell_references: IntArray
     cell_p: FloatArray
     reference_rate: FloatArray
     reference_square: FloatArray
-    cut_ins: CutIns
+    events: KeptEvents
     p_after_failure: float = 0.0
 
     @cached_property
@@ -109,7 +109,7 @@ class Pool:
     @cached_property
     def shell(self) -> IntArray:
         """Shell of each kept cut-in, shape (n,)."""
-        return np.asarray(self.cell_shell[self.cut_ins.cell])
+        return np.asarray(self.cell_shell[self.events.cell])
 
     def to_json(self) -> dict[str, Any]:
         """What is known of surrogates and shells, as plain content."""
@@ -120,15 +120,15 @@ class Pool:
         references = zip(self.library.references, self.reference_rate.tolist(), reference_error.tolist(), strict=True)
         keys = "name", "crash_rate", "std_error", "shell_probability"
         drivers = self.library.surrogates.items()
-        delays = {name: delay for name, each in drivers if (delay := each.delay_after_cut_in_s) is not None}
+        delays = {name: delay for name, each in drivers if (delay := each.delay_after_event_s) is not None}
         return {
             "pool": self.key,
             "n_paths": self.n_paths,
-            "p_cut_in": self.p_cut_in,
-            "p_cut_in_std_error": self.p_cut_in_se,
+            "p_event": self.p_event,
+            "p_event_std_error": self.p_event_se,
             "boundary": self.library.boundary,
             "envelope": self.library.envelope,
-            "delays_after_cut_in_s": {} if self.cut_ins.lead.any() else delays,
+            "delays_after_event_s": {} if self.events.lead.any() else delays,
             "surrogates": [dict(zip(keys, row, strict=True)) for row in surrogates],
             "no_surrogate_crashes": p[-1],
             "references": [dict(zip(keys[:-1], row, strict=True)) for row in references],
@@ -141,12 +141,12 @@ def pool_content(pool: Pool) -> bytes:
 
 
 def _table(pool: Pool) -> pa.Table:
-    c = pool.cut_ins
+    c = pool.events
     probability = pool.shell_p / np.maximum(np.bincount(pool.shell, minlength=pool.shell_p.size), 1)
     columns: dict[str, tuple[pa.Array, str]] = {
         "path": (pa.array(c.path), "index of the path in the pool"),
         "event": (pa.array(c.step.astype(np.int16)), "which of the path's events"),
-        "cut_in_step": (pa.array(c.at.astype(np.int16)), "step (0.1 s) in which it is"),
+        "event_step": (pa.array(c.at.astype(np.int16)), "step (0.1 s) in which it is"),
         "probability": (pa.array(probability[pool.shell]), "P under the NDE that it stands for"),
         "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
         "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
@@ -160,7 +160,7 @@ def _table(pool: Pool) -> pa.Table:
     schema = pa.schema(
         [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
     )
-    known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "cut_ins")}
+    known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "events")}
     plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known.items()}
     table = pa.table([array for array, _ in columns.values()], schema=schema)
     facts = json.dumps({"library": pool.library.model_dump(), **plain}).encode()
@@ -180,11 +180,11 @@ def pool_from(content: bytes) -> Pool:
         values = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
         return np.asarray(values).reshape(table.num_rows, -1)
 
-    path, step, cell, at, lead = map(whole, ("path", "event", "cell", "cut_in_step", "lead_steps"))
+    path, step, cell, at, lead = map(whole, ("path", "event", "cell", "event_step", "lead_steps"))
     sample = facts_from(table, family_named(facts["family"]).columns), at, lead, matrix("crashes"), matrix("path_mass")
-    cut_ins = CutIns(path, step, cell, *sample)
+    events = KeptEvents(path, step, cell, *sample)
     known: dict[str, Any] = {
         name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()
     }
-    known |= {"library": Library.model_validate(facts["library"]), "names": tuple(facts["names"]), "cut_ins": cut_ins}
+    known |= {"library": Library.model_validate(facts["library"]), "names": tuple(facts["names"]), "events": events}
     return Pool(**{field.name: known[field.name] for field in fields(Pool)})
