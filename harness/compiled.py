@@ -38,7 +38,7 @@ WORLD_SOURCES = (
     "worlds/twin.py",
 )
 """All files that decide what happens in a test; pools and tables are made again when one changes."""
-KERNEL_SOURCES = (*WORLD_SOURCES, "estimators/likelihood.py")
+KERNEL_SOURCES = (*WORLD_SOURCES, "pool/learned.py", "estimators/likelihood.py")
 """All files that compiled code may come from, or take constants from (a test holds this against the imports)."""
 
 
