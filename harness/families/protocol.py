@@ -74,7 +74,8 @@ HOLDING = Recorded(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros((0, 1)
 class Paths(NamedTuple):
     """Paths (n,): the ``number`` of each, by which all that is drawn on it follows, and how it begins.
 
-    ``start`` (n,) is a record of the family's own, made from uniforms.
+    ``start`` (n,) is a record of the family's own, made from uniforms: also of what drivers are told of the path, such
+    as the headway that people keep on it.
     """
 
     number: IntArray
@@ -117,6 +118,20 @@ class LeftOpen(NamedTuple):
     where: str
     highest: float | None
     ends: tuple[Mapping[str, float], Mapping[str, float]]
+
+
+class Exposure(NamedTuple):
+    """How many events there are in an hour of driving, between ``low`` and ``high``.
+
+    ``counted`` are events and the hours in which they were, of which the ends are 90 % Poisson limits; None where it is
+    assumed. ``source`` says where it is from.
+    """
+
+    per_hour: float
+    low: float
+    high: float
+    counted: tuple[int, float] | None
+    source: str
 
 
 class Driven(NamedTuple):
@@ -191,6 +206,9 @@ class Family(Protocol):
 
     def shows(self, traffic: Environment) -> bool:
         """Whether events can be seen before they happen."""
+
+    def exposure(self, traffic: Environment) -> Exposure:
+        """How often there are events, as `Events.probability` counts them."""
 
     def mean_distance_m(self, traffic: Environment) -> float:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens."""

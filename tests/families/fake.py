@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow as pa
 
-from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events
+from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure
 from harness.loop.cells import natural_script
 
 AT = np.array([5, 7])
@@ -59,6 +59,9 @@ class Fake:
 
     def shows(self, traffic):
         return False
+
+    def exposure(self, traffic):
+        return Exposure(2.0, 1.0, 4.0, None, "assumed")
 
     def mean_distance_m(self, traffic):
         return 180.0
