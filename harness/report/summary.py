@@ -28,7 +28,8 @@ from harness.estimators.shells import ShellDetails
 from harness.families import family_named
 from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_parts, stored_columns
-from harness.strata import ASSUMPTION_FREE, weight_of_a_test
+from harness.sampling.shells import Shells
+from harness.strata import ASSUMPTION_FREE, ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
 
@@ -46,6 +47,12 @@ class ShownShells(ShellDetails):
     """What the headline estimate of a shells run says about them."""
 
     rate: float
+    design: ShellDesign
+
+    @property
+    def described(self) -> dict[str, str]:
+        """Reference drivers in plain words, by name."""
+        return {each.name: each.described for each in self.design.references}
 
     @property
     def weight(self) -> FloatArray:
@@ -150,7 +157,8 @@ def _shells(folder: Path, headline: Estimate | Unavailable) -> ShownShells | Non
     if isinstance(headline, Unavailable) or "shells" not in headline.details:
         return None
     try:
-        return TypeAdapter(ShownShells).validate_python({**headline.details, "rate": headline.crash_rate})
+        of_run = {"rate": headline.crash_rate, "design": Shells.stored_design(folder)}
+        return TypeAdapter(ShownShells).validate_python({**headline.details, **of_run})
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
         found = f"no complete description of shells ({'.'.join(map(str, wrong['loc']))}: {wrong['msg']})"
