@@ -36,7 +36,6 @@ class GalleryRow(NamedTuple):
     share_of_estimate: float
     component: str
     avoided_by: str
-    command: str
     scene: int | None
 
 
@@ -79,8 +78,7 @@ def crash_gallery(
             row, trace = (each.filter(pc.equal(each["episode"], number)) for each in (stored, traces))
             shown.append(scenes.scene(row, trace, why=f"impact at {impact} m/s ({', '.join(why)})"))
         share = crash["weight"] / total if total > 0.0 else math.nan
-        command = f"harness replay {run.typed} {number}"
-        rows.append(GalleryRow(number, crash, ", ".join(why), share, component, by, command, scene))
+        rows.append(GalleryRow(number, crash, ", ".join(why), share, component, by, scene))
     return rows, shown
 
 

@@ -46,7 +46,8 @@ def write_report(folder: str | Path) -> Path:
         folder / "report.html", "report.html.j2",
         run=run, answer=answer, summary=summary, sizes=sizes, gallery=gallery, scenes=scenes,
         figures={plot.name: plot for plot in plots}, lateral=lateral_facts(run),
-        tabled=traffic is not None and traffic.accepted.size > 0, outcomes=outcome_rows(summary),
+        tabled=traffic is not None and traffic.accepted.size > 0,
+        outcomes=list(zip(OUTCOMES, summary.count, summary.weight, strict=True)),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         warnings=[*answer.warnings, *uncovered(run, summary)], diagnostics=diagnostics(run),
         settings=dump_campaign(run.campaign), folder=run.typed,
@@ -61,7 +62,7 @@ def _plots(run: RunFolder, summary: RunSummary, traffic: Environment | None) -> 
         where_plot(summary, family_named(run.campaign.scenario), traffic),
         None if run.shells is None else shells_plot(run.shells),
         sensitivity_plot(found) if (found := _sensitivity(run)) is not None and found.shown else None,
-        convergence_plot(run.estimates, run.target_rhw, of_statement=run.asked_statement),
+        convergence_plot(run),
     ]
     return [plot for plot in plots if plot is not None]
 
@@ -93,13 +94,6 @@ def uncovered(run: RunFolder, summary: RunSummary) -> list[str]:
         return []
     found = f"the estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}"
     return [f"{found}: run harness estimate {run.typed} --write"]
-
-
-def outcome_rows(summary: RunSummary) -> list[tuple[str, float, float, float]]:
-    """Per outcome: name, tests, share of the tests, how often it happens per naturalistic test."""
-    n = max(summary.n_episodes, 1)
-    counted = zip(OUTCOMES, summary.count.tolist(), summary.weight.tolist(), strict=True)
-    return [(name, tests, tests / n, summary.per_test(weight)) for name, tests, weight in counted]
 
 
 def diagnostics(run: RunFolder) -> list[tuple[str, Any]]:

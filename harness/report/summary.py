@@ -29,7 +29,7 @@ from harness.families import family_named
 from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_parts, stored_columns
 from harness.sampling.shells import Shells
-from harness.strata import ASSUMPTION_FREE, ShellDesign, weight_of_a_test
+from harness.strata import ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
 
@@ -84,17 +84,6 @@ class RunFolder:
     estimates: Estimates
     shells: ShownShells | None
     typed: str
-
-    @property
-    def asked_statement(self) -> str | None:
-        """The statement `library` where that should reach ``stop.rhw``; None for the assumption-free one."""
-        asked = ASSUMPTION_FREE if self.shells is None else self.campaign.testing.shells.statement
-        return None if asked == ASSUMPTION_FREE else asked
-
-    @property
-    def target_rhw(self) -> float | None:
-        """The relative half-width that was asked for; None where there is a limit to decide: that looks at no width."""
-        return None if self.campaign.accept is not None else self.campaign.stop.rhw
 
     def episodes(self, *columns: str) -> Iterator[pa.RecordBatch]:
         """Columns of the tests that count, in index order; small shards come together."""

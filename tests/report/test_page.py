@@ -181,7 +181,7 @@ def content(**within):
 @pytest.mark.parametrize(("code", "kind"), [(0, None), (4, "Error"), (5, "Failure"), (3, "Failure")])
 def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     file, report = tmp_path / "gate.xml", tmp_path / "report.html"
-    write_junit(file, "smoke", [statement_case(content(), ABOVE, "assumption_free", code)], [report])
+    write_junit(file, "smoke", statement_case(content(), ABOVE, "assumption_free", code), [report])
     (suite,) = JUnitXml.fromfile(str(file))
     assert (suite.name, suite.tests, suite.skipped) == ("smoke", 1, 0)
     assert (suite.failures, suite.errors) == (int(kind == "Failure"), int(kind == "Error"))
