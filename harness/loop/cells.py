@@ -26,7 +26,8 @@ CELL_DTYPE = np.dtype(
         ("event_step", _i8),  # step of the event, -1 before it
         ("planned", _i8),  # step in which it will be, if that is known before; else -1
         ("lead", _i8),  # steps from its onset to it
-        ("onset_step", _i8),  # from the step after it on the AV may act; -1: nobody knows of an onset yet
+        ("onset_step", _i8),  # -1: nobody knows of an onset yet
+        ("acts_from", _i8),  # first step in which the AV may act
         ("component", _i8),  # what the test was drawn from: stratum, or importance function; -1: nothing of the kind
         ("n_control", _i8),
         ("log_weight", _f8),
@@ -40,6 +41,9 @@ CELL_DTYPE = np.dtype(
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration
     ]
 )
+
+NEVER = 2**62
+"""A step that no test has."""
 
 _STEPS = "n_steps", "event_step", "lead_steps", "onset_step", "took_over_step", "n_control_steps"
 _AT_EVENT = "event_gap_m", "event_rate_mps", "onset_gap_m", "onset_rate_mps"
@@ -57,7 +61,9 @@ class Script(NamedTuple):
     ``x``, ``v``, ``lane`` (n, V) are positions (m), speeds (m/s) and lanes (0 right, 1 left) at the beginning.
     ``speed`` (n, steps, O) are the very speeds that the world is told of the others at the end of each step, and
     ``lanes`` (n, steps, O) on which lanes they then are; no steps if they are driven in the loop. The event is in step
-    ``at`` (n,), -1 for none, and shows itself ``lead`` (n,) steps earlier. ``stratum`` (n,) is what a test was drawn
+    ``at`` (n,), -1 for none, and shows itself ``lead`` (n,) steps earlier. ``n_steps`` (n,) are the most of each test,
+    ``acts_from`` (n,) the first in which the AV may act, at most the one after the onset, and ``visible_from`` (n, O)
+    those from which on it sees the others. ``stratum`` (n,) is what a test was drawn
     from, ``log_weight`` (n,) its log weight, ``log_p_event`` (n,) the log probability of an event on its path, NaN
     where nobody has asked. ``announced_index`` (n,) are the indices that AVs are told, ``motion_hash`` (n,) of what
     they must have done when the step of the onset is over: those of their baseline runs; empty where an AV keeps its
@@ -71,6 +77,9 @@ class Script(NamedTuple):
     lanes: Int8Array
     at: IntArray
     lead: IntArray
+    n_steps: IntArray
+    acts_from: IntArray
+    visible_from: IntArray
     stratum: IntArray
     log_weight: FloatArray
     log_p_event: FloatArray
@@ -83,12 +92,33 @@ class Script(NamedTuple):
 
 
 def natural_script(
-    x: FloatArray, v: FloatArray, lane: Int8Array, speed: FloatArray, lanes: Int8Array, at: IntArray, lead: IntArray
+    x: FloatArray,
+    v: FloatArray,
+    lane: Int8Array,
+    speed: FloatArray,
+    lanes: Int8Array,
+    at: IntArray,
+    lead: IntArray,
+    *,
+    n_steps: int | IntArray | None = None,
+    acts_from: int | IntArray | None = None,
+    visible_from: IntArray | None = None,
 ) -> Script:
-    """A script whose tests weigh 1; see `Script`."""
-    n = len(x)
-    natural = np.full(n, -1), np.zeros(n), np.full(n, math.nan)
-    return Script(x, v, lane, speed, lanes, at, lead, *natural, np.zeros(0, np.int64), np.zeros(0, np.uint64))
+    """A script whose tests weigh 1; see `Script`.
+
+    Where nothing else is said a test may be as long as its motion, and the AV sees all, and acts from the step after
+    the onset on.
+    """
+    n, most = len(x), speed.shape[1] if n_steps is None else n_steps
+    if acts_from is None:
+        acts_from = np.where(at < 0, NEVER, np.maximum(at - lead, 0) + 1)
+    if visible_from is None:
+        visible_from = np.zeros((n, x.shape[1] - 1), np.int64)
+    most, acts_from = (np.array(np.broadcast_to(each, n), np.int64) for each in (most, acts_from))
+    stratum, weighs, unknown = np.full(n, -1), np.zeros(n), np.full(n, math.nan)
+    index, motion = np.zeros(0, np.int64), np.zeros(0, np.uint64)
+    moves = x, v, lane, speed, lanes, at, lead
+    return Script(*moves, most, acts_from, visible_from, stratum, weighs, unknown, index, motion)
 
 
 class Cells(NamedTuple):
@@ -141,11 +171,11 @@ class KernelState(NamedTuple):
     """All that the tests of a shard are run with, and written to.
 
     ``first_episode`` is the campaign index of row 0. ``x``, ``v`` (K, V) are the world's positions (m) and speeds
-    (m/s). ``episode`` (n,) are the results, `EPISODE_DTYPE`. ``max_steps`` is the longest test; ``principal`` is the
+    (m/s). ``episode`` (n,) are the results, `EPISODE_DTYPE`. ``principal`` is the
     place of the vehicle that the event is about, and ``ahead`` that of the one ahead of it, -1 without one;
     ``sideways_m`` is the way from its first lateral motion to overlap. ``driver`` is (1,) for a built-in AV, else (0,).
     ``passed_m`` is the gap to the principal vehicle at which the AV has passed it. ``observation`` is what a controller
-    outside of the kernels sees, ``acts_early`` whether from the start; else from the step after the onset.
+    outside of the kernels sees, ``acts_early`` whether from the start, whatever the script says.
     ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or somebody is ahead on its
     lane. What may be so or not is 0 or 1.
     """
@@ -157,7 +187,6 @@ class KernelState(NamedTuple):
     v: FloatArray
     cells: Cells
     episode: RecordArray
-    max_steps: int
     principal: int
     ahead: int
     sideways_m: float

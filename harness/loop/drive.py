@@ -63,24 +63,49 @@ def observe(kernel: KernelState) -> int:
     n = 0
     for k in range(cells.cell.size):
         cell = cells.cell[k]
-        followed, comes = 0 <= cell.event_step < cell.step, 0 <= cell.onset_step < cell.step
-        if cell.row < 0 or not (comes or kernel.acts_early):
+        if cell.row < 0 or cell.step < cell.acts_from:
             continue
+        leader, comes = leader_of(k, kernel), 0 <= cell.onset_step < cell.step
+        on_lane = cells.lane_before[k, bv] == cells.lane_before[k, av]
         out.cell[n], out.episode[n], out.time_s[n] = k, cell.announced_index, cell.step * STEP_S
         out.position_m[n], out.speed_mps[n] = x[k, av], v[k, av]
         out.acceleration_mps2[n] = cells.acceleration[k]
-        out.gap_m[n] = gap(x[k, bv], x[k, av]) if followed else math.inf
-        out.lead_speed_mps[n] = v[k, bv] if followed else math.nan
-        out.bv_position_m[n], out.bv_speed_mps[n] = x[k, bv], v[k, bv]
-        out.bv_lane[n] = 0 if followed else 1
-        out.lv_position_m[n], out.lv_speed_mps[n] = math.nan, math.nan
-        if lv >= 0:
-            out.lv_position_m[n], out.lv_speed_mps[n] = x[k, lv], v[k, lv]
+        out.gap_m[n] = gap(x[k, leader], x[k, av]) if leader >= 0 else math.inf
+        out.lead_speed_mps[n] = v[k, leader] if leader >= 0 else math.nan
+        out.bv_position_m[n], out.bv_speed_mps[n] = seen_of(k, bv, kernel)
+        out.bv_lane[n] = cells.lane_before[k, bv]
+        out.lv_position_m[n], out.lv_speed_mps[n] = seen_of(k, lv, kernel)
         out.bv_lateral_m[n] = lateral_position(cell.step, cell.planned, cell.lead, distance_m) if comes else 0.0
-        out.bv_lateral_speed_mps[n] = distance_m / (cell.lead * STEP_S) if comes and not followed else 0.0
-        out.bv_overlaps[n], out.set_speed_mps[n] = 1 if followed else 0, cell.set_speed
+        out.bv_lateral_speed_mps[n] = distance_m / (cell.lead * STEP_S) if comes and not on_lane else 0.0
+        out.bv_overlaps[n], out.set_speed_mps[n] = 1 if on_lane else 0, cell.set_speed
         n += 1
     return n
+
+
+@compiled_inline
+def is_visible(k: int, other: int, kernel: KernelState) -> bool:
+    """Whether an AV sees another vehicle."""
+    cell = kernel.cells.cell[k]
+    return bool(cell.step >= kernel.script.visible_from[cell.row, other])
+
+
+@compiled_inline
+def leader_of(k: int, kernel: KernelState) -> int:
+    """The nearest vehicle ahead on the AV's lane that it sees; -1 for none."""
+    x, lane, av, leader = kernel.x, kernel.cells.lane_before, kernel.x.shape[1] - 1, -1
+    for other in range(av):
+        ahead = lane[k, other] == lane[k, av] and x[k, other] > x[k, av] and is_visible(k, other, kernel)
+        if ahead and (leader < 0 or x[k, other] < x[k, leader]):
+            leader = other
+    return leader
+
+
+@compiled_inline
+def seen_of(k: int, other: int, kernel: KernelState) -> tuple[float, float]:
+    """Position (m) and speed (m/s) of another vehicle; NaN for one that is not there, or not seen."""
+    if other < 0 or not is_visible(k, other, kernel):
+        return math.nan, math.nan
+    return kernel.x[k, other], kernel.v[k, other]
 
 
 def empty_observation(n_cells: int) -> BatchObservation:

@@ -96,7 +96,7 @@ def outcome_of(k: int, kernel: KernelState) -> int:
             return PASSED
     elif left <= kernel.passed_m and not (0 <= cell.onset_step < cell.step):
         return PASSED
-    if cell.step >= kernel.max_steps:
+    if cell.step >= kernel.script.n_steps[cell.row]:
         return TIMEOUT
     return RUNNING
 

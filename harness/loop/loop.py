@@ -168,7 +168,6 @@ class EpisodeLoop:
                 v=self._world.v,
                 cells=self._cells,
                 episode=shard.episode,
-                max_steps=scenario.max_steps,
                 principal=scenario.principal,
                 ahead=scenario.ahead,
                 sideways_m=scenario.sideways_m,
@@ -201,7 +200,7 @@ class EpisodeLoop:
     def _warm_up(self, av: ControllerHost, seen: BatchObservation) -> dict[int, str]:
         """Show controllers that are asked for the first time in their episode what was before; returns who failed."""
         cell, failures = self._cells.cell[seen.cell], dict[int, str]()
-        new = cell["step"] == cell["onset_step"] + 1
+        new = cell["step"] == cell["acts_from"]
         if new.any():
             for before in self._past.before(BatchObservation._make(column[new] for column in seen)):
                 failures = {**av.act(before, warms_up=True)[1], **failures}

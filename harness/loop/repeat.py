@@ -77,7 +77,8 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     cell.row, cell.episode, cell.step, cell.n_control, cell.motion_hash = row, episode, 0, 0, 0
     cell.event_step = cell.planned = cell.onset_step = cell.took_over_step = -1
     cell.lead = cell.asked_to_speed_up = 0
-    cell.cruises, cell.set_speed = kernel.av_cruises, kernel.v[k, av]
+    cell.acts_from = 0 if kernel.acts_early else script.acts_from[row]
+    cell.cruises, cell.set_speed = kernel.av_cruises if cell.acts_from > 0 else 0, kernel.v[k, av]
     cell.announced_index = script.announced_index[row] if script.announced_index.size > 0 else episode
     cell.component, cell.log_weight = script.stratum[row], script.log_weight[row]
     cell.log_p_event = script.log_p_event[row]
@@ -94,6 +95,7 @@ def plan(k: int, at: int, lead: int, kernel: KernelState) -> None:
     """The event will be in a step, and show itself some steps earlier."""
     cell = kernel.cells.cell[k]
     cell.planned, cell.lead, cell.onset_step = at, lead, onset_of(at, lead)
+    cell.acts_from = min(cell.acts_from, cell.onset_step + 1)
 
 
 @compiled
@@ -128,6 +130,7 @@ def note_event(k: int, kernel: KernelState) -> None:
     cell.event_step = cell.step
     if cell.onset_step < 0:
         cell.planned = cell.onset_step = cell.step
+        cell.acts_from = min(cell.acts_from, cell.step + 1)
     cell.event_gap, cell.event_rate = gap_and_rate(k, kernel)
 
 

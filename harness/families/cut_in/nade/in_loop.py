@@ -36,7 +36,8 @@ class DrawnInLoop(Traffic):
     ) -> None:
         n, nowhere = len(states), np.full(len(states), -1)
         nothing = np.zeros((n, 0, BV + 1)), np.zeros((n, 0, BV + 1), np.int8)
-        super().__init__(natural_script(*beginning(states), *nothing, nowhere, np.zeros(n, np.int64)), states)
+        start, steps = beginning(states), int(environment.numbers["max_steps"])
+        super().__init__(natural_script(*start, *nothing, nowhere, np.zeros(n, np.int64), n_steps=steps), states)
         self._given = states, environment, importance, moment_limit
 
     def rows(self, rows: slice) -> DrawnInLoop:
