@@ -139,7 +139,7 @@ def run(
 
         told = "\n".join(answer_lines(result.estimates, folder, timed=False))
         case = statement_case(result.estimates, told, campaign.testing.shells.statement, result.exit_code)
-        write_junit(junit, campaign.name, [case], [result.report])
+        write_junit(junit, campaign.name, case, [result.report])
     if as_json:
         print_json(result.estimates)
     else:
@@ -296,7 +296,7 @@ def compare(
         from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
 
         case = Case("difference", "\n".join(told), outcome_of(found.exit_code))
-        write_junit(junit, " and ".join(labels), [case], [found.report, folder / "compare.json"])
+        write_junit(junit, " and ".join(labels), case, [found.report, folder / "compare.json"])
     if as_json:
         print_json(found.content)
     else:

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from inspect import getmembers, isfunction
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
-from harness import numbers
-from harness.errors import HarnessError, RunFolderError, printable
-from harness.families import family_named
+from harness.errors import HarnessError, RunFolderError
 from harness.numbers import count, tenths
-from harness.records.folder import read_as, write_bytes
-from harness.records.reader import read_traces, stored_columns
-from harness.records.schemas import LEAD, path_columns
-from harness.report.page import sentence
+from harness.records.folder import read_as
+from harness.report.crashes import rows_of, traces_of
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
-from harness.report.player import TRACE_COLUMNS, Scene, Scenes, beside_other, templates
+from harness.report.player import Scene, Scenes, beside_other
 from harness.report.plots import WHO, pairs_plot
 from harness.report.summary import RunFolder, floats, read_run_folder
+from harness.report.templates import write_page
 from harness.report.words import short_answer
 from harness.runner.stored import replay_episode
 from harness.strata import weight_of_a_test
@@ -49,9 +44,8 @@ def write_comparison(folder: str | Path) -> Path:
             raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, MEND)
     pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
     plot = pairs_plot(pairs.who, pairs.weight, pairs.gap_m, pairs.closing_mps)
-    environment = templates()
-    environment.filters.update(getmembers(numbers, isfunction), sentence=sentence)
-    page = environment.get_template("compare.html.j2").render(
+    return write_page(
+        folder / "report.html", "compare.html.j2",
         compared=stored, asked=asked, given=asked is not stored,
         verdict=pair_words(stored["decision"]), warnings=list(pair_warnings(stored)),
         answers=[short_answer(run.campaign, run.manifest, run.estimates) for run in runs],
@@ -59,8 +53,6 @@ def write_comparison(folder: str | Path) -> Path:
         sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
         plot=plot, scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
     )  # fmt: skip
-    write_bytes(folder / "report.html", printable(page).encode("utf-8"))
-    return folder / "report.html"
 
 
 class Pairs(NamedTuple):
@@ -128,11 +120,8 @@ def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:
 
 def motion_of(run: RunFolder, episode: int) -> tuple[pa.Table, pa.Table | None]:
     """Row and trace of an episode: the stored one, or of the test run again; None where that cannot be done."""
-    lateral = {LEAD} & stored_columns(run.path)
-    asked = path_columns(family_named(run.campaign.scenario))
-    rows = pa.Table.from_batches(run.episodes(*asked, "outcome", *lateral))
-    trace = read_traces(run.path, {episode}, [*TRACE_COLUMNS, *(["lateral_m"] if lateral else [])])
+    trace = traces_of(run, {episode})
     if trace is None:
         with suppress(HarnessError):  # of another version, a vehicle that is gone or does not do the same again
             trace = replay_episode(run.path, episode).trace
-    return rows.filter(pc.equal(rows["episode"], episode)), trace
+    return rows_of(run, {episode}), trace

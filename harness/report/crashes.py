@@ -36,7 +36,6 @@ class GalleryRow(NamedTuple):
     share_of_estimate: float
     component: str
     avoided_by: str
-    command: str
     scene: int | None
 
 
@@ -60,14 +59,14 @@ def crash_gallery(
     avoided = (ends < 0) & (ends != UNKNOWN)
     rankings = _rankings(summary, avoided, avoided.any(axis=1) | (ends == UNKNOWN).any(axis=1))
     asked = {int(episode[place]) for ranked in rankings.values() for place in ranked}
-    traces = _traces(run, asked)
+    traces = traces_of(run, asked)
     traced = set() if traces is None else set(traces.column("episode").unique().to_pylist())
     reasons: dict[int, list[str]] = {}
     for reason, ranked in rankings.items():
         chosen = sorted(enumerate(ranked, 1), key=lambda item: episode[item[1]] not in traced)[:SHOWN]
         for rank, place in sorted(chosen):
             reasons.setdefault(place, []).append(reason.format(rank) if "{}" in reason else f"{reason} no. {rank}")
-    total, stored = float(crashes["weight"].sum()), _rows(run, {int(episode[place]) for place in reasons} & traced)
+    total, stored = float(crashes["weight"].sum()), rows_of(run, {int(episode[place]) for place in reasons} & traced)
     rows, shown = list[GalleryRow](), list[Scene]()
     for place, why in reasons.items():
         crash = {name: float(crashes[name][place]) for name in SHOWN_COLUMNS}
@@ -79,8 +78,7 @@ def crash_gallery(
             row, trace = (each.filter(pc.equal(each["episode"], number)) for each in (stored, traces))
             shown.append(scenes.scene(row, trace, why=f"impact at {impact} m/s ({', '.join(why)})"))
         share = crash["weight"] / total if total > 0.0 else math.nan
-        command = f"harness replay {run.typed} {number}"
-        rows.append(GalleryRow(number, crash, ", ".join(why), share, component, by, command, scene))
+        rows.append(GalleryRow(number, crash, ", ".join(why), share, component, by, scene))
     return rows, shown
 
 
@@ -106,18 +104,19 @@ def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArra
     judged = np.sort(np.argsort(-impact, kind="stable")[: MOST_TRACED if acts else MOST_JUDGED])
     asked = {int(each) for each in episode[judged]}
     if asked:
-        ends[judged] = scenes.ends(_rows(run, asked), _traces(run, asked) if acts else None)
+        ends[judged] = scenes.ends(rows_of(run, asked), traces_of(run, asked) if acts else None)
     return ends
 
 
-def _rows(run: RunFolder, episodes: set[int]) -> pa.Table:
+def rows_of(run: RunFolder, episodes: set[int]) -> pa.Table:
     """What scenes need of episodes, in index order."""
     columns = (*path_columns(family_named(run.campaign.scenario)), "outcome", *({LEAD} & stored_columns(run.path)))
     wanted = pc.field("episode").isin(sorted(episodes))
     return pa.concat_tables([pa.table(batch).filter(wanted) for batch in run.episodes(*columns)])
 
 
-def _traces(run: RunFolder, episodes: set[int]) -> pa.Table | None:
+def traces_of(run: RunFolder, episodes: set[int]) -> pa.Table | None:
+    """Their traces, as far as they are stored; None without any."""
     lateral = ["lateral_m"] if LEAD in stored_columns(run.path) else []
     return read_traces(run.path, episodes, [*TRACE_COLUMNS, *lateral])
 

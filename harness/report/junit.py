@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
 from harness.records.folder import write_text
-from harness.report.words import within
+from harness.report.rows import within
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
 Outcome = Literal["passed", "failure", "error"]
@@ -50,19 +50,16 @@ def statement_case(content: dict[str, Any], message: str, asked: str, exit_code:
     return Case(asked if asks else ASSUMPTION_FREE, message, outcome, besides)
 
 
-def write_junit(path: Path, suite: str, cases: Sequence[Case], attachments: Sequence[Path]) -> None:
-    """Write a suite; attachments are named as CI systems look for them, in the output of each case."""
-    kinds: list[str] = [case.outcome for case in cases]
+def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path]) -> None:
+    """Write a suite of one case; attachments are named as CI systems look for them, in its output."""
+    counted = {f"{kind}s": str(int(case.outcome == kind)) for kind in ("failure", "error")}
     root = ET.Element("testsuites")
-    of_suite = ET.SubElement(root, "testsuite", name=suite, tests=str(len(cases)))
-    for kind, key in (("failure", "failures"), ("error", "errors")):
-        of_suite.set(key, str(kinds.count(kind)))
-    for case in cases:
-        element = ET.SubElement(of_suite, "testcase", classname=suite, name=case.name)
-        if case.outcome != "passed":
-            ET.SubElement(element, case.outcome, message=case.message)
-        attached = [f"[[ATTACHMENT|{each.resolve()}]]" for each in attachments]
-        told = [case.message] * (case.outcome == "passed")  # else it is in the element of the outcome
-        ET.SubElement(element, "system-out").text = "\n".join([*told, *case.besides, *attached, ""])
+    of_suite = ET.SubElement(root, "testsuite", {"name": suite, "tests": "1", **counted})
+    element = ET.SubElement(of_suite, "testcase", classname=suite, name=case.name)
+    attached = [f"[[ATTACHMENT|{each.resolve()}]]" for each in attachments]
+    told = [case.message, *case.besides]
+    if case.outcome != "passed":
+        ET.SubElement(element, case.outcome, message=told.pop(0))
+    ET.SubElement(element, "system-out").text = "\n".join([*told, *attached, ""])
     ET.indent(root)
     write_text(path, printable(ET.tostring(root, encoding="unicode", xml_declaration=True)) + "\n")

@@ -6,8 +6,6 @@ as if it had not been.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import math
 from pathlib import Path
 from typing import Any
@@ -15,19 +13,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from jinja2 import Environment as Templates
-from jinja2 import PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from harness.campaign.campaign import Campaign
-from harness.errors import printable
 from harness.families import family_named
 from harness.families.protocol import Driven, Environment
 from harness.numbers import tenths
 from harness.pool.kept import onset_steps
-from harness.records.folder import write_bytes
 from harness.records.schemas import chosen_from
 from harness.report.summary import floats
+from harness.report.templates import write_page
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import LibraryDriver, library_records
 from harness.vocabulary import FloatArray, IntArray
@@ -249,27 +243,6 @@ def _when(step: int, cut: int) -> str:
     return f"{STEP_S * step:.1f} s, {STEP_S * abs(step - cut):.1f} s {side} the cut-in"
 
 
-def templates() -> Templates:
-    """Templates of pages, with what both kinds hold that the player needs."""
-    place = Path(__file__).parent
-    css, more_css, script = (
-        (place / name).read_text(encoding="utf-8") for name in ("report.css", "player.css", "player.js")
-    )
-    found = Templates(
-        loader=PackageLoader("harness.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    # Our own files, of which the policy of the page lets this one script run, by its hash.
-    found.globals.update(style=Markup(css + more_css), script=Markup(script), script_hash=Markup(digest))  # noqa: S704
-    found.policies["json.dumps_kwargs"] = {"default": np.ndarray.tolist, "separators": (",", ":")}
-    return found
-
-
 def write_player(scene: Scene, file: str | Path) -> None:
     """Write a page with nothing but the player of a scene."""
-    page = templates().get_template("replay.html.j2").render(scene=scene, scenes=[scene])
-    write_bytes(Path(file), printable(page).encode("utf-8"))
+    write_page(Path(file), "replay.html.j2", scene=scene, scenes=[scene])

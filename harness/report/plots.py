@@ -12,7 +12,8 @@ from harness.families.protocol import Environment, Family
 from harness.numbers import count, number, plain, share
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.player import OTHERS
-from harness.report.summary import RunSummary, ShownShells
+from harness.report.summary import RunFolder, RunSummary, ShownShells
+from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.library import library_records
 from harness.vocabulary import CRASH, FAILED, FloatArray, IntArray
 
@@ -29,7 +30,6 @@ IN_ROUNDS = (
 DASHED, DOTTED = "4 3", "1 3"
 SHARES = {0.0: "grid", 0.25: "red-1", 0.5: "red-2", 0.75: "red-4", 1.0: "red-6"}
 """Up to which share of cut-ins that crash a cell of the map has a colour."""
-"""Index of the maneuver 0 m/s²."""
 WHO = {"both": "grey", "only A": "blue", "only B": "reference"}
 """Who crashes, and the colour: on the page the player draws B in that of reference drivers."""
 MOST_BARS = 16
@@ -59,12 +59,11 @@ def severity_plot(estimates: Estimates) -> Plot | None:
     return Plot("severity", [panel], f"Rate of crashes above each impact speed. {text}", text)
 
 
-def convergence_plot(estimates: Estimates, target_rhw: float | None, *, of_statement: str | None = None) -> Plot | None:
-    """Rate with its band, and RHW with its target, against tests; None without a crash, or a course to draw.
-
-    ``of_statement``: the target is one for a statement of a shells run about a boundary, which convergence does not
-    record.
-    """
+def convergence_plot(run: RunFolder) -> Plot | None:
+    """Rate with its band, and RHW with its target, against tests; None without a crash, or a course to draw."""
+    estimates, campaign = run.estimates, run.campaign
+    target = None if campaign.accept is not None else campaign.stop.rhw  # a limit to decide looks at no width
+    of_library = run.shells is not None and campaign.testing.shells.statement != ASSUMPTION_FREE
     points = sorted(estimates.convergence, key=lambda point: point.n)
     if len(points) < 2 or not points[-1].crash_rate:
         return None
@@ -77,15 +76,15 @@ def convergence_plot(estimates: Estimates, target_rhw: float | None, *, of_state
     left.add("line", "blue", n, rate, label="estimate")
     left.add("line", "muted", n[[0, -1]], rate[[-1, -1]], dash=DASHED, width=1.0, label="at the end")
     caption = WEIGHTED if estimates.headline != "shells" else IN_ROUNDS
-    if target_rhw is None:
+    if target is None:
         caption += " No RHW was asked for."
-    elif of_statement:
-        caption += f" The RHW that was asked for is that of the statement {of_statement}, not of the rate drawn here."
+    elif of_library:
+        caption += " The RHW that was asked for is that of the statement library, not of the rate drawn here."
     alt = (
         f"Crash rate against number of tests with its {confidence} band, ending at {number(rate[-1])} after "
         f"{count(n[-1])} tests. Relative half-width against tests, ending at {number(rhw[-1])}."
     )
-    right = _rhw_panel(tests, n, rhw, None if of_statement else target_rhw)
+    right = _rhw_panel(tests, n, rhw, None if of_library else target)
     return Plot("convergence", [left, *([] if right is None else [right])], alt, caption)
 
 

@@ -28,7 +28,8 @@ from harness.estimators.shells import ShellDetails
 from harness.families import family_named
 from harness.records.folder import concatenated, read_as, read_manifest
 from harness.records.reader import read_campaign, read_parts, stored_columns
-from harness.strata import ASSUMPTION_FREE, weight_of_a_test
+from harness.sampling.shells import Shells
+from harness.strata import ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
 
@@ -46,6 +47,12 @@ class ShownShells(ShellDetails):
     """What the headline estimate of a shells run says about them."""
 
     rate: float
+    design: ShellDesign
+
+    @property
+    def described(self) -> dict[str, str]:
+        """Reference drivers in plain words, by name."""
+        return {each.name: each.described for each in self.design.references}
 
     @property
     def weight(self) -> FloatArray:
@@ -77,24 +84,6 @@ class RunFolder:
     estimates: Estimates
     shells: ShownShells | None
     typed: str
-
-    @property
-    def headline(self) -> Estimate:
-        """The estimate that answers the campaign's question."""
-        found = self.estimates.estimates[self.estimates.headline]
-        assert isinstance(found, Estimate)  # of a folder that has been read
-        return found
-
-    @property
-    def asked_statement(self) -> str | None:
-        """The statement `library` where that should reach ``stop.rhw``; None for the assumption-free one."""
-        asked = ASSUMPTION_FREE if self.shells is None else self.campaign.testing.shells.statement
-        return None if asked == ASSUMPTION_FREE else asked
-
-    @property
-    def target_rhw(self) -> float | None:
-        """The relative half-width that was asked for; None where there is a limit to decide: that looks at no width."""
-        return None if self.campaign.accept is not None else self.campaign.stop.rhw
 
     def episodes(self, *columns: str) -> Iterator[pa.RecordBatch]:
         """Columns of the tests that count, in index order; small shards come together."""
@@ -150,7 +139,8 @@ def _shells(folder: Path, headline: Estimate | Unavailable) -> ShownShells | Non
     if isinstance(headline, Unavailable) or "shells" not in headline.details:
         return None
     try:
-        return TypeAdapter(ShownShells).validate_python({**headline.details, "rate": headline.crash_rate})
+        of_run = {"rate": headline.crash_rate, "design": Shells.stored_design(folder)}
+        return TypeAdapter(ShownShells).validate_python({**headline.details, **of_run})
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
         found = f"no complete description of shells ({'.'.join(map(str, wrong['loc']))}: {wrong['msg']})"

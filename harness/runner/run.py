@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -193,7 +193,7 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     decided["remedy"] = pool_remedy(rule, campaign, stopped_by) or None
     if cpus:  # bits may have come from any of them
         run = run.noting(cpu=", ".join(sorted({cpu_name(), *cpus})))
-    ended = {"stopped_by": stopped_by, "unmet": rule.look.unmet, **decided}
+    ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
     run = run.written("done", **ended)
     progress.stage("writing estimates and report", None)
     estimates = estimate_blocks(even(run.blocks), campaign, run.content("done", **ended))

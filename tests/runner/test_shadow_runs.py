@@ -16,6 +16,7 @@ from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
 from harness.report.page import write_report
+from harness.sampling.shells import Shells
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.conftest import SHELLS
@@ -74,7 +75,7 @@ def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_
     campaign, out, other = golden(ACTS, AS_NEEDED), tmp_path / "run", tmp_path / "other"
     run_golden(campaign, out)
     assert "learned" in json.loads((out / "shells.json").read_text())["strata"]
-    assert "pilot tests" in estimates(out)["estimates"]["shells"]["details"]["learned"]
+    assert "pilot tests" in Shells.stored_design(out).learned
     pilot = sorted((out / "pilot").glob("*.parquet"))
     assert sum(pq.read_table(file).num_rows for file in pilot) == manifest(out)["pilot_tests"]["n_runs"] >= 300
     learned = [row for row in stored_table(out, "episodes").to_pylist() if row["outcome"] == "crash"]
