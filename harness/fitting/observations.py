@@ -31,13 +31,15 @@ def _dtype(*names: str) -> np.dtype[np.void]:
     return np.dtype([("vehicle", np.int64), *((name, np.float64) for name in names)])
 
 
-FREE = _dtype("v_mps", "acceleration_mps2")
-FOLLOWING = _dtype("v_mps", "r1_m", "r1dot_mps", "acceleration_mps2")
-INITIAL = _dtype("v_mps", "r1_m", "r1dot_mps")
-AT_RISK = np.dtype(
-    [*_dtype("duration_s", "v_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps", "ttc_s").descr, ("changes", np.bool_)]
-)
-LEADS = _dtype("lead_s", "lateral_speed_mps")
+_RISKS = _dtype("duration_s", "v_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps", "ttc_s")
+KINDS = {
+    "free": _dtype("v_mps", "acceleration_mps2"),
+    "following": _dtype("v_mps", "r1_m", "r1dot_mps", "acceleration_mps2"),
+    "initial": _dtype("v_mps", "r1_m", "r1dot_mps"),
+    "at_risk": np.dtype([*_RISKS.descr, ("changes", np.bool_)]),
+    "leads": _dtype("lead_s", "lateral_speed_mps"),
+}
+"""Kinds of `Observations`."""
 
 INITIAL_EVERY_S = 20
 CLOSING_TTC_S = 8.0
@@ -117,17 +119,17 @@ class Observations:
     recording : str
         Its name, for messages and as cluster.
     free : RecordArray
-        `FREE`: accelerations of one second of vehicles without a leader within the fit range.
+        accelerations of one second of vehicles without a leader within the fit range.
     following : RecordArray
-        `FOLLOWING`: state behind the leader, and acceleration of the second that begins there.
+        state behind the leader, and acceleration of the second that begins there.
     initial : RecordArray
-        `INITIAL`: state behind a leader every 20 s of a vehicle, from its first on.
+        state behind a leader every 20 s of a vehicle, from its first on.
     at_risk : RecordArray
-        `AT_RISK`: one row per second behind a leader with nobody alongside in the target lane; ``duration_s`` is the
+        one row per second behind a leader with nobody alongside in the target lane; ``duration_s`` is the
         time that it stands for. ``ttc_s`` is R2/-R2dot, infinite where nobody is behind or closes in; R2 and R2dot are
         infinite and 0 where nobody is behind. A row that ``changes`` is the state of a crossing to the target lane.
     leads : RecordArray
-        `LEADS`: time from onset of lateral motion to crossing, and lateral speed at it; empty without lateral
+        time from onset of lateral motion to crossing, and lateral speed at it; empty without lateral
         positions. Leads above 4 s may be lower limits.
     noise_mps2 : float
         Standard deviation of ``acceleration_mps2`` by white measurement noise.
@@ -219,10 +221,10 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
     )
     return Observations(
         recording.name,
-        _records(FREE, columns, second & state.fits & ~state.follows & seen),
-        _records(FOLLOWING, columns, second & state.behind),
-        _records(INITIAL, columns, whole & state.behind & (since // n % INITIAL_EVERY_S == 0)),
-        _records(AT_RISK, columns, state.at_risk),
+        _records("free", columns, second & state.fits & ~state.follows & seen),
+        _records("following", columns, second & state.behind),
+        _records("initial", columns, whole & state.behind & (since // n % INITIAL_EVERY_S == 0)),
+        _records("at_risk", columns, state.at_risk),
         leads,
         noise_of(track),
         tally,
@@ -254,10 +256,10 @@ def require_distinct(found: Sequence[Observations]) -> None:
             raise TrajectoryError(found[second].place, words, "other vehicles, or other times", mend)
 
 
-def _records(dtype: np.dtype[np.void], columns: dict[str, RecordArray], inside: BoolArray) -> RecordArray:
+def _records(kind: str, columns: dict[str, RecordArray], inside: BoolArray) -> RecordArray:
     """Rows of some columns (n,) that are ``inside`` (n,)."""
-    out = np.empty(int(inside.sum()), dtype)
-    for name in dtype.names or ():
+    out = np.empty(int(inside.sum()), KINDS[kind])
+    for name in KINDS[kind].names or ():
         out[name] = columns[name][inside]
     return out
 
@@ -298,7 +300,7 @@ def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int, in
             onset = _onset(before_s, track.lateral[reach])
             lead_s = -onset if onset - before_s[0] >= LEVEL_S else -before_s[0]
             found.append((track.vehicle[row], lead_s, abs(speed)))
-    return np.array(found, LEADS), straight, shifted, jumping
+    return np.array(found, KINDS["leads"]), straight, shifted, jumping
 
 
 def _onset(time_s: FloatArray, lateral: FloatArray) -> float:

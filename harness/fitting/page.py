@@ -19,7 +19,8 @@ from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environmen
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.fitting.fit import Fit
-from harness.fitting.laws import HAZARD_OF, TTC_EDGES_S, bins
+from harness.fitting.hazard import HAZARD_OF, TTC_EDGES_S
+from harness.fitting.laws import bins
 from harness.fitting.observations import Tally
 from harness.numbers import number
 from harness.report.drawing import Axis, Panel, Plot
@@ -166,7 +167,7 @@ def _acceptance_plot(fit: Fit) -> Plot:
 
 def _hazard_plot(fit: Fit) -> Plot:
     rows = fit.traffic.at_risk[fit.traffic.at_risk["ttc_s"] > TTC_EDGES_S[-1]]
-    rate, labels = fit.hazard_at(rows), ("speed of BV, m/s", "gap R1 to LV, m", "R1dot = v_LV − v_BV, m/s")
+    rate, labels = fit.hazard.rate(rows), ("speed of BV, m/s", "gap R1 to LV, m", "R1dot = v_LV − v_BV, m/s")
     panels = []
     for column, label in zip(HAZARD_OF, labels, strict=True):
         edges = np.unique(np.quantile(rows[column], np.linspace(0.0, 1.0, 9)))
