@@ -263,7 +263,7 @@ def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):
     (tmp_path / "all.csv.gz").write_bytes(gzip.compress(text.encode()))
     (tmp_path / "wide.csv").write_bytes(text.encode("utf-16"))
     for name in ("all.csv", "all.csv.gz", "wide.csv"):
-        assert judged(tmp_path / name)._replace(first_overlap="") == whole
+        assert judged(tmp_path / name) == whole
     assert judged(tmp_path / "german.csv", str(tmp_path / "own.yaml")) == whole
     parts = [tmp_path / "first.csv", tmp_path / "second.csv"]
     first = rows.recording_id < 13
@@ -298,11 +298,9 @@ def test_ngsim(tmp_path):
     for name, exactly in (("i80.csv", 1e-9), ("i80.txt", 1e-5)):
         (recording,) = recordings([tmp_path / name], load_mapping("ngsim"))
         assert recording.rate_hz == pytest.approx(10.0)
-        for column in ("s_m", "speed_mps", "length_m", "lateral_m"):
-            assert recording.rows[column].to_numpy() == pytest.approx(
-                expected[column].to_numpy(), rel=1e-6, abs=exactly
-            )
-        assert (recording.rows.lane == expected.lane.to_numpy()).all()
+        for attribute, column in {"s": "s_m", "v": "speed_mps", "length": "length_m", "lateral": "lateral_m"}.items():
+            assert getattr(recording, attribute) == pytest.approx(expected[column].to_numpy(), rel=1e-6, abs=exactly)
+        assert (recording.lane == expected.lane.to_numpy()).all()
 
 
 def test_sites_need_not_be_sorted(tmp_path):
