@@ -30,7 +30,8 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.errors import TrajectoryError
 from harness.estimators.traffic import ONE_LAW
 from harness.families.cut_in.loading import evaluate_laws, load_environment, load_parameters
-from harness.families.cut_in.parameters import FIXED, REPLACED, EnvironmentParameters
+from harness.families.cut_in.parameters import FIXED, EnvironmentParameters
+from harness.families.cut_in.sections import REPLACED
 from harness.files import write_atomically
 from harness.fitting.fit import fit_traffic, replicates
 from harness.fitting.hazard import TTC_EDGES_S

@@ -18,7 +18,8 @@ from harness.campaign.files import Places, validated
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
 from harness.families.cut_in.loading import load_environment, require_sound_laws
-from harness.families.cut_in.parameters import REPLACED, EnvironmentParameters
+from harness.families.cut_in.parameters import EnvironmentParameters
+from harness.families.cut_in.sections import REPLACED
 from harness.fitting.hazard import FREE_TTC_S, HAZARD_OF, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
 from harness.fitting.laws import LAWS, FittedLaw, Traffic, fit_rate
 from harness.progress import Progress

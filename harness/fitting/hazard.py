@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from harness.families.cut_in.parameters import SMALLEST_SHARE
+from harness.families.cut_in.sections import SMALLEST_SHARE
 from harness.fitting.laws import FittedLaw, Traffic
 from harness.fitting.maximum import Prior, maximise
 from harness.vocabulary import FloatArray, IntArray, RecordArray
