@@ -93,11 +93,7 @@ def _rounded(value: float) -> float:
 
 
 def _environment(
-    base: EnvironmentParameters,
-    laws: dict[str, FittedLaw],
-    knots: Sequence[FloatArray],
-    acceptance: Acceptance,
-    where: str,
+    base: EnvironmentParameters, laws: dict[str, FittedLaw], knots: Sequence[FloatArray], seen: Acceptance, where: str
 ) -> EnvironmentParameters:
     """The base with fitted numbers, and with tables in place of the formulas that they replace."""
     content: dict[str, Any] = base.model_dump(exclude_none=True)
@@ -123,11 +119,10 @@ def _environment(
     if "lead" in laws:
         content["lateral"]["longest_lead_s"].pop("note", None)  # it is about the share that the base cuts off
     edges = [{"value": edge, "source": "assumed"} for edge in TTC_EDGES_S.tolist()]
-    shares = zip(acceptance.shares.tolist(), acceptance.std_errors.tolist(), strict=True)
+    shares = zip(seen.shares.tolist(), seen.std_errors.tolist(), strict=True)
     steps = [{"value": _rounded(share), "source": "fitted", "se": _rounded(se)} for share, se in shares]
     steps[-1] = {"value": 1.0, "source": "assumed", "note": "the hazard is fitted where nobody closes in"}
-    exposure = [_rounded(each) for each in acceptance.exposure.tolist()]
-    counted = {"events": acceptance.events.tolist(), "exposure": exposure}
+    counted = {"events": seen.events.tolist(), "exposure": list(map(_rounded, seen.exposure.tolist()))}
     tables["acceptance_steps"] = {"ttc_s": edges, "share": steps, **counted}
     return validated({**content, **tables}, EnvironmentParameters, where, Places(where, {}))
 

@@ -161,8 +161,8 @@ def _fitted(
     Rows may be ``counted`` by kinds (k,) that likelihood and designs are of, and the kind of each row (n,).
     """
     data, cell = counted or (rows, None)
-    centre = [base[f"{section}__{name}"] for name in spread]
-    centre = [LINKS[name][0](value) if name in LINKS else value for name, value in zip(spread, centre, strict=True)]
+    by_name = {name: base[f"{section}__{name}"] for name in spread}
+    centre = [LINKS[name][0](value) if name in LINKS else value for name, value in by_name.items()]
     prior, at = Prior.of(centre, list(spread.values())), np.array([name == kept for name in spread])
     members = traffic.members(rows, cell)
     found = maximise(log_likelihood, data, designs, *members, prior, [prior.centre, *starts], kept=at)

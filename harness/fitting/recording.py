@@ -289,15 +289,15 @@ def _require_agreement(
 
 def _check_sizes(recording: Recording, speed: float, length: float) -> None:
     """Refuse medians of speeds (m/s) and lengths (m) that no road has."""
-    feet = length > USUAL_LENGTH_M[1]
+    place, feet = recording.place, length > USUAL_LENGTH_M[1]
     if not -0.5 < speed < FASTEST_MEDIAN_MPS:
         found = f"a median speed of {speed:.4g} m/s" + (f" and a median length of {length:.3g} m: feet" if feet else "")
         mend = "Give units in a mapping (units: {s_m: ft, speed_mps: ft/s, length_m: ft}); forward is positive."
-        raise TrajectoryError(recording.place, found, "0 to 70 m/s", mend)
+        raise TrajectoryError(place, found, "0 to 70 m/s", mend)
     if feet or length < USUAL_LENGTH_M[0]:
         mend = "Use a mapping: units: {length_m: ft}." if feet else "Is this the width of vehicles?"
         found = f"a median length of {length:.3g} m{': feet' if feet else ''}"
-        raise TrajectoryError(recording.place, found, "2.5 to 10 m", mend)
+        raise TrajectoryError(place, found, "2.5 to 10 m", mend)
 
 
 def _lag(begin: IntArray, frame: IntArray, vehicle: IntArray, way_m: FloatArray, driven_m: FloatArray, n: int) -> int:
