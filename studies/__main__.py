@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -356,7 +355,7 @@ def motorway(folder: Path, *, environments: Sequence[str]) -> None:
     sides = {}
     for side in ("left", "right"):
         seen = [each for each, _ in observations([table], load_mapping(mirror=side == "left"))]
-        tally = reduce(Tally.plus, (each.tally for each in seen))
+        tally = Tally.of(seen)
         sides[side] = tally, figures(Traffic.of(seen), laws)
     written = page(sides)
     write_bytes(folder / "motorway.md", written.encode())

@@ -16,14 +16,13 @@ from harness.campaign.files import read_model
 from harness.campaign.yaml_text import yaml_text
 from harness.errors import HarnessError, printable
 from harness.families.cut_in.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
-from harness.fitting.fit import Fit, fit_traffic
+from harness.fitting.fit import REPLICATES, Fit, fit_traffic, replicates
 from harness.fitting.laws import Traffic
 from harness.fitting.observations import Observations, Tally, observations, require_distinct, require_enough
 from harness.fitting.page import page
 from harness.fitting.table import Mapping as Columns
 from harness.fitting.table import load_mapping, places
 from harness.fitting.tracks import FitRange
-from harness.fitting.uncertainty import REPLICATES, replicates
 from harness.progress import Progress
 from harness.records.folder import parquet, require_place, write_together
 

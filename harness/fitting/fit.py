@@ -1,8 +1,14 @@
-"""Traffic fitted to trajectories: all laws, and the environment that they make."""
+"""Traffic fitted to trajectories: all laws, the environment that they make, and replicates of it.
+
+A replicate is what other trajectories of the same kind would have given: clusters (recordings, or vehicles where there
+are few) are drawn with replacement, and each law moves by the influence of those drawn more or less often than once
+(one-step bootstrap: θ + Σ (w_c - 1) influence_c). With few clusters, moves are widened to those of Student's t. Lane
+changes in front of a vehicle that closes in are counts: accepted shares are drawn as gamma(k + 1/2) over exposure.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,59 +18,27 @@ from harness.campaign.files import Places, validated
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
 from harness.families.cut_in.loading import load_environment, require_sound_laws
-from harness.families.cut_in.parameters import REPLACED, EnvironmentParameters
-from harness.fitting.laws import (
-    FREE_TTC_S,
-    TTC_EDGES_S,
-    Acceptance,
-    Base,
-    FittedLaw,
-    Knots,
-    Traffic,
-    fit_car_following,
-    fit_free_driving,
-    fit_gap,
-    fit_hazard,
-    fit_leads,
-    fit_rate,
-    fit_speed,
-    hazard_design,
-)
+from harness.families.cut_in.parameters import EnvironmentParameters
+from harness.families.cut_in.sections import REPLACED
+from harness.fitting.hazard import FREE_TTC_S, HAZARD_OF, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
+from harness.fitting.laws import LAWS, FittedLaw, Traffic, fit_rate
 from harness.progress import Progress
 from harness.vocabulary import FloatArray
 
 HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)
 """Degrees of freedom of R1dot: fitted (None), then tried until LV's speed is one that SUMO's lanes allow."""
 DIGITS = 6
-_LAWS: dict[str, tuple[Callable[[Traffic, Base], FittedLaw | None], str]] = {
-    "speed": (fit_speed, "speeds of BV"),
-    "gap": (fit_gap, "gaps to LV"),
-    "rate": (fit_rate, "speed differences to LV"),
-    "free driving": (fit_free_driving, "accelerations in free driving"),
-    "car following": (fit_car_following, "accelerations behind a leader"),
-    "lead": (fit_leads, "leads of lane changes"),
-}
-"""Laws that may be kept from the base."""
+REPLICATES = 200
+MOST_DRAWS = 5
+"""At most this many times the replicates asked for are drawn, as tests cannot be drawn from some."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Fitted traffic.
+    """Fitted traffic: ``environment`` is the result, ``laws`` has the hazard's, too.
 
-    Attributes
-    ----------
-    base : EnvironmentParameters
-        Environment from which numbers are kept that are not fitted; ``base_name`` is its name.
-    laws : dict of str to FittedLaw
-        Fitted laws, the hazard among them.
-    kept : dict of str to str
-        Why a law is kept from the base, by its subject.
-    knots : Knots
-        Of the hazard.
-    acceptance : Acceptance
-        Lane changes by time to collision.
-    environment : EnvironmentParameters
-        The result.
+    Numbers that are not fitted are those of ``base``, an environment called ``base_name``; ``kept`` says why a law is
+    kept from it, by its subject.
     """
 
     traffic: Traffic
@@ -72,13 +46,9 @@ class Fit:
     base_name: str
     laws: dict[str, FittedLaw]
     kept: dict[str, str]
-    knots: Knots
+    hazard: Hazard
     acceptance: Acceptance
     environment: EnvironmentParameters
-
-    def hazard_at(self, rows: Any) -> FloatArray:
-        """Rate (1/s) of lane changes with nobody closing in, by state (n,)."""
-        return np.exp(hazard_design(self.knots, rows) @ self.laws["hazard"].maximum.theta)
 
 
 def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, where: str, progress: Progress) -> Fit:
@@ -88,38 +58,34 @@ def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, w
     files.
     """
     numbers = base.values()
-    settings = EnvironmentSettings()
-    progress.stage("fitting laws", len(_LAWS) + 1)
+    progress.stage("fitting laws", len(LAWS) + 1)
     if (hazard := fit_hazard(traffic)) is None:
-        found_words = (
-            f"too few lane changes without a vehicle that closes in within {FREE_TTC_S:g} s to fit their hazard"
-        )
-        raise TrajectoryError(where, found_words, "20 or more", "Add recordings.")
+        words = f"too few lane changes without a vehicle that closes in within {FREE_TTC_S:g} s to fit their hazard"
+        raise TrajectoryError(where, words, "20 or more", "Add recordings.")
     found = {}
-    for name, (law_of, _) in _LAWS.items():
+    for name, (law_of, _) in LAWS.items():
         progress.advance(1)
         found[name] = law_of(traffic, numbers)
     progress.advance(1)
-    acceptance = Acceptance.of(traffic, *hazard)
+    acceptance = Acceptance.of(traffic, hazard)
+    why = "too few data, or the law does not fit them"
     for df in HEAVIEST_TAILS:
         if df is not None:
-            found["rate"] = fit_rate(traffic, numbers, df)
-        laws = {name: law for name, law in found.items() if law is not None} | {"hazard": hazard[0]}
+            found["rate"] = fit_rate(traffic, numbers | {"initial_state__r1dot_df": df}, kept="r1dot_df")
+        laws = {name: law for name, law in found.items() if law is not None} | {"hazard": hazard.law}
         try:
-            environment = _environment(base, laws, hazard[1], acceptance, where)
-            require_sound_laws(load_environment(settings, environment), where)
+            environment = _environment(base, laws, hazard.knots, acceptance, where)
+            require_sound_laws(load_environment(EnvironmentSettings(), environment), where)
         except CampaignError as error:
             problem = error
             continue
-        why = "too few data, or the law does not fit them"
-        kept = {_LAWS[name][1]: why for name, law in found.items() if law is None}
+        kept = {LAWS[name][1]: why for name, law in found.items() if law is None}
         if df is not None:
             kept["degrees of freedom of R1dot"] = f"{df:g}: with heavier tails LV would exceed 100 m/s"
-        return Fit(traffic, base, base_name, laws, kept, hazard[1], acceptance, environment)
+        return Fit(traffic, base, base_name, laws, kept, hazard, acceptance, environment)
+    words = f"laws that tests cannot be drawn from: {problem.where}, {problem.found}"
     mend = f"The data do not look like motorway traffic; see docs/fit.md. {problem.mend}"
-    raise TrajectoryError(
-        where, f"laws that tests cannot be drawn from: {problem.where}, {problem.found}", problem.expected, mend
-    )
+    raise TrajectoryError(where, words, problem.expected, mend)
 
 
 def _rounded(value: float) -> float:
@@ -127,7 +93,7 @@ def _rounded(value: float) -> float:
 
 
 def _environment(
-    base: EnvironmentParameters, laws: dict[str, FittedLaw], knots: Knots, acceptance: Acceptance, where: str
+    base: EnvironmentParameters, laws: dict[str, FittedLaw], knots: Sequence[FloatArray], seen: Acceptance, where: str
 ) -> EnvironmentParameters:
     """The base with fitted numbers, and with tables in place of the formulas that they replace."""
     content: dict[str, Any] = base.model_dump(exclude_none=True)
@@ -135,7 +101,7 @@ def _environment(
         for name in names:
             content["cut_in"].pop(name, None)
     tables: dict[str, Any] = {"hazard_table": {}, "acceptance_steps": {}}
-    for name, at in zip(("v_mps", "r1_m", "r1dot_mps"), knots, strict=True):
+    for name, at in zip(HAZARD_OF, knots, strict=True):
         tables["hazard_table"][name] = [{"value": knot, "source": "derived"} for knot in at.tolist()]
     for law in laws.values():
         for path, value in law.estimate.items():
@@ -153,10 +119,50 @@ def _environment(
     if "lead" in laws:
         content["lateral"]["longest_lead_s"].pop("note", None)  # it is about the share that the base cuts off
     edges = [{"value": edge, "source": "assumed"} for edge in TTC_EDGES_S.tolist()]
-    shares = zip(acceptance.shares.tolist(), acceptance.std_errors.tolist(), strict=True)
+    shares = zip(seen.shares.tolist(), seen.std_errors.tolist(), strict=True)
     steps = [{"value": _rounded(share), "source": "fitted", "se": _rounded(se)} for share, se in shares]
     steps[-1] = {"value": 1.0, "source": "assumed", "note": "the hazard is fitted where nobody closes in"}
-    exposure = [_rounded(each) for each in acceptance.exposure.tolist()]
-    counted = {"events": acceptance.events.tolist(), "exposure": exposure}
+    counted = {"events": seen.events.tolist(), "exposure": list(map(_rounded, seen.exposure.tolist()))}
     tables["acceptance_steps"] = {"ttc_s": edges, "share": steps, **counted}
     return validated({**content, **tables}, EnvironmentParameters, where, Places(where, {}))
+
+
+def replicates(fit: Fit, n: int, seed: int, progress: Progress) -> dict[str, FloatArray]:
+    """Numbers that vary, by their flat names, in n replicates (n,) from which tests can be drawn.
+
+    Raises `TrajectoryError`: there are too few of these.
+    """
+    random = np.random.default_rng(seed)
+    settings, good = EnvironmentSettings(), []
+    progress.stage("replicates", n)
+    for _ in range(MOST_DRAWS):
+        drawn = _draw(fit, n, random)
+        for row in zip(*drawn.values(), strict=True):
+            try:
+                moved = fit.environment.with_values(dict(zip(drawn, row, strict=True)))
+                require_sound_laws(load_environment(settings, moved), "replicate")
+            except (CampaignError, ValueError):
+                continue
+            good.append(row)
+            progress.advance(1)
+            if len(good) == n:
+                return dict(zip(drawn, np.array(good).T, strict=True))
+    found = f"{len(good)} of {MOST_DRAWS * n} replicates that tests can be drawn from"
+    raise TrajectoryError("replicates", found, f"{n}", "Add recordings, or ask for fewer --replicates.")
+
+
+def _draw(fit: Fit, n: int, random: np.random.Generator) -> dict[str, list[float]]:
+    """Rows, by the names of their numbers, some of which tests cannot be drawn from."""
+    n_clusters = int(fit.traffic.cluster.max()) + 1
+    times = random.multinomial(n_clusters, np.full(n_clusters, 1.0 / n_clusters), n) - 1.0
+    times *= np.sqrt(n_clusters / random.chisquare(max(n_clusters - 1, 1), n))[:, None]
+    drawn: dict[str, list[float]] = {}
+    for name, law in fit.laws.items():
+        theta, noise = law.maximum.theta, law.maximum.noise
+        moved = theta + times @ law.maximum.influence + random.standard_normal((n, noise.shape[1])) @ noise.T
+        values = law.values(moved)
+        drawn |= {key: values[:, i].tolist() for i, key in enumerate(law.names) if law.std_error[key] > 0.0}
+        if name == "hazard":
+            shares = fit.acceptance.drawn(moved, random)
+            drawn |= {f"acceptance_steps__share__{j}": shares[:, j].tolist() for j in range(TTC_EDGES_S.size)}
+    return drawn

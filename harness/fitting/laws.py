@@ -1,10 +1,7 @@
 """The laws of traffic, fitted to observations.
 
 Initial states and accelerations are fitted in the shipped families, the former as densities, the latter by the
-probabilities of the 31 accelerations, so that a law is fitted as it is drawn from. The hazard of a lane change is the
-exponential of a sum of piecewise linear functions of v, R1 and R1dot. Its log-likelihood, Σ log h over lane changes
-- Σ h Δt over all seconds at risk, is that of moments in which nobody closes in within `FREE_TTC_S`. Below that, the
-accepted share follows from k lane changes where E = Σ h Δt are expected.
+probabilities of the 31 accelerations, so that a law is fitted as it is drawn from. Lane changes are in `hazard`.
 
 Numbers that the data do not determine keep the value of the ``base``, a shipped environment.
 """
@@ -17,30 +14,21 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg, sparse, special
+from scipy import sparse, special
 
-from harness.families.cut_in.parameters import SMALLEST_SHARE
-from harness.fitting.maximum import Maximum, Prior, maximise
-from harness.fitting.observations import AT_RISK, FOLLOWING, FREE, INITIAL, LEADS, Observations
+from harness.fitting.maximum import LogLikelihood, Maximum, Prior, maximise
+from harness.fitting.observations import KINDS, Observations
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, BoolArray, FloatArray, IntArray, RecordArray
 
 Base = Mapping[str, float]
 """Numbers of an environment by ``section__name``."""
-FREE_TTC_S = 8.0
-TTC_EDGES_S = np.array([1.0, 2.0, 3.0, 5.0, FREE_TTC_S])
 FEWEST = {"initial": 100, "free": 500, "following": 500, "leads": 20}
 """Fewest rows for which a law is fitted [assumed]."""
 FEWEST_RECORDINGS = 10
 """With at least this many, recordings are the clusters, else vehicles [assumed]."""
 OUTLIERS = 1e-4
 """Share of gaps that may lie anywhere in the fit range: the shifted log-normal law rules short ones out [assumed]."""
-KNOTS = np.array([0.02, 0.2, 0.5, 0.8, 0.98])
-"""Quantiles (means of those at lane changes and at risk) between which the log-hazard is straight."""
-SMOOTH = 1.0, 3.0
-"""Prior standard deviations of the log-hazard's bends (change over a quarter of the range) and steps [assumed]."""
-Knots = tuple[FloatArray, FloatArray, FloatArray]
-HAZARD_OF = ("v_mps", "r1_m", "r1dot_mps")
 _TINY = 1e-300
 
 
@@ -58,13 +46,12 @@ class Traffic:
     @classmethod
     def of(cls, observations: Iterable[Observations]) -> Traffic:
         """Join recordings."""
-        return cls.joined(cls._alone(i, each) for i, each in enumerate(observations))
-
-    @classmethod
-    def _alone(cls, number: int, seen: Observations) -> Traffic:
-        arrays = {name: getattr(seen, name) for name in KINDS}
-        n = 1 + max((int(rows["vehicle"].max()) for rows in arrays.values() if rows.size), default=-1)
-        return cls(**arrays, recording=np.full(n, number))
+        alone = []
+        for i, seen in enumerate(observations):
+            rows = {name: getattr(seen, name) for name in KINDS}
+            n = 1 + max((int(each["vehicle"].max()) for each in rows.values() if each.size), default=-1)
+            alone.append(cls(**rows, recording=np.full(n, i)))
+        return cls.joined(alone)
 
     @classmethod
     def joined(cls, parts: Iterable[Traffic]) -> Traffic:
@@ -101,9 +88,6 @@ class Traffic:
         return sparse.csr_array((np.ones(rows.size), (rows["vehicle"], cell)), shape=shape), self.cluster
 
 
-KINDS = {"free": FREE, "following": FOLLOWING, "initial": INITIAL, "at_risk": AT_RISK, "leads": LEADS}
-
-
 @dataclass(frozen=True, eq=False)
 class FittedLaw:
     """Numbers of a law: ``names`` (m,), and ``values`` (…, m) by coefficients (…, p)."""
@@ -111,7 +95,6 @@ class FittedLaw:
     names: tuple[str, ...]
     values: Callable[[FloatArray], FloatArray]
     maximum: Maximum
-    rows: int
 
     @property
     def estimate(self) -> dict[str, float]:
@@ -138,6 +121,12 @@ def _scaled(base: Base, v: FloatArray) -> FloatArray:
     return np.asarray((v - base["fit_range__v_centre_mps"]) / base["fit_range__v_scale_mps"])
 
 
+def _between(below: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray) -> FloatArray:
+    """P(low < X ≤ high) of a symmetric X by its distribution function, precise in the tails."""
+    flipped = low > 0.0
+    return np.asarray(below(np.where(flipped, -low, high)) - below(np.where(flipped, -high, low)))
+
+
 def _log(p: FloatArray) -> FloatArray:
     return np.asarray(np.log(np.maximum(p, _TINY)))
 
@@ -146,12 +135,54 @@ def _columns(n: int, *columns: FloatArray | float) -> FloatArray:
     return np.column_stack([np.broadcast_to(column, n) for column in columns])
 
 
+LINKS: dict[str, tuple[Callable[[float], float], Callable[[FloatArray], FloatArray]]] = {
+    "v_scale_mps": (math.log, np.exp),
+    "r1dot_df": (lambda df: math.log(df - 2.0), _df),
+    "df": (lambda df: math.log(df - 2.0), _df),
+}
+"""Coefficient of a number, and number of a coefficient, where they are not the same."""
+
+
+def _fitted(
+    section: str,
+    spread: Mapping[str, float],
+    log_likelihood: LogLikelihood,
+    designs: Sequence[FloatArray],
+    traffic: Traffic,
+    rows: RecordArray,
+    base: Base,
+    starts: Sequence[FloatArray] = (),
+    *,
+    kept: str = "",
+    counted: tuple[RecordArray, IntArray] | None = None,
+) -> FittedLaw | None:
+    """A law whose numbers are its coefficients, with the prior's ``spread`` by name, around the base's, or its own.
+
+    Rows may be ``counted`` by kinds (k,) that likelihood and designs are of, and the kind of each row (n,).
+    """
+    data, cell = counted or (rows, None)
+    by_name = {name: base[f"{section}__{name}"] for name in spread}
+    centre = [LINKS[name][0](value) if name in LINKS else value for name, value in by_name.items()]
+    prior, at = Prior.of(centre, list(spread.values())), np.array([name == kept for name in spread])
+    members = traffic.members(rows, cell)
+    found = maximise(log_likelihood, data, designs, *members, prior, [prior.centre, *starts], kept=at)
+
+    def values(theta: FloatArray) -> FloatArray:
+        out = np.array(theta)
+        for i, name in enumerate(spread):
+            if name in LINKS:
+                out[..., i] = LINKS[name][1](theta[..., i])
+        return out
+
+    return None if found is None else FittedLaw(tuple(f"{section}__{name}" for name in spread), values, found)
+
+
 # -- initial states --
 
 
 def fit_speed(traffic: Traffic, base: Base) -> FittedLaw | None:
     """v_BV: skew-normal, truncated to the fit range."""
-    rows, names = traffic.initial, ("v_location_mps", "v_scale_mps", "v_shape")
+    rows, spread = traffic.initial, {"v_location_mps": 10.0, "v_scale_mps": 1.0, "v_shape": 4.0}
     if rows.size < FEWEST["initial"]:
         return None
     ends = base["fit_range__v_min_mps"], base["fit_range__v_max_mps"]
@@ -163,19 +194,17 @@ def fit_speed(traffic: Traffic, base: Base) -> FittedLaw | None:
         below, upto = (special.ndtr(end) - 2.0 * special.owens_t(end, shape[:1]) for end in ends_z)
         return np.asarray(special.log_ndtr(shape * z) - 0.5 * z * z - log_scale - np.log(upto - below))
 
-    location, scale, shape = (base[f"initial_state__{name}"] for name in names)
     mean, sd = float(rows["v_mps"].mean()), float(rows["v_mps"].std())
     starts = [np.array([mean + side * sd, math.log(sd * (1.0 + 0.5 * abs(side))), -2.0 * side]) for side in (-1, 0, 1)]
-    prior = Prior.of([location, math.log(scale), shape], [10.0, 1.0, 4.0])
-    ones = [np.ones((rows.size, 1))] * 3
-    found = maximise(log_likelihood, rows, ones, *traffic.members(rows), prior, [prior.centre, *starts])
-    return _law("initial_state", names, found, rows, {1: np.exp})
+    designs = [np.ones((rows.size, 1))] * 3
+    return _fitted("initial_state", spread, log_likelihood, designs, traffic, rows, base, starts)
 
 
 def fit_gap(traffic: Traffic, base: Base) -> FittedLaw | None:
     """R1 given v_BV: shifted log-normal, truncated to the fit range."""
     rows = traffic.initial
-    names = ("r1_shift_m", "r1_shift_u_m", "r1_log_mean", "r1_log_mean_u", "r1_log_sd", "r1_log_sd_u")
+    spread = {"r1_shift_m": 5.0, "r1_shift_u_m": 5.0, "r1_log_mean": 1.5, "r1_log_mean_u": 1.0}
+    spread |= {"r1_log_sd": 1.0, "r1_log_sd_u": 1.0}
     if rows.size < FEWEST["initial"]:
         return None
     least, most = base["fit_range__r1_min_m"], base["fit_range__r1_max_m"]
@@ -190,23 +219,18 @@ def fit_gap(traffic: Traffic, base: Base) -> FittedLaw | None:
         return _log((1.0 - OUTLIERS) * p + OUTLIERS / (most - least))
 
     design = _columns(rows.size, 1.0, _scaled(base, rows["v_mps"]))
-    centre = np.array([base[f"initial_state__{name}"] for name in names])
-    prior = Prior.of(centre.tolist(), [5.0, 5.0, 1.5, 1.0, 1.0, 1.0])
     logs = np.log(rows["r1_m"] + 1.0)
     plain = np.array([0.0, 0.0, logs.mean(), 0.0, math.log(logs.std()), 0.0])
-    found = maximise(log_likelihood, rows, [design] * 3, *traffic.members(rows), prior, [centre, plain])
-    return _law("initial_state", names, found, rows)
+    return _fitted("initial_state", spread, log_likelihood, [design] * 3, traffic, rows, base, [plain])
 
 
-def fit_rate(traffic: Traffic, base: Base, df: float | None = None) -> FittedLaw | None:
-    """R1dot given v_BV and R1: Student's t, truncated at the smallest time to collision.
-
-    Degrees of freedom are fitted unless they are given.
-    """
+def fit_rate(traffic: Traffic, base: Base, kept: str = "") -> FittedLaw | None:
+    """R1dot given v_BV and R1: Student's t, truncated at the smallest time to collision; one number may be ``kept``."""
     least_s = base["initial_state__r1dot_min_ttc_s"]
     rows = traffic.initial[traffic.initial["r1dot_mps"] > -traffic.initial["r1_m"] / least_s]
     location = ("location_mps", "location_u", "location_w", "location_uw", "location_uu")
-    names = tuple(f"r1dot_{each}" for each in (*location, "log_scale", "log_scale_u", "log_scale_w", "log_scale_ww"))
+    scale = {"log_scale": 1.5, "log_scale_u": 1.0, "log_scale_w": 1.0, "log_scale_ww": 1.0}
+    spread = {f"r1dot_{name}": each for name, each in (dict.fromkeys(location, 3.0) | scale | {"df": 1.5}).items()}
     if rows.size < FEWEST["initial"]:
         return None
 
@@ -220,33 +244,9 @@ def fit_rate(traffic: Traffic, base: Base, df: float | None = None) -> FittedLaw
 
     u = _scaled(base, rows["v_mps"])
     w = (rows["r1_m"] - base["fit_range__r1_centre_m"]) / base["fit_range__r1_scale_m"]
-    designs = [_columns(rows.size, 1.0, u, w, u * w, u * u), _columns(rows.size, 1.0, u, w, w * w)]
-    centre = [base[f"initial_state__{name}"] for name in names]
-    eta = math.log((df or base["initial_state__r1dot_df"]) - 2.0)
-    prior = Prior.of([*centre, eta], [3.0] * 5 + [1.5, 1.0, 1.0, 1.0, 1.5])
-    designs.append(np.ones((rows.size, 1)))
-    kept = (np.arange(prior.centre.size) == len(names)) & (df is not None)
-    found = maximise(log_likelihood, rows, designs, *traffic.members(rows), prior, kept=kept)
-    return _law("initial_state", (*names, "r1dot_df"), found, rows, {len(names): _df})
-
-
-def _law(
-    section: str,
-    names: Sequence[str],
-    found: Maximum | None,
-    rows: RecordArray,
-    transforms: Mapping[int, Callable[[FloatArray], FloatArray]] | None = None,
-) -> FittedLaw | None:
-    """A law whose numbers are its coefficients, some transformed."""
-
-    def values(theta: FloatArray) -> FloatArray:
-        out = np.array(theta)
-        for i, transform in (transforms or {}).items():
-            out[..., i] = transform(theta[..., i])
-        return out
-
-    named = tuple(f"{section}__{name}" for name in names)
-    return None if found is None else FittedLaw(named, values, found, rows.size)
+    of_mean, of_scale = (1.0, u, w, u * w, u * u), (1.0, u, w, w * w)
+    designs = [_columns(rows.size, *each) for each in (of_mean, of_scale, (1.0,))]
+    return _fitted("initial_state", spread, log_likelihood, designs, traffic, rows, base, kept=kept)
 
 
 # -- accelerations --
@@ -258,27 +258,18 @@ def bins(acceleration_mps2: FloatArray) -> IntArray:
     return np.asarray(np.clip(nearest, 0, N_ACCELERATIONS - 1), np.int64)
 
 
-def _t_between(low: FloatArray, high: FloatArray, df: FloatArray) -> FloatArray:
-    """P(low < T ≤ high), precise in the tails."""
-    flipped = low > 0.0
-    below, upto = np.where(flipped, -high, low), np.where(flipped, -low, high)
-    return np.asarray(special.stdtr(df, upto) - special.stdtr(df, below))
-
-
-def _in_bin(rows: RecordArray, mean: FloatArray, log_scale: FloatArray, df: FloatArray) -> FloatArray:
+def _in_bin(rows: RecordArray, mean: FloatArray, log_scale: FloatArray, eta: FloatArray) -> FloatArray:
     """Probability of the ``bin`` of each row, with the mass above its ``cap`` moved to that."""
-    k, scale = rows["bin"], np.exp(-log_scale)
+    k, scale, df = rows["bin"], np.exp(-log_scale), _df(eta)
     edge = ACCELERATIONS_MPS2[k] + 0.1
     low = np.where(k == 0, -np.inf, (edge - 0.2 - mean) * scale)
     high = np.where(k == rows["cap"], np.inf, (edge - mean) * scale)
-    return _t_between(low, high, df)
-
-
-_BINNED = np.dtype([("bin", np.int64), ("cap", np.int64)])
+    return _between(lambda t: special.stdtr(df, t), low, high)
 
 
 def _binned(k: IntArray, cap: IntArray | int) -> RecordArray:
-    out = np.empty(k.size, _BINNED)
+    """Accelerations ``bin`` (n,), at most the ``cap`` (n,)."""
+    out = np.empty(k.size, [("bin", np.int64), ("cap", np.int64)])
     out["bin"], out["cap"] = np.minimum(k, cap), cap
     return out
 
@@ -286,8 +277,8 @@ def _binned(k: IntArray, cap: IntArray | int) -> RecordArray:
 def fit_free_driving(traffic: Traffic, base: Base) -> FittedLaw | None:
     """Accelerations in free driving: Student's t, mixed with a share that brakes."""
     rows = traffic.free
-    t = ("location_mps2", "log_scale", "log_scale_u", "log_scale_uu", "df")
-    names = (*t, "brake_logit", "brake_logit_u", "brake_slope_s2pm")
+    spread = {"location_mps2": 0.5, "log_scale": 1.5, "log_scale_u": 1.0, "log_scale_uu": 1.0, "df": 1.5}
+    spread |= {"brake_logit": 3.0, "brake_logit_u": 2.0, "brake_slope_s2pm": 1.0}
     if rows.size < FEWEST["free"]:
         return None
     # Rows of about the same speed and acceleration are counted together: some thousand kinds.
@@ -307,36 +298,11 @@ def fit_free_driving(traffic: Traffic, base: Base) -> FittedLaw | None:
         share = special.expit(logit)
         powers = np.exp(slope[:, None] * ACCELERATIONS_MPS2[brakes])
         braking = np.where(brakes[rows["bin"]], np.exp(slope * ACCELERATIONS_MPS2[rows["bin"]]), 0.0)
-        p = (1.0 - share) * _in_bin(rows, mean, log_scale, _df(eta)) + share * braking / powers.sum(axis=1)
-        return _log(p)
+        return _log((1.0 - share) * _in_bin(rows, mean, log_scale, eta) + share * braking / powers.sum(axis=1))
 
-    one, linear = np.ones((k.size, 1)), _columns(k.size, 1.0, u)
-    designs = [one, _columns(k.size, 1.0, u, u * u), one, linear, one]
-    centre = [base[f"free_driving__{name}"] for name in names]
-    centre[4] = math.log(centre[4] - 2.0)
-    prior = Prior.of(centre, [0.5, 1.5, 1.0, 1.0, 1.5, 3.0, 2.0, 1.0])
-    binned = _binned(k, N_ACCELERATIONS - 1)
-    found = maximise(log_likelihood, binned, designs, *traffic.members(rows, cell), prior)
-    return _law("free_driving", names, found, rows, {4: _df})
-
-
-def follows(rows: RecordArray, base: Base) -> tuple[RecordArray, FloatArray, FloatArray, BoolArray]:
-    """Inputs of car following: bins and caps, designs of mean (n, 6) and log scale (n, 2), and the rows used.
-
-    The mean's coefficients are those of R1dot and R1, three of the gap's polynomial in u, and the closing gain.
-    """
-    r1, r1dot = rows["r1_m"], rows["r1dot_mps"]
-    used = r1 >= base["car_following__near_gap_m"]
-    room = np.maximum(r1 - base["car_following__standstill_m"], base["car_following__smallest_gap_m"])
-    needed = r1dot * r1dot / (2.0 * room)
-    closing = (r1dot < 0.0) & (needed > base["car_following__closing_threshold_mps2"])
-    u = _scaled(base, rows["v_mps"])
-    mean = _columns(rows.size, r1dot, r1, -1.0, -u, -u * u, 0.0)
-    mean[closing] = 0.0
-    mean[closing, -1] = -needed[closing]
-    scale = _columns(rows.size, 1.0, np.minimum(np.abs(r1dot), base["car_following__rate_cap_mps"]))
-    binned = _binned(bins(rows["acceleration_mps2"]), guard_caps(r1, r1dot, base))
-    return binned, mean, scale, used
+    designs = [_columns(k.size, *each) for each in ((1.0,), (1.0, u, u * u), (1.0,), (1.0, u), (1.0,))]
+    counted = _binned(k, N_ACCELERATIONS - 1), cell
+    return _fitted("free_driving", spread, log_likelihood, designs, traffic, rows, base, counted=counted)
 
 
 def guard_caps(r1: FloatArray, r1dot: FloatArray, base: Base) -> IntArray:
@@ -351,9 +317,11 @@ def guard_caps(r1: FloatArray, r1dot: FloatArray, base: Base) -> IntArray:
 
 
 def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
-    """Accelerations behind a leader; guard and behaviour near standstill are kept."""
-    binned, mean, scale, used = follows(traffic.following, base)
-    rows = traffic.following[used]
+    """Accelerations behind a leader; guard and behaviour near standstill are kept.
+
+    The mean's coefficients are those of R1dot and R1, three of the gap's polynomial in u, and the closing gain.
+    """
+    rows = traffic.following[traffic.following["r1_m"] >= base["car_following__near_gap_m"]]
     if rows.size < FEWEST["following"]:
         return None
     n = {key.removeprefix("car_following__"): value for key, value in base.items()}
@@ -364,8 +332,16 @@ def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
     centre += [n["log_scale"], n["log_scale_rate"], math.log(n["df"] - 2.0)]
     prior = Prior.of(centre, [0.5, 0.01, 0.3, 0.3, 0.3, 1.0, 1.5, 1.0, 1.5])
 
+    r1, r1dot, u = rows["r1_m"], rows["r1dot_mps"], _scaled(base, rows["v_mps"])
+    needed = r1dot * r1dot / (2.0 * np.maximum(r1 - n["standstill_m"], n["smallest_gap_m"]))
+    closing = (r1dot < 0.0) & (needed > n["closing_threshold_mps2"])
+    mean = np.where(closing[:, None], 0.0, _columns(rows.size, r1dot, r1, -1.0, -u, -u * u, 0.0))
+    mean[closing, -1] = -needed[closing]
+    scale = _columns(rows.size, 1.0, np.minimum(np.abs(r1dot), n["rate_cap_mps"]))
+    binned = _binned(bins(rows["acceleration_mps2"]), guard_caps(r1, r1dot, base))
+
     def log_likelihood(rows: RecordArray, mean: FloatArray, log_scale: FloatArray, eta: FloatArray) -> FloatArray:
-        return _log(_in_bin(rows, mean, log_scale, _df(eta)))
+        return _log(_in_bin(rows, mean, log_scale, eta))
 
     def values(theta: FloatArray) -> FloatArray:
         rate, gain, b0, b1, b2, closing, log_scale, log_scale_rate, eta = np.moveaxis(theta, -1, 0)
@@ -376,147 +352,21 @@ def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
         return np.stack(np.broadcast_arrays(*numbers), axis=-1)
 
     def fitted(kept: BoolArray | None = None) -> Maximum | None:
-        designs = [mean[used], scale[used], np.ones((rows.size, 1))]
-        return maximise(log_likelihood, binned[used], designs, *traffic.members(rows), prior, kept=kept)
+        designs = [mean, scale, np.ones((rows.size, 1))]
+        return maximise(log_likelihood, binned, designs, *traffic.members(rows), prior, kept=kept)
 
     found = fitted()
     if found is not None and found.theta[1] < 3.0 * math.sqrt(found.covariance()[1, 1]):
         found = fitted(np.arange(prior.centre.size) == 1)  # gaps are divided by it
     names = ("gain_rate_per_s", "gain_gap_per_s2", "median_gap_m", "median_gap_v", "median_gap_vv", "closing_gain")
     named = tuple(f"car_following__{name}" for name in (*names, "df", "log_scale", "log_scale_rate"))
-    return None if found is None else FittedLaw(named, values, found, rows.size)
-
-
-# -- lane changes --
-
-
-def fit_hazard(traffic: Traffic) -> tuple[FittedLaw, Knots] | None:
-    """Hazard of a lane change where nobody closes in within `FREE_TTC_S`, and the knots of v, R1 and R1dot.
-
-    Coefficients are an intercept and effects at all knots but the middle one of each.
-    """
-    rows = traffic.at_risk[traffic.at_risk["ttc_s"] > FREE_TTC_S]
-    n_changes = int(rows["changes"].sum())
-    if not n_changes:
-        return None
-    first, second, third = (_knots(rows, name) for name in HAZARD_OF)
-    knots = first, second, third
-
-    def log_likelihood(rows: RecordArray, eta: FloatArray) -> FloatArray:
-        # Decided once a second (`cut_in.laws`); beyond a chance of 1/2 straight on, as a bend has no maximum.
-        rate = -np.log1p(-np.minimum(np.exp(eta), 0.5)) + np.maximum(eta + math.log(2.0), 0.0)
-        return np.asarray(np.where(rows["changes"], np.log(rate), 0.0) - rate * rows["duration_s"])
-
-    def values(theta: FloatArray) -> FloatArray:
-        effects, at = [], 1
-        for each in knots:
-            part, middle = theta[..., at : at + each.size - 1], each.size // 2
-            none = np.zeros((*theta.shape[:-1], 1))
-            effects += [part[..., :middle], none, part[..., middle:]]
-            at += each.size - 1
-        effects[:3] = [effect + theta[..., :1] for effect in effects[:3]]  # of v, with the intercept
-        return np.concatenate(effects, axis=-1)
-
-    weights = linalg.block_diag(np.array([[0.01]]), *(_penalty(each) for each in knots))
-    centre = np.zeros(weights.shape[1])
-    centre[0] = math.log(n_changes / rows["duration_s"].sum())
-    prior = Prior(centre, weights, smooths=True)
-    found = maximise(log_likelihood, rows, [hazard_design(knots, rows)], *traffic.members(rows), prior)
-    axes = zip(("v_log", "r1_log", "r1dot_log"), knots, strict=True)
-    names = tuple(f"hazard_table__{name}__{i}" for name, each in axes for i in range(each.size))
-    return None if found is None else (FittedLaw(names, values, found, rows.size), knots)
-
-
-def hazard_design(knots: Knots, rows: RecordArray) -> FloatArray:
-    """Design matrix (n, p) of the log-hazard in some states (n,)."""
-    columns = [np.ones(rows.size)]
-    for name, at in zip(HAZARD_OF, knots, strict=True):
-        columns += [np.interp(rows[name], at, hat) for j, hat in enumerate(np.eye(at.size)) if j != at.size // 2]
-    return np.column_stack(columns)
-
-
-def _knots(rows: RecordArray, name: str) -> FloatArray:
-    """Rounded quantiles (means of those at crossings and at risk), at least a twentieth of their range apart."""
-    at = 0.5 * (np.quantile(rows[name], KNOTS) + np.quantile(rows[name][rows["changes"]], KNOTS))
-    found = [round(float(at[0]), 1)]
-    for each in np.round(at[1:], 1).tolist():
-        if each - found[-1] > 0.05 * (at[-1] - at[0]):
-            found.append(each)
-    return np.array(found)
-
-
-def _penalty(knots: FloatArray) -> FloatArray:
-    """Pseudo-observations, about 0, of bends and steps of an effect; the middle knot is left out."""
-    if knots.size == 1:
-        return np.empty((0, 0))
-    identity = np.eye(knots.size)
-    slopes = np.diff(identity, axis=0) / np.diff(knots)[:, None]
-    bends = np.diff(slopes, axis=0) * (knots[-1] - knots[0]) / 4.0
-    weights = np.vstack([bends / SMOOTH[0], np.diff(identity, axis=0) / SMOOTH[1]])
-    return np.delete(weights, knots.size // 2, axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class Acceptance:
-    """Lane changes by time to collision with the vehicle behind, in bins with the edges `TTC_EDGES_S`.
-
-    ``events`` (6,) are those seen, ``exposure`` (6,) those expected with nobody closing in: Σ h Δt. ``design``
-    holds rows of the hazard (n, p) in all bins but the last, with ``bin`` and ``duration_s`` (n,).
-    """
-
-    events: IntArray
-    exposure: FloatArray
-    design: FloatArray
-    bin: IntArray
-    duration_s: FloatArray
-
-    @classmethod
-    def of(cls, traffic: Traffic, hazard: FittedLaw, knots: Knots) -> Acceptance:
-        """Count lane changes and what is expected."""
-        rows = traffic.at_risk
-        design = hazard_design(knots, rows)
-        at = np.searchsorted(TTC_EDGES_S, rows["ttc_s"], side="right")
-        n = TTC_EDGES_S.size + 1
-        events = np.bincount(at[rows["changes"]], minlength=n).astype(np.int64)
-        wished = np.exp(design @ hazard.maximum.theta) * rows["duration_s"]
-        near = at < n - 1
-        exposure = np.bincount(at, wished, minlength=n).astype(np.float64)
-        return cls(events, exposure, design[near], at[near].astype(np.int64), rows["duration_s"][near])
-
-    def exposures(self, theta: FloatArray) -> FloatArray:
-        """Expected lane changes (b, 5) in all bins but the last, by coefficients (b, p) of the hazard."""
-        hazard = np.exp(self.design @ theta.T) * self.duration_s[:, None]
-        return np.asarray(np.stack([hazard[self.bin == j].sum(axis=0) for j in range(TTC_EDGES_S.size)], axis=1))
-
-    @property
-    def shares(self) -> FloatArray:
-        """Estimates (6,), at most 1. Without an event half of one is counted, up to the shares of longer times."""
-        events, exposure = self.events[:-1], np.maximum(self.exposure[:-1], 1e-12)
-        shares = np.append(np.minimum(np.maximum(events, 0.5) / exposure, 1.0), 1.0)
-        for step in np.flatnonzero(events == 0)[::-1]:
-            shares[step] = shares[step:].min()
-        return shares
-
-    def drawn(self, theta: FloatArray, random: np.random.Generator) -> FloatArray:
-        """Shares (b, 5) drawn by the uncertainty of counts, for hazards with coefficients (b, p).
-
-        Drivers accept a shorter time no more often than a longer one, but draws are not ordered like that. Where shares
-        are equal, as for drivers who do not look, ordered draws would be too small at the shortest times.
-        """
-        counts = random.gamma(self.events[:-1] + 0.5, size=(len(theta), TTC_EDGES_S.size))
-        return np.clip(counts / np.maximum(self.exposures(theta), 1e-12), SMALLEST_SHARE, 1.0)
-
-    @property
-    def std_errors(self) -> FloatArray:
-        """Standard errors of the shares (6,), by counts; 0 of the last."""
-        near = np.sqrt(self.events[:-1] + 0.5) / np.maximum(self.exposure[:-1], 1e-12)
-        return np.append(np.minimum(near, 1.0), 0.0)
+    return None if found is None else FittedLaw(named, values, found)
 
 
 def fit_leads(traffic: Traffic, base: Base) -> FittedLaw | None:
     """Time from onset of lateral motion to overlap: log-normal, at most the longest, in steps."""
-    rows, longest_s = traffic.leads, base.get("lateral__longest_lead_s")
-    if rows.size < FEWEST["leads"] or longest_s is None:
+    rows, longest_s = traffic.leads, base["lateral__longest_lead_s"]
+    if rows.size < FEWEST["leads"]:
         return None
     edge = longest_s - 0.5 * STEP_S
 
@@ -524,15 +374,25 @@ def fit_leads(traffic: Traffic, base: Base) -> FittedLaw | None:
         lead = np.minimum(rows["lead_s"], longest_s)
         low, high = np.maximum(lead - 0.5 * STEP_S, _TINY), np.where(lead >= edge, np.inf, lead + 0.5 * STEP_S)
         z = [(np.log(np.minimum(each, 1e300)) - mean) * np.exp(-log_sd) for each in (np.minimum(low, edge), high)]
-        flipped = z[0] > 0.0
-        below, upto = np.where(flipped, -z[1], z[0]), np.where(flipped, -z[0], z[1])
-        return _log(special.ndtr(upto) - special.ndtr(below))
+        return _log(_between(special.ndtr, *z))
 
     logs = np.log(np.clip(rows["lead_s"], STEP_S, longest_s))
     prior = Prior.of([float(logs.mean()), math.log(max(float(logs.std()), 0.05))], [3.0, 2.0])
     found = maximise(log_likelihood, rows, [np.ones((rows.size, 1))] * 2, *traffic.members(rows), prior)
 
-    def speed(mean: FloatArray) -> FloatArray:
-        return base["lateral__distance_m"] * np.exp(-mean)
+    def values(theta: FloatArray) -> FloatArray:
+        return np.stack([base["lateral__distance_m"] * np.exp(-theta[..., 0]), np.exp(theta[..., 1])], axis=-1)
 
-    return _law("lateral", ("speed_median_mps", "speed_log_sd"), found, rows, {0: speed, 1: np.exp})
+    names = "lateral__speed_median_mps", "lateral__speed_log_sd"
+    return None if found is None else FittedLaw(names, values, found)
+
+
+LAWS: dict[str, tuple[Callable[[Traffic, Base], FittedLaw | None], str]] = {
+    "speed": (fit_speed, "speeds of BV"),
+    "gap": (fit_gap, "gaps to LV"),
+    "rate": (fit_rate, "speed differences to LV"),
+    "free driving": (fit_free_driving, "accelerations in free driving"),
+    "car following": (fit_car_following, "accelerations behind a leader"),
+    "lead": (fit_leads, "leads of lane changes"),
+}
+"""Laws that may be kept from the base, and what they are of."""

@@ -11,9 +11,8 @@ row stands for the time nearest to it.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ import pandas as pd
 from harness.errors import TrajectoryError
 from harness.fitting.recording import ONE_CLOCK, Recording
 from harness.fitting.table import Mapping, recordings
-from harness.fitting.tracks import USUAL_RANGE, FitRange, Scene, States, Track, durations_s, noise_of, slopes, track_of
+from harness.fitting.tracks import USUAL_RANGE, FitRange, Scene, States, durations_s, noise_of, slopes
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 
@@ -31,13 +30,15 @@ def _dtype(*names: str) -> np.dtype[np.void]:
     return np.dtype([("vehicle", np.int64), *((name, np.float64) for name in names)])
 
 
-FREE = _dtype("v_mps", "acceleration_mps2")
-FOLLOWING = _dtype("v_mps", "r1_m", "r1dot_mps", "acceleration_mps2")
-INITIAL = _dtype("v_mps", "r1_m", "r1dot_mps")
-AT_RISK = np.dtype(
-    [*_dtype("duration_s", "v_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps", "ttc_s").descr, ("changes", np.bool_)]
-)
-LEADS = _dtype("lead_s", "lateral_speed_mps")
+_RISKS = _dtype("duration_s", "v_mps", "r1_m", "r1dot_mps", "r2_m", "r2dot_mps", "ttc_s")
+KINDS = {
+    "free": _dtype("v_mps", "acceleration_mps2"),
+    "following": _dtype("v_mps", "r1_m", "r1dot_mps", "acceleration_mps2"),
+    "initial": _dtype("v_mps", "r1_m", "r1dot_mps"),
+    "at_risk": np.dtype([*_RISKS.descr, ("changes", np.bool_)]),
+    "leads": _dtype("lead_s", "lateral_speed_mps"),
+}
+"""Kinds of `Observations`."""
 
 INITIAL_EVERY_S = 20
 CLOSING_TTC_S = 8.0
@@ -82,7 +83,6 @@ class Tally(NamedTuple):
     overlapping_fronts_s: float = 0.0
     overlapping_rears_s: float = 0.0
     """The same, if positions were those of front or rear bumpers."""
-    first_overlap: str = ""
     flickers: int = 0
     changes: int = 0
     """Lane changes to the target lane."""
@@ -99,11 +99,11 @@ class Tally(NamedTuple):
     closing_other_s: float = 0.0
     """The same on the other side."""
 
-    def plus(self, other: Tally) -> Tally:
-        """Sum of two."""
-        pairs: Iterator[tuple[Any, Any]] = zip(self, other, strict=True)
-        summed: list[Any] = [mine or theirs if isinstance(mine, str) else mine + theirs for mine, theirs in pairs]
-        return Tally(*summed)
+    @classmethod
+    def of(cls, found: Iterable[Observations]) -> Tally:
+        """Sum over recordings."""
+        summed: list[Any] = [sum(counts) for counts in zip(*(each.tally for each in found), strict=True)]
+        return cls(*summed)
 
 
 @dataclass(frozen=True)
@@ -111,44 +111,31 @@ class Observations:
     """Observations of one recording, within the fit range, of vehicles in lanes beside a target lane.
 
     Gaps are bumper to bumper (m), rates leader minus follower (m/s); ``vehicle`` numbers the vehicles of the recording.
-
-    Attributes
-    ----------
-    recording : str
-        Its name, for messages and as cluster.
-    free : RecordArray
-        `FREE`: accelerations of one second of vehicles without a leader within the fit range.
-    following : RecordArray
-        `FOLLOWING`: state behind the leader, and acceleration of the second that begins there.
-    initial : RecordArray
-        `INITIAL`: state behind a leader every 20 s of a vehicle, from its first on.
-    at_risk : RecordArray
-        `AT_RISK`: one row per second behind a leader with nobody alongside in the target lane; ``duration_s`` is the
-        time that it stands for. ``ttc_s`` is R2/-R2dot, infinite where nobody is behind or closes in; R2 and R2dot are
-        infinite and 0 where nobody is behind. A row that ``changes`` is the state of a crossing to the target lane.
-    leads : RecordArray
-        `LEADS`: time from onset of lateral motion to crossing, and lateral speed at it; empty without lateral
-        positions. Leads above 4 s may be lower limits.
-    noise_mps2 : float
-        Standard deviation of ``acceleration_mps2`` by white measurement noise.
-    tally : Tally
-        Counts for `require_enough`.
-    place : str
-        File and recording, for messages.
-    marks : IntArray
-        Hashes (m,) of a part of the rows, the same ones in a copy of them.
     """
 
     recording: str
+    place: str
+    """File and recording, for messages."""
     free: RecordArray
+    """Accelerations of one second of vehicles without a leader within the fit range."""
     following: RecordArray
+    """State behind the leader, and acceleration of the second that begins there."""
     initial: RecordArray
+    """State behind a leader every 20 s of a vehicle, from its first on."""
     at_risk: RecordArray
+    """One row per second behind a leader with nobody alongside in the target lane; ``duration_s`` is the time that it
+    stands for. ``ttc_s`` is R2/-R2dot, infinite where nobody is behind or closes in; R2 and R2dot are infinite and 0
+    where nobody is behind. A row that ``changes`` is the state of a crossing to the target lane."""
     leads: RecordArray
-    noise_mps2: float = 0.0
-    tally: Tally = field(default_factory=Tally)
-    place: str = ""
-    marks: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    """Time from onset of lateral motion to crossing, and lateral speed at it; empty without lateral positions. Leads
+    above 4 s may be lower limits."""
+    noise_mps2: float
+    """Standard deviation of ``acceleration_mps2`` by white measurement noise."""
+    tally: Tally
+    overlap: str
+    """The first two vehicles that overlap, in words; empty if none do."""
+    marks: IntArray
+    """Hashes (m,) of a part of the rows, the same ones in a copy of them."""
 
 
 def observations(
@@ -162,9 +149,8 @@ def observations(
         yield observe(recording, fit_range), recording.share_read
 
 
-def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observations:
+def observe(track: Recording, fit_range: FitRange = USUAL_RANGE) -> Observations:
     """Observations of one recording, not yet judged (`require_enough`)."""
-    track, flickers = track_of(recording)
     n = track.second
     changes = np.flatnonzero(track.crosses(-1) & track.fitted)
     chosen = track.fitted & (track.frame % n == 0)
@@ -179,27 +165,18 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
     second = whole & track.same_run(rows, n)
     acceleration = np.full(rows.size, np.nan)
     acceleration[second] = slopes(track, rows[second])
-    seen = (state.leader >= 0) | (track.s[rows] + fit_range.r1_max_m <= track.road_end[track.road[rows]])
+    seen = (state.leader >= 0) | (track.s[rows] + fit_range.r1_max_m <= track.view[1, track.road[rows]])
     since = track.frame[rows] - track.frame[np.searchsorted(track.vehicle, track.vehicle[rows])]
     crosses = np.isin(rows, changes)
-    columns = {
-        "vehicle": track.vehicle[rows],
-        "duration_s": duration_s,
-        "v_mps": track.v[rows],
-        "r1_m": state.r1,
-        "r1dot_mps": state.r1dot,
-        "r2_m": state.r2,
-        "r2dot_mps": state.r2dot,
-        "ttc_s": state.ttc_s,
-        "acceleration_mps2": acceleration,
-        "changes": crosses,
-    }
+    columns: dict[str, Any] = {"vehicle": track.vehicle[rows], "duration_s": duration_s, "v_mps": track.v[rows]}
+    columns |= {"r1_m": state.r1, "r1dot_mps": state.r1dot, "r2_m": state.r2, "r2dot_mps": state.r2dot}
+    columns |= {"ttc_s": state.ttc_s, "acceleration_mps2": acceleration, "changes": crosses}
     leads, straight, shifted, jumping = _leads(track, rows[crosses & state.fits])
     overlaps = state.follows & (state.r1 < OVERLAP_M)
     longer = 0.5 * (track.length[rows] - track.length[state.leader])
     tally = Tally(
         recordings=1,
-        recorded=len(recording.vehicles),
+        recorded=len(track.vehicles),
         vehicles=np.unique(track.vehicle[rows]).size,
         driven_s=float(duration_s.sum()),
         outside_s=float(duration_s[~state.fits].sum()),
@@ -207,8 +184,7 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         overlapping_s=float(duration_s[overlaps].sum()),
         overlapping_fronts_s=float(duration_s[state.follows & (state.r1 + longer < OVERLAP_M)].sum()),
         overlapping_rears_s=float(duration_s[state.follows & (state.r1 - longer < OVERLAP_M)].sum()),
-        first_overlap=_overlap(recording, rows, state, overlaps),
-        flickers=flickers,
+        flickers=track.flickers,
         changes=changes.size,
         used=int((state.at_risk & crosses).sum()),
         straight=straight,
@@ -218,20 +194,21 @@ def observe(recording: Recording, fit_range: FitRange = USUAL_RANGE) -> Observat
         closing_other_s=float((other.at_risk & (other.ttc_s < CLOSING_TTC_S)).sum()),
     )
     return Observations(
-        recording.name,
-        _records(FREE, columns, second & state.fits & ~state.follows & seen),
-        _records(FOLLOWING, columns, second & state.behind),
-        _records(INITIAL, columns, whole & state.behind & (since // n % INITIAL_EVERY_S == 0)),
-        _records(AT_RISK, columns, state.at_risk),
+        track.name,
+        track.place,
+        _records("free", columns, second & state.fits & ~state.follows & seen),
+        _records("following", columns, second & state.behind),
+        _records("initial", columns, whole & state.behind & (since // n % INITIAL_EVERY_S == 0)),
+        _records("at_risk", columns, state.at_risk),
         leads,
         noise_of(track),
         tally,
-        recording.place,
+        _overlap(track, rows, state, overlaps),
         _marks(track),
     )
 
 
-def _marks(track: Track) -> IntArray:
+def _marks(track: Recording) -> IntArray:
     """Hashes of one row in `ONE_OF`, by what it says of a vehicle, whatever clock, order and identifiers there are."""
     state = np.rint(np.column_stack([track.s * 1e3, track.v * 1e3, track.length * 1e2])).astype(np.int64)
     of_row = pd.util.hash_pandas_object(pd.DataFrame(state), index=False).to_numpy()
@@ -254,10 +231,10 @@ def require_distinct(found: Sequence[Observations]) -> None:
             raise TrajectoryError(found[second].place, words, "other vehicles, or other times", mend)
 
 
-def _records(dtype: np.dtype[np.void], columns: dict[str, RecordArray], inside: BoolArray) -> RecordArray:
+def _records(kind: str, columns: dict[str, RecordArray], inside: BoolArray) -> RecordArray:
     """Rows of some columns (n,) that are ``inside`` (n,)."""
-    out = np.empty(int(inside.sum()), dtype)
-    for name in dtype.names or ():
+    out = np.empty(int(inside.sum()), KINDS[kind])
+    for name in KINDS[kind].names or ():
         out[name] = columns[name][inside]
     return out
 
@@ -265,7 +242,7 @@ def _records(dtype: np.dtype[np.void], columns: dict[str, RecordArray], inside: 
 # -- lateral motion --
 
 
-def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int, int]:
+def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int, int, int]:
     """Leads of some crossings (rows before them); how many have no lateral motion, at another time, or in one frame.
 
     The onset is the bend of a line, level before and straight from there to the crossing, fitted to the lateral
@@ -298,7 +275,7 @@ def _leads(track: Track, crossings: IntArray) -> tuple[RecordArray, int, int, in
             onset = _onset(before_s, track.lateral[reach])
             lead_s = -onset if onset - before_s[0] >= LEVEL_S else -before_s[0]
             found.append((track.vehicle[row], lead_s, abs(speed)))
-    return np.array(found, LEADS), straight, shifted, jumping
+    return np.array(found, KINDS["leads"]), straight, shifted, jumping
 
 
 def _onset(time_s: FloatArray, lateral: FloatArray) -> float:
@@ -322,7 +299,7 @@ def _overlap(recording: Recording, rows: IntArray, state: States, overlaps: Bool
     if not overlaps.any():
         return ""
     i = int(np.argmax(overlaps))
-    ahead = recording.vehicles[int(recording.rows.vehicle.iloc[state.leader[i]])]
+    ahead = recording.vehicles[recording.vehicle[state.leader[i]]]
     return f"{recording.where(rows[i])}: a gap of {state.r1[i]:.1f} m to vehicle {ahead}"
 
 
@@ -337,20 +314,11 @@ def _other_side(mapping: Mapping) -> str:
 
 
 def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) -> Tally:
-    """Refuse recordings that are too few, or that were read wrongly; the sum of their counts.
+    """Refuse recordings that are too few, or that were read wrongly by the ``mapping``; the sum of their counts.
 
-    Parameters
-    ----------
-    found : sequence of Observations
-        Of all recordings.
-    where : str
-        Files, for messages.
-    mapping : Mapping
-        How they were read.
-
-    Raises `TrajectoryError`: a rule is broken; it says which, and by which recording most.
+    Raises `TrajectoryError`: a rule is broken; it says which, and by which recording most; ``where`` names the files.
     """
-    total = functools.reduce(Tally.plus, (each.tally for each in found), Tally())
+    total = Tally.of(found)
 
     def refuse(words: str, expected: str, mend: str, column: str = "", most: str = "") -> TrajectoryError:
         largest = max(found, key=lambda each: float(getattr(each.tally, most or "used")))
@@ -367,9 +335,9 @@ def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) 
         words = "no vehicle with another lane beside it, on the side where vehicles close in"
         raise refuse(words, "lanes 0, 1, …", f"Check the column of lanes. {side}", "lane")
     if total.overlapping_s > MOST_OVERLAPPING * total.followed_s:
-        share, expected = total.overlapping_s / total.followed_s, f"at most {MOST_OVERLAPPING:.1%}"
-        words = f"vehicles that overlap in {share:.1%} of the time; first {total.first_overlap}"
-        raise refuse(words, expected, _how_they_overlap(total), most="overlapping_s")
+        share, first = total.overlapping_s / total.followed_s, next(each.overlap for each in found if each.overlap)
+        words = f"vehicles that overlap in {share:.1%} of the time; first {first}"
+        raise refuse(words, f"at most {MOST_OVERLAPPING:.1%}", _how_they_overlap(total), most="overlapping_s")
     if total.flickers > max(total.changes, FEWEST_CHANGES):
         words = f"lanes that come back within a second {total.flickers:,} times, against {total.changes:,} lane changes"
         raise refuse(words, "fewer", "Smooth lanes, or take them from lateral positions.", "lane", "flickers")
@@ -400,9 +368,8 @@ def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) 
             f"{total.used} lane changes to the target lane behind a leader within the fit range (of {total.changes} in "
             f"all), in {hours:.1f} vehicle-hours beside the target lane"
         )
-        more = (
-            f"some {hours * FEWEST_CHANGES / total.used:.2g} such hours are needed" if total.used else "they are rare"
-        )
+        needed = hours * FEWEST_CHANGES / max(total.used, 1)
+        more = f"some {needed:.2g} such hours are needed" if total.used else "they are rare"
         raise refuse(words, f"at least {FEWEST_CHANGES}", f"Add recordings: {more}.")
     return total
 

@@ -19,7 +19,8 @@ from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environmen
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.fitting.fit import Fit
-from harness.fitting.laws import HAZARD_OF, TTC_EDGES_S, bins
+from harness.fitting.hazard import HAZARD_OF, TTC_EDGES_S
+from harness.fitting.laws import bins
 from harness.fitting.observations import Tally
 from harness.numbers import number
 from harness.report.drawing import Axis, Panel, Plot
@@ -128,26 +129,22 @@ def _beside(
     return panel
 
 
+def _add_limits(panel: Panel, edges: FloatArray, low: FloatArray, high: FloatArray, label: str) -> None:
+    """Limits (n,) between edges (n + 1,), as far as they are within the panel."""
+    low, high = (np.clip(each, panel.y.low, panel.y.high) for each in (low, high))
+    panel.add("boxes", "blue", edges[:-1], edges[1:], low, high, opacity=0.18, label=label)
+
+
 def _density(*curves: FloatArray) -> Axis:
     return Axis("density", 0.0, 1.15 * max(float(each.max()) for each in curves))
 
 
 def _acceptance_plot(fit: Fit) -> Plot:
-    found, edges = fit.acceptance, [0.0, *TTC_EDGES_S.tolist(), 12.0]
-    lowest = 1e-3
-    y = Axis("share carried out", lowest, 3.0, log=True)
+    found, edges = fit.acceptance, np.array([0.0, *TTC_EDGES_S, 12.0])
+    y = Axis("share carried out", 1e-3, 3.0, log=True)
     panel = Panel("", Axis("time to collision, s", 0.0, 12.0), y, height=280.0)
-    low, high = _limits(found.events, found.exposure)
-    panel.add(
-        "boxes",
-        "blue",
-        edges[:-1],
-        edges[1:],
-        np.clip(low, lowest, 3.0),
-        np.clip(high, lowest, 3.0),
-        opacity=0.18,
-        label=f"{numbers.share(CONFIDENCE)} limits by bin",
-    )
+    limits = _limits(found.events, found.exposure)
+    _add_limits(panel, edges, *limits, f"{numbers.share(CONFIDENCE)} limits by bin")
     steps = np.repeat(edges, 2)[1:-1]
     panel.add("line", "blue", steps, np.repeat(found.shares, 2), label="fitted")
     times = np.linspace(0.05, 12.0, 240)
@@ -166,7 +163,7 @@ def _acceptance_plot(fit: Fit) -> Plot:
 
 def _hazard_plot(fit: Fit) -> Plot:
     rows = fit.traffic.at_risk[fit.traffic.at_risk["ttc_s"] > TTC_EDGES_S[-1]]
-    rate, labels = fit.hazard_at(rows), ("speed of BV, m/s", "gap R1 to LV, m", "R1dot = v_LV − v_BV, m/s")
+    rate, labels = fit.hazard.rate(rows), ("speed of BV, m/s", "gap R1 to LV, m", "R1dot = v_LV − v_BV, m/s")
     panels = []
     for column, label in zip(HAZARD_OF, labels, strict=True):
         edges = np.unique(np.quantile(rows[column], np.linspace(0.0, 1.0, 9)))
@@ -181,7 +178,7 @@ def _hazard_plot(fit: Fit) -> Plot:
         low, high = _limits(seen, per_1000_s)
         top = 1.1 * float(max(high.max(), (wished / per_1000_s).max()))
         panel = Panel("", Axis(label, float(edges[0]), float(edges[-1])), Axis("lane changes per 1,000 s", 0.0, top))
-        panel.add("boxes", "blue", edges[:-1], edges[1:], low, high, opacity=0.18, label="seen, 90 % limits")
+        _add_limits(panel, edges, low, high, "seen, 90 % limits")
         panel.add("line", "blue", middle, wished / per_1000_s, label="fitted")
         panels.append(panel)
     alt = "Observed and fitted rate of lane changes, by speed, gap and speed difference."
@@ -192,9 +189,10 @@ def _hazard_plot(fit: Fit) -> Plot:
 def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
     rows = fit.traffic.initial
     drawn = InitialStates(traffic.numbers).from_uniforms(np.random.default_rng(_SEED).random((MOST_ROWS, 5)))
-    columns = (("v_mps", "v_bv_mps", "speed of BV, m/s"), ("r1_m", "r1_m", "gap R1 to LV, m"))
+    labels = {"v_mps": "speed of BV, m/s", "r1_m": "gap R1 to LV, m", "r1dot_mps": "R1dot, m/s"}
     panels = []
-    for column, of, label in (*columns, ("r1dot_mps", "r1dot_mps", "R1dot, m/s")):
+    for column, label in labels.items():
+        of = "v_bv_mps" if column == "v_mps" else column
         low, high = np.quantile(rows[column], [0.002, 0.998])
         low, high = (low, high) if low < high else (low - 0.5, high + 0.5)
         edges = np.linspace(low, high, 31)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, get_args
+from functools import cached_property
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import pandas as pd
+from scipy import ndimage
 
 from harness.errors import TrajectoryError
 from harness.vocabulary import BoolArray, FloatArray, IntArray
@@ -79,33 +81,36 @@ def require(rule: Rule, rows: pd.DataFrame, where: Callable[[int], str]) -> None
         raise TrajectoryError(where(i), rule.found.format(values[i]), rule.expected, rule.mend)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recording:
-    """All vehicles on a stretch of road during some time.
+    """All vehicles on a stretch of road during some time: rows (n,), sorted by vehicle and time.
 
-    Attributes
-    ----------
-    name, file : str
-        For messages.
-    rows : DataFrame
-        Sorted by vehicle and time: ``vehicle`` (int, a number in the recording), ``time_s``, ``frame`` (int),
-        ``s_m`` (centre, rising as one drives), ``speed_mps``, ``lane`` (int, the target lane's is one less),
-        ``length_m``, ``lateral_m`` (NaN where there is none), ``road`` (int, one of its directions), ``fitted`` (bool,
-        of a class whose driving is fitted), ``row`` (in the file, from 1).
-    rate_hz : float
-        Frames per second.
-    vehicles : list of str
-        Identifiers in the file, by number.
-    share_read : float
-        Of the bytes or rows of all files, with this recording.
+    ``vehicle`` numbers the identifiers ``vehicles``, ``row`` is that of the file, from 1; ``lane`` is smoothed, and was
+    left for less than a second ``flickers`` times. ``share_read`` is that of the bytes or rows of all files so far.
     """
 
     name: str
     file: str
-    rows: pd.DataFrame
-    rate_hz: float
-    vehicles: Sequence[str]
     share_read: float
+    vehicles: Sequence[str]
+    row: IntArray
+    vehicle: IntArray
+    time_s: FloatArray
+    road: IntArray
+    """Number of the direction of driving."""
+    lane: IntArray
+    """The target lane's is one less."""
+    s: FloatArray
+    """Centre (m), rising as one drives."""
+    v: FloatArray
+    length: FloatArray
+    lateral: FloatArray
+    """NaN where there is none."""
+    fitted: BoolArray
+    """Of a class whose driving is fitted."""
+    frame: IntArray
+    rate_hz: float = 0.0
+    flickers: int = 0
 
     @property
     def place(self) -> str:
@@ -114,11 +119,60 @@ class Recording:
 
     def where(self, i: int | np.intp) -> str:
         """Place in the file of the i-th row."""
-        each = self.rows.iloc[int(i)]
+        vehicle = self.vehicles[self.vehicle[i]]
         return (
-            f"{self.file}, row {each.row} (vehicle {self.vehicles[int(each.vehicle)]} of recording {self.name}, "
-            f"t = {each.time_s:.10g} s)"
+            f"{self.file}, row {self.row[i]} (vehicle {vehicle} of recording {self.name}, t = {self.time_s[i]:.10g} s)"
         )
+
+    @cached_property
+    def piece(self) -> IntArray:
+        """Number of the part of a vehicle's track without a gap in time."""
+        return _numbers((np.diff(self.vehicle) != 0) | (np.diff(self.frame) != 1))
+
+    @cached_property
+    def run(self) -> IntArray:
+        """Number of the part of it in one lane."""
+        return _numbers((np.diff(self.piece) != 0) | (np.diff(self.lane) != 0))
+
+    @cached_property
+    def view(self) -> FloatArray:
+        """First and last s of each road, (2, roads)."""
+        of_road = [self.s[self.road == each] for each in range(int(self.road.max()) + 1)]
+        return np.array([(s.min(), s.max()) for s in of_road]).T
+
+    @property
+    def second(self) -> int:
+        """Frames per second, rounded."""
+        return round(self.rate_hz)
+
+    def crosses(self, side: int) -> BoolArray:
+        """Rows (n,) after which the vehicle is in the next lane."""
+        same = np.diff(self.piece, append=-1) == 0
+        return np.asarray(same & (np.diff(self.lane, append=0) == side))
+
+    def has_lane(self, side: int) -> BoolArray:
+        """Rows (n,) beside a lane in which vehicles drive in this recording."""
+        lanes = self.lane - self.lane.min() + 1
+        at = self.road * (lanes.max() + 2) + lanes
+        return np.asarray(np.isin(at + side, np.unique(at)))
+
+    def same_run(self, rows: IntArray, frames: int) -> BoolArray:
+        """Whether the vehicle stays in its lane for so many frames after some rows (m,)."""
+        last = np.minimum(rows + frames, self.run.size - 1)
+        return np.asarray((self.run[last] == self.run[rows]) & (last == rows + frames))
+
+    def gap(self, leader: IntArray, follower: IntArray) -> FloatArray:
+        """Gap (m), bumper to bumper; infinite where a row is -1."""
+        gap = self.s[leader] - self.s[follower] - 0.5 * (self.length[leader] + self.length[follower])
+        return np.where((leader >= 0) & (follower >= 0), gap, np.inf)
+
+    def rate(self, leader: IntArray, follower: IntArray) -> FloatArray:
+        """Speed of the leader minus that of the follower (m/s); 0 where a row is -1."""
+        return np.where((leader >= 0) & (follower >= 0), self.v[leader] - self.v[follower], 0.0)
+
+
+_COLUMNS = {"s": "s_m", "v": "speed_mps", "length": "length_m", "lateral": "lateral_m"}
+_COLUMNS |= {name: name for name in ("row", "time_s", "road", "lane", "fitted")}
 
 
 def recording_of(name: str, file: str, rows: pd.DataFrame, share_read: float) -> Recording:
@@ -133,8 +187,9 @@ def recording_of(name: str, file: str, rows: pd.DataFrame, share_read: float) ->
     dt = np.diff(time_s)
     same = np.diff(code) == 0
     another = np.append(True, ~same | (dt > ANOTHER_VEHICLE_S))
-    rows["vehicle"] = np.cumsum(another) - 1
-    recording = Recording(name, file, rows, 0.0, [str(identifiers[i]) for i in code[another]], share_read)
+    vehicles = [str(identifiers[i]) for i in code[another]]
+    columns: dict[str, Any] = {key: rows[column].to_numpy() for key, column in _COLUMNS.items()}
+    recording = Recording(name, file, share_read, vehicles, vehicle=np.cumsum(another) - 1, frame=code, **columns)
     if (twice := same & (dt == 0.0)).any():
         where = recording.where(np.argmax(twice) + 1)
         mend = "Delete it; or, if it is another vehicle, add a recording_id."
@@ -151,9 +206,10 @@ def recording_of(name: str, file: str, rows: pd.DataFrame, share_read: float) ->
     if (same_place := rows.duplicated(["frame", "road", "lane", "s_m"]).to_numpy()).any():
         where = recording.where(np.argmax(same_place))
         raise TrajectoryError(where, "the time, lane and s_m of another vehicle", "one at a place", ONE_CLOCK)
-    recording = replace(recording, rate_hz=rate)
-    _check_motion(recording)
-    return recording
+    recording = replace(recording, rate_hz=rate, frame=rows.frame.to_numpy())
+    _check_motion(recording, rows)
+    lane, flickers = _smoothed(recording.lane, recording.piece, recording.second)
+    return replace(recording, lane=lane, flickers=flickers)
 
 
 def _rate_hz(recording: Recording, steps_s: FloatArray) -> float:
@@ -171,13 +227,13 @@ def _rate_hz(recording: Recording, steps_s: FloatArray) -> float:
     return float(round(rate)) if abs(rate / round(rate) - 1.0) < 1e-4 else rate
 
 
-def _check_motion(recording: Recording) -> None:
+def _check_motion(recording: Recording, rows: pd.DataFrame) -> None:
     """Refuse wrong units, columns that are shifted in time, and rows whose positions and speeds disagree."""
-    rows, rate, n = recording.rows, recording.rate_hz, round(recording.rate_hz)
     require(SOME_LENGTH, rows, recording.where)
-    frame, vehicle, s, v = (rows[name].to_numpy() for name in ("frame", "vehicle", "s_m", "speed_mps"))
+    frame, vehicle, s, v = recording.frame, recording.vehicle, recording.s, recording.v
+    rate, n = recording.rate_hz, recording.second
     driven_m = np.append(0.0, np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(frame) / rate))
-    begin = np.arange(max(len(rows) - n, 0))
+    begin = np.arange(max(s.size - n, 0))
     begin = begin[(vehicle[begin] == vehicle[begin + n]) & (frame[begin + n] == frame[begin] + n)]
     way_m, of_speeds_m = s[begin + n] - s[begin], driven_m[begin + n] - driven_m[begin]
     ratio = _ratio(way_m, of_speeds_m)
@@ -189,7 +245,7 @@ def _check_motion(recording: Recording) -> None:
         if ratio < 0.0:
             mend = "s_m must rise in driving direction, and speeds be positive."
         raise TrajectoryError(recording.place, found, "positions in m and speeds in m/s that agree", mend)
-    _check_sizes(recording, float(np.median(v)), float(np.median(rows.length_m)))
+    _check_sizes(recording, float(np.median(v)), float(np.median(recording.length)))
     few = slice(None, None, max(n // 2, 1))
     lag_s = _lag(begin[few], frame, vehicle, way_m[few], driven_m, n) / rate
     if abs(lag_s) >= LEAST_LAG_S:
@@ -201,11 +257,11 @@ def _check_motion(recording: Recording) -> None:
     step = np.flatnonzero(np.diff(vehicle) == 0)
     dt = (frame[step + 1] - frame[step]) / rate
     off = np.abs(np.diff(v))[step] > JUMP_MPS + HARDEST_MPS2 * dt
-    _require_agreement(recording, step[off], 1, "speed_mps")
+    _require_agreement(recording, step[off], 1, "speed_mps", v)
     off = np.abs(np.diff(s) - np.diff(driven_m) / ratio)[step] > OFF_IN_STEP_M + JUMP_MPS * dt
-    _require_agreement(recording, step[off], 1, "s_m", driven_m / ratio)
+    _require_agreement(recording, step[off], 1, "s_m", s, driven_m / ratio)
     off = np.abs(way_m - of_speeds_m / ratio) > OFF_IN_SECOND_M
-    _require_agreement(recording, begin[off], n, "s_m", driven_m / ratio)
+    _require_agreement(recording, begin[off], n, "s_m", s, driven_m / ratio)
 
 
 def _ratio(way_m: FloatArray, of_speeds_m: FloatArray) -> float:
@@ -215,14 +271,14 @@ def _ratio(way_m: FloatArray, of_speeds_m: FloatArray) -> float:
 
 
 def _require_agreement(
-    recording: Recording, off: IntArray, frames: int, column: str, driven_m: FloatArray | None = None
+    recording: Recording, off: IntArray, frames: int, name: str, column: FloatArray, driven_m: FloatArray | None = None
 ) -> None:
     """Refuse rows ``off`` (m,) after which a column moves within so many rows as no vehicle at these speeds does."""
     if not off.size:
         return
     first, last = int(off[0]), int(off[0]) + frames
-    a, b = recording.rows[column].iloc[[first, last]]
-    found = f"{column} {a:.6g}, and {b:.6g} in row {recording.rows.row.iloc[last]}"
+    a, b = column[[first, last]]
+    found = f"{name} {a:.6g}, and {b:.6g} in row {recording.row[last]}"
     if driven_m is not None:
         found += f", where speeds say {a + driven_m[last] - driven_m[first]:.6g}"
     if off.size > 1:
@@ -233,15 +289,15 @@ def _require_agreement(
 
 def _check_sizes(recording: Recording, speed: float, length: float) -> None:
     """Refuse medians of speeds (m/s) and lengths (m) that no road has."""
-    feet = length > USUAL_LENGTH_M[1]
+    place, feet = recording.place, length > USUAL_LENGTH_M[1]
     if not -0.5 < speed < FASTEST_MEDIAN_MPS:
         found = f"a median speed of {speed:.4g} m/s" + (f" and a median length of {length:.3g} m: feet" if feet else "")
         mend = "Give units in a mapping (units: {s_m: ft, speed_mps: ft/s, length_m: ft}); forward is positive."
-        raise TrajectoryError(recording.place, found, "0 to 70 m/s", mend)
+        raise TrajectoryError(place, found, "0 to 70 m/s", mend)
     if feet or length < USUAL_LENGTH_M[0]:
         mend = "Use a mapping: units: {length_m: ft}." if feet else "Is this the width of vehicles?"
         found = f"a median length of {length:.3g} m{': feet' if feet else ''}"
-        raise TrajectoryError(recording.place, found, "2.5 to 10 m", mend)
+        raise TrajectoryError(place, found, "2.5 to 10 m", mend)
 
 
 def _lag(begin: IntArray, frame: IntArray, vehicle: IntArray, way_m: FloatArray, driven_m: FloatArray, n: int) -> int:
@@ -263,3 +319,23 @@ def _lag(begin: IntArray, frame: IntArray, vehicle: IntArray, way_m: FloatArray,
     gain = error[lags.size // 2] - error[best]
     sure = gain.mean() > 6.0 * gain.std() / np.sqrt(gain.size) and gain.mean() > 0.2 * error[best].mean()
     return int(lags[best]) if sure else 0
+
+
+def _numbers(breaks: BoolArray) -> IntArray:
+    """Number of each row's part (n,), between breaks (n - 1,)."""
+    return np.append(0, np.cumsum(breaks))
+
+
+def _smoothed(lane: IntArray, piece: IntArray, second: int) -> tuple[IntArray, int]:
+    """Lanes (n,), by the median of two seconds where one came back within a second, and how often it did."""
+    run = _numbers((np.diff(piece) != 0) | (np.diff(lane) != 0))
+    first = np.flatnonzero(np.diff(run, prepend=-1))
+    frames = np.diff(first, append=lane.size)
+    at, of = lane[first], piece[first]
+    back = np.zeros(first.size, np.bool_)
+    back[1:-1] = (of[:-2] == of[2:]) & (at[:-2] == at[2:]) & (frames[1:-1] < second)
+    out = lane.copy()
+    for each in np.unique(of[back]):
+        part = slice(*np.searchsorted(piece, [each, each + 1]))
+        out[part] = ndimage.median_filter(lane[part], 2 * second + 1, mode="nearest")
+    return out, int(back.sum())

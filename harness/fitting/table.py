@@ -160,9 +160,8 @@ def _reading(path: Path) -> Iterator[None]:
         first = str(error).splitlines()[0]
         mend = "Is it complete, of the type that its name says, and text in UTF-8? Copy or write it again."
         if "columns, got" in first:
-            mend = (
-                "Give each row as many values as the header has names. Decimal commas need semicolons between columns."
-            )
+            mend = "Give each row as many values as the header has names. "
+            mend += "Decimal commas need semicolons between columns."
         raise TrajectoryError(str(path), f"a file that cannot be read ({first})", expected, mend) from None
 
 
@@ -185,8 +184,7 @@ def _read(path: Path, mapping: Mapping) -> pd.DataFrame:
             )
     if not len(table):
         raise TrajectoryError(str(path), "no rows", "one row per vehicle and time", "Is it the right file?")
-    row, commas = (text.row, text.commas) if text else (1, False)
-    return _renamed(table, columns, row, path, mapping, commas=commas)
+    return _renamed(table, columns, path, mapping, first=text.row if text else 1, commas=bool(text and text.commas))
 
 
 def _unpacked(path: Path) -> Any:
@@ -274,7 +272,7 @@ def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, st
 
 
 def _renamed(
-    table: Any, columns: dict[str, str], first: int, path: Path, mapping: Mapping, *, commas: bool = False
+    table: Any, columns: dict[str, str], path: Path, mapping: Mapping, *, first: int, commas: bool
 ) -> pd.DataFrame:
     """Rows of a table by the names of the input table, constants filled in."""
     data: dict[str, Any] = {}

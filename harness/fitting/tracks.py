@@ -1,11 +1,10 @@
-"""Vehicles of a recording: their lanes over time, and their neighbours."""
+"""Vehicles of a recording, their neighbours, and how they accelerate."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
 
 from harness.fitting.recording import Recording
 from harness.vocabulary import BoolArray, FloatArray, IntArray
@@ -27,96 +26,10 @@ USUAL_RANGE = FitRange()
 """Fit range of the shipped environments."""
 
 
-class Track(NamedTuple):
-    """Columns of a recording, sorted by vehicle and frame; a run is a vehicle in one lane without a gap in time."""
-
-    vehicle: IntArray
-    frame: IntArray
-    road: IntArray
-    lane: IntArray
-    s: FloatArray
-    v: FloatArray
-    length: FloatArray
-    lateral: FloatArray
-    fitted: BoolArray
-    piece: IntArray
-    """Number of the part of a vehicle's track without a gap in time."""
-    run: IntArray
-    road_begin: FloatArray
-    road_end: FloatArray
-    """Ends of the view, by road."""
-    rate_hz: float
-
-    @property
-    def second(self) -> int:
-        """Frames per second, rounded."""
-        return round(self.rate_hz)
-
-    def crosses(self, side: int) -> BoolArray:
-        """Rows (n,) after which the vehicle is in the next lane."""
-        same = np.diff(self.piece, append=-1) == 0
-        return np.asarray(same & (np.diff(self.lane, append=0) == side))
-
-    def has_lane(self, side: int) -> BoolArray:
-        """Rows (n,) beside a lane in which vehicles drive in this recording."""
-        lanes = self.lane - self.lane.min() + 1
-        at = self.road * (lanes.max() + 2) + lanes
-        return np.asarray(np.isin(at + side, np.unique(at)))
-
-    def same_run(self, rows: IntArray, frames: int) -> BoolArray:
-        """Whether the vehicle stays in its lane for so many frames after some rows (m,)."""
-        last = np.minimum(rows + frames, self.run.size - 1)
-        return np.asarray((self.run[last] == self.run[rows]) & (last == rows + frames))
-
-    def gap(self, leader: IntArray, follower: IntArray) -> FloatArray:
-        """Gap (m), bumper to bumper; infinite where a row is -1."""
-        gap = self.s[leader] - self.s[follower] - 0.5 * (self.length[leader] + self.length[follower])
-        return np.where((leader >= 0) & (follower >= 0), gap, np.inf)
-
-    def rate(self, leader: IntArray, follower: IntArray) -> FloatArray:
-        """Speed of the leader minus that of the follower (m/s); 0 where a row is -1."""
-        return np.where((leader >= 0) & (follower >= 0), self.v[leader] - self.v[follower], 0.0)
-
-
-def track_of(recording: Recording) -> tuple[Track, int]:
-    """Columns with smoothed lanes, and how often a vehicle came back to a lane within a second."""
-    rows = recording.rows
-    vehicle, frame, lane = (rows[name].to_numpy() for name in ("vehicle", "frame", "lane"))
-    road, s, n = rows.road.to_numpy(), rows.s_m.to_numpy(), round(recording.rate_hz)
-    piece = _numbers((np.diff(vehicle) != 0) | (np.diff(frame) != 1))
-    lane, flickers = _smoothed(lane, piece, n)
-    run = _numbers((np.diff(piece) != 0) | (np.diff(lane) != 0))
-    begin, end = np.array([(s[road == each].min(), s[road == each].max()) for each in range(int(road.max()) + 1)]).T
-    v, length, lateral, fitted = (rows[each].to_numpy() for each in ("speed_mps", "length_m", "lateral_m", "fitted"))
-    rate_hz = recording.rate_hz
-    track = Track(vehicle, frame, road, lane, s, v, length, lateral, fitted, piece, run, begin, end, rate_hz)
-    return track, flickers
-
-
-def _numbers(breaks: BoolArray) -> IntArray:
-    """Number of each row's part (n,), between breaks (n - 1,)."""
-    return np.append(0, np.cumsum(breaks))
-
-
-def _smoothed(lane: IntArray, piece: IntArray, second: int) -> tuple[IntArray, int]:
-    """Lanes (n,), by the median of two seconds where one came back within a second, and how often it did."""
-    run = _numbers((np.diff(piece) != 0) | (np.diff(lane) != 0))
-    first = np.flatnonzero(np.diff(run, prepend=-1))
-    frames = np.diff(first, append=lane.size)
-    at, of = lane[first], piece[first]
-    back = np.zeros(first.size, np.bool_)
-    back[1:-1] = (of[:-2] == of[2:]) & (at[:-2] == at[2:]) & (frames[1:-1] < second)
-    out = lane.copy()
-    for each in np.unique(of[back]):
-        part = slice(*np.searchsorted(piece, [each, each + 1]))
-        out[part] = ndimage.median_filter(lane[part], 2 * second + 1, mode="nearest")
-    return out, int(back.sum())
-
-
 class Scene:
     """Positions of all vehicles at the moments of some rows."""
 
-    def __init__(self, track: Track, chosen: BoolArray) -> None:
+    def __init__(self, track: Recording, chosen: BoolArray) -> None:
         at = np.flatnonzero(np.isin(track.frame, np.unique(track.frame[chosen])))
         lanes = track.lane - track.lane.min() + 1
         frames = track.frame - track.frame.min()
@@ -153,7 +66,7 @@ class Scene:
         ttc_s = np.full(rows.size, np.inf)
         closing = r2dot < 0.0
         ttc_s[closing] = r2[closing] / -r2dot[closing]
-        seen = (after >= 0) | (track.s[rows] - track.road_begin[track.road[rows]] >= IN_VIEW_M)
+        seen = (after >= 0) | (track.s[rows] - track.view[0, track.road[rows]] >= IN_VIEW_M)
         at_risk = behind & (r2 > 0.0) & (track.gap(ahead, rows) > 0.0) & seen
         return States(leader, r1, track.rate(leader, rows), fits, follows, behind, r2, r2dot, ttc_s, at_risk)
 
@@ -178,7 +91,7 @@ class States(NamedTuple):
     """Behind a leader, nobody alongside, and the road behind in view."""
 
 
-def durations_s(track: Track, rows: IntArray) -> FloatArray:
+def durations_s(track: Recording, rows: IntArray) -> FloatArray:
     """Time (s) that each of some rows (m,) stands for: the part of its run that is nearest to it."""
     run, frame = track.run[rows], track.frame[rows].astype(np.float64)
     alone = np.flatnonzero(np.diff(track.run, prepend=-1))
@@ -192,7 +105,7 @@ def durations_s(track: Track, rows: IntArray) -> FloatArray:
     return np.asarray(end - begin) / track.rate_hz
 
 
-def slopes(track: Track, rows: IntArray) -> FloatArray:
+def slopes(track: Recording, rows: IntArray) -> FloatArray:
     """Slope (m/s²) of a line through the speeds of the second that begins at each of some rows (m,)."""
     since = np.arange(track.second + 1) - track.second / 2
     weights = since / (since @ since) * track.rate_hz
@@ -202,7 +115,7 @@ def slopes(track: Track, rows: IntArray) -> FloatArray:
     return slopes
 
 
-def noise_of(track: Track) -> float:
+def noise_of(track: Recording) -> float:
     """Standard deviation (m/s²) of slopes by white noise, from third differences, to which motion adds little."""
     same = track.piece[3:] == track.piece[:-3]
     third = np.diff(track.v, 3)[same]

@@ -12,9 +12,9 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.errors import HarnessError, TrajectoryError
 from harness.families.cut_in.loading import load_parameters
-from harness.fitting import fit
 from harness.fitting.files import fit_files
-from harness.fitting.laws import FREE_TTC_S, FittedLaw
+from harness.fitting.hazard import FREE_TTC_S
+from harness.fitting.laws import LAWS, FittedLaw
 from harness.fitting.maximum import Maximum
 from harness.runner.other_traffic import read_replicates
 from tests.fitting.trajectories import overtaking
@@ -37,9 +37,9 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
         0 < page.index("No lane change was seen at TTC &lt; 1 s") < page.index("How to use it")
     )  # the chief finding first
     grey = re.findall(r'<tr class="open"><th scope="row"><code>(.*?)<', page)
-    numbers = parameters.numbers()
-    assert grey
-    assert all(each.se > abs(each.value) for each in (numbers[name.replace(".", "__")] for name in grey))
+    numbers = [parameters.numbers()[name.replace(".", "__")] for name in grey]
+    assert numbers
+    assert all(each.se > abs(each.value) for each in numbers)
     assert len(grey) < len(re.findall(r'<tr><th scope="row"><code>', page))
     again = fit_files(["rows.parquet"], tmp_path / "again" / "a #1: b.yaml", n_replicates=5)
     for file in (again.environment, again.replicates, again.page):
@@ -51,14 +51,14 @@ def test_a_hazard_above_what_a_second_allows_is_fitted(tmp_path):
     overtaking(2.0).assign(length_m=4.5).to_parquet(tmp_path / "rows.parquet", index=False)
     found = fit_files([tmp_path / "rows.parquet"], tmp_path / "mine.yaml", n_replicates=2).fit
     risk = found.traffic.at_risk[found.traffic.at_risk["ttc_s"] > FREE_TTC_S]
-    wished = float(found.hazard_at(risk) @ risk["duration_s"])
+    wished = float(found.hazard.rate(risk) @ risk["duration_s"])
     assert wished == pytest.approx(risk["changes"].sum(), rel=0.1)
 
 
 def test_a_law_with_a_number_that_no_environment_allows_is_named(tmp_path, monkeypatch):
     found = Maximum(np.array([1e-4]), np.full((24, 1), 1e-5), np.zeros((1, 1)), np.ones(1, np.bool_))
-    law = FittedLaw(("initial_state__v_scale_mps",), lambda theta: theta, found, 100)
-    monkeypatch.setitem(fit._LAWS, "speed", (lambda *_: law, "speeds of BV"))
+    law = FittedLaw(("initial_state__v_scale_mps",), lambda theta: theta, found)
+    monkeypatch.setitem(LAWS, "speed", (lambda *_: law, "speeds of BV"))
     overtaking(2.0).to_parquet(tmp_path / "rows.parquet", index=False)
     with pytest.raises(TrajectoryError, match=r"initial_state\.v_scale_mps.* 0\.0001"):
         fit_files([tmp_path / "rows.parquet"], tmp_path / "mine.yaml")

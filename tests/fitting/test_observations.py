@@ -1,7 +1,5 @@
 """Observations of motion that is known, and recordings that are refused."""
 
-import functools
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,7 +14,7 @@ def observed(rows: pd.DataFrame, tmp_path, **mapping) -> tuple[list[Observations
     file = tmp_path / "rows.parquet"
     rows.to_parquet(file, index=False)
     found = [each for each, _ in observations([file], load_mapping().model_copy(update=mapping))]
-    return found, functools.reduce(Tally.plus, (each.tally for each in found))
+    return found, Tally.of(found)
 
 
 def joined(found: list[Observations], name: str) -> np.ndarray:

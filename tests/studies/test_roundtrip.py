@@ -9,7 +9,8 @@ from scipy.stats import gamma
 
 from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.fitting.fit import HEAVIEST_TAILS, fit_traffic
-from harness.fitting.laws import Acceptance, Traffic
+from harness.fitting.hazard import Acceptance
+from harness.fitting.laws import Traffic
 from harness.fitting.observations import observations
 from harness.fitting.table import load_mapping
 from harness.progress import Progress

@@ -10,13 +10,8 @@ import pyarrow.parquet as pq
 
 from harness.campaign.files import read_model
 from harness.campaign.yaml_text import read_yaml
-from harness.families.cut_in.parameters import (
-    OF_REPLICATES,
-    REPLACED,
-    SHIPPED_FOLDER,
-    EnvironmentParameters,
-    content_hash,
-)
+from harness.families.cut_in.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
+from harness.families.cut_in.sections import REPLACED
 
 SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
 DATA, _ = read_yaml(SHIPPED)

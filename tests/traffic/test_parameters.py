@@ -76,45 +76,55 @@ def test_the_hash_is_that_of_the_numbers_alone(mine):
 # -- what is refused --
 
 
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        *(([("cut_in", "ignore_share", text)], "cut_in.ignore_share.value") for text in ["7", *NOT_NUMBERS]),
-        ([("initial_state", "v_scale_mps", "-5")], "initial_state.v_scale_mps.value"),
-        ([("initial_state", "r2_min_m", "100"), ("initial_state", "r2_max_m", "20")], "initial_state.r2_min_m"),
-        ([("initial_state", "r2dot_min_mps", "-5"), ("initial_state", "r2dot_max_mps", "-10")], "r2dot_min_mps"),
-        ([("fit_range", "v_min_mps", "40"), ("fit_range", "v_max_mps", "20")], "fit_range.v_min_mps"),
-        ([("fit_range", "v_max_mps", "55")], "speeds of the AV"),
-        ([("scenario", "duration_s", "10.05")], "scenario.duration_s.value"),
-        ([("cut_in", "intercept", "-999")], "cut_in"),
-        ([("cut_in", "intercept", "999")], "a wish to change lanes of inf"),
-        ([("cut_in", "ignore_share", "0"), ("cut_in", "accept_scale_s", "0.001")], "cut_in.accept_scale_s"),
-        ([("initial_state", "v_location_mps", "900")], "initial_state.v_location_mps"),
-        ([("initial_state", "r1_shift_m", "300")], "initial_state.r1_*"),
-        ([("initial_state", "r1dot_log_scale", "5")], "initial_state.r1dot_*"),
-        ([("free_driving", "log_scale", "-20")], "noise of scale"),
-    ],
-)
-def test_what_does_not_fit_together_names_the_place(mine, changes, named):
-    said = refusal(section := mine(changed(*changes)))
+def lateral(**numbers):
+    lines = [f"  {name}: {{value: {value}, source: user}}\n" for name, value in numbers.items()]
+    return TEXT + "lateral:\n" + "".join(lines)
+
+
+def dumped(**changes):
+    """Tables in place of formulas, but for some changes."""
+    return yaml.safe_dump(tabled(**changes))
+
+
+RANGED = {"value": 1.0, "source": "user"}
+REFUSED = [
+    *((changed(("cut_in", "ignore_share", text)), "cut_in.ignore_share.value") for text in ["7", *NOT_NUMBERS]),
+    (changed(("initial_state", "v_scale_mps", "-5")), "initial_state.v_scale_mps.value"),
+    (changed(("initial_state", "r2_min_m", "100"), ("initial_state", "r2_max_m", "20")), "initial_state.r2_min_m"),
+    (changed(("initial_state", "r2dot_min_mps", "-5"), ("initial_state", "r2dot_max_mps", "-10")), "r2dot_min_mps"),
+    (changed(("fit_range", "v_min_mps", "40"), ("fit_range", "v_max_mps", "20")), "fit_range.v_min_mps"),
+    (changed(("fit_range", "v_max_mps", "55")), "speeds of the AV"),
+    (changed(("scenario", "duration_s", "10.05")), "scenario.duration_s.value"),
+    (changed(("cut_in", "intercept", "-999")), "cut_in"),
+    (changed(("cut_in", "intercept", "999")), "a wish to change lanes of inf"),
+    (changed(("cut_in", "ignore_share", "0"), ("cut_in", "accept_scale_s", "0.001")), "cut_in.accept_scale_s"),
+    (changed(("initial_state", "v_location_mps", "900")), "initial_state.v_location_mps"),
+    (changed(("initial_state", "r1_shift_m", "300")), "initial_state.r1_*"),
+    (changed(("initial_state", "r1dot_log_scale", "5")), "initial_state.r1dot_*"),
+    (changed(("free_driving", "log_scale", "-20")), "noise of scale"),
+    (lateral(distance_m=1.7), ": found neither; expected lead_s alone"),
+    (lateral(distance_m=1.7, lead_s=1.0, speed_median_mps=0.7), ": found lead_s, speed_median_mps; expected"),
+    (lateral(distance_m=1.7, lead_s=0.55), "lateral.lead_s.value"),
+    (lateral(distance_m=0.0, lead_s=0.5), "lateral.distance_m.value"),
+    (dumped(acceptance_steps__share=of([0.5] * 5)), "acceptance_steps.share"),
+    (dumped(acceptance_steps__share=of([0.0] * 6)), "acceptance_steps.share.0.value"),
+    (dumped(acceptance_steps__events=[1, 2]), "acceptance_steps.events"),
+    (dumped(hazard_table__v_mps=of([20.0, 20.0, 30.0])), "hazard_table.v_mps"),
+    (dumped(hazard_table__r1_log=of([0.0, 1.0])), "hazard_table.r1_log"),
+    (dumped(cut_in__ignore_share={"value": 0.1, "source": "user"}), "ignore_share besides"),
+    (yaml.safe_dump(tabled() | {"hazard_table": None}), "u, log_gap"),
+    (dumped(guard__margin_m={**RANGED, "range": [2.0, 3.0]}), "guard.margin_m.range"),
+    (dumped(guard__margin_m={**RANGED, "range": [-2.0, 3.0]}), "guard.margin_m.range"),
+    ("like: ndd-overtaking-3\n", "like ("),
+    ("like: ndd-overtaking-1\nguard: {margn_m: {value: 2.0, source: user}}\n", "guard.margn_m"),
+]
+
+
+@pytest.mark.parametrize(("text", "named"), REFUSED, ids=[named for _, named in REFUSED])
+def test_what_does_not_fit_together_names_the_place(mine, text, named):
+    said = refusal(section := mine(text))
     assert named in said
     assert section.parameters in said
-
-
-@pytest.mark.parametrize(
-    ("numbers", "found"),
-    [
-        ({"distance_m": 1.7}, "neither"),
-        ({"distance_m": 1.7, "lead_s": 1.0, "speed_median_mps": 0.7}, "lead_s, speed_median_mps"),
-        ({"distance_m": 1.7, "lead_s": 0.55}, "0.55"),
-        ({"distance_m": 0.0, "lead_s": 0.5}, "found 0"),
-    ],
-)
-def test_a_lateral_section_that_says_too_little_or_too_much_is_refused(mine, numbers, found):
-    lines = [f"  {name}: {{value: {value}, source: user}}\n" for name, value in numbers.items()]
-    said = refusal(mine(TEXT + "lateral:\n" + "".join(lines)))
-    assert "lateral" in said
-    assert found in said
 
 
 # -- tables in place of formulas, and what is known of numbers --
@@ -152,32 +162,10 @@ def test_an_environment_is_like_another_but_for_what_it_says(mine):
     )
     other = load_parameters(EnvironmentSettings(parameters="ndd-overtaking-2"))
     assert own.values() == {**of_all_but(other, "lateral"), "guard__margin_m": 2.0}
-    assert "like (" in str(refusal(mine("like: ndd-overtaking-3\n")))
-    assert "guard.margn_m" in str(
-        refusal(mine("like: ndd-overtaking-1\nguard: {margn_m: {value: 2.0, source: user}}\n"))
-    )
 
 
 def of_all_but(parameters, section):
     return {name: value for name, value in parameters.values().items() if not name.startswith(section)}
-
-
-@pytest.mark.parametrize(
-    ("content", "named"),
-    [
-        (tabled(acceptance_steps__share=of([0.5] * 5)), "acceptance_steps.share"),
-        (tabled(acceptance_steps__share=of([0.0] * 6)), "acceptance_steps.share.0.value"),
-        (tabled(acceptance_steps__events=[1, 2]), "acceptance_steps.events"),
-        (tabled(hazard_table__v_mps=of([20.0, 20.0, 30.0])), "hazard_table.v_mps"),
-        (tabled(hazard_table__r1_log=of([0.0, 1.0])), "hazard_table.r1_log"),
-        (tabled(cut_in__ignore_share={"value": 0.1, "source": "user"}), "ignore_share besides"),
-        (tabled() | {"hazard_table": None}, "u, log_gap"),
-        (tabled(guard__margin_m={"value": 1.0, "source": "user", "range": [2.0, 3.0]}), "guard.margin_m.range"),
-        (tabled(guard__margin_m={"value": 1.0, "source": "user", "range": [-2.0, 3.0]}), "guard.margin_m.range"),
-    ],
-)
-def test_tables_and_ranges_that_do_not_fit_are_refused_where_they_stand(mine, content, named):
-    assert named in str(refusal(mine(yaml.safe_dump(content))))
 
 
 # -- leads: by known answers, files by their rules, hashes that stay where nothing is said --

@@ -19,7 +19,7 @@ from harness.compiled import compiled_threads, unboxed
 from harness.errors import CampaignError
 from harness.families.cut_in import laws
 from harness.families.cut_in.lateral import constant_lead
-from harness.families.cut_in.laws import Environment, InitialStates, build_environment
+from harness.families.cut_in.laws import Environment, InitialStates, Wish, build_environment
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
 from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray, State
 
@@ -51,13 +51,15 @@ def load_parameters(settings: EnvironmentSettings) -> EnvironmentParameters:
 
 def load_environment(settings: EnvironmentSettings, parameters: EnvironmentParameters | None = None) -> Environment:
     """The environment of a campaign, with its tables; ``parameters`` are read unless they are given."""
-    level, hold_s, lead_s = settings.lane_change_level, settings.acceleration_hold_s, settings.cut_in_lead_s
     given = parameters or load_parameters(settings)
+    level, hold_s = settings.lane_change_level, settings.acceleration_hold_s
     numbers = parameter_record(given, lane_change_level=level, hold_s=hold_s)
-    lateral = given.lateral_motion()
-    if lead_s is not None:
-        lateral = constant_lead(lead_s, lateral.distance_m)
-    return build_environment(numbers, lateral, given.wish(), given.accepted())
+    lateral = constant_lead() if given.lateral is None else given.lateral.motion()
+    if settings.cut_in_lead_s is not None:
+        lateral = constant_lead(settings.cut_in_lead_s, lateral.distance_m)
+    wish, steps = given.hazard_table, given.acceptance_steps
+    tables = wish.wish() if wish else Wish(*np.empty((3, 0, 2))), steps.steps() if steps else np.empty((0, 2))
+    return build_environment(numbers, lateral, *tables)
 
 
 def require_sound_laws(environment: Environment, file: str) -> None:

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 from scipy.special import gammainc, gammaincinv
 
-from harness.families.cut_in.parameters import SMALLEST_SHARE, AcceptanceSteps, EnvironmentParameters
+from harness.families.cut_in.parameters import EnvironmentParameters
+from harness.families.cut_in.sections import SMALLEST_SHARE, AcceptanceSteps
 from harness.families.protocol import LeftOpen
 
 NOT_LOOKING = "cut_in__ignore_share"

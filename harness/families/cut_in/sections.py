@@ -1,0 +1,332 @@
+"""Sections of an environment file: numbers with their provenance, each within its limits, and tables of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from itertools import pairwise
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, Field, model_validator
+
+from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
+from harness.campaign.problems import broken_rule
+from harness.campaign.sections import Section
+from harness.families.cut_in.lateral import LateralMotion, constant_lead, log_normal_speed
+from harness.families.cut_in.laws import Wish
+from harness.numbers import plain
+from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import ACCELERATIONS_MPS2, FloatArray
+
+LONGEST_LEAD_S = 10.0
+SMALLEST_SHARE = 1e-12
+"""Of lane changes that are accepted."""
+_SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
+_AXES = (("v_mps", "v_log"), ("r1_m", "r1_log"), ("r1dot_mps", "r1dot_log"))
+
+
+class Number(Section):
+    """A value and where it comes from (the tags are explained in the shipped file).
+
+    ``se`` is the standard error of a fitted one, ``range`` says where an assumed one may lie; neither changes a test.
+    """
+
+    value: float
+    source: Literal[
+        "paper", "itsc", "ndd", "cutin", "openacc", "published", "assumed", "fitted", "derived", "measured", "user"
+    ]
+    note: str = ""
+    se: Annotated[float, Field(ge=0.0)] | None = None
+    range: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _range_holds_the_value(self) -> Self:
+        if self.range is not None and not self.range[0] <= self.value <= self.range[1]:
+            mend = "Name the lower end first, and one that the value is not outside of."
+            raise broken_rule("range", f"{self.range}, with the value {self.value:g}", "two ends around it", mend)
+        return self
+
+
+def _within(low: float, high: float) -> AfterValidator:
+    """Refuse a value, or an end of its range, outside of [low, high]."""
+
+    def checked(number: Number) -> Number:
+        for key, values in (("value", [number.value]), ("range", number.range or [])):
+            if outside := [each for each in values if not low <= each <= high]:
+                expected = f"{'a number' if key == 'value' else 'numbers'} from {low:g} to {high:g}"
+                raise broken_rule(key, f"{outside[0]:g}", expected, "Correct the value.")
+        return number
+
+    return AfterValidator(checked)
+
+
+# Wide limits: what a law makes of its numbers is judged by `harness.families.cut_in.loading`.
+Coefficient = Annotated[Number, _within(-1000.0, 1000.0)]
+LogScale = Annotated[Number, _within(-50.0, 50.0)]
+Scale = Annotated[Number, _within(0.001, 1000.0)]
+Gain = Annotated[Number, _within(0.0, 100.0)]
+Gap = Annotated[Number, _within(0.0, 300.0)]  # 4 km of road hold two of them and 25 s at 100 m/s
+Speed = Annotated[Number, _within(0.0, MAX_CONFIGURED_SPEED_MPS)]
+Rate = Annotated[Number, _within(-MAX_CONFIGURED_SPEED_MPS, MAX_CONFIGURED_SPEED_MPS)]
+Acceleration = Annotated[Number, _within(*map(float, ACCELERATIONS_MPS2[[0, -1]]))]
+Braking = Annotated[Number, _within(0.0, 20.0)]
+Time = Annotated[Number, _within(0.0, 100.0)]
+Share = Annotated[Number, _within(0.0, 1.0)]
+DegreesOfFreedom = Annotated[Number, _within(2.0, 1000.0)]  # below 2 more than 1e-4 lies outside of the t table
+
+
+def _ordered(*ranges: tuple[str, str], equal: bool) -> Any:
+    """Validator of a section: the ends of each range are in order, and may be ``equal``."""
+
+    def checked(self: BaseModel) -> BaseModel:
+        for low, high in ranges:
+            least, most = getattr(self, low).value, getattr(self, high).value
+            if least > most or (least == most and not equal):
+                expected = f"a number {'of at most' if equal else 'below'} {high}"
+                mend = "Change places, or correct one of them."
+                raise broken_rule(low, f"{least:g}, with {high} {most:g}", expected, mend)
+        return self
+
+    return model_validator(mode="after")(checked)
+
+
+def _whole_steps(number: Number) -> Number:
+    steps = number.value / STEP_S
+    if abs(steps - round(steps)) >= 1e-9:
+        expected, mend = f"a multiple of the {STEP_S:g} s step", f"The nearest one is {round(steps) * STEP_S:g}."
+        raise broken_rule("value", f"{number.value:g}", expected, mend)
+    return number
+
+
+class Scenario(Section):
+    """Horizon of a test."""
+
+    duration_s: Annotated[Number, _within(1.0, 25.0), AfterValidator(_whole_steps)]
+    """At most 25 s: BV's free driving has 256 random numbers for each cut-in, and the road is 4 km long."""
+
+
+class FitRange(Section):
+    """Where the fits hold; states outside are clamped to it."""
+
+    v_min_mps: Speed
+    v_max_mps: Speed
+    v_centre_mps: Speed
+    v_scale_mps: Scale
+    r1_min_m: Gap
+    r1_max_m: Gap
+    r1_centre_m: Gap
+    r1_scale_m: Scale
+
+    _ranges = _ordered(("v_min_mps", "v_max_mps"), ("r1_min_m", "r1_max_m"), equal=False)
+
+
+class InitialState(Section):
+    """Distribution of (v_BV, R1, R1dot, R2, R2dot)."""
+
+    v_location_mps: Coefficient
+    v_scale_mps: Scale
+    v_shape: Coefficient
+    r1_shift_m: Coefficient
+    r1_shift_u_m: Coefficient
+    r1_log_mean: Coefficient
+    r1_log_mean_u: Coefficient
+    r1_log_sd: LogScale
+    r1_log_sd_u: LogScale
+    r1dot_df: DegreesOfFreedom
+    r1dot_location_mps: Coefficient
+    r1dot_location_u: Coefficient
+    r1dot_location_w: Coefficient
+    r1dot_location_uw: Coefficient
+    r1dot_location_uu: Coefficient
+    r1dot_log_scale: LogScale
+    r1dot_log_scale_u: LogScale
+    r1dot_log_scale_w: LogScale
+    r1dot_log_scale_ww: LogScale
+    r1dot_min_ttc_s: Annotated[Number, _within(0.1, 100.0)]
+    r2_min_m: Annotated[Number, _within(0.1, 300.0)]
+    r2_max_m: Gap
+    r2dot_min_mps: Rate
+    r2dot_max_mps: Rate
+
+    _ranges = _ordered(("r2_min_m", "r2_max_m"), ("r2dot_min_mps", "r2dot_max_mps"), equal=True)
+
+
+class FreeDriving(Section):
+    """Accelerations of LV, and of BV after its cut-in."""
+
+    df: DegreesOfFreedom
+    location_mps2: Acceleration
+    log_scale: LogScale
+    log_scale_u: LogScale
+    log_scale_uu: LogScale
+    brake_logit: LogScale
+    brake_logit_u: LogScale
+    brake_slope_s2pm: LogScale
+    brake_max_mps2: Acceleration
+
+
+class CarFollowing(Section):
+    """Accelerations of BV behind LV."""
+
+    gain_rate_per_s: Gain
+    gain_gap_per_s2: Gain
+    median_gap_m: Coefficient
+    median_gap_v: Coefficient
+    median_gap_vv: Coefficient
+    standstill_m: Gap
+    smallest_gap_m: Scale
+    closing_threshold_mps2: Gain
+    closing_gain: Gain
+    near_gap_m: Gap
+    near_mean_max_mps2: Acceleration
+    df: DegreesOfFreedom
+    log_scale: LogScale
+    log_scale_rate: LogScale
+    rate_cap_mps: Speed
+
+
+class Guard(Section):
+    """What keeps BV off LV; part of p."""
+
+    lead_braking_mps2: Braking
+    own_braking_mps2: Annotated[Number, _within(0.1, 20.0)]
+    horizon_s: Annotated[Number, _within(0.0, 10.0)]
+    margin_m: Gap
+
+
+class CutIn(Section):
+    """Hazard of the cut-in; coefficients in whose place there is a table are left out (`REPLACED`)."""
+
+    intercept: Coefficient | None = None
+    u: Coefficient | None = None
+    log_gap: Coefficient | None = None
+    rate: Coefficient | None = None
+    rate_squared: Coefficient | None = None
+    u_squared: Coefficient | None = None
+    rate_scale_mps: Scale | None = None
+    rate_clamp_mps: Speed | None = None
+    ignore_share: Share | None = None
+    accept_ttc_s: Time | None = None
+    accept_scale_s: Scale | None = None
+    max_probability_1s: Annotated[Number, _within(1e-6, 0.5)]
+
+
+_ACCEPTANCE = ("ignore_share", "accept_ttc_s", "accept_scale_s")
+REPLACED = {
+    "hazard_table": tuple(name for name in CutIn.model_fields if name not in (*_ACCEPTANCE, "max_probability_1s")),
+    "acceptance_steps": _ACCEPTANCE,
+}
+"""Coefficients of ``cut_in`` in whose place a table may stand."""
+
+
+def _rising(knots: list[Number]) -> list[Number]:
+    for before, after in pairwise(each.value for each in knots):
+        if not before < after:
+            raise broken_rule("", f"{after:g} after {before:g}", "numbers that rise", "Sort them, each once.")
+    return knots
+
+
+_LENGTH = Field(min_length=1, max_length=64)
+Knots = Annotated[list[Rate], _LENGTH, AfterValidator(_rising)]
+Gaps = Annotated[list[Gap], _LENGTH, AfterValidator(_rising)]
+LogHazards = Annotated[list[LogScale], _LENGTH]
+
+
+def _one_each(*pairs: tuple[str, str], beyond: str = "") -> Any:
+    """Validator of a section: a list for each pair (list, of) is as long as the other, but for one with one beyond."""
+
+    def checked(self: BaseModel) -> BaseModel:
+        for key, of in pairs:
+            numbers, wanted = getattr(self, key), len(getattr(self, of)) + (key == beyond)
+            if numbers is not None and len(numbers) != wanted:
+                expected = f"{wanted}, one for each of {of}" + " and one beyond" * (key == beyond)
+                mend = "Add what is missing, or delete what is too much."
+                raise broken_rule(key, f"{len(numbers)} numbers", expected, mend)
+        return self
+
+    return model_validator(mode="after")(checked)
+
+
+class HazardTable(Section):
+    """Logarithm of the wish to change lanes (per second): three functions, linear between knots, that are added."""
+
+    v_mps: Knots
+    v_log: LogHazards
+    r1_m: Gaps
+    r1_log: LogHazards
+    r1dot_mps: Knots
+    r1dot_log: LogHazards
+
+    _one_value_per_knot = _one_each(*((logs, knots) for knots, logs in _AXES))
+
+    def wish(self) -> Wish:
+        """As kernels read it."""
+        return Wish(*(np.column_stack([_values(getattr(self, name)) for name in axis]) for axis in _AXES))
+
+
+class AcceptanceSteps(Section):
+    """Share of wished lane changes carried out, by time to collision with the AV: below each of ``ttc_s``, and above.
+
+    ``events`` were seen in each step, and ``exposure`` of them would have been expected if each wish were carried out.
+    """
+
+    ttc_s: Annotated[list[Annotated[Number, _within(0.01, 100.0)]], _LENGTH, AfterValidator(_rising)]
+    share: list[Annotated[Number, _within(SMALLEST_SHARE, 1.0)]]
+    events: list[Annotated[int, Field(ge=0)]] | None = None
+    exposure: list[Annotated[float, Field(ge=0.0)]] | None = None
+
+    _one_share_per_step = _one_each(("share", "ttc_s"), ("events", "share"), ("exposure", "share"), beyond="share")
+
+    def steps(self) -> FloatArray:
+        """Upper ends (s) and shares (n, 2), as kernels read them."""
+        return np.column_stack([[*_values(self.ttc_s), math.inf], _values(self.share)])
+
+    @property
+    def without_events(self) -> list[int]:
+        """Steps in which no lane change was seen."""
+        return [step for step, events in enumerate(self.events or ()) if not events]
+
+    def where(self, some: Collection[int]) -> str:
+        """Times to collision of steps, neighbours together: ``TTC < 2 s``, ``TTC 3 to 5 s``."""
+        ends = [0.0, *_values(self.ttc_s), math.inf]
+        low = [plain(ends[step]) for step in some if step - 1 not in some]
+        high = [plain(ends[step + 1]) for step in some if step + 1 not in some]
+        between = (f"TTC {a} to {b} s" if float(a) else f"TTC < {b} s" for a, b in zip(low, high, strict=True))
+        return " and ".join(between).replace("to inf s", "s and more")
+
+
+def _values(numbers: list[Number]) -> list[float]:
+    return [each.value for each in numbers]
+
+
+class Lateral(Section):
+    """How long cut-ins show themselves before BV overlaps: a constant lead, or a log-normal lateral speed."""
+
+    distance_m: Annotated[Number, _within(0.1, 5.0)]
+    lead_s: Annotated[Number, _within(0.0, LONGEST_LEAD_S), AfterValidator(_whole_steps)] | None = None
+    speed_median_mps: Annotated[Number, _within(0.05, 20.0)] | None = None
+    speed_log_sd: Annotated[Number, _within(0.01, 3.0)] | None = None
+    longest_lead_s: Annotated[Number, _within(0.1, LONGEST_LEAD_S), AfterValidator(_whole_steps)] | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        named = tuple(name for name in ("lead_s", *_SPEED) if getattr(self, name) is not None)
+        if named not in (("lead_s",), _SPEED):
+            mend = "A lead is constant, or follows from a lateral speed and is cut off at the longest."
+            raise broken_rule("", ", ".join(named) or "neither", f"lead_s alone, or {', '.join(_SPEED)}", mend)
+        return self
+
+    def motion(self) -> LateralMotion:
+        """As kernels read it."""
+        if self.lead_s is not None:
+            return constant_lead(self.lead_s.value, self.distance_m.value)
+        median, log_sd, longest = (getattr(self, name).value for name in _SPEED)
+        return log_normal_speed(self.distance_m.value, median, log_sd, longest)
+
+
+class Replicates(Section):
+    """Which environments other data of the same kind would have given: a file beside this one, and its hash."""
+
+    file: Annotated[str, Field(pattern=r"^[^\x00-\x1f]+$", examples=["mine.replicates.parquet"])]
+    sha256: str
