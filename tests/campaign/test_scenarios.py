@@ -141,27 +141,27 @@ def test_damaged_text_loads_or_is_a_clear_error(load, text, draw):
 
 
 SHIPPED = {
-    "overtaking_forced": "d9b477868a5a1fc6",
-    "overtaking_mixture": "c2eb6e427cca3adc",
-    "overtaking_nade": "0e703f4f5d31042f",
-    "overtaking_nade_epsilon_0.1": "accc0ed8c78ae519",
-    "overtaking_nde": "fc3545d6478cee32",
-    "overtaking_recursive": "0987054c7065eccf",
-    "overtaking_shells": "13a26e5ad92a97bb",
-    "smoke": "83c743f424310ab6",
+    "overtaking_forced": "85504652fdda6458",
+    "overtaking_mixture": "fde3fb3eeb1f5980",
+    "overtaking_nade": "fec9c9c4df543392",
+    "overtaking_nade_epsilon_0.1": "e48caaab5f8cbd19",
+    "overtaking_nde": "c98c8fdc6148b86d",
+    "overtaking_recursive": "7f387515239aac2f",
+    "overtaking_shells": "2b84fe87273faa41",
+    "smoke": "ace6c174cd1643c2",
 }
-PANEL = "3d9016982bad7952"
+PANEL = "133823d05923f5bc"
 CHANGED = [
-    (["crash.counts_above_mps=5"], "b9a0793296b4e085"),
-    (["environment.cut_in_lead_s=0.5"], "ff63b7f56962ec48"),
-    (["testing.shells.smallest_round=8"], "282dae74ee9ed7e6"),
-    (["av={controller: 'a:B', parameters: {x: 1}, before_event: controller}"], "4d26ac0bd2021c01"),
-    (["av={controller: 'a:B', warm_up_s: 0}"], "d8aab23f8f6ac5d0"),
-    (["av={traci: {command: x}}"], "f85e9160fd0e259a"),
-    (["av={sumo: {tau: 1}}"], "30bb4389775c6076"),
-    (["surrogates={}", "accept.crash_rate_below=1e-7"], "fc804d9a60e48a02"),
-    (["testing.method=forced"], "6305dd2dfba9fe91"),
-    (["run.shard_size=7", "records.moments=all", "pool.library=ladder-1"], "6becec20ca8471c1"),
+    (["crash.counts_above_mps=5"], "51d5036da6e54171"),
+    (["environment.cut_in_lead_s=0.5"], "c88dd2839c295aad"),
+    (["testing.shells.smallest_round=8"], "0c227c0d5d4097b8"),
+    (["av={controller: 'a:B', parameters: {x: 1}, before_event: controller}"], "47746e237c53a00d"),
+    (["av={controller: 'a:B', warm_up_s: 0}"], "cf786e1eb9e4e68b"),
+    (["av={traci: {command: x}}"], "d094bec5abd19af3"),
+    (["av={sumo: {tau: 1}}"], "3c0d1e59cdee027c"),
+    (["surrogates={}", "accept.crash_rate_below=1e-7"], "c06b94232e0e6787"),
+    (["testing.method=forced"], "64923764c230f07f"),
+    (["run.shard_size=7", "records.moments=all", "pool.library=ladder-1"], "8ee9bb452642a24e"),
 ]
 
 
