@@ -42,16 +42,14 @@ class Campaign(Section):
 
     name: str = Field(pattern=NAME_PATTERN, description="short name of letters, digits, _ . and -, used in reports")
     description: str = Field("", description="what this campaign is for, in a sentence")
-    seed: Whole = Field(
-        1, ge=0, lt=2**63, description="random numbers of the tests follow from it; those of the pool from pool.seed"
-    )
+    seed: Whole = Field(1, ge=0, lt=2**63)
+    """random numbers of the tests follow from it; those of the pool from pool.seed"""
     scenario: str = Field("cut_in", description="kind of events that are tested: cut_in, or one that a package brings")
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
     crash: CrashSettings = CrashSettings()
-    surrogates: dict[SurrogateName, Surrogate] = Field(
-        default_factory=default_surrogates, description="stand-ins for the unknown AV, by name"
-    )
+    surrogates: dict[SurrogateName, Surrogate] = Field(default_factory=default_surrogates)
+    """stand-ins for the unknown AV, by name"""
     testing: Testing = Testing()
     pool: PoolSettings = PoolSettings()
     world: World = World()

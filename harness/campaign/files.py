@@ -293,9 +293,8 @@ class Panel(Section):
     format: Literal["av-panel"]
     version: Literal[1]
     description: str = ""
-    avs: dict[Annotated[str, Field(pattern=NAME_PATTERN)], AutomatedVehicle] = Field(
-        min_length=1, description="av sections by name"
-    )
+    avs: dict[Annotated[str, Field(pattern=NAME_PATTERN)], AutomatedVehicle] = Field(min_length=1)
+    """av sections by name"""
 
 
 def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
