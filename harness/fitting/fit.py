@@ -159,4 +159,4 @@ def _environment(
     exposure = [_rounded(each) for each in acceptance.exposure.tolist()]
     counted = {"events": acceptance.events.tolist(), "exposure": exposure}
     tables["acceptance_steps"] = {"ttc_s": edges, "share": steps, **counted}
-    return validated({**content, **tables}, EnvironmentParameters, where, Places(where, {}))
+    return validated({**content, **tables}, EnvironmentParameters, Places(where, {}))
