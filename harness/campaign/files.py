@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
@@ -131,7 +131,8 @@ def shipped_or_own(name: str, folder: Path, where: str) -> Path:
 # -- values given with the command --
 
 
-class Override(NamedTuple):
+@dataclass(frozen=True)
+class Override:
     """One ``--set`` (or ``--av``): where, the value that replaces what is there, and the option as it was typed."""
 
     path: tuple[str, ...]
