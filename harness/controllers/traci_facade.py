@@ -19,8 +19,6 @@ from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 VEH_ID = "AV"
 ROAD = "cell0"
 LANE_CENTRES_M = (-1.6, 1.6)
-LANES = {"LV": 1, "BV": 1, VEH_ID: 0}
-"""Vehicles of a cell, and their lanes (0 right, 1 left) before a cut-in."""
 MAX_SPEED_MPS = 100.0
 _ROUNDING = 1e-9
 _SAFE_SPEED, _ACCEL, _DECEL = 1, 2, 4
@@ -70,18 +68,18 @@ class Seen(NamedTuple):
     speed: float
     acceleration: float
     lane: int
-    max_speed: float
     sideways: float = 0.0
     sideways_speed: float = 0.0
+    max_speed: float = MAX_SPEED_MPS
 
 
 class NotSeen(NamedTuple):
     """The same before the first step."""
 
     lane: int
-    max_speed: float
     sideways: float = 0.0
     sideways_speed: float = 0.0
+    max_speed: float = MAX_SPEED_MPS
 
     def __getattr__(self, name: str) -> NoReturn:
         raise TraCIException(f"The {name} of a vehicle is not known before the first step.")
@@ -129,7 +127,6 @@ class VehicleDomain(Domain):
 
     def __init__(self, set_speed_mps: float = math.nan) -> None:
         self.legacy_leader = True
-        self._max_speed = {"LV": MAX_SPEED_MPS, "BV": MAX_SPEED_MPS, VEH_ID: set_speed_mps}
         self._plan: Iterator[float] = iter(())
         """Accelerations (m/s²) of the coming steps; empty without a command."""
         self._command: Callable[[], Iterator[float]] | None = None
@@ -139,24 +136,23 @@ class VehicleDomain(Domain):
         self._accel = self._decel = math.inf
         self._speed_mode = _ACCEL | _DECEL
         self._subscribed: dict[str, tuple[int, ...]] = {}
-        self._seen: Mapping[str, Seen | NotSeen] = {
-            name: NotSeen(lane, self._max_speed[name]) for name, lane in LANES.items()
-        }
-        self._begun = False
+        self._set_speed = set_speed_mps
+        own = NotSeen(0, max_speed=set_speed_mps)
+        self._seen: Mapping[str, Seen | NotSeen] = {"LV": NotSeen(1), "BV": NotSeen(1), VEH_ID: own}
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""
         lv, bv = now.lv, now.bv
-        lv_acceleration = (lv.speed_mps - self._seen["LV"].speed) / STEP_S if self._begun else 0.0
-        bv_acceleration = (bv.speed_mps - self._seen["BV"].speed) / STEP_S if self._begun else 0.0
+        begins = isinstance(self._seen[VEH_ID], NotSeen)
+        lv_acceleration = 0.0 if begins else (lv.speed_mps - self._seen["LV"].speed) / STEP_S
+        bv_acceleration = 0.0 if begins else (bv.speed_mps - self._seen["BV"].speed) / STEP_S
         # SUMO counts to the left; once BV overlaps it counts as a vehicle of the right lane, in its middle.
         sideways = 0.0 if now.bv_overlaps else -now.bv_lateral_m, -now.bv_lateral_speed_mps
         self._seen = {
-            "LV": Seen(lv.position_m, lv.speed_mps, lv_acceleration, 1, self._max_speed["LV"]),
-            "BV": Seen(bv.position_m, bv.speed_mps, bv_acceleration, bv.lane, self._max_speed["BV"], *sideways),
-            VEH_ID: Seen(now.position_m, now.speed_mps, now.acceleration_mps2, 0, self._max_speed[VEH_ID]),
+            "LV": Seen(lv.position_m, lv.speed_mps, lv_acceleration, 1),
+            "BV": Seen(bv.position_m, bv.speed_mps, bv_acceleration, bv.lane, *sideways),
+            VEH_ID: Seen(now.position_m, now.speed_mps, now.acceleration_mps2, 0, max_speed=self._set_speed),
         }
-        self._begun = True
         # In the warm-up, and as long as it is held, the AV does not do what it is told. A command of longer than a step
         # waits for it: else it would ask, at the hand-over, for speeds that it should have reached by then.
         if self._command is not None and abs(now.speed_mps - self._told) > _ROUNDING:
@@ -362,7 +358,7 @@ class SimulationDomain(Domain):
         return self.time_s
 
     getDeltaT = staticmethod(lambda: STEP_S)
-    getMinExpectedNumber = staticmethod(lambda: len(LANES))
+    getMinExpectedNumber = staticmethod(lambda: 3)
     getCollidingVehiclesNumber = staticmethod(lambda: 0)
     getCollidingVehiclesIDList = getCollisions = getArrivedIDList = staticmethod(tuple)
 
