@@ -143,9 +143,6 @@ class Use(NamedTuple):
     takes_time: bool = False
 
 
-WHILE_READ = Use()
-
-
 class Combination(NamedTuple):
     """What is refused: where to put the blame, when, and the words, with values of the campaign in braces."""
 
@@ -250,11 +247,12 @@ REFUSED = (
 """All that is refused, in the order in which it is told."""
 
 
-def refusal(campaign: Campaign, use: Use = WHILE_READ) -> tuple[str, str, str, str] | None:
+def refusal(campaign: Campaign, use: Use | None = None) -> tuple[str, str, str, str] | None:
     """Where, found, expected and mend of the first combination that is refused; None if the campaign may go on."""
-    values = dict(campaign)
+    values, while_read = dict(campaign), Use()
+    use = use or while_read
     for row in REFUSED:
         # A command may change a campaign that has been read: what it was allowed with then is not asked again.
-        if row.is_asked(campaign, use) and not (use != WHILE_READ and row.is_asked(campaign, WHILE_READ)):
+        if row.is_asked(campaign, use) and not (use != while_read and row.is_asked(campaign, while_read)):
             return row.where, row.found.format(**values), row.expected.format(**values), row.mend
     return None

@@ -30,7 +30,6 @@ from harness.errors import CampaignError
 from harness.files import real_path
 
 Model = TypeVar("Model", bound=BaseModel)
-
 SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"
 _FILES = {
     ("av", "controller"): "a Python file with the controller",
@@ -90,11 +89,9 @@ def load_campaign(
 
         shipped = family_named(campaign.scenario, place(("scenario",))).shipped
         shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))
-    runtime_env = {
-        key: _absolute(value, folder) if key in ("working_dir", "py_modules") else value
-        for key, value in campaign.run.ray.runtime_env.items()
-    }
-    return campaign.replaced(("run", "ray", "runtime_env"), runtime_env)
+    env = campaign.run.ray.runtime_env
+    paths = {key: _absolute(env[key], folder) for key in ("working_dir", "py_modules") if key in env}
+    return campaign.replaced(("run", "ray", "runtime_env"), {**env, **paths})
 
 
 def campaign_of(campaign: Campaign | str | Path) -> Campaign:
@@ -259,8 +256,7 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     panel = load_panel(place or SHIPPED_PANEL).avs
     if name in panel:
         return panel[name].model_dump(exclude_unset=True)
-    models = () if colon else get_args(ModelName)
-    if name in models:
+    if name in (models := () if colon else get_args(ModelName)):
         return {"model": name}
     known = list(dict.fromkeys((*models, *sorted(panel))))
     files = [] if colon else [str(file) for file in Path().glob("*.y*ml")]
@@ -326,7 +322,10 @@ def validated(data: dict[str, Any], model: type[Model], place: Places) -> Model:
             # A value of several kinds is refused once for each.
             if (alike := problems.get((where, found))) is not None and expected not in alike.expected:
                 expected = f"{alike.expected} or {expected}"
-            mend = parts["mend"] or _where_it_belongs(str(where[-1]), model)
+            if not (mend := parts["mend"]):  # of an unknown key that resembles none beside it
+                places = dict.fromkeys(each or "the top level" for each in _places_of(str(where[-1]), model, ""))
+                belongs = f"'{where[-1]}' belongs under {' or '.join(places)}."
+                mend = belongs if places else "Delete it, or correct its name."
             problems[where, found] = CampaignError(place(where), found, expected, mend)
     first, *more = problems.values()
     if not more:
@@ -345,12 +344,6 @@ def _path_of(loc: Sequence[str | int], data: Any) -> tuple[str | int, ...]:
             path.append(part)
             data = data[part]
     return tuple(path)
-
-
-def _where_it_belongs(key: str, model: type[BaseModel]) -> str:
-    """How to mend an unknown key that resembles none beside it."""
-    places = dict.fromkeys(place or "the top level" for place in _places_of(key, model, ""))
-    return f"'{key}' belongs under {' or '.join(places)}." if places else "Delete it, or correct its name."
 
 
 def _places_of(key: str, kind: Any, prefix: str) -> Iterator[str]:

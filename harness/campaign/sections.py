@@ -21,12 +21,10 @@ from pydantic import (
 from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, in_words
 from harness.vocabulary import Method
 
-LARGEST_EXACT_WHOLE_FLOAT = 2.0**53
-
 
 def whole(value: Any) -> Any:
     """Turn ``1e6`` into ``1000000``: YAML reads every number with an exponent as a float."""
-    if isinstance(value, float) and value.is_integer() and abs(value) <= LARGEST_EXACT_WHOLE_FLOAT:
+    if isinstance(value, float) and value.is_integer() and abs(value) <= 2.0**53:  # exact up to there
         return int(value)
     return value
 

@@ -154,9 +154,10 @@ def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any],
     if isfunction(found) and not _is_controller(made) and first is not None and first.default is Parameter.empty:
         return lambda **parameters: SimpleNamespace(step=partial(found, **parameters)), {first.name: None}
     _require_controller(made, name)
-    loads = isinstance(found, type) and "loaded" in takes and callable(getattr(found, "load", None))
-    handed = {"loaded": None} if loads else {}
-    if isinstance(found, type) and "traci" in takes and not _is_batch(found):
+    if not isinstance(found, type):
+        return found, {}
+    handed = {"loaded": None} if "loaded" in takes and callable(getattr(found, "load", None)) else {}
+    if "traci" in takes and not _is_batch(found):
         return partial(StepListenerController, found), {"traci": None, **handed}
     return found, handed
 
