@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from types import ModuleType
-from typing import Any, ClassVar, NamedTuple, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 from harness.controllers.protocol import Observation
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -61,31 +61,23 @@ class Domain:
         return refused
 
 
-class Seen(NamedTuple):
+class Seen:
     """What a script may ask of one vehicle: m, m/s, m/s²; lane 0 right, 1 left; sideways positive to the left."""
 
+    __slots__ = "acceleration", "lane", "max_speed", "position", "sideways", "sideways_speed", "speed"
     position: float
     speed: float
     acceleration: float
-    lane: int
-    sideways: float = 0.0
-    sideways_speed: float = 0.0
-    max_speed: float = MAX_SPEED_MPS
 
-
-class NotSeen(NamedTuple):
-    """The same before the first step."""
-
-    lane: int
-    sideways: float = 0.0
-    sideways_speed: float = 0.0
-    max_speed: float = MAX_SPEED_MPS
+    def __init__(self, lane: int, max_speed: float) -> None:
+        self.lane, self.max_speed = lane, max_speed
+        self.sideways = self.sideways_speed = 0.0
 
     def __getattr__(self, name: str) -> NoReturn:
         raise TraCIException(f"The {name} of a vehicle is not known before the first step.")
 
 
-_QUESTIONS: dict[str, tuple[int, Callable[[Any], Any]]] = {
+_QUESTIONS: dict[str, tuple[int, Callable[[Seen], Any]]] = {
     "getLateralSpeed": (0x32, lambda of: of.sideways_speed),
     "getSpeed": (0x40, lambda of: of.speed),
     "getMaxSpeed": (0x41, lambda of: of.max_speed),  # of the AV that at which it cruises
@@ -136,23 +128,21 @@ class VehicleDomain(Domain):
         self._accel = self._decel = math.inf
         self._speed_mode = _ACCEL | _DECEL
         self._subscribed: dict[str, tuple[int, ...]] = {}
-        self._set_speed = set_speed_mps
-        own = NotSeen(0, max_speed=set_speed_mps)
-        self._seen: Mapping[str, Seen | NotSeen] = {"LV": NotSeen(1), "BV": NotSeen(1), VEH_ID: own}
+        self._lv, self._bv, self._own = Seen(1, MAX_SPEED_MPS), Seen(1, MAX_SPEED_MPS), Seen(0, set_speed_mps)
+        self._seen = {"LV": self._lv, "BV": self._bv, VEH_ID: self._own}
+        self._begun = False
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""
-        lv, bv = now.lv, now.bv
-        begins = isinstance(self._seen[VEH_ID], NotSeen)
-        lv_acceleration = 0.0 if begins else (lv.speed_mps - self._seen["LV"].speed) / STEP_S
-        bv_acceleration = 0.0 if begins else (bv.speed_mps - self._seen["BV"].speed) / STEP_S
+        for other, there in ((self._lv, now.lv), (self._bv, now.bv)):
+            other.acceleration = (there.speed_mps - other.speed) / STEP_S if self._begun else 0.0
+            other.position, other.speed, other.lane = there
         # SUMO counts to the left; once BV overlaps it counts as a vehicle of the right lane, in its middle.
-        sideways = 0.0 if now.bv_overlaps else -now.bv_lateral_m, -now.bv_lateral_speed_mps
-        self._seen = {
-            "LV": Seen(lv.position_m, lv.speed_mps, lv_acceleration, 1),
-            "BV": Seen(bv.position_m, bv.speed_mps, bv_acceleration, bv.lane, *sideways),
-            VEH_ID: Seen(now.position_m, now.speed_mps, now.acceleration_mps2, 0, max_speed=self._set_speed),
-        }
+        self._bv.sideways = 0.0 if now.bv_overlaps else -now.bv_lateral_m
+        self._bv.sideways_speed = -now.bv_lateral_speed_mps
+        own = self._own
+        own.position, own.speed, own.acceleration = now.position_m, now.speed_mps, now.acceleration_mps2
+        self._begun = True
         # In the warm-up, and as long as it is held, the AV does not do what it is told. A command of longer than a step
         # waits for it: else it would ask, at the hand-over, for speeds that it should have reached by then.
         if self._command is not None and abs(now.speed_mps - self._told) > _ROUNDING:
@@ -166,10 +156,10 @@ class VehicleDomain(Domain):
             acceleration = max(acceleration, -self._decel)
         if self._speed_mode & _ACCEL:
             acceleration = min(acceleration, self._accel)
-        self._told = max(0.0, self._seen[VEH_ID].speed + acceleration * STEP_S)
+        self._told = max(0.0, self._own.speed + acceleration * STEP_S)
         return acceleration
 
-    def _of(self, vehID: str) -> Seen | NotSeen:
+    def _of(self, vehID: str) -> Seen:
         try:
             return self._seen[vehID]
         except KeyError:
@@ -272,7 +262,7 @@ class VehicleDomain(Domain):
     def _hold(self, speed: float) -> Iterator[float]:
         """Until further notice."""
         while True:
-            yield (speed - self._seen[VEH_ID].speed) / STEP_S
+            yield (speed - self._own.speed) / STEP_S
 
     def _accelerate(self, acceleration: float, duration: float) -> Iterator[float]:
         """For whole steps, and a share of a last one."""
@@ -282,11 +272,11 @@ class VehicleDomain(Domain):
             left -= 1.0
 
     def _approach(self, target: float, duration: float) -> Iterator[float]:
-        start, steps, done = self._seen[VEH_ID].speed, max(duration / STEP_S, 1.0), 0
+        start, steps, done = self._own.speed, max(duration / STEP_S, 1.0), 0
         while done <= steps - _ROUNDING:
             done += 1
             share = min(1.0, done / steps)
-            yield (start + (target - start) * share - self._seen[VEH_ID].speed) / STEP_S
+            yield (start + (target - start) * share - self._own.speed) / STEP_S
 
     def setAccel(self, vehID: str, accel: float) -> None:
         """Bound the acceleration (m/s²) that later commands lead to."""
@@ -312,7 +302,7 @@ class VehicleDomain(Domain):
             raise TraCIException(f"vehicle.{name}('{vehID}') is refused: {why}. Commands are for 'AV' only.")
 
 
-def _question(answer: Callable[[Any], Any]) -> Callable[[VehicleDomain, str], Any]:
+def _question(answer: Callable[[Seen], Any]) -> Callable[[VehicleDomain, str], Any]:
     return lambda self, vehID: answer(self._of(vehID))
 
 

@@ -213,3 +213,12 @@ def test_a_step_listener_is_removed_when_it_says_so():
         assert [controller.step(seen(0.1 * i)) for i in range(3)] == pytest.approx([-10.0] * 3)
     assert Twice.log == [0.0, 0.1, "clean"]
     assert told == []  # each episode's listener has parameters of its own
+
+
+def test_before_the_first_step_what_moves_is_not_known_and_all_else_is():
+    vehicle = Traci(31.0).vehicle
+    vehicle.subscribe("AV")
+    assert (vehicle.getMaxSpeed("AV"), vehicle.getLength("BV"), vehicle.getLaneIndex("LV")) == (31.0, 5.0, 1)
+    for name in ("getSpeed", "getAcceleration", "getPosition", "getLeader"):
+        with pytest.raises(traci_facade.TraCIException, match="not known before the first step"):
+            getattr(vehicle, name)("AV")
