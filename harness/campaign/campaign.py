@@ -42,16 +42,14 @@ class Campaign(Section):
 
     name: str = Field(pattern=NAME_PATTERN, description="short name of letters, digits, _ . and -, used in reports")
     description: str = Field("", description="what this campaign is for, in a sentence")
-    seed: Whole = Field(
-        1, ge=0, lt=2**63, description="random numbers of the tests follow from it; those of the pool from pool.seed"
-    )
+    seed: Whole = Field(1, ge=0, lt=2**63)
+    """random numbers of the tests follow from it; those of the pool from pool.seed"""
     scenario: str = Field("cut_in", description="kind of events that are tested: cut_in, or one that a package brings")
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
     crash: CrashSettings = CrashSettings()
-    surrogates: dict[SurrogateName, Surrogate] = Field(
-        default_factory=default_surrogates, description="stand-ins for the unknown AV, by name"
-    )
+    surrogates: dict[SurrogateName, Surrogate] = Field(default_factory=default_surrogates)
+    """stand-ins for the unknown AV, by name"""
     testing: Testing = Testing()
     pool: PoolSettings = PoolSettings()
     world: World = World()
@@ -143,9 +141,6 @@ class Use(NamedTuple):
 
     command: Command | None = None
     takes_time: bool = False
-
-
-WHILE_READ = Use()
 
 
 class Combination(NamedTuple):
@@ -252,11 +247,12 @@ REFUSED = (
 """All that is refused, in the order in which it is told."""
 
 
-def refusal(campaign: Campaign, use: Use = WHILE_READ) -> tuple[str, str, str, str] | None:
+def refusal(campaign: Campaign, use: Use | None = None) -> tuple[str, str, str, str] | None:
     """Where, found, expected and mend of the first combination that is refused; None if the campaign may go on."""
-    values = dict(campaign)
+    values, while_read = dict(campaign), Use()
+    use = use or while_read
     for row in REFUSED:
         # A command may change a campaign that has been read: what it was allowed with then is not asked again.
-        if row.is_asked(campaign, use) and not (use != WHILE_READ and row.is_asked(campaign, WHILE_READ)):
+        if row.is_asked(campaign, use) and not (use != while_read and row.is_asked(campaign, while_read)):
             return row.where, row.found.format(**values), row.expected.format(**values), row.mend
     return None

@@ -78,30 +78,18 @@ class Reference(Following):
     for ``risk_evaluation_s``, and nothing stands in for that.
     """
 
-    reaction_time_s: float = Field(
-        0.75, ge=0.0, le=5.0, description="from the evaluated risk to the brakes [JRC-FSM: CC_rt, FSM_rt]"
-    )
-    lateral_speed_mps: Positive = Field(
-        1.8, le=10.0, description="of BV, where the cut-in is one step [JRC-FSM: 0.72 m in 0.4 s]"
-    )
-    evaluated_at_m: float = Field(
-        0.505,
-        ge=0.0,
-        le=5.0,
-        description="lateral distance when the risk has been evaluated [JRC-FSM: CC_calc_dist_to_react]",
-    )
-    risk_evaluation_s: StepTime = Field(
-        RISK_EVALUATION_S,
-        ge=0.0,
-        le=5.0,
-        description="from seeing a cut-in that takes time to the evaluated risk [JRC-FSM: 0.4 s]",
-    )
-    min_acceleration_mps2: Braking = Field(
-        -7.59294, description="hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"
-    )
-    braking_jerk_mps3: Positive = Field(
-        12.65, le=1000.0, description="build-up of braking, 0.774 g in 0.6 s [JRC-FSM: CC_min_jerk]"
-    )
+    reaction_time_s: float = Field(0.75, ge=0.0, le=5.0)
+    """from the evaluated risk to the brakes [JRC-FSM: CC_rt, FSM_rt]"""
+    lateral_speed_mps: Positive = Field(1.8, le=10.0)
+    """of BV, where the cut-in is one step [JRC-FSM: 0.72 m in 0.4 s]"""
+    evaluated_at_m: float = Field(0.505, ge=0.0, le=5.0)
+    """lateral distance when the risk has been evaluated [JRC-FSM: CC_calc_dist_to_react]"""
+    risk_evaluation_s: StepTime = Field(RISK_EVALUATION_S, ge=0.0, le=5.0)
+    """from seeing a cut-in that takes time to the evaluated risk [JRC-FSM: 0.4 s]"""
+    min_acceleration_mps2: Braking = -7.59294
+    """hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"""
+    braking_jerk_mps3: Positive = Field(12.65, le=1000.0)
+    """build-up of braking, 0.774 g in 0.6 s [JRC-FSM: CC_min_jerk]"""
     following_min_acceleration_mps2: Braking = Field(-4.0, description="hardest braking of that IDM [assumed]")
 
     @property
@@ -118,9 +106,8 @@ class Reference(Following):
 class CarefulCompetentParameters(Reference):
     """The careful and competent human driver of UN Regulation No. 157."""
 
-    critical_ttc_s: Strength = Field(
-        2.0, description="time to collision below which it brakes [JRC-FSM: CC_critical_ttc]"
-    )
+    critical_ttc_s: Strength = 2.0
+    """time to collision below which it brakes [JRC-FSM: CC_critical_ttc]"""
     coasting_mps2: float = Field(0.4, ge=0.0, le=5.0, description="deceleration off the accelerator [JRC-FSM]")
 
 
@@ -196,9 +183,8 @@ class Driver(Section):
     model_config = ConfigDict(json_schema_extra=_with_parameters_by_model)
 
     model: ModelName = Field(description="driver model")
-    parameters: Annotated[BuiltInParameters, Parameters] = Field(
-        default_factory=dict, validate_default=True, description="of the model, as under av"
-    )
+    parameters: Annotated[BuiltInParameters, Parameters] = Field(default_factory=dict, validate_default=True)
+    """of the model, as under av"""
 
 
 class Surrogate(Driver):
@@ -206,8 +192,9 @@ class Surrogate(Driver):
 
     model: Literal["idm", "fvdm"] = Field(description="driver model")
     parameters: Annotated[IDMParameters | FVDMParameters, Parameters] = Field(
-        default_factory=dict, validate_default=True, description="of the model, as under av"
+        default_factory=dict, validate_default=True
     )
+    """of the model, as under av"""
 
 
 def default_surrogates() -> dict[str, Surrogate]:
@@ -223,24 +210,17 @@ def default_surrogates() -> dict[str, Surrogate]:
 class Reflexes(Section):
     """How a driver lags behind its model: surrogates may be late and smooth, but not random."""
 
-    delay_s: StepTime = Field(
-        0.0, ge=0.0, le=10.0, description="time after the cut-in in which it keeps its speed [assumed]"
-    )
-    max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = Field(
-        None, description="fastest change of acceleration; none: unlimited [assumed]"
-    )
-    perceives_lateral_m: float = Field(
-        PERCEIVES_LATERAL_M,
-        ge=0.0,
-        le=10.0,
-        description="how far BV has come over when it is seen, where cut-ins take time [JRC-FSM: 0.375 of wandering]",
-    )
+    delay_s: StepTime = Field(0.0, ge=0.0, le=10.0)
+    """time after the cut-in in which it keeps its speed [assumed]"""
+    max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = None
+    """fastest change of acceleration; none: unlimited [assumed]"""
+    perceives_lateral_m: float = Field(PERCEIVES_LATERAL_M, ge=0.0, le=10.0)
+    """how far BV has come over when it is seen, where cut-ins take time [JRC-FSM: 0.375 of wandering]"""
 
 
 class Reaction(Reflexes):
     """How a built-in AV lags behind its model, now and then by inattention."""
 
-    inattention_probability: Probability = Field(
-        0.0, description="share of episodes in which it reacts later still [assumed]"
-    )
+    inattention_probability: Probability = 0.0
+    """share of episodes in which it reacts later still [assumed]"""
     inattention_delay_s: StepTime = Field(0.0, ge=0.0, le=10.0, description="how much later it then reacts [assumed]")

@@ -30,8 +30,6 @@ from harness.errors import CampaignError
 from harness.files import real_path
 
 Model = TypeVar("Model", bound=BaseModel)
-
-
 SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"
 _FILES = {
     ("av", "controller"): "a Python file with the controller",
@@ -66,7 +64,7 @@ def load_campaign(
     data, lines = read_yaml(path) if of_file else (_default_campaign(str(path)), {})
     typed = [parse_override(each) for each in overrides]
     place = Places(str(path), lines, [*laid, *_nothing_sooner(typed), *typed])
-    campaign = _checked(data, Campaign, place)
+    campaign = validated(data, Campaign, place)
     if campaign.accept is not None and not any(each.path[0] == "accept" for each in typed):
         for each in filter(_asks_for_precision, typed):
             found, expected = "a precision, in a campaign with a limit", "one of the two: a limit ends it at a decision"
@@ -81,9 +79,8 @@ def load_campaign(
         if not Path(file).exists() and place(where).startswith("--set"):  # typed in another folder than the campaign's
             file = _absolute(name, Path.cwd())
         if check_files and not Path(file).is_file():
-            meant = did_you_mean(
-                Path(name).name, [each.name for each in Path(file).parent.glob("*" + Path(name).suffix)]
-            )
+            beside = Path(file).parent.glob("*" + Path(name).suffix)
+            meant = did_you_mean(Path(name).name, [each.name for each in beside])
             mend = meant or "Correct the path; it is relative to the folder of the campaign file."
             raise CampaignError(place(where), f"no file {file}", expected, mend)
         campaign = campaign.replaced(where, f"{file}:{end}" if end else file)
@@ -92,11 +89,9 @@ def load_campaign(
 
         shipped = family_named(campaign.scenario, place(("scenario",))).shipped
         shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))
-    runtime_env = {
-        key: _absolute(value, folder) if key in ("working_dir", "py_modules") else value
-        for key, value in campaign.run.ray.runtime_env.items()
-    }
-    return campaign.replaced(("run", "ray", "runtime_env"), runtime_env)
+    env = campaign.run.ray.runtime_env
+    paths = {key: _absolute(env[key], folder) for key in ("working_dir", "py_modules") if key in env}
+    return campaign.replaced(("run", "ray", "runtime_env"), {**env, **paths})
 
 
 def campaign_of(campaign: Campaign | str | Path) -> Campaign:
@@ -224,6 +219,8 @@ class Places:
 
 FEW_NAMES = 6
 _OTHER_FORMS = "my_av.py:MyClass, package.module:MyClass, my_av.fmu, sumo:MODEL, PANEL.yaml:NAME, or "
+QUICK = {"rhw": 0.3, "below_reference": 0.3}
+"""When a vehicle without a campaign has been tested enough."""
 
 
 def names_a_campaign(path: str | Path) -> bool:
@@ -234,16 +231,12 @@ def names_a_campaign(path: str | Path) -> bool:
     return suffix not in (".py", ".fmu") and (Path(path).exists() or ("/" in text and ":" not in text))
 
 
-QUICK = {"rhw": 0.3, "below_reference": 0.3}
-"""When a vehicle without a campaign has been tested enough."""
-
-
 def _default_campaign(vehicle: str) -> dict[str, Any]:
     place, _, name = vehicle.rpartition(":")
     words = Path(vehicle).stem if vehicle.endswith(".fmu") else f"{Path(place).name.removesuffix('.py')}-{name}"
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", words).strip("-._")
-    kept = {"traces": "crash"}  # for the page's player
-    return {"name": name, "av": named_vehicle(vehicle), "stop": dict(QUICK), "records": kept}
+    av, for_the_player = named_vehicle(vehicle), {"traces": "crash"}
+    return {"name": name, "av": av, "stop": dict(QUICK), "records": for_the_player}
 
 
 def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
@@ -263,8 +256,7 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     panel = load_panel(place or SHIPPED_PANEL).avs
     if name in panel:
         return panel[name].model_dump(exclude_unset=True)
-    models = () if colon else get_args(ModelName)
-    if name in models:
+    if name in (models := () if colon else get_args(ModelName)):
         return {"model": name}
     known = list(dict.fromkeys((*models, *sorted(panel))))
     files = [] if colon else [str(file) for file in Path().glob("*.y*ml")]
@@ -293,46 +285,32 @@ class Panel(Section):
     format: Literal["av-panel"]
     version: Literal[1]
     description: str = ""
-    avs: dict[Annotated[str, Field(pattern=NAME_PATTERN)], AutomatedVehicle] = Field(
-        min_length=1, description="av sections by name"
-    )
+    avs: dict[Annotated[str, Field(pattern=NAME_PATTERN)], AutomatedVehicle] = Field(min_length=1)
+    """av sections by name"""
 
 
 def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:
     """Read a panel, or name all that is wrong with it (`CampaignError`); paths of FMUs become absolute."""
     panel = read_model(path, Panel)
-    avs = {
-        name: av if av.fmu is None else av.replaced(("fmu", "file"), _absolute(av.fmu.file, Path(path).parent))
-        for name, av in panel.avs.items()
-    }
+    avs = dict(panel.avs)
+    for name, av in avs.items():
+        if av.fmu is not None:
+            avs[name] = av.replaced(("fmu", "file"), _absolute(av.fmu.file, Path(path).parent))
     return panel.replaced(("avs",), avs)
 
 
 # -- a file as a model, or every problem by its place --
 
 
-def _one_error(path: str, problems: Sequence[CampaignError]) -> CampaignError:
-    """That of a file with one or more problems, each with its own place."""
-    if len(problems) == 1:
-        return problems[0]
-    at_least = "at least " if len(problems) == MOST_SHOWN else ""
-    error = CampaignError(path, f"{at_least}{len(problems)} problems", "none", "Mend each:")
-    error.problems = tuple(problems)
-    return error
-
-
 def read_model(path: str | Path, model: type[Model], overrides: Sequence[Override] = ()) -> Model:
     """Read a YAML file into a model, or name the path and line of every problem (`CampaignError`)."""
     data, lines = read_yaml(path)
-    return _checked(data, model, Places(str(path), lines, overrides))
+    return validated(data, model, Places(str(path), lines, overrides))
 
 
-def _checked(data: dict[str, Any], model: type[Model], places: Places) -> Model:
-    return validated(apply_overrides(data, places.overrides), model, places.path, places)
-
-
-def validated(data: Any, model: type[Model], path: str, place: Places) -> Model:
-    """Data of a file as a model; a `CampaignError` names every place where they do not fit."""
+def validated(data: dict[str, Any], model: type[Model], place: Places) -> Model:
+    """Data of a file, with its overrides, as a model; a `CampaignError` names every place where they do not fit."""
+    data = apply_overrides(data, place.overrides)
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -340,14 +318,22 @@ def validated(data: Any, model: type[Model], path: str, place: Places) -> Model:
         for details in in_words(error, model).errors(include_url=False):
             parts = details["ctx"]
             where = (*_path_of(details["loc"], data), *filter(None, parts["key"].split(".")))
-            alike = problems.get((where, parts["found"]))
-            expected = parts["expected"]
+            found, expected = parts["found"], parts["expected"]
             # A value of several kinds is refused once for each.
-            if alike is not None and expected not in alike.expected:
+            if (alike := problems.get((where, found))) is not None and expected not in alike.expected:
                 expected = f"{alike.expected} or {expected}"
-            mend = parts["mend"] or _where_it_belongs(str(where[-1]), model)
-            problems[where, parts["found"]] = CampaignError(place(where), parts["found"], expected, mend)
-        raise _one_error(path, list(problems.values())) from None
+            if not (mend := parts["mend"]):  # of an unknown key that resembles none beside it
+                places = dict.fromkeys(each or "the top level" for each in _places_of(str(where[-1]), model, ""))
+                belongs = f"'{where[-1]}' belongs under {' or '.join(places)}."
+                mend = belongs if places else "Delete it, or correct its name."
+            problems[where, found] = CampaignError(place(where), found, expected, mend)
+    first, *more = problems.values()
+    if not more:
+        raise first
+    at_least = "at least " if len(problems) == MOST_SHOWN else ""
+    together = CampaignError(place.path, f"{at_least}{len(problems)} problems", "none", "Mend each:")
+    together.problems = (first, *more)
+    raise together
 
 
 def _path_of(loc: Sequence[str | int], data: Any) -> tuple[str | int, ...]:
@@ -358,14 +344,6 @@ def _path_of(loc: Sequence[str | int], data: Any) -> tuple[str | int, ...]:
             path.append(part)
             data = data[part]
     return tuple(path)
-
-
-def _where_it_belongs(key: str, model: type[BaseModel]) -> str:
-    """How to mend an unknown key that resembles none beside it."""
-    places = list(dict.fromkeys(_places_of(key, model, "")))
-    if places:
-        return f"'{key}' belongs under {' or '.join(place or 'the top level' for place in places)}."
-    return "Delete it, or correct its name."
 
 
 def _places_of(key: str, kind: Any, prefix: str) -> Iterator[str]:

@@ -21,12 +21,10 @@ from pydantic import (
 from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, in_words
 from harness.vocabulary import Method
 
-LARGEST_EXACT_WHOLE_FLOAT = 2.0**53
-
 
 def whole(value: Any) -> Any:
     """Turn ``1e6`` into ``1000000``: YAML reads every number with an exponent as a float."""
-    if isinstance(value, float) and value.is_integer() and abs(value) <= LARGEST_EXACT_WHOLE_FLOAT:
+    if isinstance(value, float) and value.is_integer() and abs(value) <= 2.0**53:  # exact up to there
         return int(value)
     return value
 
@@ -40,7 +38,9 @@ SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
 class Section(BaseModel):
     """A section of the campaign: unknown keys are errors, values never change after loading."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
     @model_validator(mode="wrap")
     @classmethod
@@ -85,26 +85,19 @@ class EnvironmentSettings(Section):
     """The naturalistic driving environment."""
 
     parameters: str = Field("ndd-overtaking-2", description="name of a shipped parameter file, or a path to your own")
-    lane_change_level: Positive = Field(
-        1.0,
-        le=1e8,
-        description="multiplies the cut-in hazard; highD: about 270 (python -m studies traffic)",
-    )
-    acceleration_hold_s: StepTime = Field(
-        1.0, ge=0.1, le=2.0, description="how long a drawn acceleration is held: 1.0 or 0.1"
-    )
-    cut_in_lead_s: LeadTime | None = Field(
-        None,
-        description="time from onset to overlap of every cut-in; none: as the parameters say",
-    )
+    lane_change_level: Positive = Field(1.0, le=1e8)
+    """multiplies the cut-in hazard; highD: about 270 (python -m studies traffic)"""
+    acceleration_hold_s: StepTime = Field(1.0, ge=0.1, le=2.0)
+    """how long a drawn acceleration is held: 1.0 or 0.1"""
+    cut_in_lead_s: LeadTime | None = None
+    """time from onset to overlap of every cut-in; none: as the parameters say"""
 
 
 class CrashSettings(Section):
     """Which crashes count."""
 
-    counts_above_mps: float = Field(
-        0.0, ge=0.0, le=50.0, description="impact speed above which a crash counts, for all drivers"
-    )
+    counts_above_mps: float = Field(0.0, ge=0.0, le=50.0)
+    """impact speed above which a crash counts, for all drivers"""
 
 
 class ShellSettings(Section):
@@ -115,15 +108,10 @@ class ShellSettings(Section):
         description="what stop.rhw or accept is about; library: if the vehicle crashes only inside the library's "
         "boundary, outside of which nothing is tested then",
     )
-    first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = Field(
-        None, description="tests of each shell before any is preferred; none: by its probability"
-    )
-    smallest_round: Whole = Field(
-        1,
-        ge=1,
-        le=10_000,
-        description="fewest tests of a round; raise it for many workers",
-    )
+    first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = None
+    """tests of each shell before any is preferred; none: by its probability"""
+    smallest_round: Whole = Field(1, ge=1, le=10_000)
+    """fewest tests of a round; raise it for many workers"""
 
 
 class Testing(Section):
@@ -134,9 +122,8 @@ class Testing(Section):
         description="shells: cut-ins of a pool; forced: a cut-in in every test; nde: no control; step_mixture: NADE as "
         "published; episode_mixture: one importance function per test",
     )
-    challenge: Literal["immediate", "recursive"] = Field(
-        "recursive", description="immediate: crash if BV cuts in now (published); recursive: backward induction"
-    )
+    challenge: Literal["immediate", "recursive"] = "recursive"
+    """immediate: crash if BV cuts in now (published); recursive: backward induction"""
     epsilon: float = Field(
         0.1,
         ge=1e-6,
@@ -144,9 +131,8 @@ class Testing(Section):
         description="share of natural driving in every importance function; at 0 what no surrogate crashes on would "
         "never be drawn, and the rate be too low",
     )
-    alpha: dict[SurrogateName, Probability] | None = Field(
-        None, description="weight of each surrogate, summing to 1; none: equal"
-    )
+    alpha: dict[SurrogateName, Probability] | None = None
+    """weight of each surrogate, summing to 1; none: equal"""
     defensive_share: float = Field(0.1, gt=0.0, lt=1.0, description="share of forced cut-ins in the episode mixture")
     criticality_threshold: float = Field(0.0, ge=0.0, lt=1.0, description="a moment is critical above it")
     shells: ShellSettings = ShellSettings()
@@ -167,53 +153,35 @@ LEAST_POOL_ERROR, MOST_CUT_INS = 0.001, 1_000_000
 class PoolSettings(Section):
     """The pool of cut-ins that shells are drawn from; built once, in the twin."""
 
-    library: str | None = Field(
-        None, description="name of a shipped surrogate library, or a path to your own; none: the traffic's"
-    )
-    relative_error: float = Field(
-        0.005,
-        ge=LEAST_POOL_ERROR,
-        le=0.2,
-        description="relative standard error of the surrogates' crash rates; four times that beyond the boundary",
-    )
-    events_per_shell: Whole = Field(
-        25_000, ge=100, le=MOST_CUT_INS, description="cut-ins kept of each shell: its most tests"
-    )
-    shadow_paths: Whole = Field(
-        500,
-        ge=50,
-        le=100_000,
-        description="baseline runs of a vehicle that acts before the cut-in",
-    )
-    pilot_tests: Whole = Field(
-        300,
-        ge=0,
-        le=100_000,
-        description="its tests that do not count, from which a surrogate is learned; 0: none",
-    )
-    seed: Whole = Field(
-        1, ge=0, lt=2**63, description="of the pool and of baseline runs, which another seed alone leaves as they are"
-    )
+    library: str | None = None
+    """name of a shipped surrogate library, or a path to your own; none: the traffic's"""
+    relative_error: float = Field(0.005, ge=LEAST_POOL_ERROR, le=0.2)
+    """relative standard error of the surrogates' crash rates; four times that beyond the boundary"""
+    events_per_shell: Whole = Field(25_000, ge=100, le=MOST_CUT_INS)
+    """cut-ins kept of each shell: its most tests"""
+    shadow_paths: Whole = Field(500, ge=50, le=100_000)
+    """baseline runs of a vehicle that acts before the cut-in"""
+    pilot_tests: Whole = Field(300, ge=0, le=100_000)
+    """its tests that do not count, from which a surrogate is learned; 0: none"""
+    seed: Whole = Field(1, ge=0, lt=2**63)
+    """of the pool and of baseline runs, which another seed alone leaves as they are"""
 
 
 class World(Section):
     """Where episodes are simulated."""
 
     engine: Literal["sumo", "twin"] = Field("sumo", description="sumo, or twin: the same motion without SUMO")
-    cells: Whole = Field(
-        64, ge=1, le=4096, description="episodes side by side, in SUMO at most 256; never changes a result"
-    )
+    cells: Whole = Field(64, ge=1, le=4096)
+    """episodes side by side, in SUMO at most 256; never changes a result"""
 
 
 class Records(Section):
     """What is kept of every episode."""
 
-    moments: Literal["all", "first_9", "none"] = Field(
-        "first_9", description="control steps kept: all, first_9 (which scv needs) or none"
-    )
-    traces: Literal["all", "crash", "critical", "none"] = Field(
-        "none", description="episodes whose motion is kept: all, crash, critical or none"
-    )
+    moments: Literal["all", "first_9", "none"] = "first_9"
+    """control steps kept: all, first_9 (which scv needs) or none"""
+    traces: Literal["all", "crash", "critical", "none"] = "none"
+    """episodes whose motion is kept: all, crash, critical or none"""
     trace_share: Probability = Field(0.0, description="share of episodes traced whatever their outcome")
 
 
@@ -221,9 +189,8 @@ class Stop(Section):
     """When the campaign is long enough."""
 
     episodes: Whole = Field(100_000, ge=1, le=10**10, description="most episodes to run")
-    rhw: float | None = Field(
-        None, gt=0.0, lt=10.0, description="stop at this half-width of the interval over the rate; not for step_mixture"
-    )
+    rhw: float | None = Field(None, gt=0.0, lt=10.0)
+    """stop at this half-width of the interval over the rate; not for step_mixture"""
     below_reference: float | None = Field(
         None,
         gt=0.0,
@@ -232,9 +199,8 @@ class Stop(Section):
         "library's first reference driver; not where --set says rhw alone",
     )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
-    min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = Field(
-        None, description="crashes needed before rhw may stop the campaign; none: 100, with shells 1"
-    )
+    min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = None
+    """crashes needed before rhw may stop the campaign; none: 100, with shells 1"""
 
 
 class TimesReference(Section):
@@ -247,9 +213,8 @@ class TimesReference(Section):
 class Accept(Section):
     """A limit: a run of shells ends when it is known on which side of it the rate of testing.shells.statement lies."""
 
-    crash_rate_below: float | None = Field(
-        None, gt=0.0, lt=1.0, description="crashes per test: accepted below it, rejected above"
-    )
+    crash_rate_below: float | None = Field(None, gt=0.0, lt=1.0)
+    """crashes per test: accepted below it, rejected above"""
     times_reference: TimesReference | None = Field(None, description="the same beside a reference driver")
 
     @property
@@ -278,13 +243,11 @@ class Resources(Section):
 class RaySettings(Section):
     """A Ray cluster, used where run.executor is ray."""
 
-    address: str | None = Field(
-        None, description="HOST:6379 or auto; none: $RAY_ADDRESS, else a cluster of this machine"
-    )
+    address: str | None = None
+    """HOST:6379 or auto; none: $RAY_ADDRESS, else a cluster of this machine"""
     resources: Resources = Resources()
-    runtime_env: dict[str, Any] = Field(
-        default_factory=dict, description="Ray's runtime_env: brings the controller's package to the machines"
-    )
+    runtime_env: dict[str, Any] = Field(default_factory=dict)
+    """Ray's runtime_env: brings the controller's package to the machines"""
 
 
 USUAL_SHARD, LARGEST_SHARD = 5_000, 2_000_000
@@ -294,14 +257,11 @@ SHARD_SHARE, LONG_RUN = 32, 2_500_000
 class Run(Section):
     """How the work is spread; nothing here changes a result."""
 
-    shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = Field(
-        None,
-        description="episodes per task; none: 5,000, and more in long runs",
-    )
+    shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = None
+    """episodes per task; none: 5,000, and more in long runs"""
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
-    executor: Literal["local", "ray"] = Field(
-        "local", description="workers run on this machine (local) or on a Ray cluster (ray)"
-    )
+    executor: Literal["local", "ray"] = "local"
+    """workers run on this machine (local) or on a Ray cluster (ray)"""
     ray: RaySettings = RaySettings()
 
     @property

@@ -66,9 +66,8 @@ class TraciProcess(Section):
     command: str = Field(min_length=1, description="starts the program; {port} and {cells} are filled in")
     connect_time_s: Positive = Field(60.0, le=3600.0, description="time it may take to connect")
     restarts: Whole = Field(3, ge=0, le=100, description="times that it is started again when it has ended")
-    allow_public: bool = Field(
-        False, description="run also on a machine with a public address: SUMO's server listens on every address"
-    )
+    allow_public: bool = False
+    """run also on a machine with a public address: SUMO's server listens on every address"""
 
     @field_validator("command")
     @classmethod
@@ -94,13 +93,10 @@ class FmuController(Section):
     """An FMI 2.0 co-simulation FMU as controller."""
 
     file: str = Field(min_length=1, description="path of the .fmu, relative to the campaign file")
-    inputs: dict[str, str] = Field(
-        default_factory=dict,
-        description="input variable of each observation (speed_mps, gap_m, …); empty: inputs named as one",
-    )
-    output: str | None = Field(
-        None, min_length=1, description="output variable that is the acceleration, m/s2; none: the only one"
-    )
+    inputs: dict[str, str] = Field(default_factory=dict)
+    """input variable of each observation (speed_mps, gap_m, …); empty: inputs named as one"""
+    output: str | None = Field(None, min_length=1)
+    """output variable that is the acceleration, m/s2; none: the only one"""
     start_values: dict[str, float] = Field(default_factory=dict, description="values set before initialisation")
 
 
@@ -124,36 +120,24 @@ class AutomatedVehicle(Section):
 
     model: ModelName | None = Field(None, description="built-in driver model, idm where nothing is named")
     controller: str | None = Field(
-        None,
-        pattern=CONTROLLER_PATTERN,
-        examples=["my_av.py:MyClass", "my_package.my_module:MyClass"],
-        description="your own: 'file.py:Class' or 'package.module:Class', or a function step(seen)",
+        None, pattern=CONTROLLER_PATTERN, examples=["my_av.py:MyClass", "my_package.my_module:MyClass"]
     )
-    sumo: dict[str, str | float] | None = Field(
-        None, description="SUMO drives it: carFollowModel and other vType attributes"
-    )
+    """your own: 'file.py:Class' or 'package.module:Class', or a function step(seen)"""
+    sumo: dict[str, str | float] | None = None
+    """SUMO drives it: carFollowModel and other vType attributes"""
     traci: TraciProcess | None = Field(None, description="your program, in any language, as a TraCI client")
     fmu: FmuController | None = Field(None, description="an FMI 2.0 co-simulation FMU")
     parameters: Annotated[BuiltInParameters | dict[str, Any], Parameters] = Field(
-        default_factory=dict,
-        validate_default=True,
-        description="of the built-in model or of the controller",
+        default_factory=dict, validate_default=True
     )
+    """of the built-in model or of the controller"""
     reaction: Reaction = Reaction()
-    before_event: Literal["hold_speed", "controller"] = Field(
-        "hold_speed",
-        description="hold_speed until the cut-in [itsc], or controller: it acts from the start",
-    )
-    takes_over: Literal["first_braking", "onset"] = Field(
-        "first_braking",
-        description="it keeps its speed until it first asks to brake, or BV is on its lane; or until the onset alone",
-    )
-    warm_up_s: StepTime = Field(
-        2.0,
-        ge=0.0,
-        le=60.0,
-        description="time before the cut-in shown to a controller or FMU that keeps its speed; its answers are unused",
-    )
+    before_event: Literal["hold_speed", "controller"] = "hold_speed"
+    """hold_speed until the cut-in [itsc], or controller: it acts from the start"""
+    takes_over: Literal["first_braking", "onset"] = "first_braking"
+    """it keeps its speed until it first asks to brake, or BV is on its lane; or until the onset alone"""
+    warm_up_s: StepTime = Field(2.0, ge=0.0, le=60.0)
+    """time before the cut-in shown to a controller or FMU that keeps its speed; its answers are unused"""
     limits: Limits = Limits()
 
     @property

@@ -10,7 +10,6 @@ from copy import deepcopy
 from functools import cache, partial
 from importlib.util import module_from_spec, spec_from_file_location
 from inspect import Parameter, Signature, isfunction, signature
-from multiprocessing.connection import Connection
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar, get_type_hints
@@ -83,23 +82,19 @@ def _of_file(file: Path) -> ModuleType:
 
 
 def build_host(
-    av: AutomatedVehicle,
-    *,
-    n_cells: int,
-    seed: int,
-    before_test: BeforeTest = lambda _: None,
+    av: AutomatedVehicle, *, n_cells: int, seed: int, before_test: BeforeTest = lambda _: None
 ) -> ControllerHost | None:
     """Host of the AV's controller, or None for an AV that needs none (built in, or driven by SUMO).
 
     Raises `CampaignError`: the controller cannot be found or made, or is of neither kind.
     """
-    if av.source not in ("controller", "fmu"):
+    if not has_foreign_code(av):
         return None
-    guard = Guard(av.limits)
+    told = av, seed, (guard := Guard(av.limits)), before_test
     if av.fmu is not None:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
-        return VehicleHost(fmu_maker(av.fmu), n_cells, av, seed, guard, before_test)
+        return VehicleHost(*told, fmu_maker(av.fmu), n_cells)
     try:
         make = _maker(av)
         guard.restore_modes()
@@ -111,9 +106,7 @@ def build_host(
         found = f"{av.controller}, of which looking at its attributes fails ({cause_of(error)})"
         mend = "Mend what is raised: a __getattr__ raises AttributeError for what is not there."
         raise CampaignError("av.controller", found, "a controller (see docs/controllers.md)", mend) from error
-    if is_batch:
-        return BatchHost(first, av, seed, guard, before_test)
-    return VehicleHost(make, n_cells, av, seed, guard, before_test, first)
+    return BatchHost(*told, first) if is_batch else VehicleHost(*told, make, n_cells, first)
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
@@ -161,9 +154,10 @@ def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any],
     if isfunction(found) and not _is_controller(made) and first is not None and first.default is Parameter.empty:
         return lambda **parameters: SimpleNamespace(step=partial(found, **parameters)), {first.name: None}
     _require_controller(made, name)
-    loads = isinstance(found, type) and "loaded" in takes and callable(getattr(found, "load", None))
-    handed = {"loaded": None} if loads else {}
-    if isinstance(found, type) and "traci" in takes and not _is_batch(found):
+    if not isinstance(found, type):
+        return found, {}
+    handed = {"loaded": None} if "loaded" in takes and callable(getattr(found, "load", None)) else {}
+    if "traci" in takes and not _is_batch(found):
         return partial(StepListenerController, found), {"traci": None, **handed}
     return found, handed
 
@@ -223,7 +217,7 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
 
     Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process.
     """
-    child = Child(_work_and_tell, work, arguments)
+    child = Child(tell, partial(work, *arguments))
     try:
         answer = first_to_answer([child]).answer()
     finally:
@@ -233,10 +227,6 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
         mend = "Look for os._exit, a crash of compiled code, or a shortage of memory; then check again."
         raise AvEndedProcessError(f"av.{av.source}", found, "a controller that returns or raises", mend)
     return answer  # type: ignore[no-any-return]
-
-
-def _work_and_tell(connection: Connection, work: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-    tell(connection, partial(work, *arguments))
 
 
 def require_controller(av: AutomatedVehicle) -> str | None:

@@ -63,7 +63,7 @@ def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
         mend = "Export it again, and try 'fmpy validate' on it."
         raise CampaignError("av.fmu.file", found, "an FMI 2.0 co-simulation FMU", mend) from error
     if not str(description.fmiVersion).startswith("2.") or description.coSimulation is None:
-        kind = "co-simulation" if description.coSimulation is not None else "model exchange"
+        kind = "model exchange" if description.coSimulation is None else "co-simulation"
         found = f"{fmu.file}, for FMI {description.fmiVersion} {kind}"
         mend = "Export the model as a co-simulation FMU of that version."
         raise CampaignError("av.fmu.file", found, "FMI 2.0 co-simulation", mend)
@@ -120,11 +120,10 @@ def _unpack(archive: zipfile.ZipFile, folder: Path) -> None:
 def wire(fmu: FmuController, description: Any) -> Wiring:
     """Check ``av.fmu`` against the FMU's variables: a `CampaignError` names the key, and what there is."""
     connected = fmu.inputs or _by_name(fmu, description)
-    for name in connected:
-        if name not in OBSERVATIONS:
-            expected = f"one of {', '.join(OBSERVATIONS)}"
-            mend = did_you_mean(name, list(OBSERVATIONS)) or "The values are the FMU's input variables."
-            raise CampaignError(f"av.fmu.inputs.{name}", "no such observation", expected, mend)
+    for name in sorted(connected.keys() - OBSERVATIONS.keys()):
+        expected = f"one of {', '.join(OBSERVATIONS)}"
+        mend = did_you_mean(name, list(OBSERVATIONS)) or "The values are the FMU's input variables."
+        raise CampaignError(f"av.fmu.inputs.{name}", "no such observation", expected, mend)
     inputs = [_reference(f"av.fmu.inputs.{key}", name, description, ("input",)) for key, name in connected.items()]
     starts = [_reference("av.fmu.start_values", name, description, ("parameter", "input", "local", "output"))
               for name in fmu.start_values]  # fmt: skip
@@ -166,28 +165,22 @@ class FmuVehicleController:
 
     def __init__(self, wiring: Wiring, description: Any, folder: Path) -> None:
         self._wiring = wiring
-        self._instance = {
-            "guid": description.guid,
-            "modelIdentifier": description.coSimulation.modelIdentifier,
-            "unzipDirectory": str(folder),
-        }
+        known_as = {"guid": description.guid, "modelIdentifier": description.coSimulation.modelIdentifier}
+        self._instance = {**known_as, "unzipDirectory": str(folder)}
         self._fmu: Any = None
         self._begun = False
 
     def start(self, episode: EpisodeStart) -> None:  # noqa: ARG002 - FMI has no random stream to hand over
         """Forget the last episode; the instance is set up with the first observation."""
-        if self._fmu is not None and self._begun:
-            self._forget()
-        self._begun = False
-
-    def _forget(self) -> None:
         from fmpy.fmi1 import FMICallException  # noqa: PLC0415 - an extra
 
-        try:
-            self._fmu.terminate()
-            self._fmu.reset()
-        except FMICallException:
-            self.close()
+        if self._begun:
+            try:
+                self._fmu.terminate()
+                self._fmu.reset()
+            except FMICallException:
+                self.close()
+        self._begun = False
 
     def _begin(self, time_s: float) -> None:
         from fmpy.fmi2 import FMU2Slave  # noqa: PLC0415 - an extra

@@ -12,6 +12,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import parent_process
 from pathlib import Path
@@ -81,18 +82,13 @@ def cause_of(error: BaseException) -> str:
         text = f"{type(error).__name__}: {error}"
     except BaseException as again:  # noqa: BLE001 - whatever a user's code raises
         text = f"{type(error).__name__}, whose text raised {type(again).__name__}"
-    if _of_another_traci(error):
+    origin = error.name if isinstance(error, ImportError) else type(error).__module__
+    if (origin or "").partition(".")[0] in ("traci", "libsumo"):  # not what stands for it here
         text = f"{text.rstrip('.')}. Use the traci that is handed in (docs/controllers.md), not the module"
     asked = type(error.obj) if isinstance(error, AttributeError) else object
     if isinstance(error, AttributeError) and asked.__module__.startswith("harness."):
         text += f". {did_you_mean(error.name, [name for name in dir(asked) if name[0] != '_'])}".rstrip(". ")
     return text.encode("utf-8", "backslashreplace").decode().splitlines()[0][:500] + _place_of(error)
-
-
-def _of_another_traci(error: BaseException) -> bool:
-    """Whether a script has asked the module traci, or libsumo, instead of what stands for it here."""
-    origin = error.name if isinstance(error, ImportError) else type(error).__module__
-    return (origin or "").partition(".")[0] in ("traci", "libsumo")
 
 
 NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), "<"
@@ -237,45 +233,45 @@ def optional(name: str, *arguments: Any) -> Callable[[Any], None]:
     return lambda controller: getattr(controller, name, lambda *_: None)(*arguments)
 
 
-class _Host:
-    """What both hosts are told: the campaign's seed, who makes the calls, and when the loop asks."""
+@dataclass
+class Host:
+    """What both hosts are told: the vehicle, the campaign's seed, who makes the calls, and who is told of tests."""
 
-    def __init__(self, av: AutomatedVehicle, seed: int, guard: Guard, before_test: BeforeTest) -> None:
-        self.acts_before_event, self.warm_up_steps = av.acts_before_event, av.warm_up_steps
-        self.cruises = av.takes_over == "first_braking"
-        self._seed, self._guard, self._before_test = seed, guard, before_test
-        self.require_untouched, self.construction_s = guard.require_untouched, guard.construction_s
+    av: AutomatedVehicle
+    seed: int
+    guard: Guard
+    before_test: BeforeTest
+
+    def __post_init__(self) -> None:
+        self.acts_before_event, self.warm_up_steps = self.av.acts_before_event, self.av.warm_up_steps
+        self.cruises = self.av.takes_over == "first_braking"
+        self.require_untouched, self.construction_s = self.guard.require_untouched, self.guard.construction_s
 
 
-class VehicleHost(_Host):
+@dataclass
+class VehicleHost(Host):
     """One controller object per cell, made by ``make``; the ``first``, if there is one already, is that of cell 0."""
 
-    def __init__(
-        self,
-        make: Callable[[], VehicleController],
-        n_cells: int,
-        av: AutomatedVehicle,
-        seed: int,
-        guard: Guard,
-        before_test: BeforeTest,
-        first: VehicleController | None = None,
-    ) -> None:
-        super().__init__(av, seed, guard, before_test)
-        self._make = make
-        self._controllers: list[VehicleController | None] = [first, *[None] * (n_cells - 1)]
+    make: Callable[[], VehicleController]
+    n_cells: int
+    first: VehicleController | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._controllers: list[VehicleController | None] = [self.first, *[None] * (self.n_cells - 1)]
 
     def start(self, cells: IntArray, episodes: IntArray, announced: IntArray, set_speed_mps: FloatArray) -> Failures:
         """Begin episodes, ``announced`` to their controllers under these indices; returns those that failed at once."""
         failures = {}
-        with self._guard:
+        with self.guard:
             begun = cells.tolist(), episodes.tolist(), announced.tolist(), set_speed_mps.tolist()
             for k, episode, index, set_speed in zip(*begun, strict=True):
-                wrong = self._before_test(episode)
+                wrong = self.before_test(episode)
                 if wrong is None and self._controllers[k] is None:
-                    self._controllers[k], wrong = self._guard.call(self._make, makes=True)
+                    self._controllers[k], wrong = self.guard.call(self.make, makes=True)
                 if wrong is None:
-                    start = EpisodeStart(index, STEP_S, controller_random(self._seed, index), set_speed)
-                    _, wrong = self._guard.call(optional("start", start), self._controllers[k])
+                    start = EpisodeStart(index, STEP_S, controller_random(self.seed, index), set_speed)
+                    _, wrong = self.guard.call(optional("start", start), self._controllers[k])
                 if wrong is not None:
                     failures[k] = f"start: {wrong}"
                     self._drop(k)
@@ -289,8 +285,8 @@ class VehicleHost(_Host):
         answer = np.zeros(observation.cell.size)
         failures = {}
         rows = zip(*(column.tolist() for column in observation), strict=True)
-        call, check = self._guard.call, None if warms_up else self._guard.acceleration
-        with self._guard:
+        call, check = self.guard.call, None if warms_up else self.guard.acceleration
+        with self.guard:
             for i, (k, _, *seen) in enumerate(rows):
                 if (controller := self._controllers[k]) is None:
                     continue  # its episode has failed in this turn's start
@@ -305,11 +301,11 @@ class VehicleHost(_Host):
     def _drop(self, k: int) -> None:
         """A controller that failed is not used again: its next episode gets a new one."""
         controller, self._controllers[k] = self._controllers[k], None
-        self._guard.close([controller])
+        self.guard.close([controller])
 
     def close(self) -> None:
         """Release all controllers."""
-        self._guard.end(self._controllers)
+        self.guard.end(self._controllers)
         self._controllers[:] = [None] * len(self._controllers)
 
 
@@ -332,25 +328,22 @@ def _numbers(n: int, answer: Any) -> tuple[FloatArray | None, str | None]:
     return found.astype(np.float64), None
 
 
-class BatchHost(_Host):
+@dataclass
+class BatchHost(Host):
     """One controller object for all cells. A fault that cannot be laid at one cell's door fails all that were asked."""
 
-    def __init__(
-        self, controller: BatchController, av: AutomatedVehicle, seed: int, guard: Guard, before_test: BeforeTest
-    ) -> None:
-        super().__init__(av, seed, guard, before_test)
-        self._controller = controller
+    controller: BatchController
 
     def start(self, cells: IntArray, episodes: IntArray, announced: IntArray, _set_speed_mps: FloatArray) -> Failures:
         """As `VehicleHost.start`."""
-        causes = [self._before_test(episode) for episode in episodes.tolist()]
+        causes = [self.before_test(episode) for episode in episodes.tolist()]
         failures = {k: f"start: {cause}" for k, cause in zip(cells.tolist(), causes, strict=True) if cause is not None}
         sound = np.array([cause is None for cause in causes])
         cells, announced = cells[sound], announced[sound]
-        random = [controller_random(self._seed, index) for index in announced.tolist()]
-        with self._guard:
+        random = [controller_random(self.seed, index) for index in announced.tolist()]
+        with self.guard:
             begin = optional("start_batch", read_only(cells), read_only(announced), random)
-            _, wrong = self._guard.call(begin, self._controller)
+            _, wrong = self.guard.call(begin, self.controller)
         return failures if wrong is None else failures | dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")
 
     def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:
@@ -358,20 +351,20 @@ class BatchHost(_Host):
         n, cells = observation.cell.size, observation.cell
 
         def ask() -> Any:
-            answer = self._controller.step_batch(observation)
+            answer = self.controller.step_batch(observation)
             return np.zeros(n) if warms_up else answer
 
-        with self._guard:
-            answer, wrong = self._guard.call(ask, check=partial(_numbers, n))
+        with self.guard:
+            answer, wrong = self.guard.call(ask, check=partial(_numbers, n))
         if wrong is not None:
             call = "step_batch, warming up" if warms_up else "step_batch"
             return np.zeros(n), dict.fromkeys(cells.tolist(), f"{call}: {wrong}")
-        outside = self._guard.outside(answer).tolist()
-        return answer, {int(cells[i]): f"step_batch: {self._guard.acceleration(answer[i])[1]}" for i in outside}
+        outside = self.guard.outside(answer).tolist()
+        return answer, {int(cells[i]): f"step_batch: {self.guard.acceleration(answer[i])[1]}" for i in outside}
 
     def close(self) -> None:
         """As `VehicleHost.close`."""
-        self._guard.end([self._controller])
+        self.guard.end([self.controller])
 
 
 ControllerHost = VehicleHost | BatchHost

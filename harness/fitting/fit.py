@@ -124,7 +124,7 @@ def _environment(
     steps[-1] = {"value": 1.0, "source": "assumed", "note": "the hazard is fitted where nobody closes in"}
     counted = {"events": seen.events.tolist(), "exposure": list(map(_rounded, seen.exposure.tolist()))}
     tables["acceptance_steps"] = {"ttc_s": edges, "share": steps, **counted}
-    return validated({**content, **tables}, EnvironmentParameters, where, Places(where, {}))
+    return validated({**content, **tables}, EnvironmentParameters, Places(where, {}))
 
 
 def replicates(fit: Fit, n: int, seed: int, progress: Progress) -> dict[str, FloatArray]:

@@ -58,13 +58,11 @@ class Library(Section):
     assumes: str = Field(
         "", description='what that assumes, as the end of a sentence that begins with "If this vehicle"'
     )
-    envelope: SurrogateName = Field(
-        description="a driver at constant full throttle: it crashes wherever any vehicle within its acceleration does"
-    )
+    envelope: SurrogateName
+    """a driver at constant full throttle: it crashes wherever any vehicle within its acceleration does"""
     surrogates: dict[SurrogateName, LibraryDriver] = Field(description="drivers by name")
-    references: dict[SurrogateName, LibraryDriver] = Field(
-        default_factory=dict, description="drivers that the vehicle is compared with; no shell is made of them"
-    )
+    references: dict[SurrogateName, LibraryDriver] = Field(default_factory=dict)
+    """drivers that the vehicle is compared with; no shell is made of them"""
 
     _counts_above_mps: float = PrivateAttr(0.0)
 

@@ -38,7 +38,7 @@ from harness.errors import CampaignError, WorldDisagreementError
 from harness.processes import end
 from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import AVLostError
-from harness.worlds.sumo import NEVER_PLAN_S, OBEY, PLAN_NOW_S, SumoCells, sumo_program
+from harness.worlds.sumo import NEVER_PLAN_S, OBEY, SumoCells, sumo_program
 from harness.worlds.twin import advance
 
 HARNESS_ORDER = 2
@@ -287,12 +287,7 @@ class TraciWorld(SumoCells):
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
         """Take the AVs of these cells back under command."""
         program = self._running()
-        to = program.connection.vehicle
-        for k in cells.tolist():
-            for vehicle in self._in_order(k, lane[k]):
-                there = float(x[k, vehicle]), float(v[k, vehicle]), int(lane[k, vehicle])
-                program.answer(partial(self._move, to, k, vehicle, *there))
-        self.x[cells], self.v[cells], self.lane[cells] = x[cells], v[cells], lane[cells]
+        program.answer(lambda: self._put(program.connection.vehicle, cells, x, v, lane))
         self._released[cells] = self.acts_before_event
 
     def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
@@ -303,11 +298,11 @@ class TraciWorld(SumoCells):
         """
         program = self._running()
         api = program.connection
-        changing = self._changes(lane)
+        meets = (lane != self.lane).any(1)
         commanded = np.ones_like(self.x, np.bool_)
         commanded[self._released, -1] = False
         try:
-            program.answer(lambda: self._command(api, commanded, speed, lane))
+            changing = program.answer(lambda: self._command(api, commanded, speed, lane))
             program.answer(api.simulationStep)
             program.require_connected()
             contact = program.answer(lambda: self._contacts(api.simulation.getCollisions))
@@ -315,17 +310,18 @@ class TraciWorld(SumoCells):
             raise _meddled("a vehicle of the harness", str(error), "a vehicle that is there") from error
         self.lane[:] = lane
         self._read(api.vehicle.getAllSubscriptionResults(), speed, commanded)
-        for k, vehicle in changing:
-            program.answer(partial(api.vehicle.setActionStepLength, self._names[k][vehicle], NEVER_PLAN_S, True))
-            self._released[k] = True
+        for name, _ in changing:
+            program.answer(partial(self._plan_every, api.vehicle, NEVER_PLAN_S, name))
+        self._released |= meets
         return contact
 
-    def _command(self, api: BatchConnection, commanded: BoolArray, speed: FloatArray, lane: Int8Array) -> None:
-        for k, vehicle in self._changes(lane):
-            api.vehicle.setActionStepLength(self._names[k][vehicle], PLAN_NOW_S, True)
-            api.vehicle.changeLane(self._names[k][vehicle], int(lane[k, vehicle]), 0.0)
+    def _command(
+        self, api: BatchConnection, commanded: BoolArray, speed: FloatArray, lane: Int8Array
+    ) -> list[tuple[str, int]]:
+        changing = self._change_lanes(api.vehicle, lane)
         told = np.flatnonzero(commanded)
         api.set_speeds([self._flat[i] for i in told.tolist()], speed.ravel()[told].tolist())
+        return changing
 
     def _read(self, found: dict[str, Any], speed: FloatArray, commanded: BoolArray) -> None:
         """Compare what was commanded with where it is, and take over where the program's AVs are."""

@@ -42,7 +42,7 @@ def open_shim(names: Sequence[str], told: FloatArray, x: FloatArray, v: FloatArr
         library.shim_error.argtypes = library.shim_close.argtypes = [_POINTER]
     except (OSError, AttributeError):
         return None  # built for another machine, or by an earlier version
-    encoded = (ctypes.c_char_p * len(names))(*(name.encode() for name in names))
+    encoded = (ctypes.c_char_p * len(names))(*map(str.encode, names))
     handle = library.shim_open(inner.__file__.encode(), encoded, ctypes.c_long(len(names)))
     return Shim(library, handle, told, x, v) if handle else None
 

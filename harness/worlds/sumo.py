@@ -92,13 +92,17 @@ class SumoCells(World):
     def _is_av(self, vehicle: int) -> bool:
         return vehicle == len(self.vehicles) - 1
 
-    def _in_order(self, k: int, lane: Int8Array) -> list[int]:
-        """In which order a cell's vehicles are moved to the beginning of a test: who changes lanes for it comes last.
+    def _put(self, to: Any, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
+        """Move the vehicles of the given cells (n,) to ``x[cells]``, at ``v[cells]``, on ``lane[cells]``.
 
-        SUMO does not sort its list of a lane again when a vehicle is moved within it; one from another lane it puts at
-        the right place.
+        Who changes lanes for it comes last: SUMO does not sort its list of a lane again when a vehicle is moved within
+        it; one from another lane it puts at the right place.
         """
-        return sorted(range(len(self.vehicles)), key=lambda vehicle: bool(lane[vehicle] != self.lane[k, vehicle]))
+        for k, at, driving in zip(cells.tolist(), x[cells].tolist(), v[cells].tolist(), strict=True):
+            changes = (lane[k] != self.lane[k]).tolist()
+            for vehicle in sorted(range(len(changes)), key=changes.__getitem__):
+                self._move(to, k, vehicle, at[vehicle], driving[vehicle], int(lane[k, vehicle]))
+        self.x[cells], self.v[cells], self.lane[cells] = x[cells], v[cells], lane[cells]
 
     def _move(self, to: Any, k: int, vehicle: int, x: float, v: float, lane: int) -> None:
         name = self._names[k][vehicle]
@@ -106,11 +110,18 @@ class SumoCells(World):
         to.setPreviousSpeed(name, v)
         to.setSpeed(name, v)
 
-    def _changes(self, lane: Int8Array) -> list[tuple[int, int]]:
-        """Cell and place of those who change to other lanes (K, V) in this step."""
+    def _change_lanes(self, to: Any, lane: Int8Array) -> list[tuple[str, int]]:
+        """Let those who change to other lanes (K, V) in this step do so: their names and lanes."""
         if lane.tobytes() == self.lane.tobytes():  # in most steps, and ten times faster to see
             return []
-        return [(k, vehicle) for k, vehicle in np.argwhere(lane != self.lane).tolist()]
+        changing = [(self._names[k][i], int(lane[k, i])) for k, i in np.argwhere(lane != self.lane).tolist()]
+        for name, other in changing:
+            self._plan_every(to, PLAN_NOW_S, name)
+            to.changeLane(name, other, 0.0)
+        return changing
+
+    def _plan_every(self, to: Any, seconds: float, name: str) -> None:
+        to.setActionStepLength(name, seconds, True)
 
     def _contacts(self, get_collisions: Callable[[], Iterable[Any]]) -> BoolArray:
         """Cells with a collision in this step.
@@ -218,30 +229,16 @@ class SumoWorld(SumoCells):
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
         """Positions and speeds are read back and compared."""
-        positions, speeds = x[cells], v[cells]
-        for k, at, driving in zip(cells.tolist(), positions.tolist(), speeds.tolist(), strict=True):
-            for vehicle in self._in_order(k, lane[k]):
-                self._move(self._api.vehicle, k, vehicle, at[vehicle], driving[vehicle], int(lane[k, vehicle]))
-        self.x[cells], self.v[cells], self.lane[cells], self._told[cells] = positions, speeds, lane[cells], speeds
+        self._put(self._api.vehicle, cells, x, v, lane)
+        self._told[cells] = v[cells]
         names = [name for k in cells.tolist() for name in self._names[k]]
-        self._require_equal("m", self._get_position, positions, names)
-        self._require_equal("m/s", self._get_speed, speeds, names)
+        self._require_equal("m", self._get_position, x[cells], names)
+        self._require_equal("m/s", self._get_speed, v[cells], names)
 
     def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
-        changing = [(self._names[k][vehicle], int(lane[k, vehicle])) for k, vehicle in self._changes(lane)]
-        for name, to in changing:
-            self._plan_every(PLAN_NOW_S, name)
-            self._api.vehicle.changeLane(name, to, 0.0)
+        changing = self._change_lanes(self._api.vehicle, lane)
         advance(self.x, self.v, speed)
-        if self._shim is not None:
-            if not self._shim.step(speed):
-                self._read_released()
-                # Libsumo's getters are asked again only where the shim has read other values than are wanted now.
-                if not np.array_equal(self._shim.position, self.x.ravel()):
-                    self._require_equal("m", self._get_position, self.x)
-                if not np.array_equal(self._shim.speed, self.v.ravel()):
-                    self._require_equal("m/s", self._get_speed, self.v)
-        else:
+        if self._shim is None:
             self._tell(speed)
             self._simulation_step(0.0)
             self._read_released()
@@ -249,8 +246,15 @@ class SumoWorld(SumoCells):
             self._n_steps += 1
             if self._n_steps % SPEED_CHECK_STEPS == 0:
                 self._require_equal("m/s", self._get_speed, self.v)
+        elif not self._shim.step(speed):
+            self._read_released()
+            # Libsumo's getters are asked again only where the shim has read other values than are wanted now.
+            if not np.array_equal(self._shim.position, self.x.ravel()):
+                self._require_equal("m", self._get_position, self.x)
+            if not np.array_equal(self._shim.speed, self.v.ravel()):
+                self._require_equal("m/s", self._get_speed, self.v)
         for name, to in changing:
-            self._plan_every(NEVER_PLAN_S, name)
+            self._plan_every(self._api.vehicle, NEVER_PLAN_S, name)
             if (found := self._api.vehicle.getLaneIndex(name)) != to:
                 raise _disobeyed(f"{name}, lane", found, to)
         self.lane[:] = lane
@@ -266,9 +270,9 @@ class SumoWorld(SumoCells):
         deque(map(self._set_speed, names, speed[changed].tolist()), maxlen=0)
         self._told[:] = speed
 
-    def _plan_every(self, seconds: float, name: str) -> None:
+    def _plan_every(self, to: Any, seconds: float, name: str) -> None:
         if not self._vanilla:
-            self._api.vehicle.setActionStepLength(name, seconds, True)
+            super()._plan_every(to, seconds, name)
 
     def _require_equal(
         self, unit: str, getter: Callable[[str], float], expected: FloatArray, names: Sequence[str] | None = None

@@ -254,16 +254,8 @@ class Learned(IDM):
     def __init__(self, loaded, braking):
         super().__init__()
         self.loaded, self.braking = loaded, braking
-        self.made.append(self)
-
-
-class ChangesItsParameters(IDM):
-    made = []
-
-    def __init__(self, braking):
-        super().__init__()
         braking.append(0.01)
-        self.made.append(braking)
+        self.made.append(self)
 
 
 class RaisesInClose(IDM):

@@ -12,7 +12,7 @@ from harness.cli import main
 from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.runner.workers import LocalWorkers
-from tests.controllers.misbehaving import ChangesItsParameters, Learned
+from tests.controllers.misbehaving import Learned
 from tests.stored_runs import sets, stored_table
 from tests.worlds.running import drive, forced
 
@@ -219,7 +219,7 @@ def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, c
     assert (tmp_path / "run").exists() == (at == "step")
 
 
-def test_what_is_loaded_is_loaded_once_a_process_and_shared(tmp_path):
+def test_what_is_loaded_is_loaded_once_a_process_and_shared_and_nothing_else_is(tmp_path):
     av = forced(f"av={_of('Learned', note=str(tmp_path / 'note'), braking=[1.0])}").av
     host = build_host(av, n_cells=3, seed=1)
     assert host.start(*3 * (np.arange(3),), np.zeros(3)) == {}
@@ -227,6 +227,8 @@ def test_what_is_loaded_is_loaded_once_a_process_and_shared(tmp_path):
     assert (tmp_path / "note").read_text() == "loaded 3\n"
     assert len({id(each.loaded) for each in made}) == 1
     assert len({id(each.braking) for each in made}) == 3
+    assert [each.braking for each in made] == [[1.0, 0.01]] * 3  # each changes a list of its own
+    assert av.parameters["braking"] == [1.0]
     assert (len(host.construction_s), len(Learned.made)) == (3, 3)  # the first of all is that of a cell
     host.close()
 
@@ -304,13 +306,3 @@ def test_nothing_that_a_batch_controller_is_handed_can_be_written_into(field):
     failures = {k: without_place(cause) for k, cause in failures.items()}
     call = "start_batch" if field in ("cells", "episodes") else "step_batch, warming up"
     assert failures == dict.fromkeys(range(24), f"{call}: ValueError: assignment destination is read-only")
-
-
-def test_controllers_do_not_share_the_lists_among_their_parameters():
-    av = forced(f"av={_of('ChangesItsParameters', braking=[1.0])}").av
-    hosts = [build_host(av, n_cells=3, seed=1) for _ in range(2)]
-    for host in hosts:
-        assert host.start(*3 * (np.arange(3),), np.zeros(3)) == {}
-        host.close()
-    assert ChangesItsParameters.made[-6:] == [[1.0, 0.01]] * 6
-    assert av.parameters == {"braking": [1.0]}

@@ -166,7 +166,7 @@ def test_tests_of_one_baseline_run_that_begin_together_have_streams_of_their_own
         def close(self): ...
 
     av = forced(EARLY).av
-    host = BatchHost(Draws(), av, 7, Guard(av.limits), lambda _: None)
+    host = BatchHost(av, 7, Guard(av.limits), lambda _: None, Draws())
     assert host.start(np.arange(3), np.arange(3), np.array([3, 5, 3]), np.zeros(3)) == {}
     host.close()
     np.testing.assert_array_equal(seen[0], seen[2])

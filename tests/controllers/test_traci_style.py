@@ -6,9 +6,10 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
-from harness.controllers import traci_style
+from harness.controllers import traci_facade
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_style import StepListenerController, Traci, TraciStyleController
+from harness.controllers.traci_facade import Traci
+from harness.controllers.traci_style import StepListenerController, TraciStyleController
 
 
 def seen(time_s=0.0, speed=20.0, *lateral, bv_lane=0, lead_speed=20.0):
@@ -95,7 +96,7 @@ def test_questions_about_neighbours_and_subscriptions_are_answered_as_sumo_does(
     assert vehicle.getSubscriptionResults("LV") == {}
     with pytest.raises(traci.TraCIException, match="Variable 0x60 of vehicles is not known here"):
         vehicle.subscribe("AV", [constants.VAR_CO2EMISSION])
-    for number in traci_style._VARIABLES:
+    for number in traci_facade._VARIABLES:
         vehicle.subscribe("AV", [number])
         assert list(vehicle.getSubscriptionResults("AV")) == [number]
     assert traci.simulation.getCollidingVehiclesIDList() == traci.simulation.getCollisions() == ()
@@ -212,3 +213,12 @@ def test_a_step_listener_is_removed_when_it_says_so():
         assert [controller.step(seen(0.1 * i)) for i in range(3)] == pytest.approx([-10.0] * 3)
     assert Twice.log == [0.0, 0.1, "clean"]
     assert told == []  # each episode's listener has parameters of its own
+
+
+def test_before_the_first_step_what_moves_is_not_known_and_all_else_is():
+    vehicle = Traci(31.0).vehicle
+    vehicle.subscribe("AV")
+    assert (vehicle.getMaxSpeed("AV"), vehicle.getLength("BV"), vehicle.getLaneIndex("LV")) == (31.0, 5.0, 1)
+    for name in ("getSpeed", "getAcceleration", "getPosition", "getLeader"):
+        with pytest.raises(traci_facade.TraCIException, match="not known before the first step"):
+            getattr(vehicle, name)("AV")
