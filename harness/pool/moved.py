@@ -126,9 +126,9 @@ def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
     return found
 
 
-def environment_with(there: Resolved, parameters: Any, values: Mapping[str, float]) -> Environment | None:
+def environment_with(there: Resolved, values: Mapping[str, float]) -> Environment | None:
     """The traffic ``there`` with other numbers; None where they give no laws."""
-    return there.family.traffic_with(there.campaign.environment, parameters, values)
+    return there.family.traffic_with(there.campaign.environment, there.parameters, values)
 
 
 def assumed_in(resolved: Resolved, design: ShellDesign | None, progress: Progress) -> dict[str, Any] | None:
@@ -136,8 +136,7 @@ def assumed_in(resolved: Resolved, design: ShellDesign | None, progress: Progres
     if design is not None and not resolved.campaign.has_baseline_runs:
         found = assumed(resolved, campaign_pool(resolved, progress), design, progress)
     else:
-        parameters = resolved.family.parameters(resolved.campaign.environment)
-        found = Assumed(parameters.unseen) if parameters.unseen else None
+        found = Assumed(resolved.parameters.unseen) if resolved.parameters.unseen else None
     return None if found is None else asdict(found)
 
 
@@ -147,10 +146,9 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
     That is the range that is stated for who does not look, or shares of lane changes at times to collision where none
     was seen, which are anything up to what that many vehicles without one refuse.
     """
-    parameters = traffic.family.parameters(traffic.campaign.environment)
-    if (left := traffic.family.left_open(parameters)) is None:
+    if (left := traffic.family.left_open(traffic.parameters)) is None:
         return None
-    ends = [environment_with(traffic, parameters, each) for each in left.ends]
+    ends = [environment_with(traffic, each) for each in left.ends]
     if None in ends:
         return None
     paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)

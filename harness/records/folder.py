@@ -10,7 +10,7 @@ import json
 import os
 import tempfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +23,10 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened
 from harness.files import checksum, write_atomically
-from harness.records.schemas import ShardTables
 
 T = TypeVar("T")
+Tables = Mapping[str, pa.Table | None]
+"""Tables of the same tests, by name; None where the campaign keeps none."""
 
 MANIFEST = "manifest.json"
 CAMPAIGN = "campaign.yaml"
@@ -33,6 +34,8 @@ SHELLS = "shells.json"
 SENSITIVITY = "sensitivity.json"
 """Strata of a shells campaign, as its estimates need them."""
 TABLES = ("episodes", "moments", "traces")
+SHADOW, PILOT = BEFORE = ("shadow", "pilot")
+"""Tables of what comes before tests that count: baseline runs, which keep their first name, and pilot tests."""
 MEND_PART = "Delete this file and run again with --resume: the same tests are made anew."
 SEAL = "crc32"
 """Key of a JSON file's checksum."""
@@ -144,12 +147,11 @@ def parquet(table: pa.Table) -> bytes:
     return sink.getvalue().to_pybytes()  # type: ignore[no-any-return]
 
 
-def write_part(folder: Path, shards: Sequence[ShardTables], first: int, n: int) -> Part:
+def write_part(folder: Path, shards: Sequence[Tables], first: int, n: int) -> Part:
     """Write tables of consecutive tests, a file for each that has rows; they count once a manifest lists them."""
     files = {}
-    for name in TABLES:
-        kept = [table for shard in shards if (table := getattr(shard, name)) is not None and table.num_rows]
-        if kept:
+    for name in shards[0]:
+        if kept := [table for shard in shards if (table := shard[name]) is not None and table.num_rows]:
             path = f"{name}/{first:09d}-{first + n:09d}.parquet"
             content = parquet(concatenated(kept, folder))
             write_bytes(folder / path, content)
@@ -157,10 +159,10 @@ def write_part(folder: Path, shards: Sequence[ShardTables], first: int, n: int) 
     return Part(first, n, files)
 
 
-def remove_unlisted(folder: Path, parts: Sequence[Part]) -> None:
+def remove_unlisted(folder: Path, parts: Iterable[Part]) -> None:
     """Remove files of tables that no part lists."""
     listed = {folder / file.path for part in parts for file in part.files.values()}
-    for table in TABLES:
+    for table in (*TABLES, *BEFORE):
         for path in set((folder / table).glob("*.parquet")) - listed:
             path.unlink()
 
@@ -290,9 +292,8 @@ class StoredManifest(Stored):
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
     repeated: Repeated | None = None
-    baseline_crc32: list[Count] = []
     pilot_tests: dict[str, Count] | None = None
-    pilot_crc32: list[Count] = []
+    before: dict[str, Part] = {}
 
 
 def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
@@ -302,7 +303,7 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
         expected = "a run folder, which holds a manifest.json"
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     found = read_as(StoredManifest, path, mend=mend)
-    return {**found.model_dump(exclude_unset=True, exclude={"parts"}), "parts": found.parts}
+    return {**found.model_dump(exclude_unset=True), "parts": found.parts, "before": found.before}
 
 
 def read_as(kind: type[T], path: Path, *, mend: str) -> T:

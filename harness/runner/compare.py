@@ -27,7 +27,6 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import ended_by
 from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
 from harness.estimators.stopping import PairRule
-from harness.families import family_named
 from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
@@ -120,7 +119,7 @@ def compare_campaigns(
         "to_decide": _to_decide(sides[0].campaign, rounds, pairs),
         "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
         "ended": ended_by(a, rule, found["n_pairs"]),
-        "unseen": family_named(a.scenario).parameters(a.environment).unseen,
+        "unseen": sides[0].parameters.unseen,
     }
     code = EXIT_DONE if rule.ended else EXIT_BUDGET_SPENT
     if margin is not None:

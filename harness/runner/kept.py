@@ -11,7 +11,7 @@ import platform
 import time
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib import metadata
@@ -21,12 +21,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from harness.campaign.campaign import Campaign
 from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
+    PILOT,
+    SHADOW,
     SHELLS,
     TABLES,
     Part,
@@ -44,6 +47,7 @@ from harness.records.origin import signature
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult, finished
+from harness.sampling.baseline import BaselineResult
 from harness.sampling.protocol import ShardRequest, Source
 
 SMALLEST_FAILED_SAMPLE = 200
@@ -51,6 +55,8 @@ SMALLEST_FAILED_SAMPLE = 200
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
 _INTERVAL_S, _SHARE = 5.0, 0.05
 """Time between two writes, and the share of the time that they may take."""
+COUNTED = {SHADOW: "shadow_runs", PILOT: "pilot_tests"}
+"""Keys of how many there were of what comes before tests."""
 PART_TESTS, PART_ROWS = 50_000, 2_000_000
 """Tests, or rows of all tables, from which on they go on in other files: so many are kept in memory."""
 
@@ -121,6 +127,9 @@ class Run:
     n_crashes: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     repeated: Repeated | None = None
+    before: Mapping[str, tuple[pa.Table, ...]] = field(default_factory=dict)
+    """What comes before tests that count, by table; ``parts_before`` are written, by an earlier run if need be."""
+    parts_before: Mapping[str, Part] = field(default_factory=dict)
     wrote: tuple[float, float] = (0.0, 0.0)
     """When it was written last, and how long that took (s)."""
     is_named: bool = False
@@ -165,10 +174,17 @@ class Run:
         run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
         if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or run.n_rows >= PART_ROWS:
             return replace(run.written(), open=(), n_rows=0)
+        return run if run.is_behind else run.written_if_due()
+
+    def with_baseline(self, name: str, result: BaselineResult) -> Run:
+        """The next baseline runs or pilot tests, written as tests are."""
+        before = {**self.before, name: (*self.before.get(name, ()), result.table)}
+        return replace(self, before=before).written_if_due()
+
+    def written_if_due(self) -> Run:
+        """All that there is, every few seconds."""
         when, took = self.wrote
-        if run.is_behind or time.monotonic() - when < max(_INTERVAL_S, took / _SHARE):
-            return run
-        return run.written()
+        return self if time.monotonic() - when < max(_INTERVAL_S, took / _SHARE) else self.written()
 
     def written(self, status: str = "running", **of_the_end: Any) -> Run:
         """All that there is, and the manifest with it."""
@@ -176,25 +192,32 @@ class Run:
         run = self._kept()
         if status == "done" or not run.is_behind:
             run._write_manifest(run.content(status, **of_the_end))
-            remove_unlisted(run.folder, run.parts)
+            remove_unlisted(run.folder, [*run.parts, *run.parts_before.values()])
             run = replace(run, is_named=True)
         return replace(run, wrote=(time.monotonic(), time.monotonic() - began))
 
     def _kept(self) -> Run:
         """The last part as far as it goes, in the place of one that held less of it."""
+        parts_before = dict(self.parts_before)
+        for name, tables in self.before.items():
+            n = sum(table.num_rows for table in tables)
+            if name not in parts_before or n > parts_before[name].n_episodes:
+                parts_before[name] = write_part(self.folder, [{name: table} for table in tables], 0, n)
         if not self.open:
-            return self
+            return replace(self, parts_before=parts_before)
         first = self.open[0].request.first_episode
         listed = [part for part in self.earlier.parts if (part.first_episode, part.end) == (first, self.n_episodes)]
         if any(shard.is_new for shard in self.open) or not listed:
-            listed = [write_part(self.folder, [shard.tables for shard in self.open], first, self.n_episodes - first)]
-        return replace(self, parts=(*(part for part in self.parts if part.first_episode < first), *listed))
+            listed = [
+                write_part(self.folder, [each.tables._asdict() for each in self.open], first, self.n_episodes - first)
+            ]
+        parts = (*(part for part in self.parts if part.first_episode < first), *listed)
+        return replace(self, parts=parts, parts_before=parts_before)
 
     def require_few_failed(self, *, at_least: int = 0) -> None:
         """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many."""
         if self.n_episodes >= at_least:
-            most = self.resolved.campaign.run.max_failed_share
-            require_few_failed(self.failures.total(), self.n_episodes, self.failures, most)
+            require_few_failed(self.failures, self.n_episodes, self.resolved.campaign)
 
     def content(self, status: str, **of_the_end: Any) -> dict[str, Any]:
         """What the manifest says."""
@@ -210,10 +233,13 @@ class Run:
             "wall_time_s": round(time.monotonic() - self.began, 3),
             "n_episodes": self.n_episodes,
             "parts": self.parts,
+            "before": self.parts_before,
+            **{key: _counted(self.before[name]) for name, key in COUNTED.items() if name in self.before},
         }
 
     def _write_manifest(self, content: dict[str, Any]) -> None:
-        content = {**content, "parts": [asdict(part) for part in self.parts]}
+        before = {name: asdict(part) for name, part in self.parts_before.items()}
+        content = {**content, "parts": [asdict(part) for part in self.parts], "before": before}
         if not self.is_named:
             # Until it is there no checksum is told: not of the old one, nor of this.
             write_sealed(self.folder / MANIFEST, {**content, "campaign_crc32": None})
@@ -242,7 +268,14 @@ def take_over(
         **facts,
     }
     began -= float(earlier.get("wall_time_s") or 0.0)
-    return Run(folder, resolved, source, Earlier(folder, earlier), began, of_run).written()
+    gone = [name for name, part in earlier["before"].items() if not (folder / part.files[name].path).exists()]
+    before = {name: part for name, part in earlier["before"].items() if name not in gone}
+    return Run(folder, resolved, source, Earlier(folder, earlier), began, of_run, parts_before=before).written()
+
+
+def _counted(tables: Sequence[pa.Table]) -> dict[str, int]:
+    failed = [len(table) - table.column("failure").null_count for table in tables]
+    return {"n_runs": sum(map(len, tables)), "n_failed": sum(failed)}
 
 
 def versions() -> dict[str, str]:
@@ -260,14 +293,14 @@ def cpu_name() -> str:
 
 
 def require_few_failed(
-    n_failed: int, n: int, causes: Counter[str], most: float, what: str = "episodes", where: str = "the episodes table"
+    causes: Counter[str], n: int, campaign: Campaign, what: str = "episodes", where: str = "the episodes table"
 ) -> None:
-    """Refuse (`TooManyFailedError`) an answer where more than the share ``most`` of tests, or ``what`` else, failed."""
-    if n_failed > most * n:
+    """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
+    if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in causes.most_common(1))
         raise TooManyFailedError(
             "run.max_failed_share",
-            f"{n_failed} of {n} {what} failed{cause}",
+            f"{causes.total()} of {n} {what} failed{cause}",
             f"a share of at most {most:g}",
             "Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
             f"are in the column 'failure' of {where}.",
@@ -286,7 +319,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
 
     require_place(folder)
     if not folder.exists() or not any(folder.iterdir()):
-        return {"n_episodes": 0, "parts": []}
+        return {"n_episodes": 0, "parts": [], "before": {}}
     elsewhere = "Choose another folder with --out."
     if not (folder / MANIFEST).exists():
         expected = "a new or empty folder, or one that a run has left"

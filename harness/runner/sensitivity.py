@@ -21,7 +21,6 @@ from harness.arguments import checked
 from harness.errors import CampaignError
 from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
-from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.families.cut_in.unseen import as_if_unseen
 from harness.progress import Progress
@@ -66,7 +65,7 @@ def sensitivity(
     tested = StoredShells.of(folder, progress, _OPTION)
     require_shares(tested)
     settings = tested.here.campaign.environment
-    parameters = load_parameters(settings)
+    parameters = tested.here.parameters
     asked = list(moves(settings.parameters, parameters, ranges or {}))
     if not asked:
         found = f"{settings.parameters}, of which no number has a standard error (se) or a range"

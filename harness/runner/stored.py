@@ -233,7 +233,7 @@ def _replay(
     """Row and trace of the episode, run again."""
     source = prepare(resolved)
     if source.baseline_paths is not None:
-        begin(source, partial(read_stored, folder, source.baseline_paths, read_manifest(folder)))
+        begin(source, partial(read_stored, folder, source.baseline_paths, read_manifest(folder)["before"]))
     require_same_pool(folder, source)
     options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
     world = build_world(resolved.campaign, 1, in_sumo=gui or fcd is not None, gui=gui, options=options)

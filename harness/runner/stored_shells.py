@@ -193,8 +193,7 @@ class Elsewhere:
 
         Of a vehicle whose shares may change with it, the factor is that of its upper limit.
         """
-        parameters = self.traffic.family.parameters(self.traffic.campaign.environment)
-        traffic = [environment_with(self.traffic, parameters, row) for row in rows]
+        traffic = [environment_with(self.traffic, row) for row in rows]
         known = [each for each in traffic if each is not None]
         progress.stage("other traffic", len(known))
         tested, p, shares = self.tested, self.design.p, reference_shares(self.tested.design)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -16,6 +15,7 @@ from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
 from harness.report.page import write_report
+from harness.sampling.baseline import run_baseline
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.conftest import SHELLS
@@ -29,6 +29,7 @@ from tests.stored_runs import (
     part_files,
     stored_table,
     unlike_columns,
+    with_fewer_before,
 )
 
 SHADOWS, TWIN = "pool.shadow_paths=120", "world.engine=twin"
@@ -44,26 +45,37 @@ def files_of(folder):
 
 
 ACTS = "shells-acting-twin"
-"""Its shadow runs are in two files."""
+"""Sixty shadow runs, in two tasks."""
 
 
 def test_a_run_that_was_interrupted_goes_on_where_it_was(stored_run, tmp_path):
     """Ended in the middle of the shadow runs, and again among the tests: the end is that of a run in one go."""
     out = copy_of(stored_run(ACTS), tmp_path / "run")
-    tables = [pq.read_table(path) for path in files_of(out)]
-    assert [table.num_rows for table in tables] == [50, 10]
-    assert all(table.schema.equals(baseline_schema(CUT_IN.columns)) for table in tables)
-    for table in ("episodes", "traces"):
-        shutil.rmtree(out / table)
-    files_of(out)[1].unlink()
-    kept = files_of(out)[0].stat().st_mtime_ns
-    edit(out, n_episodes=0, parts=[], status="interrupted")
-    run_golden(golden(ACTS), out, resume=True)
+    [table] = [pq.read_table(path) for path in files_of(out)]
+    assert table.num_rows == 60
+    assert table.schema.equals(baseline_schema(CUT_IN.columns))
+    with_fewer_before(out, "shadow", 50)
+    files_of(out)[-1].unlink()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("harness.runner.workers.run_baseline", driven := Driven())
+        run_golden(golden(ACTS), out, resume=True)
+    assert driven.first == [50]
     assert unlike_columns(stored_run(ACTS), out) == []
-    assert files_of(out)[0].stat().st_mtime_ns == kept
+    assert len(files_of(out)) == 1
     part_files(out)[-1].unlink()
     run_golden(golden(ACTS), out, resume=True)
     assert unlike_columns(stored_run(ACTS), out) == []
+
+
+class Driven:
+    """Baseline runs as they are, noting which."""
+
+    def __init__(self):
+        self.first = []
+
+    def __call__(self, loop, paths, resolved, request):
+        self.first.append(request.first_episode)
+        return run_baseline(loop, paths, resolved, request)
 
 
 AS_NEEDED = "av.controller=examples.acting:CarefulAsNeeded"
@@ -75,16 +87,12 @@ def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_
     run_golden(campaign, out)
     assert "learned" in json.loads((out / "shells.json").read_text())["strata"]
     assert "pilot tests" in estimates(out)["estimates"]["shells"]["details"]["learned"]
-    pilot = sorted((out / "pilot").glob("*.parquet"))
-    assert sum(pq.read_table(file).num_rows for file in pilot) == manifest(out)["pilot_tests"]["n_runs"] >= 300
+    [pilot] = (out / "pilot").glob("*.parquet")
+    assert pq.read_table(pilot).num_rows == manifest(out)["pilot_tests"]["n_runs"] >= 300
     learned = [row for row in stored_table(out, "episodes").to_pylist() if row["outcome"] == "crash"]
     assert replay(out, learned[-1]["episode"]).bit_equal
     assert estimate(out)["estimates"]["shells"]["crash_rate"] == estimates(out)["estimates"]["shells"]["crash_rate"]
-    copy_of(out, other)
-    for table in ("episodes", "traces"):
-        shutil.rmtree(other / table)
-    (other / "pilot" / pilot[-1].name).unlink()
-    edit(other, n_episodes=0, parts=[], status="interrupted")
+    with_fewer_before(copy_of(out, other), "pilot", 200)
     run_golden(campaign, other, resume=True)
     assert unlike_columns(out, other) == []
 
@@ -176,10 +184,10 @@ def test_a_forced_test_fails_where_its_shadow_run_did(campaign, run_here, tmp_pa
 def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
     folder = copy_of(stored_run(ACTS), tmp_path / "run")
     files_of(folder)[0].write_bytes(b"PAR1")
-    with pytest.raises(RunFolderError, match=r"shard-000000\.parquet.*Delete this file"):
+    with pytest.raises(RunFolderError, match=r"shadow/000000000-000000060\.parquet.*Delete this file"):
         replay(folder, 5)
     files_of(folder)[0].unlink()
-    with pytest.raises(RunFolderError, match="baseline runs of 1 of 2 files"):
+    with pytest.raises(RunFolderError, match="0 baseline runs; expected all 60"):
         replay(folder, 5)
     assert estimate(folder) == estimates(folder)  # needs no path
 
