@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened
-from harness.files import checksum, write_atomically
+from harness.files import write_atomically
 
 T = TypeVar("T")
 Tables = Mapping[str, pa.Table | None]
@@ -124,20 +124,11 @@ def _seal(values: Mapping[str, Any]) -> int:
     return zlib.crc32(json.dumps(values, ensure_ascii=False).encode())
 
 
-def require_unchanged(path: Path, crc32: int | None, mend: str) -> None:
-    """Refuse (`RunFolderError`) a file whose bytes are not those that the manifest tells of; None where it does not."""
-    try:
-        found = None if crc32 is None else checksum(path)
-    except OSError as error:
-        raise damaged(path, error, mend) from error
-    require_sum(path, crc32, found, mend)
-
-
-def require_sum(path: Path, crc32: int | None, found: int | None, mend: str) -> None:
-    """Refuse (`RunFolderError`) a file that was ``found`` with another checksum than the manifest tells of, if any."""
-    if crc32 is not None and found != crc32:
+def require_sum(path: Path, crc32: int | None, content: bytes, mend: str) -> None:
+    """Refuse (`RunFolderError`) a file whose ``content`` has another checksum than the manifest tells of, if any."""
+    if crc32 is not None and (found := zlib.crc32(content)) != crc32:
         expected = f"{crc32:08x} (manifest.json): the file as the run has left it"
-        raise RunFolderError(str(path), f"a changed or damaged file: checksum {found or 0:08x}", expected, mend)
+        raise RunFolderError(str(path), f"a changed or damaged file: checksum {found:08x}", expected, mend)
 
 
 def parquet(table: pa.Table) -> bytes:
@@ -182,13 +173,12 @@ def read_table(
     """
     try:
         content = path.read_bytes()
-        require_sum(path, crc32, zlib.crc32(content), mend)
+        require_sum(path, crc32, content, mend)
         source = pa.BufferReader(content)
         if rows is not None:
             return pq.read_table(source, columns=columns, filters=rows, partitioning=None)
-        with pq.ParquetFile(
-            source, page_checksum_verification=crc32 is None
-        ) as file:  # faster than read_table by a millisecond
+        # Faster than read_table by a millisecond.
+        with pq.ParquetFile(source, page_checksum_verification=crc32 is None) as file:
             table = file.read(columns, use_threads=file.metadata.num_rows > ROWS_FOR_THREADS)
     except (OSError, pa.ArrowException, KeyError, UnicodeDecodeError) as error:
         raise damaged(path, error, mend) from error
@@ -198,11 +188,7 @@ def read_table(
 
 
 def read_kept(
-    folder: Path,
-    part: Part,
-    table: str,
-    columns: list[str] | None = None,
-    rows: pc.Expression | None = None,
+    folder: Path, part: Part, table: str, columns: list[str] | None = None, rows: pc.Expression | None = None
 ) -> pa.Table:
     """One table of a part, as the manifest lists it; see `read_table`."""
     file = part.files[table]

@@ -34,7 +34,7 @@ from harness.records.folder import (
     read_as,
     read_kept,
     read_manifest,
-    require_unchanged,
+    require_sum,
 )
 from harness.records.schemas import traces_schema
 from harness.vocabulary import IntArray
@@ -46,7 +46,7 @@ TableName = Literal["episodes", "moments", "traces"]
 
 _MOST_SHELLS = 128
 """More than an int8 counts."""
-_READERS = 2
+N_READERS = 2
 """Threads; each holds a part."""
 _WEIGHT = pa.field(
     "weight", pa.float64(), metadata={"unit": "1", "doc": "the mean of weight times crash is the crash rate"}
@@ -67,7 +67,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
         expected = "a campaign with all its sections, as the run has written it"
         raise RunFolderError(str(path), found, expected, mend) from error
     crc32 = manifest.get("campaign_crc32")
-    require_unchanged(path, crc32, mend)
+    require_sum(path, crc32, path.read_bytes(), mend)
     if crc32 is None:  # its run was killed as it began
         with suppress(CampaignError):  # its environment file is gone: nobody can tell
             parameters = family_named(campaign.scenario).parameters(campaign.environment)
@@ -94,11 +94,6 @@ def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment |
     return family.traffic(campaign.environment, parameters) if known else None
 
 
-def read_parts(folder: Path, columns: list[str] | None = None) -> Iterator[pa.Table]:
-    """Episodes of every part that the manifest lists, see `read_part`."""
-    yield from made_ahead(partial(read_part, folder, columns=columns), read_manifest(folder)["parts"], _READERS)
-
-
 def read_part(folder: Path, part: Part, columns: list[str] | None = None) -> pa.Table:
     """Episodes of one part, which must be as many as the manifest says; all columns by default."""
     episodes = read_kept(folder, part, "episodes", columns)
@@ -109,22 +104,16 @@ def read_part(folder: Path, part: Part, columns: list[str] | None = None) -> pa.
     return episodes
 
 
-def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> pa.Table | None:
+def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) -> pa.Table | None:
     """Trace rows of a few episodes; None where none of them was traced."""
     wanted = pc.field("episode").isin(sorted(episodes))
     tables = [
-        read_kept(folder, part, "traces", columns, wanted)
-        for part in read_manifest(folder)["parts"]
+        read_kept(folder, part, "traces", rows=wanted)
+        for part in parts
         if "traces" in part.files and any(part.first_episode <= episode < part.end for episode in episodes)
     ]
     found = [table for table in tables if table.num_rows]
     return concatenated(found, folder) if found else None
-
-
-def stored_columns(folder: Path) -> set[str]:
-    """Columns of the episodes table of a run; none if it has no test."""
-    parts = read_manifest(folder)["parts"]
-    return set(read_kept(folder, parts[0], "episodes").column_names) if parts else set()
 
 
 class TableSize(NamedTuple):
@@ -136,9 +125,8 @@ class TableSize(NamedTuple):
     n_bytes: int
 
 
-def table_sizes(folder: Path) -> list[TableSize]:
+def table_sizes(parts: Sequence[Part]) -> list[TableSize]:
     """Files, rows and bytes per table."""
-    parts = read_manifest(folder)["parts"]
     kept = {table: [part.files[table] for part in parts if table in part.files] for table in TABLES}
     return [
         TableSize(table, len(files), sum(file.n_rows for file in files), sum(file.n_bytes for file in files))
@@ -214,7 +202,7 @@ class StoredRun:
         if weighed and (self.folder / SHELLS).is_file():
             components = (read(part, columns=["component"])["component"] for part in parts)
             per_shell = np.sum([np.bincount(shells, minlength=_MOST_SHELLS) for shells in components], axis=0)
-        for piece in made_ahead(partial(read, columns=needed), parts, _READERS):
+        for piece in made_ahead(partial(read, columns=needed), parts, N_READERS):
             if not weighed:
                 yield piece
                 continue

@@ -17,7 +17,7 @@ from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.numbers import count, leaves, number
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
-from harness.records.reader import table_sizes, traffic_of
+from harness.records.reader import table_sizes
 from harness.report.crashes import crash_gallery
 from harness.report.drawing import Plot
 from harness.report.notes import note_words
@@ -32,7 +32,7 @@ PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")
 
 @checked("harness.write_report")
 def write_report(folder: str | Path) -> Path:
-    """Write ``report.html`` and ``plots/`` (SVG) into a run folder, and return the page.
+    """Write ``report.html`` and ``plots/`` (SVG) into a run folder anew, and return the page.
 
     The page is self-contained: it can be mailed, archived and opened offline. The same folder gives the same bytes if
     it is reached from the working directory by the same relative path, by which the commands on the page name it;
@@ -41,9 +41,12 @@ def write_report(folder: str | Path) -> Path:
 
     Raises `RunFolderError`: if the folder misses a file, or a file is damaged or belongs to another run.
     """
-    folder = Path(folder)
-    run = read_run_folder(folder)
-    sizes, summary, traffic = table_sizes(folder), summarise(run), traffic_of(run.campaign, run.manifest)
+    return write_page(read_run_folder(Path(folder)))
+
+
+def write_page(run: RunFolder) -> Path:
+    """Write the page of a run in hand: none of its files is read but traces of crashes."""
+    folder, summary, traffic = run.path, summarise(run), run.traffic
     plots = _plots(run, summary, traffic)
     gallery, scenes = crash_gallery(run, summary, traffic)
     environment, answer = templates(), short_answer(run.campaign, run.manifest, run.estimates)
@@ -52,7 +55,7 @@ def write_report(folder: str | Path) -> Path:
         run=run,
         answer=answer,
         summary=summary,
-        sizes=sizes,
+        sizes=table_sizes(run.manifest["parts"]),
         gallery=gallery,
         scenes=scenes,
         figures={plot.name: plot for plot in plots},

@@ -45,8 +45,9 @@ from harness.records.folder import (
 )
 from harness.records.origin import signature
 from harness.records.schemas import ShardTables
+from harness.records.shown import ShownTests
 from harness.resolved import Resolved
-from harness.runner.workers import ShardResult, finished
+from harness.runner.workers import ShardResult
 from harness.sampling.baseline import BaselineResult
 from harness.sampling.protocol import ShardRequest, Source
 
@@ -62,22 +63,13 @@ PART_TESTS, PART_ROWS = 50_000, 2_000_000
 
 
 class Earlier:
-    """What an earlier run has left in a folder: its manifest, and its tests by their index, one part read at a time."""
+    """The tests that an earlier run has left in a folder: ``parts`` of them, of which one is read at a time."""
 
     def __init__(self, folder: Path, manifest: Mapping[str, Any]) -> None:
-        self.manifest, self._folder = manifest, folder
+        self._folder = folder
+        self.parts: list[Part] = manifest["parts"]
+        self.n_episodes: int = manifest["n_episodes"]
         self._read: tuple[Part, dict[str, pa.Table] | None] | None = None
-
-    @property
-    def n_episodes(self) -> int:
-        """How many tests it has left."""
-        return int(self.manifest["n_episodes"])
-
-    @property
-    def parts(self) -> list[Part]:
-        """Their files, in order."""
-        found: list[Part] = self.manifest["parts"]
-        return found
 
     def tables(self, first: int, n: int) -> ShardTables | None:
         """Tables of consecutive tests; None where there are not so many, or one of their files is gone.
@@ -89,8 +81,12 @@ class Earlier:
             return None
         tables: dict[str, pa.Table | None] = dict.fromkeys(TABLES)
         for name in TABLES:
-            if kept := [_between(part[name], first, first + n) for part in found if part is not None and name in part]:
-                tables[name] = pa.concat_tables(kept)
+            for part in found:
+                if part is not None and name in part:
+                    index = part[name].column("episode").to_numpy()
+                    low, high = np.searchsorted(index, (first, first + n)).tolist()
+                    rows = part[name].slice(low, high - low)
+                    tables[name] = rows if tables[name] is None else pa.concat_tables([tables[name], rows])
         return ShardTables(**tables)
 
     def _tables(self, part: Part) -> dict[str, pa.Table] | None:
@@ -98,11 +94,6 @@ class Earlier:
             there = all((self._folder / file.path).exists() for file in part.files.values())
             self._read = part, {name: read_kept(self._folder, part, name) for name in part.files} if there else None
         return self._read[1]
-
-
-def _between(table: pa.Table, first: int, end: int) -> pa.Table:
-    low, high = np.searchsorted(table.column("episode").to_numpy(), (first, end)).tolist()
-    return table.slice(low, high - low)
 
 
 @dataclass(frozen=True)
@@ -122,6 +113,8 @@ class Run:
     parts: tuple[Part, ...] = ()
     open: tuple[ShardResult, ...] = ()
     blocks: tuple[Block, ...] = ()
+    shown: tuple[ShownTests, ...] = ()
+    """What the page shows of them."""
     n_rows: int = 0
     """Of all tables of those that are open."""
     n_crashes: int = 0
@@ -153,7 +146,7 @@ class Run:
         tables = self.earlier.tables(request.first_episode, request.n_episodes)
         if tables is None or not self.source.is_shard(request, tables.episodes):
             return None
-        return replace(finished(self.source, request, tables), is_new=False)
+        return ShardResult(request, tables, self.source.block(tables), is_new=False)
 
     def noting(self, **facts: Any) -> Run:
         """More keys of the manifest."""
@@ -166,7 +159,8 @@ class Run:
             self,
             open=(*self.open, shard),
             blocks=(*self.blocks, replace(shard.block, drawn=drawn)),
-            n_rows=self.n_rows + shard.tables.n_rows,
+            shown=(*self.shown, ShownTests.of(shard.tables.episodes, self.resolved.family)),
+            n_rows=self.n_rows + sum(table.num_rows for table in shard.tables if table is not None),
             n_crashes=self.n_crashes + int(shard.block.crash.sum()),
             failures=self.failures + shard.failures,
             repeated=self.repeated or shard.repeated,
@@ -191,7 +185,14 @@ class Run:
         began = time.monotonic()
         run = self._kept()
         if status == "done" or not run.is_behind:
-            run._write_manifest(run.content(status, **of_the_end))
+            before = {name: asdict(part) for name, part in run.parts_before.items()}
+            content = run.content(status, **of_the_end)
+            content |= {"parts": [asdict(part) for part in run.parts], "before": before}
+            if not run.is_named:
+                # Until it is there no checksum is told: not of the old one, nor of this.
+                write_sealed(run.folder / MANIFEST, {**content, "campaign_crc32": None})
+                write_bytes(run.folder / CAMPAIGN, dump_campaign(run.resolved.campaign).encode())
+            write_sealed(run.folder / MANIFEST, content)
             remove_unlisted(run.folder, [*run.parts, *run.parts_before.values()])
             run = replace(run, is_named=True)
         return replace(run, wrote=(time.monotonic(), time.monotonic() - began))
@@ -234,17 +235,8 @@ class Run:
             "n_episodes": self.n_episodes,
             "parts": self.parts,
             "before": self.parts_before,
-            **{key: _counted(self.before[name]) for name, key in COUNTED.items() if name in self.before},
+            **{COUNTED[name]: _counted(tables) for name, tables in self.before.items()},
         }
-
-    def _write_manifest(self, content: dict[str, Any]) -> None:
-        before = {name: asdict(part) for name, part in self.parts_before.items()}
-        content = {**content, "parts": [asdict(part) for part in self.parts], "before": before}
-        if not self.is_named:
-            # Until it is there no checksum is told: not of the old one, nor of this.
-            write_sealed(self.folder / MANIFEST, {**content, "campaign_crc32": None})
-            write_bytes(self.folder / CAMPAIGN, dump_campaign(self.resolved.campaign).encode())
-        write_sealed(self.folder / MANIFEST, content)
 
 
 def take_over(
@@ -268,9 +260,9 @@ def take_over(
         **facts,
     }
     began -= float(earlier.get("wall_time_s") or 0.0)
-    gone = [name for name, part in earlier["before"].items() if not (folder / part.files[name].path).exists()]
-    before = {name: part for name, part in earlier["before"].items() if name not in gone}
-    return Run(folder, resolved, source, Earlier(folder, earlier), began, of_run, parts_before=before).written()
+    listed = earlier["before"].items()
+    there = {name: part for name, part in listed if (folder / part.files[name].path).exists()}
+    return Run(folder, resolved, source, Earlier(folder, earlier), began, of_run, parts_before=there).written()
 
 
 def _counted(tables: Sequence[pa.Table]) -> dict[str, int]:

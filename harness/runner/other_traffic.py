@@ -132,10 +132,9 @@ def compare_in_other_traffic(
     if (found := _replicated(moved, confidence, progress)) is None:
         expected = "an environment that names replicates, as `harness fit` writes them"
         raise CampaignError(OPTION, f"{environment}, which names none", expected, "Compare in that environment.")
+    below = found.unseen is None
     a, b = (
-        found.uncertain(
-            of["crash_rate"], (of["ci_low"], of["ci_high"]), found.times(side), from_below=found.unseen is None
-        )
+        found.uncertain(of["crash_rate"], (of["ci_low"], of["ci_high"]), found.times(side), from_below=below)
         for side, of in enumerate((told["a"], told["b"]))
     )
     moves, ratios = found.times(0) / found.times(1), {}

@@ -27,7 +27,7 @@ from harness.campaign.sections import RaySettings
 from harness.compiled import source_hash
 from harness.controllers.find import require_controller
 from harness.errors import CampaignError, HarnessError
-from harness.processes import WorkerDeath, fit_to_travel, handlers_restored, usable_cpus
+from harness.processes import WorkerDeath, fit_to_travel, usable_cpus
 from harness.resolved import Resolved
 from harness.runner.kept import cpu_name
 from harness.runner.workers import (
@@ -39,6 +39,7 @@ from harness.runner.workers import (
     Workers,
 )
 from harness.sampling import source_of
+from harness.signals import handlers_restored
 
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""

@@ -6,10 +6,10 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
@@ -23,6 +23,7 @@ from harness.files import remove_unfinished
 from harness.pool.moved import assumed_in
 from harness.progress import Progress
 from harness.records.folder import SHELLS, StoppedBy, parquet, sole_use, write_sealed
+from harness.records.shown import ShownTests
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import (
     Run,
@@ -39,6 +40,9 @@ from harness.sampling import prepare
 from harness.sampling.baseline import IN_WORDS, begin, stored_baseline, stored_table
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
+
+if TYPE_CHECKING:
+    from harness.report.summary import RunFolder
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
 ESTIMATES = "estimates.json"
@@ -58,6 +62,8 @@ class RunResult:
     estimates: dict[str, Any]
     stopped_by: StoppedBy
     exit_code: int
+    shown: RunFolder = field(repr=False)
+    """What its page is made of."""
 
 
 @checked("harness.run")
@@ -189,11 +195,15 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     ended = {"stopped_by": stopped_by, "unmet": rule.look.unmet, **decided}
     run = run.written("done", **ended)
     progress.stage("writing estimates and report", None)
-    estimates = estimate_blocks(even(run.blocks), campaign, run.content("done", **ended))
+    manifest = run.content("done", **ended)
+    estimates = estimate_blocks(even(run.blocks), campaign, manifest)
     write_sealed(run.folder / ESTIMATES, estimates)
-    from harness.report.page import write_report  # noqa: PLC0415
+    from harness.report.page import write_page  # noqa: PLC0415 - draws
+    from harness.report.summary import RunFolder  # noqa: PLC0415
 
-    return RunResult(run.folder, write_report(run.folder), estimates, stopped_by, code)
+    tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
+    shown = RunFolder.of(run.folder, campaign, manifest, estimates, tests, traffic)
+    return RunResult(run.folder, write_page(shown), estimates, stopped_by, code, shown)
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:

@@ -25,7 +25,7 @@ from harness.files import write_atomically
 from harness.processes import SharedFile, made_ahead
 from harness.records.folder import CAMPAIGN, Part, no_episodes, read_kept, read_manifest
 from harness.records.origin import require_trust
-from harness.records.reader import read_campaign, read_part, require_campaign, traffic_of
+from harness.records.reader import N_READERS, read_campaign, read_part, require_campaign, traffic_of
 from harness.records.schemas import moments_schema, shard_tables
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
@@ -38,8 +38,6 @@ from harness.worlds.system_libraries import require_libraries
 
 FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
 """Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
-_READERS = 2
-"""Threads; each holds a part."""
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
@@ -88,7 +86,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
         return block_of(campaign, read_part(folder, part, needed), steps, design)
 
     n = 0
-    for block in made_ahead(read, manifest["parts"], _READERS):
+    for block in made_ahead(read, manifest["parts"], N_READERS):
         if block.first_episode != n:
             raise _incomplete(folder, f"a part that begins at episode {block.first_episode}", f"episode {n}")
         counted = block.take(slice(0, n_counted - n))

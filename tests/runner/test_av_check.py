@@ -16,6 +16,7 @@ from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import CampaignError
 from harness.records.folder import read_manifest
+from harness.report.av_check import cause, rows, verdict
 from harness.runner.look import check_av
 from harness.runner.stored import replay_episode, suspects
 from tests.pool.test_vehicle_pool import ACTING
@@ -153,7 +154,7 @@ def test_the_built_in_idm_is_fine():
 
 
 @pytest.mark.parametrize(
-    ("name", "cause"),
+    ("name", "why"),
     [
         ("Steady", ""),
         ("Noisy", ""),
@@ -166,9 +167,9 @@ def test_the_built_in_idm_is_fine():
         ("OfItsProcess", "It differs from process to process: "),
     ],
 )
-def test_a_controller_that_is_not_reproduced_is_found_out(name, cause):
-    found, differs = check(name), bool(cause)
-    assert cause in found.likely_cause
+def test_a_controller_that_is_not_reproduced_is_found_out(name, why):
+    found, differs = check(name), bool(why)
+    assert why in cause(found)
     assert (found.exit_code, bool(found.differing), bool(found.failures)) == (3 if differs else 0, differs, False)
     if name == "Steady":
         did = found.behaviour
@@ -188,7 +189,7 @@ def test_a_controller_that_is_not_reproduced_is_found_out(name, cause):
 def test_what_winds_up_in_a_longer_warm_up_is_seen(overrides, moves):
     found = check("WindsUp", *overrides)
     assert found.exit_code == 0
-    assert ("LOOK AGAIN" in found.verdict and "winds up" in found.verdict) == bool(moves)
+    assert ("LOOK AGAIN" in verdict(found) and "winds up" in verdict(found)) == bool(moves)
     assert set(found.moved_mps2) == (set() if moves is None else {0.0, 20.0})
     assert all(moved < 0.5 for seconds, moved in found.moved_mps2.items() if not moves or seconds == 0.0)
 
@@ -199,7 +200,7 @@ def test_what_winds_up_in_a_longer_warm_up_is_seen(overrides, moves):
 def test_a_slow_constructor_is_measured_and_counted(name, n):
     found = check(name, "world.cells=80")
     assert found.speed.constructions == n
-    assert (found.speed.construction_s > 0.1, "calls it 80 times" in found.verdict) == (name == "Slow",) * 2
+    assert (found.speed.construction_s > 0.1, "calls it 80 times" in verdict(found)) == (name == "Slow",) * 2
 
 
 def test_failures_that_differ_in_digits_are_one_and_name_line_and_what_was_meant():
@@ -315,4 +316,4 @@ def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_at_one_that_acts_befo
     assert (with_lead.exit_code, with_lead.take_time, without.take_time) == (0, True, False)
     assert with_lead.behaviour.n_crashes <= without.behaviour.n_crashes
     early = check_av(campaign(LEAD, "testing.method=forced", f"av={ACTING.format('Speeds')}"), 4)
-    assert (early.exit_code, early.rows[0]["found"]) == (0, "controller, twin, step_mixture, cut-ins of one step")
+    assert (early.exit_code, rows(early)[0]["found"]) == (0, "controller, twin, step_mixture, cut-ins of one step")
