@@ -10,7 +10,7 @@ import pytest
 
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
-from harness.records.reader import read_parts
+from harness.records.reader import read
 from harness.report.pair_words import pair_words
 from harness.runner.compare import compare_campaigns
 from harness.runner.workers import ShardRunner, Workers
@@ -58,9 +58,8 @@ def driven(monkeypatch):
 def by_stratum(folder):
     """Cut-in, initial range and outcome of each test, in order, by stratum."""
     found = defaultdict(list)
-    for episodes in read_parts(folder, ["component", "pool_row", "r2_m", "outcome"]):
-        for row in episodes.to_pylist():
-            found[row["component"]].append((row["pool_row"], row["r2_m"], row["outcome"]))
+    for row in read(folder).table("episodes", ["component", "pool_row", "r2_m", "outcome"]).to_pylist():
+        found[row["component"]].append((row["pool_row"], row["r2_m"], row["outcome"]))
     return found
 
 

@@ -15,11 +15,12 @@ import pytest
 import harness
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.report.page import write_report
+from harness.resolved import require_ready
 from harness.runner import kept
 from harness.vehicles import library
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import controllers_here, one_process, run_here, run_with_workers
-from tests.stored_runs import golden, manifest, part_files, unlike_columns
+from tests.stored_runs import golden, manifest, part_files, stored_table, unlike_columns
 
 opened: dict[Path, Counter[str]] = {}
 hooked: list[bool] = []
@@ -47,31 +48,40 @@ def opens_below(folder):
         opened.clear()
 
 
-def counted_run(folder, *overrides):
-    """A run with its page, by how often its inputs and what it wrote were read."""
-    with opens_below(folder) as reads, one_process(), controllers_here():
-        harness.run(harness.load_campaign(folder / "campaign.yaml", overrides), folder / "run", workers=1)
-        return dict(reads)
+def inputs_in(folder, name):
+    """Files of one's own that a golden campaign may be run from, and its overrides."""
+    campaign = golden(name)
+    drivers = campaign.pool.library or library.OF_TRAFFIC[False]
+    shutil.copy(BASE, folder / "campaign.yaml")
+    shutil.copy(SHIPPED_FOLDER / f"{campaign.environment.parameters}.yaml", folder / "traffic.yaml")
+    shutil.copy(library.SHIPPED_FOLDER / f"{drivers}.yaml", folder / "drivers.yaml")
+    return [*RUNS[name], "environment.parameters=traffic.yaml", "pool.library=drivers.yaml"]
 
 
 @pytest.mark.parametrize("name", ["nde-twin", "shells-twin", "step-recursive-twin", "shells-acting-twin"])
 def test_the_answer_and_the_page_come_from_what_is_in_hand(name, tmp_path):
     """But for traces, which the page plays; made from the folder it is the same page. Each input is read once."""
-    shutil.copy(BASE, tmp_path / "campaign.yaml")
-    campaign = golden(name)
-    inputs = {"campaign.yaml": 1, "traffic.yaml": 1, **({"drivers.yaml": 1} if campaign.sampling.strata else {})}
-    shutil.copy(SHIPPED_FOLDER / f"{campaign.environment.parameters}.yaml", tmp_path / "traffic.yaml")
-    drivers = campaign.pool.library or library.OF_TRAFFIC[False]
-    shutil.copy(library.SHIPPED_FOLDER / f"{drivers}.yaml", tmp_path / "drivers.yaml")
-    own = "environment.parameters=traffic.yaml", "pool.library=drivers.yaml"
-    reads = counted_run(tmp_path, *RUNS[name], *own)
-    assert {path: n for path, n in reads.items() if not path.startswith("run/traces/")} == inputs
+    overrides = inputs_in(tmp_path, name)
+    inputs = ["campaign.yaml", "traffic.yaml", *(["drivers.yaml"] if golden(name).sampling.strata else [])]
+    with opens_below(tmp_path) as reads, one_process(), controllers_here():
+        harness.run(harness.load_campaign(tmp_path / "campaign.yaml", overrides), tmp_path / "run", workers=1)
+        read = {path: n for path, n in reads.items() if not path.startswith("run/traces/")}
+    assert read == dict.fromkeys(inputs, 1)
     page = (tmp_path / "run" / "report.html").read_bytes()
     assert write_report(tmp_path / "run").read_bytes() == page
 
 
+def test_workers_and_page_need_no_file_once_it_is_resolved(stored_run, tmp_path):
+    overrides = inputs_in(tmp_path, "shells-twin")
+    resolved = require_ready(harness.load_campaign(tmp_path / "campaign.yaml", overrides))
+    for name in ("campaign", "traffic", "drivers"):
+        (tmp_path / f"{name}.yaml").unlink()
+    assert harness.run(resolved, tmp_path / "run", workers=2).report.is_file()
+    tables = (stored_table(folder, "episodes") for folder in (tmp_path / "run", stored_run("shells-twin")))
+    assert next(tables).equals(next(tables))
+
+
 def test_what_an_earlier_run_has_left_is_read_once(tmp_path):
-    shutil.copy(BASE, tmp_path / "campaign.yaml")
     name = "shells-acting-twin"
     run_here(golden(name, "stop.episodes=200"), tmp_path / "run")
     with opens_below(tmp_path / "run") as reads, one_process(), controllers_here():
