@@ -190,9 +190,13 @@ def read_table(
 def read_kept(
     folder: Path, part: Part, table: str, columns: list[str] | None = None, rows: pc.Expression | None = None
 ) -> pa.Table:
-    """One table of a part, as the manifest lists it; see `read_table`."""
+    """One table of a part, with as many rows as the manifest says, unless ``rows`` are asked for; see `read_table`."""
     file = part.files[table]
-    return read_table(folder / file.path, columns, rows, crc32=file.crc32)
+    found = read_table(folder / file.path, columns, rows, crc32=file.crc32)
+    if rows is None and found.num_rows != file.n_rows:
+        expected = f"{file.n_rows} rows (manifest.json)"
+        raise RunFolderError(str(folder / file.path), f"{found.num_rows} rows", expected, MEND_PART)
+    return found
 
 
 def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:

@@ -20,12 +20,10 @@ from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
-from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.processes import made_ahead
 from harness.records.folder import (
     CAMPAIGN,
-    MEND_PART,
     SHELLS,
     TABLES,
     Part,
@@ -37,6 +35,7 @@ from harness.records.folder import (
     require_sum,
 )
 from harness.records.schemas import traces_schema
+from harness.resolved import resolve
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
@@ -70,8 +69,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
     require_sum(path, crc32, path.read_bytes(), mend)
     if crc32 is None:  # its run was killed as it began
         with suppress(CampaignError):  # its environment file is gone: nobody can tell
-            parameters = family_named(campaign.scenario).parameters(campaign.environment)
-            require_campaign(path, campaign.content_hash(parameters.content_hash()), manifest)
+            require_campaign(path, resolve(campaign).content_hash, manifest)
     return campaign
 
 
@@ -85,23 +83,10 @@ def require_campaign(path: Path, content_hash: str, manifest: Mapping[str, Any])
 
 def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment | None:
     """The run's traffic, where its parameters are still what they were; else others cannot be driven."""
-    try:
-        family = family_named(campaign.scenario)
-        parameters = family.parameters(campaign.environment)
-    except CampaignError:
-        return None
-    known = campaign.content_hash(parameters.content_hash()) == manifest["campaign_hash"]
-    return family.traffic(campaign.environment, parameters) if known else None
-
-
-def read_part(folder: Path, part: Part, columns: list[str] | None = None) -> pa.Table:
-    """Episodes of one part, which must be as many as the manifest says; all columns by default."""
-    episodes = read_kept(folder, part, "episodes", columns)
-    if episodes.num_rows != part.n_episodes:
-        expected = f"{part.n_episodes} rows (manifest.json)"
-        found = f"{episodes.num_rows} rows"
-        raise RunFolderError(str(folder / part.files["episodes"].path), found, expected, MEND_PART)
-    return episodes
+    with suppress(CampaignError):
+        resolved = resolve(campaign)
+        return resolved.environment if resolved.content_hash == manifest["campaign_hash"] else None
+    return None
 
 
 def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) -> pa.Table | None:

@@ -13,8 +13,8 @@ import pyarrow.compute as pc
 
 from harness.families.protocol import Family
 from harness.processes import made_ahead
-from harness.records.folder import Part, concatenated, no_episodes
-from harness.records.reader import N_READERS, read_part
+from harness.records.folder import Part, concatenated, no_episodes, read_kept
+from harness.records.reader import N_READERS
 from harness.records.schemas import LEAD, path_columns
 
 COLUMNS = (
@@ -57,7 +57,7 @@ class ShownTests:
         asked = {"failure", *(name for of in _columns(family, sees=manifest["events_take_time"]) for name in of)}
 
         def shown(part: Part) -> ShownTests:
-            episodes = read_part(folder, part, sorted(asked))
+            episodes = read_kept(folder, part, "episodes", sorted(asked))
             return cls.of(episodes.slice(0, max(manifest["n_episodes"] - part.first_episode, 0)), family)
 
         return cls.joined(list(made_ahead(shown, manifest["parts"], N_READERS)), folder)

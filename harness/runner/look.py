@@ -118,10 +118,7 @@ class AvCheck:
 
 
 @checked("harness.av_check")
-def check_av(
-    campaign: Campaign | str | Path,
-    n_episodes: Annotated[int, Field(ge=2)] = EPISODES,
-) -> AvCheck:
+def check_av(campaign: Campaign | str | Path, n_episodes: Annotated[int, Field(ge=2)] = EPISODES) -> AvCheck:
     """Run a few dozen episodes with a campaign's AV, twice, and say what is to be seen.
 
     The second run has other cells, begins in the middle, and follows episodes of its own: a controller that remembers

@@ -29,15 +29,7 @@ from harness.pool.moved import assumed
 from harness.progress import Progress
 from harness.records.folder import read_table
 from harness.resolved import resolve
-from harness.runner.stored_shells import (
-    ELSEWHERE,
-    OPTION,
-    Elsewhere,
-    Nearby,
-    StoredShells,
-    moved_to,
-    require_shares,
-)
+from harness.runner.stored_shells import ELSEWHERE, OPTION, Elsewhere, Nearby, StoredShells, moved_to, require_shares
 from harness.vocabulary import EstimatorName, FloatArray
 
 

@@ -30,14 +30,7 @@ from harness.errors import CampaignError, HarnessError
 from harness.processes import WorkerDeath, fit_to_travel, usable_cpus
 from harness.resolved import Resolved
 from harness.runner.kept import cpu_name
-from harness.runner.workers import (
-    CLOSING_S,
-    LocalWorkers,
-    Result,
-    WorkerLostError,
-    WorkerProcess,
-    Workers,
-)
+from harness.runner.workers import CLOSING_S, LocalWorkers, Result, WorkerLostError, WorkerProcess, Workers
 from harness.sampling import source_of
 from harness.signals import handlers_restored
 

@@ -26,7 +26,7 @@ from harness.families.cut_in.unseen import as_if_unseen
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
 from harness.runner.other_traffic import read_replicates
-from harness.runner.stored_shells import Nearby, StoredShells, require_shares
+from harness.runner.stored_shells import Elsewhere, Nearby, StoredShells, require_shares
 
 BLOCKS = {
     "initial state": ("initial_state",),
@@ -71,17 +71,12 @@ def sensitivity(
         found = f"{settings.parameters}, of which no number has a standard error (se) or a range"
         mend = "State one, e.g. --range cut_in.ignore_share=0.001:0.08."
         raise CampaignError(_OPTION, found, "numbers that are said to be uncertain", mend)
-    results = tested.itself.nearby([each for move in asked for each in move.settings], progress)
+    itself = Elsewhere(tested, tested.here, tested.design)
+    results = itself.nearby([each for move in asked for each in move.settings], progress)
     bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
-    drivers = [each.name for each in tested.design.references]
-    content = finite_json(
-        Sensitivity(
-            tested.manifest["campaign_hash"],
-            Path(settings.parameters).stem,
-            drivers[0] if drivers else "",
-            tuple(sorted(bars, key=lambda bar: -bar.span)),
-        )
-    )
+    driver = next((each.name for each in tested.design.references), "")
+    ordered, traffic = tuple(sorted(bars, key=lambda bar: -bar.span)), Path(settings.parameters).stem
+    content = finite_json(Sensitivity(tested.manifest["campaign_hash"], traffic, driver, ordered))
     write_sealed(folder / SENSITIVITY, content)
     return content
 

@@ -25,7 +25,7 @@ from harness.files import write_atomically
 from harness.processes import SharedFile, made_ahead
 from harness.records.folder import CAMPAIGN, Part, no_episodes, read_kept, read_manifest
 from harness.records.origin import require_trust
-from harness.records.reader import N_READERS, read_campaign, read_part, require_campaign, traffic_of
+from harness.records.reader import N_READERS, read_campaign, require_campaign, traffic_of
 from harness.records.schemas import moments_schema, shard_tables
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
@@ -83,7 +83,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
 
     def read(part: Part) -> Block:
         steps = read_kept(folder, part, "moments", ratios) if ratios and "moments" in part.files else none
-        return block_of(campaign, read_part(folder, part, needed), steps, design)
+        return block_of(campaign, read_kept(folder, part, "episodes", needed), steps, design)
 
     n = 0
     for block in made_ahead(read, manifest["parts"], N_READERS):
@@ -221,12 +221,7 @@ def _simulated(
 
 
 def _replay(
-    resolved: Resolved,
-    folder: Path,
-    episode: int,
-    stored: pa.Table,
-    gui: bool,
-    fcd: Path | None,
+    resolved: Resolved, folder: Path, episode: int, stored: pa.Table, gui: bool, fcd: Path | None
 ) -> dict[str, pa.Table]:
     """Row and trace of the episode, run again."""
     source = prepare(resolved)

@@ -90,11 +90,6 @@ class StoredShells:
         """Hardest acceleration of the vehicle."""
         return acceleration_limit(self.here.campaign.av)
 
-    @property
-    def itself(self) -> Elsewhere:
-        """As it answers for its own traffic."""
-        return Elsewhere(self, self.here, self.design)
-
     @cached_property
     def blocks(self) -> list[Block]:
         """Its tests."""

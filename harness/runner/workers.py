@@ -25,16 +25,7 @@ from harness.controllers.hosts import death_cause
 from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.loop.loop import EpisodeLoop
-from harness.processes import (
-    Began,
-    Child,
-    SharedFile,
-    WorkerDeath,
-    first_to_answer,
-    start_server,
-    tell,
-    usable_cpus,
-)
+from harness.processes import Began, Child, SharedFile, WorkerDeath, first_to_answer, start_server, tell, usable_cpus
 from harness.records.folder import Repeated, read_table
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
