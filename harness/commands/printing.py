@@ -64,34 +64,24 @@ def show_interrupted(command: str, signal_name: str | None) -> None:
         click.echo(f"Interrupted{by}.{_HOW_TO_GO_ON.get(command, '')}", err=True)
 
 
-_OF_THE_SYSTEM = {
-    ("ENOSPC", "EDQUOT"): ("no space left", "room for what is written there", f"Free some space. {_AGAIN}"),
-    ("EFBIG", "EIO"): (
-        "a file that cannot be written or read on ({})",
-        "a sound disk, and no limit on the size of files (`ulimit -f`)",
-        f"Lift the limit or choose another disk. {_AGAIN}",
-    ),
-    ("ENAMETOOLONG", "ELOOP", "ENOTDIR"): (
-        "a name that the system refuses ({})",
-        "the name of a file or folder",
-        "Correct it.",
-    ),
-    ("EACCES", "EPERM", "EROFS"): (
-        "no permission ({})",
-        "a place that may be read and written",
-        "Change its permissions, or choose another place.",
-    ),
-    ("EISDIR",): ("a path that leads to no file ({})", "a file, or a place for one", "Correct the path."),
-}
-"""Errors that a user can mend: what was found and expected, and how."""
+_OF_THE_SYSTEM = (
+    (("ENOSPC", "EDQUOT"), "no space left", "room for what is written there", f"Free some space. {_AGAIN}"),
+    (("EFBIG", "EIO"), "a file that cannot be written or read on ({})",
+     "a sound disk, and no limit on the size of files (`ulimit -f`)", f"Lift the limit or choose another disk. {_AGAIN}"),
+    (("ENAMETOOLONG", "ELOOP", "ENOTDIR"), "a name that the system refuses ({})", "the name of a file or folder",
+     "Correct it."),
+    (("EACCES", "EPERM", "EROFS"), "no permission ({})", "a place that may be read and written",
+     "Change its permissions, or choose another place."),
+    (("EISDIR",), "a path that leads to no file ({})", "a file, or a place for one", "Correct the path."),
+)  # fmt: skip
+"""Errors that a user can mend: which, what was found and expected, and how."""
 
 
 def system_error(error: OSError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
-    name = errno.errorcode.get(error.errno or 0)
-    for names, (found, expected, mend) in _OF_THE_SYSTEM.items():
+    name, where = errno.errorcode.get(error.errno or 0), str(error.filename or "disk of the output folder")
+    for names, found, expected, mend in _OF_THE_SYSTEM:
         if name in names:
-            where = str(error.filename or "disk of the output folder")
             return HarnessError(where, found.format(error.strerror), expected, mend)
     return None
 
