@@ -67,7 +67,8 @@ def show_interrupted(command: str, signal_name: str | None) -> None:
 _OF_THE_SYSTEM = (
     (("ENOSPC", "EDQUOT"), "no space left", "room for what is written there", f"Free some space. {_AGAIN}"),
     (("EFBIG", "EIO"), "a file that cannot be written or read on ({})",
-     "a sound disk, and no limit on the size of files (`ulimit -f`)", f"Lift the limit or choose another disk. {_AGAIN}"),
+     "a sound disk, and no limit on the size of files (`ulimit -f`)",
+     f"Lift the limit or choose another disk. {_AGAIN}"),
     (("ENAMETOOLONG", "ELOOP", "ENOTDIR"), "a name that the system refuses ({})", "the name of a file or folder",
      "Correct it."),
     (("EACCES", "EPERM", "EROFS"), "no permission ({})", "a place that may be read and written",
