@@ -28,8 +28,10 @@ from harness.errors import HarnessError
 from harness.estimators.block import Block, joined
 from harness.estimators.estimate import FailureBounds, finite_json
 from harness.estimators.likelihood import Level
+from harness.estimators.one_pass import refusal
 from harness.estimators.scv import Scv
 from harness.progress import Progress
+from harness.report.notes import note_words
 from harness.runner.stored import stored_blocks
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, Int8Array, IntArray
 
@@ -296,8 +298,8 @@ def required_tests_of_runs(
         grid, n_crashes = procedure.grid(tests.n), int(np.count_nonzero(~tests.failed))
         for name in dict.fromkeys(estimators or [plain]):
             rows.append(row := {"run": str(folder), "estimator": name, "n_episodes": tests.n, "n_crashes": n_crashes})
-            if reason := block.refusal(name):
-                row |= {"mean": None, "reason": reason}
+            if why := refusal(block, name):
+                row |= {"mean": None, "reason": note_words(why)}
                 continue
             told.stage(f"{folder.name} {name}", procedure.n_shuffles)
             found = over_shuffles(tests, procedure, lambda: told.advance(1), scv_of=block if name == "scv" else None)

@@ -218,7 +218,7 @@ def test_an_independent_repetition_meets_another_pool_too(monkeypatch, options, 
 def test_estimate_prints_a_table_and_closes_with_what_was_asked(stored_run, capsys):
     folder = stored_run("mixture-twin")
     before, content = sorted(folder.iterdir()), estimate_run(folder, estimators=("mixture_cv", "nde"), confidence=0.95)
-    found, reason = content["estimates"]["mixture_cv"], content["estimates"]["nde"]["reason"]
+    found, reason = content["estimates"]["mixture_cv"], note_words(content["estimates"]["nde"]["why"])
     command = ["estimate", str(folder), "-e", "nde", "--confidence", "0.95"]
     assert main([*command, "-e", "mixture_cv"]) == 0
     out = capsys.readouterr().out

@@ -55,7 +55,7 @@ def fit(
     """
     from harness.fitting.files import fit_files  # noqa: PLC0415 - keeps --help fast
     from harness.fitting.page import CONFIDENCE  # noqa: PLC0415 - keeps --help fast
-    from harness.report.words import too_few  # noqa: PLC0415 - keeps --help fast
+    from harness.report.traffic_words import too_few  # noqa: PLC0415 - keeps --help fast
 
     with progress_bar() as bar:
         given: dict[str, Any] = {"mapping": mapping, "mirror": mirror, "leave_out": leave_out, "force": force}

@@ -142,8 +142,8 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
     ]
     print_table(f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests", rows)
     for name, entry in shown.items():
-        for remark in [*map(note_words, entry.get("warnings", ())), *filter(None, [entry.get("reason")])]:
-            say(f"{name}: {remark}")
+        for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("why")])]:
+            say(f"{name}: {note_words(remark)}")
     if shells := shown.get("shells", {}).get("details", {}).get("shells"):
         names = ("shell", "inside", "p", "n_episodes", "n_crashes", "contribution")
         print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])

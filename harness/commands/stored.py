@@ -113,13 +113,14 @@ def _compared_elsewhere(folder: Path, environment: str, confidence: float | None
     if as_json:
         print_json(content)
     else:
-        from harness.report.words import told_of_traffic  # noqa: PLC0415 - keeps --help fast
+        from pydantic import TypeAdapter  # noqa: PLC0415 - keeps --help fast
+
+        from harness.estimators.traffic import TrafficError  # noqa: PLC0415 - keeps --help fast
+        from harness.report.traffic_words import traffic_rows  # noqa: PLC0415 - keeps --help fast
 
         traffic = content["traffic"]
-        told = [
-            dict(zip(("what", "value", "interval", "remark"), row.texts, strict=True))
-            for row in told_of_traffic(traffic)
-        ]
+        rows = traffic_rows(TypeAdapter(TrafficError).validate_python(traffic))
+        told = [dict(zip(("what", "value", "interval", "remark"), row.texts, strict=True)) for row in rows]
         print_table(f"A by {traffic['n_replicates']} replicates of {traffic['environment']}", told)
 
 
@@ -170,7 +171,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
 
 
 def _bar(bar: dict[str, Any]) -> dict[str, str]:
-    from harness.report.words import bar_note  # noqa: PLC0415 - keeps --help fast
+    from harness.report.traffic_words import bar_note  # noqa: PLC0415 - keeps --help fast
 
     def ends(of: list[float | None]) -> str:
         return "× " + " … ".join(number(end, 3) for end in of)

@@ -12,7 +12,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import LEAST_POOL_ERROR, MOST_CUT_INS
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate, Number, Point, Unavailable, finite_json
+from harness.estimators.estimate import Estimate, Note, Number, Point, Unavailable, finite_json
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import Severity
@@ -23,11 +23,8 @@ from harness.records.folder import StoppedBy
 from harness.strata import Assumed, weight_of_a_test
 from harness.vocabulary import ESTIMATORS, EstimatorName
 
-_PER_KM = 1e6
 ROOM = 1.25
 """Tests go in steps, and not to all shells alike: beyond those that would just do [measured: 1.15 at most]."""
-
-
 CARRIES = 0.05
 """Share of a rate from which on there is an upper limit alone, where nothing was seen of it [assumed]."""
 
@@ -84,7 +81,7 @@ class Estimates:
     severity: Severity | None = None
     assumed: AssumedOfRate | None = None
     stopped_by: StoppedBy | None = None
-    unmet: tuple[str, ...] = ()
+    unmet: tuple[Note, ...] = ()
     decision: dict[str, Any] | None = None
     traffic: TrafficError | None = None
     elsewhere: Elsewhere | None = None
@@ -114,7 +111,6 @@ def estimate_blocks(
     """
     done = one_pass(blocks, estimators or ESTIMATORS, confidence=confidence or campaign.stop.confidence)
     best = done.headline_estimate
-    estimates = {done.headline: best, **done.estimates}
     level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
     distance_km = None if distance_m is None else distance_m / 1000.0
     return finite_json(
@@ -127,14 +123,14 @@ def estimate_blocks(
             n_crashes=best.n_crashes,
             headline=done.headline,
             distance_per_test_km=distance_km,
-            crash_rate_per_1e6_km=None if distance_km is None else per_distance(best, distance_km),
-            estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in estimates.items()},
+            crash_rate_per_1e6_km=None if distance_km is None else _per_1e6_km(best, distance_km),
+            estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in done.estimates.items()},
             diagnostics=done.diagnostics.result(campaign.importance_names),
             convergence=tuple(done.convergence),
             severity=done.severity,
             assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
             stopped_by=manifest.get("stopped_by"),
-            unmet=tuple(manifest.get("unmet", ())),
+            unmet=tuple(Note(**each) for each in manifest.get("unmet", ())),
             decision=manifest.get("decision"),
         )
     )
@@ -151,18 +147,16 @@ def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
     return AssumedOfRate(assumed.where, assumed.highest, times)
 
 
-def per_distance(estimate: Estimate, distance_per_test_km: float) -> dict[str, float]:
-    """Crash rate and interval per 1e6 km of such overtaking driving."""
-    scale = _PER_KM / distance_per_test_km
+def _per_1e6_km(estimate: Estimate, distance_per_test_km: float) -> dict[str, float]:
+    scale = 1e6 / distance_per_test_km
     return {"rate": estimate.crash_rate * scale, "ci_low": estimate.ci_low * scale, "ci_high": estimate.ci_high * scale}
 
 
 def ended_by(campaign: Campaign, rule: Rule, n_episodes: int) -> StoppedBy:
     """Why a campaign ended after so many tests."""
     look = rule.look
-    if look.stopped:
-        reached: StoppedBy = "rhw" if look.below is None else "below_reference"
-        return getattr(rule, "ended", None) or ("accept" if look.decision is not None else reached)
+    if look.ended is not None:
+        return look.ended
     if look.pool_error_above_target:  # whatever else is spent: more of it would not help
         return "pool_error"
     return "episodes" if n_episodes >= campaign.stop.episodes else "pool"

@@ -26,7 +26,6 @@ from harness.vocabulary import (
     SAMPLING,
     TIMEOUT,
     BoolArray,
-    EstimatorName,
     FloatArray,
     Int8Array,
     IntArray,
@@ -43,24 +42,13 @@ EPISODE_COLUMNS = (
 SHELL_COLUMNS = ("component", "cell", "cell_mass")
 BASELINE_COLUMNS = ("shadow", "event_mass")
 """Of vehicles that act before the cut-in, where `ShellDesign.candidates` says that they are on record."""
-DANGER_TTC_S = 4.0
-"""A test whose time was up counts as cut off where it came closer to a collision than this (s).
+CUT_OFF_STEPS, DANGER_TTC_S = 40, 4.0
+"""A test whose time was up so soon after a cut-in, and closer to a collision (s), was cut off.
 
 A driver who brakes with 3 m/s² after half a second stays clear from there at closing speeds up to 21 m/s; the fastest
-cut-ins of `ndd-overtaking-1` close with 16.
-"""
-CUT_OFF_STEPS = 40
-"""A test whose time was up so soon after a cut-in, and closer to a collision than `DANGER_TTC_S`, was cut off."""
+cut-ins of `ndd-overtaking-1` close with 16."""
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 Column = NDArray[Any]
-NEEDS: dict[EstimatorName, str] = {
-    "nde": "a share of crashes needs naturalistic tests (method nde)",
-    "nade": "shares of crashes within shells must be added by the shells' probabilities (estimator shells)",
-    "mixture_cv": "needs the episode mixture: it alone has control variates of known means without heavy tails",
-    "scv": "is defined for the step mixture ([paper] section III-C)",
-    "shells": "tests must be drawn from shells (testing.method shells)",
-}
-"""Of each estimator, why not every method's records allow it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,16 +86,15 @@ class Block:
     """Consecutive episodes ``first_episode … first_episode + n - 1``, in index order.
 
     ``outcome`` (n,) are places in `OUTCOMES`: a failed episode is a row like any other and never a crash.
-    ``log_weight`` (n,) is log p(x_c) - log q_sampled(x_c), exactly 0 without control. ``columns`` are what else the
-    method records, a row for each episode, also as attributes; those that it does not record are left out. ``cut_in``
-    (n,) bool. ``took_over_early`` (n,) bool: the AV did something before BV was on its lane, ``asked_to_speed_up``
-    (n,) bool: or asked for that in vain. ``impact_mps`` (n,): closing speed at contact, NaN without a crash.
-    ``cut_off`` (n,) bool: see `CUT_OFF_STEPS`. ``log_q`` (n, M): per importance function, the sum over control steps of
-    log(q_j/p), -inf where q_j cannot draw the episode. ``n_control_steps`` (n,): stratum l of each episode.
-    ``first_ratios`` (n, 9, J): q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one.
-    ``log_p_event`` (n,): log P(cut-in | path), where the method draws the path ahead; it bounds Y of that episode
-    alone. Of shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C): its path's probability of a cut-in of each
-    cell; and `BASELINE_COLUMNS`, with ``step`` (n,) of the cut-in, below 0 where a failed test has come to none.
+    ``log_weight`` (n,) is log p(x_c) - log q_sampled(x_c), exactly 0 without control. ``columns``, also as attributes,
+    are what else the method records, a row for each episode: bool (n,) ``cut_in``, ``cut_off`` (`CUT_OFF_STEPS`),
+    ``took_over_early`` (the AV did something before BV was on its lane) and ``asked_to_speed_up`` (or that in vain);
+    ``impact_mps`` (n,), closing speed at contact, NaN without a crash; ``n_control_steps`` (n,). ``log_q`` (n, M) is,
+    per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode;
+    ``first_ratios`` (n, 9, J) q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one;
+    ``log_p_event`` (n,) log P(cut-in | path), where the path is drawn ahead: it bounds Y of that episode alone. Of
+    shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C), its path's probability of a cut-in of each cell, and
+    `BASELINE_COLUMNS`, with ``step`` (n,) of the cut-in, below 0 where a failed test has come to none.
     """
 
     first_episode: int
@@ -123,14 +110,6 @@ class Block:
         if name.startswith("_") or name == "columns" or name not in self.columns:
             raise AttributeError(f"the block has no {name}")
         return self.columns[name]
-
-    def refusal(self, estimator: EstimatorName) -> str | None:
-        """Why records like this block do not allow an estimator; None if they do."""
-        if estimator not in self.drawn.sampling.estimators:
-            return f"{NEEDS[estimator]}; these were drawn by {self.drawn.method}"
-        if estimator == "scv" and "first_ratios" not in self.columns:
-            return "needs the control steps of every episode: set records.moments to first_9 or all"
-        return None
 
     @property
     def crash(self) -> BoolArray:
@@ -189,9 +168,8 @@ class Block:
     def take(self, rows: slice) -> Block:
         """Cut out the block of some consecutive rows, a slice with step 1."""
         start, stop, _ = rows.indices(len(self))
-        if (start, stop) == (0, len(self)):
-            return self
-        return self.chosen(slice(start, stop), self.first_episode + start)
+        whole = (start, stop) == (0, len(self))
+        return self if whole else self.chosen(slice(start, stop), self.first_episode + start)
 
     def chosen(self, rows: slice | IntArray, first_episode: int = 0) -> Block:
         """Block of any rows, numbered anew."""
@@ -221,10 +199,9 @@ def block_from_tables(
 ) -> Block:
     """Block of one shard; rows that are missing, out of order, or contradict each other are a `RunFolderError`.
 
-    ``episodes`` are rows of that table, consecutive and in index order, with `EPISODE_COLUMNS`; ``moments``, of the
-    step mixture, are the control steps of the same episodes, sorted by episode and step, with `MOMENT_COLUMNS`.
-    ``alpha`` (M,) are mixture weights in the order of ``log_q``. A campaign that draws from ``shells`` needs
-    `SHELL_COLUMNS`, too. Crashes that are no harder than ``counts_above_mps`` count as none.
+    ``episodes`` are rows of that table, consecutive and in index order, with `EPISODE_COLUMNS`, of ``shells`` also
+    `SHELL_COLUMNS`; ``moments``, of the step mixture, are the control steps of the same episodes, sorted by episode and
+    step, with `MOMENT_COLUMNS`. ``alpha`` (M,) are mixture weights in the order of ``log_q``; for the rest see `Drawn`.
     """
     index = _integers(episodes, "episode")
     if not index.size:
@@ -235,23 +212,20 @@ def block_from_tables(
         raise _damaged(f"episodes, row {at + 1}", f"episode {index[at + 1]} after episode {index[at]}", expected)
     outcome = outcome_places(episodes.column("outcome"), "episodes")
     failed, n_control_steps = outcome == FAILED, _integers(episodes, "n_control_steps")
+    left = pc.subtract(episodes["n_steps"], episodes["event_step"])
+    close = pc.and_(pc.less(left, CUT_OFF_STEPS), pc.less(episodes["min_ttc_s"], DANGER_TTC_S))
+    early = pc.less_equal(episodes["took_over_step"], episodes["event_step"])
     columns: dict[str, Column] = {
         "cut_in": _known(episodes, "event_step"),
         "n_control_steps": n_control_steps,
+        "n_steps": _integers(episodes, "n_steps"),
+        "impact_mps": np.asarray(episodes["impact_speed_mps"].to_numpy(), dtype=np.float64),
+        "cut_off": (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy(),
+        "took_over_early": pc.fill_null(early, fill_value=False).to_numpy(),
+        "asked_to_speed_up": episodes["asked_to_speed_up"].to_numpy(),
     }
     if SAMPLING[method].mixes:
         columns["log_q"] = _nested(episodes, "log_q", len(alpha))
-    if "impact_speed_mps" in episodes.column_names:
-        columns["impact_mps"] = np.asarray(episodes.column("impact_speed_mps").to_numpy(), dtype=np.float64)
-    if "n_steps" in episodes.column_names:
-        columns["n_steps"] = _integers(episodes, "n_steps")
-        left = pc.subtract(episodes.column("n_steps"), episodes.column("event_step"))
-        close = pc.and_(pc.less(left, CUT_OFF_STEPS), pc.less(episodes.column("min_ttc_s"), DANGER_TTC_S))
-        columns["cut_off"] = (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy()
-    if "took_over_step" in episodes.column_names:
-        early = pc.less_equal(episodes.column("took_over_step"), episodes.column("event_step"))
-        columns["took_over_early"] = pc.fill_null(early, fill_value=False).to_numpy()
-        columns["asked_to_speed_up"] = episodes.column("asked_to_speed_up").to_numpy()
     if moments is not None and SAMPLING[method].mixes_steps:
         columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     if np.all(_known(episodes, "log_p_event") | failed):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from pydantic import BeforeValidator
@@ -26,7 +26,7 @@ it noticeably."""
 
 @dataclass(frozen=True)
 class Note:
-    """Something that a reader must know: its kind, by a ``key`` of `harness.report.notes`, and the numbers in it."""
+    """Something to be told, in the words that `harness.report.notes` has for its ``key``, with these numbers."""
 
     key: str
     numbers: dict[str, Any] = field(default_factory=dict)
@@ -35,6 +35,13 @@ class Note:
 def note(key: str, **numbers: Any) -> Note:
     """A note of some kind."""
     return Note(key, numbers)
+
+
+IntervalKind = Literal["clopper_pearson", "normal", "skewed", "likelihood_ratio"]
+BoundKind = Literal["one_sided", "two_sided", "hoeffding"]
+"""An interval's own limit, one-sided or as its upper end is; or Hoeffding's, of a mean of capped values."""
+CapKind = Literal["design", "tests", "seen_events", "seen", "none"]
+"""What a cap rests on: the design, the tests driven, or only the largest weight seen, among tests with an event."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +53,9 @@ class Estimate:
     interval's half-width relative to the rate, infinite when the rate is 0. Of ``n_episodes`` tests ``n_crashes`` are
     crashes; ``n_effective`` is (ΣY)²/ΣY², ``largest_weight_share`` the largest single Y as a share of ΣY, and
     ``weight_cap`` the largest weight that a crash can have by design, infinite where nothing is known to bound it.
-    ``method`` says how rate, interval and upper bound were made. ``warnings`` are what a reader must know, the
-    ``cautions`` first: why the interval may be wrong. A statement begins with them, and no precision is claimed beside
-    them. ``details`` are what only this estimator has to say.
+    ``interval`` and ``bound`` say how these were made, ``cap`` what Hoeffding's bound rests on. ``warnings`` are what
+    a reader must know, the ``cautions`` first: why the interval may be wrong, so that no precision is claimed.
+    ``details`` are what only this estimator has to say.
     """
 
     crash_rate: float
@@ -62,7 +69,9 @@ class Estimate:
     n_crashes: int
     n_effective: Number
     largest_weight_share: Number
-    method: str
+    interval: IntervalKind
+    bound: BoundKind
+    cap: CapKind = "none"
     weight_cap: Number = math.inf
     warnings: tuple[Note, ...] = ()
     cautions: tuple[Note, ...] = ()
@@ -96,9 +105,9 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Unavailable:
-    """An estimator that these records do not allow: what is missing, and what would provide it."""
+    """An estimator that these records do not allow, and why."""
 
-    reason: str
+    why: Note
     crash_rate: None = None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Point, Unavailable
+from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Note, Point, Unavailable, note
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.severity import Impacts, Severity
 from harness.estimators.shells import SeenShells
@@ -40,7 +40,7 @@ class Diagnostics:
     def __init__(self) -> None:
         self.n, self.counts = 0, Counter[str]()
         self._weight, self._cut_in, self._contact = Moments(), Moments(), Moments()
-        self._ratios: list[Moments] = []
+        self._ratios = defaultdict[int, Moments](Moments)
 
     def add(self, block: Block) -> None:
         """Add one block."""
@@ -53,19 +53,16 @@ class Diagnostics:
         self._weight += Moments.of(weights)
         self._cut_in += Moments.of(weights[block.cut_in])
         self._contact += Moments.of(weights[contact])
-        if self._sampling.mixes:
-            self._ratios = self._ratios or [Moments()] * block.drawn.alpha.size
-            self._ratios = [
-                sums + Moments.of(ratios) for sums, ratios in zip(self._ratios, block.mixture_ratios().T, strict=True)
-            ]
+        for j, ratios in enumerate(block.mixture_ratios().T if self._sampling.mixes else ()):
+            self._ratios[j] += Moments.of(ratios)
 
     def result(self, importance_names: tuple[str, ...] = ()) -> dict[str, Any]:
         """Means with standard errors; the M importance functions, in order, are numbered where names are left out."""
-        names = importance_names or tuple(f"q_{j}" for j in range(len(self._ratios)))
+        ratios = {importance_names[j] if importance_names else f"q_{j}": sums for j, sums in self._ratios.items()}
         return {
             "mean_weight": self._mean(self._weight),
             "mean_weight_event": self._mean(self._cut_in),
-            "mean_ratio": {name: self._mean(sums) for name, sums in zip(names, self._ratios, strict=False)},
+            "mean_ratio": {name: self._mean(sums) for name, sums in ratios.items()},
             "bv_lv_contact_share": self._mean(self._contact),
             **self.counts,
         }
@@ -74,6 +71,13 @@ class Diagnostics:
         if self._sampling.strata:
             return {"mean": math.nan, "std_error": math.inf}
         return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)}
+
+
+def refusal(block: Block, estimator: EstimatorName) -> Note | None:
+    """Why records like this block do not allow an estimator; None if they do."""
+    if estimator not in block.drawn.sampling.estimators:
+        return note(f"needs_{estimator}", method=block.drawn.method)
+    return note("needs_moments") if estimator == "scv" and "first_ratios" not in block.columns else None
 
 
 def accumulator(name: EstimatorName) -> FailureBounds:
@@ -85,8 +89,8 @@ def accumulator(name: EstimatorName) -> FailureBounds:
 class PassResult:
     """What one pass over a campaign's blocks gives.
 
-    ``headline`` is the method's own estimator, asked for or not; ``convergence`` its estimate on growing prefixes, for
-    plots: block boundaries at least 1 % apart; ``severity`` is how hard the crashes of that estimate are.
+    ``estimates`` begin with the ``headline``, the method's own, asked for or not; ``convergence`` is that on growing
+    prefixes, for plots: block boundaries at least 1 % apart; ``severity`` is how hard its crashes are.
     """
 
     estimates: dict[EstimatorName, Estimate | Unavailable]
@@ -107,15 +111,15 @@ def one_pass(
     own: EstimatorName | None = None
     impacts: Impacts | None = None
     states: dict[EstimatorName, FailureBounds] = {}
-    refusals: dict[EstimatorName, str | None] = {}
+    refusals: dict[EstimatorName, Note | None] = {}
     diagnostics, convergence, n = Diagnostics(), list[Point](), 0
     for block in blocks:
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
         if own is None:
             own = block.drawn.sampling.headline
-            refusals = {name: block.refusal(name) for name in (own, *names)}
-            states = {name: accumulator(name) for name, reason in refusals.items() if reason is None}
+            refusals = {name: refusal(block, name) for name in (own, *names)}
+            states = {name: accumulator(name) for name, why in refusals.items() if why is None}
             if "impact_mps" in block.columns:
                 empty = SeenShells if own == "shells" else partial(accumulator, own)
                 impacts = Impacts(empty, block.drawn.counts_above_mps)
@@ -132,7 +136,7 @@ def one_pass(
     results = {name: state.result(confidence) for name, state in states.items()}
     if convergence[-1].n != n:
         convergence.append(_point(results[own]))
-    estimates = {name: results.get(name) or Unavailable(str(refusals[name])) for name in names}
+    estimates = {name: results[name] if why is None else Unavailable(why) for name, why in refusals.items()}
     severity = None if impacts is None else impacts.result(confidence)
     return PassResult(estimates, own, results[own], diagnostics, convergence, severity)
 

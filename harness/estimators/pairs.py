@@ -33,9 +33,9 @@ DIFFERENCE = A_CRASHES - B_CRASHES
 
 
 @cache
-def _kinds(failed_a: bool, failed_b: bool) -> IntArray:
-    """Of the four outcomes, which ends of A and B belong to each, shape (3, 3, 4)."""
-    a, b = np.meshgrid([False, True, failed_a], [False, True, failed_b], indexing="ij")
+def _kinds(worse: float) -> IntArray:
+    """Of the four outcomes, which ends of A and B belong to each, shape (3, 3, 4); ``worse`` see `PairCounts`."""
+    a, b = np.meshgrid([False, True, worse > 0.0], [False, True, worse < 0.0], indexing="ij")
     return np.stack((a & b, a & ~b, ~a & b, ~a & ~b), axis=2).astype(np.int64)
 
 
@@ -70,10 +70,11 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PairCounts:
-    """Pairs of tests of some strata.
+    """Pairs of tests of some strata, which are the first of the design's.
 
     ``ends`` (S, 3, 3) is how often A ended in one way (second axis) and B in another (third): no crash, crash, failed.
     ``mass`` (S, 3, 3, S) is, over the same pairs, the sum of their paths' probability of a cut-in of every stratum.
+    Where something is asked with A, or B, the ``worse`` (1, or -1; 0 for neither), its failed tests count as crashes.
     """
 
     design: ShellDesign
@@ -82,7 +83,7 @@ class PairCounts:
 
     @property
     def p(self) -> FloatArray:
-        """Probabilities of the strata, which are the first of the design's, shape (S,)."""
+        """Probabilities of the strata, shape (S,)."""
         return self.design.p[: len(self.ends)]
 
     @property
@@ -95,9 +96,9 @@ class PairCounts:
         within = slice(0, self.design.n_inside if n is None else n)
         return PairCounts(self.design, self.ends[within], self.mass[within, :, :, within])
 
-    def outcomes(self, *, failed_a: bool = False, failed_b: bool = False) -> Counts:
-        """How often both crash, only A, only B, neither, shape (S, 4), with failed tests as crashes or as none."""
-        return np.tensordot(self.ends, _kinds(failed_a, failed_b))
+    def outcomes(self, worse: float = 0.0) -> Counts:
+        """How often both crash, only A, only B, neither, shape (S, 4)."""
+        return np.tensordot(self.ends, _kinds(worse))
 
     def tally(self, side: int) -> Tally:
         """Tests of A (0) or B (1) by themselves."""
@@ -131,26 +132,24 @@ class PairCounts:
         """So many times as many pairs of each stratum, ending as often."""
         return PairCounts(self.design, np.asarray(self.ends * factor, np.float64), self.mass * factor)
 
-    def pool_variance(self, weights: FloatArray, *, failed_a: bool = False, failed_b: bool = False) -> float:
+    def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
         """Variance of a weighted sum that comes from the pool's finite number of paths.
 
         The mean square of a path's part in it is at most that of its outcomes of positive weight and that of those of
         negative weight together, as the product of the two only lowers it.
         """
-        scale, square, rate = weight_of_a_test(self.p, self.tests), 0.0, 0.0
-        kinds = _kinds(failed_a, failed_b)
+        scale, square, rate, kinds = weight_of_a_test(self.p, self.tests), 0.0, 0.0, _kinds(worse)
         for sign in (1.0, -1.0):
             part = np.maximum(sign * weights, 0.0)
             mass = np.tensordot(self.mass, kinds @ part, ((1, 2), (0, 1)))
             square += float(part.max()) * mean_square(scale, mass)
-            rate += sign * float(scale @ (self.outcomes(failed_a=failed_a, failed_b=failed_b) @ part))
+            rate += sign * float(scale @ (self.outcomes(worse) @ part))
         return max(square - rate**2, 0.0) / self.design.n_paths
 
     def limit(self, weights: FloatArray, level: Level, side: float) -> float:
         """One limit of a weighted sum that does not fall where A crashes more often or B less."""
-        worst = {"failed_a": side > 0.0, "failed_b": side < 0.0}
-        variance = self.pool_variance(weights, **worst)
-        return contrast_limit(self.p[:, None] * weights, self.outcomes(**worst), level, side, variance)
+        variance = self.pool_variance(weights, side)
+        return contrast_limit(self.p[:, None] * weights, self.outcomes(side), level, side, variance)
 
     def difference(self, level: Level) -> Interval:
         """A - B in crashes per test."""
@@ -172,12 +171,10 @@ class PairCounts:
         a, b, p = self.rate(A_CRASHES), self.rate(B_CRASHES), self.p[:, None]
 
         def limits(side: float) -> tuple[float, float]:
-            worst = {"failed_a": side > 0.0, "failed_b": side < 0.0}
-
             def variance(ratio: float) -> float:
-                return self.pool_variance(A_CRASHES - ratio * B_CRASHES, **worst)
+                return self.pool_variance(A_CRASHES - ratio * B_CRASHES, side)
 
-            return ratio_limits(p * A_CRASHES, p * B_CRASHES, self.outcomes(**worst), level, variance)
+            return ratio_limits(p * A_CRASHES, p * B_CRASHES, self.outcomes(side), level, variance)
 
         return Interval(a / b if b > 0.0 else math.nan, limits(-1.0)[0], limits(1.0)[1])
 
@@ -191,8 +188,7 @@ class PairCounts:
 
     def spread(self, level: Level, size: int, most: IntArray) -> IntArray:
         """Divide further pairs among strata, (S,), at most so many each, to where they narrow the difference most."""
-        lower, upper = self.outcomes(failed_b=True), self.outcomes(failed_a=True)
-        return spread(self.p[:, None] * DIFFERENCE, lower, upper, level, size, most)
+        return spread(self.p[:, None] * DIFFERENCE, self.outcomes(-1.0), self.outcomes(1.0), level, size, most)
 
     def verdict(self, margin: float, level: Level) -> PairVerdict:
         """Whether B's rate is at most 1 + margin times A's: proven, refuted, or open."""
@@ -254,8 +250,7 @@ def contrast(pairs: PairCounts, level: Level) -> dict[str, Any]:
         "only_a": pairs.alone(0, level)._asdict(),
         "only_b": pairs.alone(1, level)._asdict(),
         "n_pairs": int(pairs.tests.sum()),
-        "n_only_a": pairs.n_alone[0],
-        "n_only_b": pairs.n_alone[1],
+        **dict(zip(("n_only_a", "n_only_b"), pairs.n_alone, strict=True)),
     }
 
 

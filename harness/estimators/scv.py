@@ -36,7 +36,6 @@ from harness.estimators.weighted import FEW_FOR_RESIDUALS, Nade
 from harness.processes import side_by_side
 from harness.vocabulary import FloatArray
 
-MOST_NAMED = 12
 MAX_COLUMNS = 729
 """Most columns of one stratum: J = 3 reaches 2^9 = 512, J = 4 3^6 = 729 at six steps, and uses no more steps then."""
 CHUNK_ROWS = 2_048
@@ -92,7 +91,6 @@ class MixtureCv(Nade):
             std_error,
             third_moment,
             confidence,
-            method="mean of weighted crashes with the episode mixture's known-mean control variates",
             warnings=warnings,
             details={
                 "beta": coefficients[1:].tolist(),
@@ -162,9 +160,8 @@ class Scv(Nade):
             math.sqrt(var_z / n),
             None,
             confidence,
-            method="sparse control variates as published (Algorithm 1)",
             cautions=[note("published_scv")],
-            warnings=_overfitted(gain),
+            warnings=_saturated(gain),
             details={
                 "var_z": var_z,
                 "var_y": var_y,
@@ -247,13 +244,12 @@ def _ratio(before: float, after: float) -> float | None:
     return before / after if before > 0.0 and after > 0.0 else None
 
 
-def _overfitted(gain: Mapping[str, Any]) -> list[Note]:
+def _saturated(gain: Mapping[str, Any]) -> list[Note]:
     """Warn of strata in which a gain is claimed whatever the results are."""
-    if not (saturated := gain["saturated"]):
+    if not (levels := gain["saturated"]):
         return []
-    levels = [*saturated[:MOST_NAMED], *["…"] * (len(saturated) > MOST_NAMED)]
     gains = {"claimed": gain["claimed"], "corrected": gain["degrees_of_freedom"]}
-    return [note("saturated", n=len(saturated), of=len(gain["strata"]), levels=levels, **gains)]
+    return [note("saturated", n=len(levels), of=len(gain["strata"]), levels=levels, **gains)]
 
 
 class Stratum:

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from harness.estimators.beside import Unavoidable, share_of_crashes, unavoidable
 from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator, Number
 from harness.estimators.likelihood import Level
-from harness.estimators.shells import SeenShells, Unavoidable
+from harness.estimators.shells import SeenShells
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import FloatArray
 
@@ -40,12 +41,11 @@ class Exceedance:
 
 @dataclass(frozen=True)
 class Severity:
-    """Impact speeds of the crashes, each counted by what it adds to the rate; nothing of them without a crash.
+    """Impact speeds of the crashes, each counted by what it adds to the rate.
 
-    ``median_mps`` and ``p95_mps`` are quantiles of the impact speed (m/s), ``share_below_1_mps`` and
-    ``share_above_5_mps`` shares of the rate, of shells with ``limits``; ``exceedance`` has a row for each of
-    `SPEEDS_MPS` above what is counted, and ``unavoidable`` what not even the most careful driver of the library avoids,
-    of shells. ``cut_off`` is the rate of tests that ended with the AV about to crash (`Block`, column ``cut_off``).
+    ``median_mps`` and ``p95_mps`` are quantiles of the speed, ``share_below_1_mps`` and ``share_above_5_mps`` shares of
+    the rate; ``exceedance`` has a row for each of `SPEEDS_MPS` above what is counted. Of shells there are ``limits`` of
+    the shares, and ``unavoidable``. ``cut_off`` is the rate of tests that ended with the AV about to crash (`Block`).
     """
 
     median_mps: float
@@ -60,10 +60,7 @@ class Severity:
 
 
 class Impacts:
-    """Running state: an accumulator for each speed, and the impact speed of each crash with its weight.
-
-    ``empty`` makes an estimator without tests, ``counts_above_mps`` is what the campaign counts.
-    """
+    """Running state: an accumulator, made by ``empty``, for each speed; and impact speeds with weights."""
 
     def __init__(self, empty: Callable[[], Accumulator], counts_above_mps: float = 0.0) -> None:
         speeds = [counts_above_mps, *(speed for speed in SPEEDS_MPS if speed > counts_above_mps)]
@@ -87,21 +84,23 @@ class Impacts:
         impact, weight = (np.concatenate(column) for column in zip(*self._crashes, strict=True))
         if not impact.size:
             return None
-        every, unavoidable, cut_off = self._above[self._first], None, np.concatenate(self._cut_off) / self._n
+        every, of_careful, cut_off = self._above[self._first], None, np.concatenate(self._cut_off)
         limits: list[tuple[float, float] | None] = [None, None]
         if isinstance(every, SeenShells):
             level, each = Level.two_sided(confidence), every.weight_of_a_crash()
-            weight, cut_off = each[weight.astype(np.int64)], each[np.concatenate(self._cut_off).astype(np.int64)]
-            unavoidable = every.unavoidable(level)
+            weight, cut_off = each[weight.astype(np.int64)], each[cut_off.astype(np.int64)]
+            of_careful = unavoidable(every.design, every.cells, level)
             for k, (speed, softer) in enumerate(((TOUCH_MPS, True), (HARD_MPS, False))):
                 if isinstance(harder := self._above.get(speed), SeenShells):
-                    limits[k] = every.share_of_crashes(harder, level, of_the_others=softer)
+                    limits[k] = share_of_crashes(every.design, every.tally, harder.tally, level, of_the_others=softer)
+        else:
+            cut_off = cut_off / self._n
         if not weight.any():  # too small for a number
             return None
         total, median, high = float(weight.sum()), *weighted_quantiles(impact, weight, (0.5, 0.95))
         below, above = (float(weight[rows].sum()) / total for rows in (impact <= TOUCH_MPS, impact > HARD_MPS))
         rows = tuple(_exceedance(speed, state, confidence) for speed, state in self._above.items())
-        of_all = median, high, below, above, rows, unavoidable
+        of_all = median, high, below, above, rows, of_careful
         return Severity(*of_all, limits[0], limits[1], float(cut_off.sum()))
 
 

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept, Stop
-from harness.estimators.estimate import Estimate
+from harness.estimators.estimate import Estimate, Note, note
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts, PairDecision, PairVerdict
 from harness.estimators.shells import SeenShells
@@ -37,14 +37,12 @@ LOOK_RATIO = 1.1
 the half-width itself at the default floor of 100 crashes (half of 1/√100); a finer grid mostly repeats the same look.
 With two passes a campaign uses about 20 % more tests than a fixed size would need, at a ratio of 1.25 nearly 50 %."""
 DEFAULT_MIN_CRASHES = 100
-FIRST_TESTS = "the first tests of each shell (testing.shells.first_tests)"
 POOL_SHARE = 0.5
 """Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
 NARROW = 0.1
 """Half-width of a difference over the larger rate at which two vehicles are as good as told apart."""
 MOST_TIMES = 1e3
 """As many pairs as there are that nobody foresees what would be seen."""
-Verdict = Literal["accepted", "rejected", "undecided"]
 DECISION_THRESHOLDS = ((2.5, 4.5), (10.0, 3.4), (100.0, 4.5), (1_000.0, 5.0), (math.inf, 5.5))
 """Below so many crashes, the threshold of the likelihood ratio at which a limit is decided with an error of 5 % a side.
 
@@ -55,13 +53,15 @@ limit are decided. Few tests need more than some more: then one crash in a shell
 DECISION_TAIL = 0.05
 """Error a side for which the thresholds are."""
 
+Verdict = Literal["accepted", "rejected", "undecided"]
+Ended = Literal["rhw", "accept", "below_reference"]
+
 
 def decision_level(expected: float, confidence: float) -> Level:
     """At which a look decides, so that all looks together err in (1 - confidence)/2 of campaigns a side.
 
-    ``expected`` crashes see `DECISION_THRESHOLDS`.
-
-    The threshold is one for few crashes and many; the pool's error has the quantile that belongs to it.
+    ``expected`` crashes see `DECISION_THRESHOLDS`. The threshold is one for few crashes and many; the pool's error has
+    the quantile that belongs to it.
     """
     threshold = next(threshold for most, threshold in DECISION_THRESHOLDS if expected < most)
     threshold = max(threshold + math.log(2.0 * DECISION_TAIL / (1.0 - confidence)), 0.5)
@@ -73,9 +73,8 @@ class Decision:
     """What is known about a limit of the crash rate, by an interval that allows for every look.
 
     ``limit`` is in crashes per test, or in crash rates of a reference ``driver``, as are ``low`` and ``high``, between
-    which the rate lies after ``n_episodes`` tests. ``statement`` is the one that decides. ``confidence`` is that the
-    crash rate lies on the side which is said, whatever the budget: a campaign is wrong in at most 1 - ``confidence`` of
-    cases even where the limit is the rate itself.
+    which the rate lies after ``n_episodes`` tests. Even where the limit is the rate itself, at most 1 - ``confidence``
+    of campaigns take the wrong side, whatever the budget.
     """
 
     limit: float
@@ -94,31 +93,31 @@ class Decision:
         return "accepted" if self.high < self.limit else "undecided"
 
     def to_json(self) -> dict[str, Any]:
-        """All of it; a limit per test also by its key in the campaign."""
-        of_rate = {} if self.driver else {"crash_rate_below": self.limit}
-        return {"verdict": self.verdict, **of_rate, **asdict(self)}
+        """All of it."""
+        return {"verdict": self.verdict, **asdict(self)}
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a rule has found at its last look; a relative half-width is infinite where the interval may be wrong."""
+    """What a rule has found at its last look; a relative half-width is infinite where the interval may be wrong.
+
+    ``ended`` is which end was reached, if any. ``unmet`` are conditions that were not met when a look last failed: what
+    decided, or what is still missing. ``pool_error_above_target`` says that no test would help: the pool's own error is
+    too large for the asked precision; ``rhw_from_pool`` is what it alone would leave, 0 while little is known.
+    ``decision`` is what is known about the limit that the campaign asks about, if it does; then that is waited for.
+    """
 
     rhw: float = math.inf
-    one_more_crash: float = 0.0
-    """By how much of itself one more crash of the largest weight would have moved the estimate; 0 for limits within
-    shells, which allow for every crash that has not been seen."""
-    stopped: bool = False
-    """Whether the asked precision, or decision, was reached; always False when none was asked."""
-    unmet: tuple[str, ...] = ()
-    """Conditions that were not met when a look last failed: what decided, or what is still missing."""
+    ended: Ended | None = None
+    unmet: tuple[Note, ...] = ()
     pool_error_above_target: bool = False
-    """Whether the error of the pool, which no test narrows, is too large for the asked precision."""
-    decision: Decision | None = None
-    """What is known about the limit that the campaign asks about, if it does; then that is waited for."""
     rhw_from_pool: float = 0.0
-    """What the pool's error alone would leave of ``rhw``; 0 while little is known."""
-    below: Decision | None = None
-    """That the crash rate is far enough below a reference driver's (``stop.below_reference``), if that ended it."""
+    decision: Decision | None = None
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the asked precision, or decision, was reached; always False when none was asked."""
+        return self.ended is not None
 
 
 class Rule:
@@ -141,33 +140,32 @@ class Rule:
         rhw: float,
         n_crashes: int,
         *,
-        of: str = "",
+        of: str = "rhw",
         one_more_crash: float = 0.0,
-        more: Mapping[str, bool] | None = None,
-        also: str | None = None,
+        after_first_tests: bool = False,
+        also: Note | None = None,
         pool: tuple[float, float] = (0.0, 0.0),
     ) -> bool:
         """Note a look at a precision, ``of`` which it is, and say whether to stop.
 
-        ``more`` are further conditions by name, and whether they are met; ``also`` is what was waited for besides, if
-        nothing is unmet; ``pool`` has the half-widths that the pool's own error would leave by itself, as it was seen,
-        and at least.
+        ``one_more_crash`` is by how much of itself one of the largest weight would have moved the estimate; ``also`` is
+        what was waited for besides, if nothing is unmet; ``pool`` has the half-widths that the pool's own error would
+        leave by itself, as it was seen, and at least.
         """
-        if self._target is None:
-            self.look = Look(rhw, one_more_crash)
+        if (target := self._target) is None:
+            self.look = Look(rhw)
             return False
-        asked = f"stop.rhw ({self._target:g}{of})"
-        met = {
-            asked: rhw <= self._target,
-            f"{asked} for one more crash of the largest possible weight": one_more_crash <= self._target,
-            f"stop.min_crashes ({self._min_crashes:,})": n_crashes >= self._min_crashes,
-            **(more or {}),
-        }
-        unmet = tuple(condition for condition, is_met in met.items() if not is_met)
+        met = [
+            (note(of, target=target), rhw <= target),
+            (note("one_more_crash", target=target), one_more_crash <= target),
+            (note("min_crashes", least=self._min_crashes), n_crashes >= self._min_crashes),
+            (note("first_tests"), not (after_first_tests and self.of_first_tests)),
+        ]
+        unmet = tuple(condition for condition, is_met in met if not is_met)
         self._passes = 0 if unmet else self._passes + 1
-        stopped, too_rough = self._passes >= self._needed, pool[1] > self._target
+        stopped, too_rough = self._passes >= self._needed, pool[1] > target
         unmet = unmet or ((also,) if also else self.look.unmet)
-        self.look = Look(rhw, one_more_crash, stopped, unmet, too_rough, rhw_from_pool=pool[0])
+        self.look = Look(rhw, "rhw" if stopped else None, unmet, too_rough, pool[0])
         return stopped or (too_rough and pool[0] ** 2 >= POOL_SHARE * rhw**2)
 
 
@@ -202,7 +200,6 @@ class StopRule(Rule):
         super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or DEFAULT_MIN_CRASHES)
         self.estimator: EstimatorName = SAMPLING[method].headline
         self.looks = look_grid(campaign_stop.episodes, shard_ends, ratio)
-        self.look = Look(one_more_crash=math.inf)
         self._n_looks = 0
 
     def due(self, n: int) -> bool:
@@ -219,9 +216,8 @@ class StopRule(Rule):
         self._n_looks += 1
         last, total = self._n_looks == len(self.looks), n * estimate.crash_rate
         one_more = estimate.weight_cap / total if total > 0.0 else math.inf
-        also = "the same at a second look" if last and self._passes == 0 else None
-        crashes = estimate.n_crashes
-        return self._looked(estimate.precision, crashes, one_more_crash=one_more, also=also) or last
+        also = note("second_look") if last and self._passes == 0 else None
+        return self._looked(estimate.precision, estimate.n_crashes, one_more_crash=one_more, also=also) or last
 
 
 class RoundRule(Rule):
@@ -248,29 +244,26 @@ class RoundRule(Rule):
         if self._accept is not None:
             return self._decided(seen, self._accept)
         limits, tally = seen.limits_of(self._statement, Level.two_sided(self._confidence)), seen.tally
-        n_crashes, also = int(tally.crashes.sum()), FIRST_TESTS if self.of_first_tests else None
+        n_crashes, also = int(tally.crashes.sum()), note("first_tests") if self.of_first_tests else None
         pool = limits.from_pool_relative() if n_crashes >= self._min_crashes else (0.0, 0.0)
         enough = self._looked(limits.rhw, n_crashes, also=also, pool=pool)
-        if not self.look.stopped and (below := self._below(seen)) is not None:
-            unmet = (f"stop.below_reference ({below.limit:g})",)
-            self.look = replace(self.look, stopped=True, unmet=unmet, below=below)
+        if not self.look.stopped and (limit := self._below_reference) is not None and self._is_below(seen, limit):
+            self.look = replace(self.look, ended="below_reference", unmet=(note("below_reference", limit=limit),))
         return self.look.stopped or (enough and tally.tests.sum() >= self._held)
 
     def more_tests(self, target: float, more_runs: float) -> float:
         """How many times as many tests are expected to reach a relative half-width, see `SeenShells.more_tests`."""
         return self.seen.more_tests(self._statement, Level.two_sided(self._confidence), target, more_runs)
 
-    def _below(self, seen: SeenShells) -> Decision | None:
-        """That the rate is below the asked multiple of a reference driver's, at the level of decisions."""
-        limit, first = self._below_reference, seen.first_reference
-        if limit is None or first is None:
-            return None
+    def _is_below(self, seen: SeenShells, limit: float) -> bool:
+        """Whether the rate is below a multiple of a reference driver's, at the level of decisions."""
+        if (first := seen.design.first_reference) is None:
+            return False
         driver, rate = first
         # Limits of a ratio take a hundred times as long as those of a rate: most looks are far from an end.
         if seen.limits_of(self._statement, Level.two_sided(self._confidence)).high > 2.0 * limit * rate:
-            return None
-        found = self._beside(seen, limit, driver)
-        return found if found.verdict == "accepted" else None
+            return False
+        return self._beside(seen, limit, driver).verdict == "accepted"
 
     def _beside(self, seen: SeenShells, limit: float, driver: str | None) -> Decision:
         """What is known about a limit after these tests, at the level of decisions."""
@@ -284,9 +277,10 @@ class RoundRule(Rule):
         n, found = int(seen.tally.tests.sum()), self.look.decision
         if found is None or found.verdict == "undecided":
             key, limit, driver = accept.asked
-            found, unmet = self._beside(seen, limit, driver), (f"accept.{key} ({limit:g})",)
+            found = self._beside(seen, limit, driver)
             rhw = seen.limits_of(self._statement, Level.two_sided(self._confidence)).rhw
-            self.look = Look(rhw, stopped=found.verdict != "undecided", unmet=unmet, decision=found)
+            ended: Ended | None = None if found.verdict == "undecided" else "accept"
+            self.look = Look(rhw, ended, (note("accept", asked=key, limit=limit),), decision=found)
         return found.verdict != "undecided" and n >= self._held
 
 
@@ -296,7 +290,7 @@ class PairRule(Rule):
     What is known of that is ``decision``. Without a margin it is enough, too, once the half-width of the difference is
     `NARROW` of the larger rate, or both rates are below ``stop.below_reference``. An ``rhw`` that is asked for is all
     that is waited for (``ends_at_rhw``); then a decision is looked for once. ``look.rhw`` is that half-width;
-    ``conditional`` says whether only what lies within the boundary is looked at; ``ended`` is why it is enough.
+    ``conditional`` says whether only what lies within the boundary is looked at.
     """
 
     level_at = staticmethod(decision_level)
@@ -306,26 +300,30 @@ class PairRule(Rule):
         super().__init__(NARROW if margin is None and rhw is None else rhw, campaign.min_crashes)
         self._confidence, self.ends_at_rhw = stop.confidence, rhw is not None
         self._below_reference = stop.below_reference if margin is None and rhw is None else None
-        self._asked = "who crashes less often" if margin is None else f"--margin ({margin:g})"
+        self._asked = note("sign") if margin is None else note("margin", margin=margin)
         self.conditional = self._statement != ASSUMPTION_FREE
         self.decision = PairDecision(margin or 0.0, "open", (1.0 + stop.confidence) / 2.0, self.conditional)
-        self.ended: Literal["accept", "below_reference", "rhw"] | None = None
 
     def observe(self, pairs: PairCounts) -> bool:
         """Whether to stop at the end of a round."""
         watched, level = pairs.inside(pairs.design.n_within(self._statement)), Level.two_sided(self._confidence)
         self.decision = replace(self.decision, verdict=self._verdict(watched))
-        pool, more = watched.rhw_from_pool(level), {FIRST_TESTS: not self.of_first_tests}
-        seen = watched.rhw(level), pairs.n_crashes
-        given_up = self._looked(*seen, of=", of the difference", more=more, pool=(pool, pool))
-        self.ended = "rhw" if self.look.stopped else None
+        pool = watched.rhw_from_pool(level)
+        given_up = self._looked(
+            watched.rhw(level),
+            pairs.n_crashes,
+            of="rhw_of_difference",
+            after_first_tests=True,
+            pool=(pool, pool),
+        )
         if not self.ends_at_rhw:
+            ended = self.look.ended
             if self.decision.verdict != "open":
-                self.ended = "accept"
-            elif self.ended is None and self._both_below(watched):
-                self.ended = "below_reference"
-            unmet = self.look.unmet if self.ended == "rhw" else (self._asked,)
-            self.look = replace(self.look, stopped=self.ended is not None, unmet=unmet)
+                ended = "accept"
+            elif ended is None and self._both_below(watched):
+                ended = "below_reference"
+            unmet = self.look.unmet if ended == "rhw" else (self._asked,)
+            self.look = replace(self.look, ended=ended, unmet=unmet)
         return self.look.stopped or given_up
 
     def more_pairs(self, pairs: PairCounts) -> float:

@@ -20,10 +20,9 @@ from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 FEWEST_PATHS = 40.0
 """Below so many paths that count there is no interval: their error alone would be above 16 %, and is not known."""
-FEWEST_PAIRS, FEWEST_CRASHES = 3, 10
-"""Pairs of crashed tests of one baseline run, or crashes, that say something about the number of paths."""
-FEW_PAIRS = 10
-"""Below so many, the variance has room for one more pair."""
+FEWEST_PAIRS, FEWEST_CRASHES, FEW_PAIRS = 3, 10, 10
+"""Pairs of crashed tests of one baseline run, or crashes, that say something about the number of paths; pairs below
+which the variance has room for one more."""
 ROOM = 1.645
 """Standard errors of the variance, as told by the number of pairs, that are added to it."""
 
@@ -53,11 +52,10 @@ class RateLimits(NamedTuple):
 
 
 class Tally(NamedTuple):
-    """What tests of strata have come to.
+    """What tests of strata have come to: ``tests``, ``crashes``, ``failed`` (S,).
 
-    ``tests``, ``crashes``, ``failed`` (S,). ``crash_mass``, ``failed_mass`` (S, S): over the crashed or failed tests of
-    each stratum, the sum of their paths' probability of a cut-in of every stratum. ``runs`` is what is known of the
-    baseline runs, of vehicles that act before the cut-in.
+    ``crash_mass``, ``failed_mass`` (S, S) are, over crashed or failed tests of each stratum, the sum of their paths'
+    probability of a cut-in of every stratum; ``runs`` what is known of runs, of vehicles that act before the cut-in.
     """
 
     tests: IntArray
@@ -69,9 +67,7 @@ class Tally(NamedTuple):
 
     def part(self, strata: slice) -> Tally:
         """That of some strata."""
-        counts = self.tests[strata], self.crashes[strata], self.failed[strata]
-        runs = self.runs and self.runs.joined(np.eye(self.tests.size)[:, strata])
-        return Tally(*counts, self.crash_mass[strata, strata], self.failed_mass[strata, strata], runs)
+        return self.joined(np.eye(self.tests.size)[:, strata])
 
     def plus(self, other: Tally) -> Tally:
         """With further tests of the same strata; whose runs are not known."""
@@ -90,9 +86,9 @@ class Tally(NamedTuple):
             return self
         counted = np.ones(self.tests.size, np.bool_) if where is None else where
         failed, mass = self.failed * counted, self.failed_mass * counted[:, None]
-        counts, runs = (self.tests, self.crashes + failed, self.failed - failed), self.runs
         masses = self.crash_mass + mass, self.failed_mass - mass
-        return Tally(*counts, *masses, runs and runs.failed_as_crashes(counted))
+        runs = self.runs and self.runs.failed_as_crashes(counted)
+        return Tally(self.tests, self.crashes + failed, self.failed - failed, *masses, runs)
 
     @property
     def outcomes(self) -> Counts:
@@ -117,10 +113,7 @@ def empty_tally(n_strata: int) -> Tally:
 
 
 class CrashedTests(NamedTuple):
-    """Crashed and failed tests, (n,) each: baseline run, step of the cut-in, its ``mass``, and ``place``.
-
-    The last is the stratum, plus the number of strata where the test failed.
-    """
+    """Crashed and failed tests, (n,) each; ``place`` is the stratum, plus the number of strata if the test failed."""
 
     run: IntArray
     step: IntArray
@@ -214,10 +207,9 @@ def paths_that_count(p: FloatArray, tally: Tally, errors: float = 0.0) -> float:
 def pool_variance(
     p: FloatArray, tally: Tally, n_paths: float, factor: FloatArray | float = 1.0, errors: float = ROOM
 ) -> float:
-    """Variance of Σ p_s c_s that comes from the pool's finite number of paths, wherever the vehicle crashes.
+    """Variance of Σ p_s c_s that comes from the pool's finite number of paths: (Σ E[x_s x_t] - μ²)/n.
 
-    It is (Σ E[x_s x_t] - μ²)/n, see `crash_square`. A stratum in which no crash was seen adds nothing. ``factor`` (S,)
-    says by how much crashes of each stratum are fewer than seen.
+    A stratum in which no crash was seen adds nothing. ``factor`` (S,) is by how much crashes are fewer than seen.
     """
     scale = weight_of_a_test(p, tally.tests) * factor
     rate = float(scale @ tally.crashes)
@@ -231,7 +223,7 @@ def crash_square(scale: FloatArray, tally: Tally, errors: float = ROOM) -> float
 
 
 def mean_square(scale: FloatArray, crash_mass: FloatArray) -> float:
-    """Bound of Σ E[x_s x_t], x_s being a path's probability of a crash in stratum s.
+    """The bound.
 
     A crashed test of s is a draw in proportion to x_s, so that B_st, p_s/n_s (``scale``, shape (S,)) times the sum of
     the paths' whole probabilities m_t in t over these tests (``crash_mass``, shape (S, S)), estimates E[x_s m_t], which
@@ -245,8 +237,7 @@ def mean_square(scale: FloatArray, crash_mass: FloatArray) -> float:
 def combined(p: FloatArray, tally: Tally, n_paths: float, level: Level) -> RateLimits:
     """Rate Σ p_s c_s with the two limits of an interval; ``p`` (S,) are known from ``n_paths`` paths of a pool.
 
-    The upper limit may lie above Σ p_s, which is as uncertain as the pool: a vehicle that crashes on all cut-ins has
-    that rate.
+    The upper limit may lie above Σ p_s, the rate of a vehicle that crashes on all cut-ins: it is as uncertain as that.
     """
     worst, variance = tally.failed_as_crashes(), pool_variance(p, tally, n_paths)
     variance_of_worst = variance if worst is tally else pool_variance(p, worst, n_paths)

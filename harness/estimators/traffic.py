@@ -45,10 +45,7 @@ class Uncertain:
 
 @dataclass(frozen=True)
 class Unseen:
-    """Where in time to collision (``where``) no lane change was seen, and the share of the rate that arises there.
-
-    ``steps`` are those of the acceptance.
-    """
+    """Where no lane change was seen: times to collision, share of the rate there, and ``steps`` of the acceptance."""
 
     where: str
     share: float
@@ -57,10 +54,10 @@ class Unseen:
 
 @dataclass(frozen=True)
 class TrafficError:
-    """What replicates of an ``environment`` say of a rate, and of its ratios by the names of others.
+    """What replicates of an ``environment`` say of a rate, and of its ratios to others, by name.
 
-    Of ``n_replicates`` ``n_refused`` could not be answered; the others are taken to be ``off`` by so much in the mean.
-    With ``unseen`` there are upper limits alone.
+    Of ``n_replicates`` ``n_refused`` could not be answered; the others may be ``off`` by so much in the mean. With
+    ``unseen`` there are upper limits alone.
     """
 
     environment: str
@@ -114,12 +111,11 @@ def _log(value: float) -> float:
 
 @dataclass(frozen=True)
 class Bar:
-    """A number, or a block, by how it is ``known``, and the factors of rate and ratio at the two ends of it.
+    """A number, or a block, by how it is ``known``, and the factors of rate and ratio at its two ends.
 
-    ``values`` are its ends, of a block none. ``off`` is by how much a reference driver's rate comes out wrong at most,
-    at each end.
-    A factor is NaN where the tests cannot answer it: of ``n`` environments ``no_laws`` have laws that give no
-    probabilities, and ``unlike`` are unlike what was tested.
+    ``values`` are the ends, of a block none, ``off`` by how much a reference driver's rate comes out wrong at most. A
+    factor is NaN where the tests do not say it: of ``n`` environments ``no_laws`` have laws that give no probabilities,
+    and ``unlike`` are unlike what was tested.
     """
 
     what: str

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate, Note, note
+from harness.estimators.estimate import CapKind, Estimate, Note, note
 from harness.estimators.limits import capped_mean_upper, clopper_pearson, skewed_distances
 from harness.vocabulary import FloatArray
 
@@ -140,21 +140,21 @@ class Nade:
         of_tests = math.exp(self._log_cap) if self._log_cap < LARGEST_LOG else math.inf
         return max(self._design_cap if math.isfinite(self._design_cap) else of_tests, self._largest_y)
 
-    def cap(self) -> tuple[float, str]:
-        """Cap on Y for the upper bound, and where it comes from, in words."""
+    def cap(self) -> tuple[float, CapKind]:
+        """Cap on Y for the upper bound, and what it rests on."""
         known = self.known_cap()
-        if math.isfinite(self._design_cap):
-            return known, "the weight cap known by design"
         if math.isfinite(known):
-            return known, "the largest weight that the tests driven could have had"
-        seen, among = self._largest_event_log_weight, " among episodes with a cut-in"
-        if not math.isfinite(seen):
-            seen, among = self._largest_log_weight, ""
-        return math.exp(seen) if seen < LARGEST_LOG else math.inf, f"the largest weight seen{among} (no cap is known)"
+            return known, "design" if math.isfinite(self._design_cap) else "tests"
+        of_events = math.isfinite(self._largest_event_log_weight)
+        seen = self._largest_event_log_weight if of_events else self._largest_log_weight
+        return math.exp(seen) if seen < LARGEST_LOG else math.inf, "seen_events" if of_events else "seen"
 
     def is_settled(self) -> bool:
         """Whether there are enough crashes for limits from moments to mean what they say."""
         return self.n_crashes >= FEW_CRASHES and self.y.n_effective >= FEW_EFFECTIVE
+
+    def _few_crashes(self) -> list[Note]:
+        return [note("few_crashes", n=self.n_crashes, least=FEW_CRASHES)] if self.n_crashes < FEW_CRASHES else []
 
     def cautions(self) -> list[Note]:
         """Why an interval around a mean of these Y may be wrong."""
@@ -165,21 +165,19 @@ class Nade:
         if not math.isfinite(cap):
             found.append(note("unbounded"))
         elif self.n_crashes and (times := cap / self.y.total) > OVERTURNS:
-            more = (
-                note("one_may_weigh", cap=cap, seen=self.y.total) if cap > 1.0 else note("one_more_adds", times=times)
-            )
-            found.append(more)
+            more = note("one_may_weigh", cap=cap, seen=self.y.total), note("one_more_adds", times=times)
+            found.append(more[0] if cap > 1.0 else more[1])
         return found
 
     def warnings(self, half_width: float) -> list[Note]:
         """What else a reader of a mean of these Y should know, beside an interval of this half-width."""
-        found, effective, cap = count_warnings(self.n_crashes), self.y.n_effective, self.known_cap()
+        found, effective, cap = self._few_crashes(), self.y.n_effective, self.known_cap()
         if 0.0 < effective < FEW_EFFECTIVE:
             found.append(note("few_effective", n=effective, least=FEW_EFFECTIVE))
         if self.largest_share() > LARGE_SHARE:
             found.append(note("one_carries", share=self.largest_share()))
         if not math.isfinite(self._design_cap) and not self.is_settled():
-            found.append(note("bound_rests", origin=self.cap()[1]))
+            found.append(note("bound_rests", cap=self.cap()[1]))
         if 0.0 < half_width < cap / self.n <= OVERTURNS * self.y.mean(self.n):  # beyond that there is a caution
             found.append(note("one_more_moves", cap=cap, by=cap / self.n))
         return found
@@ -187,7 +185,7 @@ class Nade:
     def result(self, confidence: float) -> Estimate:
         """Mean of Y with its interval."""
         errors = self.y.std_error(self.n), self.y.third_moment(self.n)
-        return self.estimate(self.y.mean(self.n), *errors, confidence, method="mean of weighted crashes")
+        return self.estimate(self.y.mean(self.n), *errors, confidence)
 
     def estimate(
         self,
@@ -196,7 +194,6 @@ class Nade:
         third_moment: float | None,
         confidence: float,
         *,
-        method: str,
         details: Mapping[str, Any] | None = None,
         warnings: Sequence[Note] = (),
         cautions: Sequence[Note] = (),
@@ -214,12 +211,9 @@ class Nade:
         low, high, half = max(0.0, rate - below), min(1.0, rate + above), (below + above) / 2.0
         if self.n_crashes == 0:
             low, high = 0.0, capped_mean_upper(0.0, cap, self.n, (1.0 + confidence) / 2.0)
-        upper = hoeffding
-        bound = f"Hoeffding's for the mean of Y, with {origin}; without a crash Clopper-Pearson times that cap"
-        if self.is_settled():
+        upper, settled = hoeffding, self.is_settled()
+        if settled:
             upper = min(1.0, rate + skewed_distances(std_error, third_moment or 0.0, 1.0 - confidence)[1])
-            bound = "the same, one-sided"
-        interval = "normal interval" if third_moment is None else "normal interval, widened for skewness (Hall)"
         negative = () if rate >= 0.0 else (note("negative"),)
         cautions = (*cautions, *negative, *self.cautions())
         return Estimate(
@@ -234,19 +228,14 @@ class Nade:
             n_crashes=self.n_crashes,
             n_effective=self.y.n_effective,
             largest_weight_share=self.largest_share(),
-            method=f"{method}; {interval}; upper bound: {bound}",
+            interval="normal" if third_moment is None else "skewed",
+            bound="one_sided" if settled else "hoeffding",
+            cap=origin,
             weight_cap=self.known_cap(),
             cautions=cautions,
             warnings=(*cautions, *self.warnings(half), *warnings),
             details={"upper_bound_hoeffding": hoeffding, **(details or {})},
         )
-
-
-def count_warnings(n_crashes: int) -> list[Note]:
-    """Warn of too few crashes, which matters to any estimator."""
-    if n_crashes >= FEW_CRASHES:
-        return []
-    return [note("few_crashes", n=n_crashes, least=FEW_CRASHES)]
 
 
 class Nde(Nade):
@@ -268,7 +257,9 @@ class Nde(Nade):
             n_crashes=self.n_crashes,
             n_effective=float(self.n_crashes),
             largest_weight_share=1.0 / self.n_crashes if self.n_crashes else 0.0,
-            method="share of crashes; Clopper-Pearson interval and upper bound",
+            interval="clopper_pearson",
+            bound="one_sided",
+            cap="design",
             weight_cap=1.0,
-            warnings=tuple(count_warnings(self.n_crashes)),
+            warnings=tuple(self._few_crashes()),
         )

@@ -23,7 +23,7 @@ from harness.fitting.laws import HAZARD_OF, TTC_EDGES_S, bins
 from harness.fitting.observations import Tally
 from harness.numbers import number
 from harness.report.drawing import Axis, Panel, Plot
-from harness.report.player import templates
+from harness.report.templates import templates
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, IntArray, RecordArray
 
 CONFIDENCE = 0.9

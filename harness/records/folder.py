@@ -278,7 +278,7 @@ class StoredManifest(Stored):
     campaign_crc32: Count | None = None
     versions: dict[str, str] = {}
     stopped_by: StoppedBy | None = None
-    unmet: list[str] = []
+    unmet: list[dict[str, Any]] = []
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
     repeated: Repeated | None = None

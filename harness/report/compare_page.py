@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from inspect import getmembers, isfunction
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,15 +11,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from harness import numbers
 from harness.errors import HarnessError, RunFolderError, printable
 from harness.numbers import count, tenths
 from harness.records.folder import read_as, write_bytes
-from harness.report.page import sentence
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
-from harness.report.player import Scene, Scenes, beside_other, templates
+from harness.report.player import Scene, Scenes, beside_other
 from harness.report.plots import WHO, pairs_plot
 from harness.report.summary import RunFolder, floats, read_run_folder
+from harness.report.templates import templates
 from harness.report.words import short_answer
 from harness.runner.stored import replay_episode
 from harness.strata import weight_of_a_test
@@ -51,9 +49,7 @@ def write_page(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder]) 
     """Write the page of a comparison in hand."""
     pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
     plot = pairs_plot(pairs.who, pairs.weight, pairs.gap_m, pairs.closing_mps)
-    environment = templates()
-    environment.filters.update(getmembers(numbers, isfunction), sentence=sentence)
-    page = environment.get_template("compare.html.j2").render(
+    page = templates().get_template("compare.html.j2").render(
         compared=stored, asked=asked, given=asked is not stored,
         verdict=pair_words(stored["decision"]), warnings=list(pair_warnings(stored)),
         answers=[short_answer(run.campaign, run.manifest, run.estimates) for run in runs],

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
 from harness.records.folder import write_text
-from harness.report.words import within
+from harness.report.rows import within
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
 Outcome = Literal["passed", "failure", "error"]

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import re
-from inspect import getmembers, isfunction
 from pathlib import Path
 from typing import Any
 
-from harness import numbers
 from harness.arguments import checked
 from harness.campaign.files import dump_campaign
 from harness.errors import printable
-from harness.estimators.shells import Within
 from harness.estimators.traffic import Sensitivity
 from harness.families import family_named
 from harness.families.protocol import Environment
-from harness.numbers import count, leaves, number
+from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.records.reader import table_sizes
 from harness.report.crashes import crash_gallery
 from harness.report.drawing import Plot
-from harness.report.notes import note_words
-from harness.report.player import templates
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
+from harness.report.templates import templates
 from harness.report.words import short_answer
 from harness.vocabulary import OUTCOMES
 
@@ -49,25 +45,27 @@ def write_page(run: RunFolder) -> Path:
     folder, summary, traffic = run.path, summarise(run), run.traffic
     plots = _plots(run, summary, traffic)
     gallery, scenes = crash_gallery(run, summary, traffic)
-    environment, answer = templates(), short_answer(run.campaign, run.manifest, run.estimates)
-    environment.filters.update(getmembers(numbers, isfunction), verdict=verdict, sentence=sentence, note=note_words)
-    page = environment.get_template("report.html.j2").render(
-        run=run,
-        answer=answer,
-        summary=summary,
-        sizes=table_sizes(run.manifest["parts"]),
-        gallery=gallery,
-        scenes=scenes,
-        figures={plot.name: plot for plot in plots},
-        lateral=lateral_facts(run),
-        tabled=traffic is not None and traffic.accepted.size > 0,
-        estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
-        outcomes=outcome_rows(summary),
-        beside=what_if_rows(run),
-        warnings=[*answer.warnings, *uncovered(run, summary)],
-        diagnostics=diagnostics(run),
-        settings=dump_campaign(run.campaign),
-        folder=run.typed,
+    answer = short_answer(run.campaign, run.manifest, run.estimates)
+    page = (
+        templates()
+        .get_template("report.html.j2")
+        .render(
+            run=run,
+            answer=answer,
+            summary=summary,
+            sizes=table_sizes(run.manifest["parts"]),
+            gallery=gallery,
+            scenes=scenes,
+            figures={plot.name: plot for plot in plots},
+            lateral=lateral_facts(run),
+            tabled=traffic is not None and traffic.accepted.size > 0,
+            estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
+            outcomes=outcome_rows(summary),
+            warnings=[*answer.warnings, *uncovered(run, summary)],
+            diagnostics=diagnostics(run),
+            settings=dump_campaign(run.campaign),
+            folder=run.typed,
+        )
     )
     _write_plots(folder / "plots", plots)
     write_bytes(folder / "report.html", printable(page).encode("utf-8"))
@@ -114,38 +112,11 @@ def uncovered(run: RunFolder, summary: RunSummary) -> list[str]:
     return [f"{found}: run harness estimate {run.typed} --write"]
 
 
-def verdict(found: Within) -> str:
-    """What the tests say about the assumption that it crashes only inside the boundary."""
-    if found.refuted:
-        return "refuted by these tests"
-    return "no crash seen outside" if found.n_episodes_outside else "not put to the test"
-
-
-def sentence(text: str) -> str:
-    """Write a phrase as a sentence: capital first, full stop last."""
-    text = text.strip()
-    return text[:1].upper() + text[1:] + ("" if text[-1:] in ".!?" else ".")
-
-
 def outcome_rows(summary: RunSummary) -> list[tuple[str, float, float, float]]:
     """Per outcome: name, tests, share of the tests, how often it happens per naturalistic test."""
     n = max(summary.n_episodes, 1)
     counted = zip(OUTCOMES, summary.count.tolist(), summary.weight.tolist(), strict=True)
     return [(name, tests, tests / n, summary.per_test(weight)) for name, tests, weight in counted]
-
-
-def what_if_rows(run: RunFolder) -> list[tuple[str, str]]:
-    """What is to be known of tests that count otherwise than they might: failed, cut off, or run a second time."""
-    details, severity, found = run.headline.details, run.estimates.severity, []
-    if details["n_failed"]:
-        found.append(("Crash rate, had all failed tests crashed", number(details["crash_rate_if_failed_had_crashed"])))
-    if severity is not None and severity.cut_off:
-        worst = run.headline.crash_rate + severity.cut_off
-        found.append(("Crash rate, had all tests crashed whose time was up while it closed in", number(worst)))
-    if repeated := run.manifest.get("repeated"):
-        told = f"{count(repeated['n_episodes'])}, {count(len(repeated['differing']))} of them otherwise"
-        found.append(("Tests that were run a second time", told))
-    return found
 
 
 def diagnostics(run: RunFolder) -> list[tuple[str, Any]]:

@@ -6,8 +6,6 @@ as if it had not been.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import math
 from pathlib import Path
 from typing import Any
@@ -15,9 +13,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from jinja2 import Environment as Templates
-from jinja2 import PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from harness.campaign.campaign import Campaign
 from harness.errors import printable
@@ -28,6 +23,7 @@ from harness.pool.kept import onset_steps
 from harness.records.folder import write_bytes
 from harness.records.schemas import chosen_from
 from harness.report.summary import floats
+from harness.report.templates import templates
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import LibraryDriver, library_records
 from harness.vocabulary import FloatArray, IntArray
@@ -246,26 +242,6 @@ def _when(step: int, cut: int) -> str:
         return f"{STEP_S * step:.1f} s"
     side = "after" if step > cut else "before"
     return f"{STEP_S * step:.1f} s, {STEP_S * abs(step - cut):.1f} s {side} the cut-in"
-
-
-def templates() -> Templates:
-    """Templates of pages, with what both kinds hold that the player needs."""
-    place = Path(__file__).parent
-    css, more_css, script = (
-        (place / name).read_text(encoding="utf-8") for name in ("report.css", "player.css", "player.js")
-    )
-    found = Templates(
-        loader=PackageLoader("harness.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    # Our own files, of which the policy of the page lets this one script run, by its hash.
-    found.globals.update(style=Markup(css + more_css), script=Markup(script), script_hash=Markup(digest))  # noqa: S704
-    found.policies["json.dumps_kwargs"] = {"default": np.ndarray.tolist, "separators": (",", ":")}
-    return found
 
 
 def write_player(scene: Scene, file: str | Path) -> None:

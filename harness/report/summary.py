@@ -22,7 +22,7 @@ from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.estimators.answer import Estimates
 from harness.estimators.block import outcome_places
-from harness.estimators.estimate import Estimate, Unavailable
+from harness.estimators.estimate import Estimate
 from harness.estimators.shells import ShellDetails
 from harness.families import family_named
 from harness.families.protocol import Environment
@@ -30,7 +30,8 @@ from harness.records.folder import read_as, read_manifest
 from harness.records.reader import read_campaign, read_traces, traffic_of
 from harness.records.schemas import LEAD
 from harness.records.shown import ShownTests
-from harness.strata import ASSUMPTION_FREE, weight_of_a_test
+from harness.sampling.shells import Shells
+from harness.strata import ASSUMPTION_FREE, ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
 
@@ -42,6 +43,12 @@ class ShownShells(ShellDetails):
     """What the headline estimate of a shells run says about them."""
 
     rate: float
+    design: ShellDesign
+
+    @property
+    def described(self) -> dict[str, str]:
+        """Reference drivers in plain words, by name."""
+        return {each.name: each.described for each in self.design.references}
 
     @property
     def weight(self) -> FloatArray:
@@ -83,12 +90,13 @@ class RunFolder:
         campaign: Campaign,
         manifest: dict[str, Any],
         estimates: Estimates | dict[str, Any],
+        design: ShellDesign | None,
         tests: ShownTests,
         traffic: Environment | None,
     ) -> RunFolder:
         """A run in hand; ``estimates`` as they are written, or read."""
         told = _ESTIMATES.validate_python(estimates)
-        shells = _shells(path, told.estimates[told.headline])
+        shells = None if design is None else _shells(path, told.best, design)
         return cls(path, campaign, manifest, told, tests, traffic, shells, typed_folder(path))
 
     @property
@@ -138,7 +146,8 @@ def read_run_folder(path: Path) -> RunFolder:
     manifest = read_manifest(path)
     estimates, campaign = _read_estimates(path, manifest["campaign_hash"]), read_campaign(path, manifest)
     tests = ShownTests.stored(path, manifest, family_named(campaign.scenario))
-    return RunFolder.of(path, campaign, manifest, estimates, tests, traffic_of(campaign, manifest))
+    design = Shells.stored_design(path) if campaign.sampling.strata else None
+    return RunFolder.of(path, campaign, manifest, estimates, design, tests, traffic_of(campaign, manifest))
 
 
 def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:
@@ -154,11 +163,10 @@ def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:
     return estimates
 
 
-def _shells(folder: Path, headline: Estimate | Unavailable) -> ShownShells | None:
-    if isinstance(headline, Unavailable) or "shells" not in headline.details:
-        return None
+def _shells(folder: Path, headline: Estimate, design: ShellDesign) -> ShownShells:
     try:
-        return TypeAdapter(ShownShells).validate_python({**headline.details, "rate": headline.crash_rate})
+        of_run = {"rate": headline.crash_rate, "design": design}
+        return TypeAdapter(ShownShells).validate_python({**headline.details, **of_run})
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
         found = f"no complete description of shells ({'.'.join(map(str, wrong['loc']))}: {wrong['msg']})"

@@ -124,7 +124,7 @@ def compare_campaigns(
         "ended": ended_by(a, rule, found["n_pairs"]),
         "unseen": sides[0].parameters.unseen,
     }
-    code = EXIT_DONE if rule.ended else EXIT_BUDGET_SPENT
+    code = EXIT_DONE if rule.look.stopped else EXIT_BUDGET_SPENT
     if margin is not None:
         code = EXIT_OF[rule.decision.verdict]
     write_sealed(out / COMPARISON, content)

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -192,7 +192,7 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     decided["remedy"] = pool_remedy(rule, campaign, stopped_by) or None
     if cpus:  # bits may have come from any of them
         run = run.noting(cpu=", ".join(sorted({cpu_name(), *cpus})))
-    ended = {"stopped_by": stopped_by, "unmet": rule.look.unmet, **decided}
+    ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
     run = run.written("done", **ended)
     progress.stage("writing estimates and report", None)
     manifest = run.content("done", **ended)
@@ -202,7 +202,7 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     from harness.report.summary import RunFolder  # noqa: PLC0415
 
     tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
-    shown = RunFolder.of(run.folder, campaign, manifest, estimates, tests, traffic)
+    shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
     return RunResult(run.folder, write_page(shown), estimates, stopped_by, code, shown)
 
 

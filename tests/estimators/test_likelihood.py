@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize
 from scipy.special import betaincinv, gammaln, xlogy
 
+from harness.estimators.beside import preventable_share, rate_ratio_limits
 from harness.estimators.likelihood import Level, contrast_limit, likelihood_limit, ratio_limits, spread
-from harness.estimators.shells import preventable_share, rate_ratio_limits
 from harness.estimators.tally import Tally
 from tests.estimators.small_blocks import EXACT, tally
 

@@ -19,7 +19,7 @@ from harness.estimators.pairs import (
     no_pairs,
     paired_estimate,
 )
-from harness.report.pair_words import pair_warnings, pair_words
+from harness.report.pair_words import pair_warnings
 from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import SHELLS, in_shells
 
@@ -108,21 +108,6 @@ def test_equal_vehicles_are_not_told_apart_and_json_has_no_infinity():
     content = json.loads(json.dumps(found, allow_nan=False))
     assert content["ratio_high"] is None
     assert content["only_a"]["ci_low"] == 0.0
-
-
-@pytest.mark.parametrize(
-    ("margin", "verdict", "said"),
-    [
-        (0.0, "proven", "B crashes less often than A"),
-        (0.0, "refuted", "B crashes more often than A"),
-        (0.0, "open", "Not told apart"),
-        (0.1, "proven", "B is at most 10 % worse than A"),
-        (0.1, "refuted", "B is more than 10 % worse than A"),
-        (0.1, "open", "Open whether B is more than 10 % worse than A"),
-    ],
-)
-def test_the_verdict_in_words(margin, verdict, said):
-    assert pair_words({"margin": margin, "verdict": verdict}) == said
 
 
 def test_more_pairs_that_end_as_often_say_the_same_with_less_doubt():

@@ -107,7 +107,7 @@ SAFE = population({"a": 1.0}, {"b": 0.1}, {})
 def test_what_ends_a_comparison(statement, shares, args, stop, ended, verdict):
     """The sign, half-width 0.1, or both far below the reference; what is asked by hand ends at that alone."""
     *_, (rule, pairs) = rounds_of(statement, shares, 3, *args, **stop)
-    assert (rule.ended, rule.decision.verdict, rule.look.stopped) == (ended, verdict, ended is not None)
+    assert (rule.look.ended, rule.decision.verdict) == (ended, verdict)
     watched = pairs.inside() if rule.conditional else pairs
     level = Level.two_sided(0.9)
     if ended == "rhw":

@@ -45,14 +45,14 @@ def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
     driven = nade(block(*some, method="forced", log_p_event=paths))
     mixed = nade(block(*some, method="episode_mixture", alpha=np.array([0.1, 0.9]), log_p_event=paths))
     seen = nade(block(*some, method="step_mixture"))
-    assert known.cap() == (5e-3, "the weight cap known by design")
+    assert known.cap() == (5e-3, "design")
     assert driven.cap()[0] == pytest.approx(2e-3)
     assert mixed.cap()[0] == pytest.approx(2e-3 / 0.1)  # over the defensive share
     assert seen.cap()[0] == pytest.approx(math.exp(-7.0))
     assert not any("upper bound rests" in note_words(w) for w in known.result(0.9).warnings)
     for unknown in (driven, seen):
         assert any("upper bound rests" in note_words(w) for w in unknown.result(0.9).warnings)
-        assert unknown.cap()[1] in unknown.result(0.9).method
+        assert (unknown.result(0.9).bound, unknown.result(0.9).cap) == ("hoeffding", unknown.cap()[1])
 
 
 @pytest.mark.parametrize(

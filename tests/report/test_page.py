@@ -16,8 +16,8 @@ from harness.records.folder import write_sealed
 from harness.report import page
 from harness.report.junit import statement_case, write_junit
 from harness.report.page import uncovered, write_report
+from harness.report.rows import Row
 from harness.report.summary import read_run_folder, summarise, typed_folder
-from harness.report.words import Row
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
 from tests.stored_runs import truncate
 

@@ -118,31 +118,6 @@ def test_the_plot_shows_contributions_and_half_widths(runs):
     assert sum(map(found.share_of_uncertainty, half_widths)) == pytest.approx(1.0)
 
 
-def test_no_line_runs_through_a_label_and_no_tick_through_the_legend(runs):
-    plot = shells_plot(runs["shells"].shells)
-    rates = plot.panels[0]
-    ends = {float(mark.columns[1][0]): mark.columns[0][1] for mark in rates.marks if mark.kind == "line"}
-    labels = {float(mark.columns[1]): mark.label for mark in rates.marks if mark.label.startswith("outside")}
-    assert labels.keys() == ends.keys() != set()
-    assert all(ends[y] == rates.x.high * max(rates.room_before(label), 0.0) for y, label in labels.items())
-    assert ("orange" in plot.caption) == any(
-        s.contribution > 0.0 and not s.inside for s in runs["shells"].shells.shells
-    )
-    legend = severity_plot(runs["shells"].estimates).panels[0]
-    rows = [row for _, row, _ in legend._legend()]
-    [top] = re.findall(r'<svg x="54.0" y="(\d+)"', str(legend.svg))
-    assert float(top) - 5.0 >= 32.0 + 15.0 * max(rows) + 3.0  # of texts 11 high that stand on a line 4 below
-
-
-def test_a_long_name_of_a_driver_is_not_cut(runs):
-    found, name = runs["shells"].shells, "blind-brakes-2-late-1s"
-    shells = [replace(found.shells[0], shell=name), *found.shells[1:]]
-    rates = shells_plot(replace(found, shells=shells)).panels[0]
-    labels = [mark.label for mark in rates.marks if mark.label.startswith("outside")]
-    assert labels
-    assert min(map(rates.room_before, labels)) > 0.0
-
-
 def test_a_shell_without_tests_is_said_so_and_runs_out_of_the_plot(runs):
     found = runs["shells_inside_only"].shells
     rates, widths = shells_plot(found).panels

@@ -1,6 +1,5 @@
 """The answer at a glance of every kind of run: short, and with what changes its meaning."""
 
-import json
 import math
 import re
 from dataclasses import asdict, replace
@@ -12,28 +11,22 @@ from harness.campaign.files import load_campaign
 from harness.estimators.answer import estimate_blocks
 from harness.records.folder import read_manifest
 from harness.report.lines import LINES, WIDTH, lines, pair_lines
-from harness.report.pair_words import deciding_words
+from harness.report.pair_words import deciding_words, pair_words
+from harness.report.rows import width_row
 from harness.report.summary import read_run_folder
-from harness.report.words import _whence, answer_of, remedy_words, short_answer, vehicle_words
+from harness.report.words import answer_of, short_answer, vehicle_words
 from harness.runner.stored import stored_blocks
 from tests.golden.campaigns import BASE, RUNS
-from tests.stored_runs import answer_in, estimates, golden
+from tests.stored_runs import answer_in, golden
 
 SAID = {
     "nde-twin": ["lane-change level 3,000,000: never compare", "impact "],
     "step-immediate-twin": ["the true rate may lie far above this interval: a crash may weigh 1.00 × 10²⁰⁰, and all"],
     "forced-failing-twin": [" of 240 tests FAILED; had they all crashed, the rate would be "],
-    "shells-twin": [
-        "× competent driver  ",
-        "r157-cc of UN R157",
-        "not even 8 m/s² avoids it",
-    ],
+    "shells-twin": ["crash rate  ", "× competent driver  ", "r157-cc of UN R157", "not even 8 m/s² avoids it"],
     "shells-accepted": ["ACCEPTED ", "below 4 × 10⁻⁷ per test", "confidence 0.95", "ended by: decision reached"],
-    "shells-refuted": [
-        "138 (crashes more)",
-        "ended by: all tests done",
-    ],
-    "shells-inside": ["keeping to library ", "nothing tested beyond it"],
+    "shells-refuted": ["138 (crashes more)", "ended by: all tests done"],
+    "shells-inside": ["keeping to library ", "nothing tested beyond it", "crash rate so far", "unavoidable so far"],
     "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc, same approach"],
     "forced-inattentive": ["fvdm (reaction.delay_s 0.2, "],
     "forced-krauss": ["SUMO’s Krauss · 240 tests in SUMO"],
@@ -41,28 +34,28 @@ SAID = {
 }
 
 
-def shown(folder):
-    run = read_run_folder(folder)
-    return lines(short_answer(run.campaign, run.manifest, run.estimates), 3.21, folder / "report.html")
-
-
 @pytest.mark.parametrize("name", RUNS)
 def test_it_is_short_and_says_what_changes_the_meaning(name, stored_run):
-    text = shown(stored_run(name))
+    run = read_run_folder(stored_run(name))
+    text = lines(short_answer(run.campaign, run.manifest, run.estimates), 3.21, run.path / "report.html")
     assert len(text) - sum(line.startswith("    ") for line in text) <= LINES
     assert max(map(len, text[:-1])) <= WIDTH
     assert "…" not in "".join(text[1:])
     assert " · 3.2 s" in text[0]
-    assert text[-1] == f"  report  {stored_run(name)}/report.html"
+    assert text[-1] == f"  report  {run.path}/report.html"
     assert "\n  sampling error in this simulated traffic only (90 %)" in "\n".join(text)
     assert [each for each in SAID.get(name, ()) if each not in re.sub(r"\n    ", " ", "\n".join(text))] == []
 
 
-def answered(stored_run, name="shells-twin", **manifest):
-    folder = stored_run(name)
+def answered(stored_run, name="shells-twin", blocks=None, more=("stop.rhw=0.1",), **manifest):
+    """The answer of a run's tests, or of others, with other settings and keys of the manifest."""
+    folder, campaign = stored_run(name), golden(name, *more)
     known = {**read_manifest(folder), **manifest}
-    campaign = golden(name, "stop.rhw=0.1")
-    return answer_of(campaign, known, estimate_blocks(stored_blocks(folder, moments=False), campaign, known))
+    return answer_of(campaign, known, estimate_blocks(blocks or blocks_of(folder), campaign, known))
+
+
+def blocks_of(folder):
+    return list(stored_blocks(folder, moments=False))
 
 
 def said(run, best=None, campaign=None, manifest=None, **changes):
@@ -77,79 +70,59 @@ def test_a_vehicle_that_is_not_reproducible_and_a_precision_that_was_not_reached
     assert re.search(r"ended by: budget spent ± \d+ %, asked: ± 10 %$", answer.scope)
 
 
-def test_a_limit_that_is_rejected_or_open(stored_run):
-    decision = json.loads(json.dumps(read_manifest(stored_run("shells-accepted"))["decision"]))
-    for verdict, value in (("rejected", "above 4 × 10⁻⁷ per test"), ("undecided", "limit 4 × 10⁻⁷ per test")):
-        asked = {**decision, "verdict": verdict}
-        answer = answered(stored_run, decision=asked)
-        assert (answer.rows[0].what, answer.rows[0].value) == (verdict.upper(), value)
-        assert len([line for line in lines(answer, 1.0) if not line.startswith("    ")]) <= LINES
+@pytest.mark.parametrize(("verdict", "value"), [("rejected", "above"), ("undecided", "limit")])
+def test_a_limit_that_is_rejected_or_open(verdict, value, stored_run):
+    decision = {**read_manifest(stored_run("shells-accepted"))["decision"], "verdict": verdict}
+    answer = answered(stored_run, decision=decision)
+    assert (answer.rows[0].what, answer.rows[0].value) == (verdict.upper(), f"{value} 4 × 10⁻⁷ per test")
+    assert len([line for line in lines(answer, 1.0) if not line.startswith("    ")]) <= LINES
 
 
 def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     """Of the same tests had none crashed: above 50 m/s none did."""
-    folder, campaign = stored_run("shells-twin"), golden("shells-twin", "crash.counts_above_mps=50")
-    blocks = [block.harder_than(50.0) for block in stored_blocks(folder, moments=False)]
-    content = estimate_blocks(blocks, campaign, read_manifest(folder))
-    rows = {row.key: row for row in answer_of(campaign, {}, content).rows}
+    blocks = [block.harder_than(50.0) for block in blocks_of(stored_run("shells-twin"))]
+    rows = {row.key: row for row in answered(stored_run, blocks=blocks, more=["crash.counts_above_mps=50"]).rows}
     assert set(rows) == {"rate", "ratio"}
     assert (rows["rate"].what, rows["rate"].interval) == ("crash rate > 50 m/s", "no crash seen")
     assert rows["rate"].value.startswith("< ")
     assert rows["rate"].remark.startswith("< ")
-    assert content["severity"] is None
 
 
 def test_a_vehicle_that_only_touches_is_said_so(stored_run):
     """Of the same tests had each crash been fifty times softer; its rate is what it was."""
-    folder, campaign = stored_run("shells-refuted"), golden("shells-refuted")
+    folder = stored_run("shells-refuted")
     blocks = [
-        replace(block, columns={**block.columns, "impact_mps": 0.02 * block.impact_mps})
-        for block in stored_blocks(folder, moments=False)
+        replace(each, columns={**each.columns, "impact_mps": 0.02 * each.impact_mps}) for each in blocks_of(folder)
     ]
-    content = estimate_blocks(blocks, campaign, read_manifest(folder))
-    answer = answer_of(campaign, {}, content)
-    text = lines(answer, 1.0)
-    assert any(
-        re.match(r"  impact +median 0.1 m/s +0 % \(0–\d+ %\) > 5 m/s +100 % \(\d+–100 %\) < 1 m/s", line)
-        for line in text
-    )
+    answer = answered(stored_run, "shells-refuted", blocks, ())
+    text, row = lines(answer, 1.0), r"  impact +median 0.1 m/s +0 % \(0–\d+ %\) > 5 m/s +100 % \(\d+–100 %\) < 1 m/s"
+    assert any(re.match(row, line) for line in text)
     assert "  ! 100 % of this rate are touches below 1 m/s" in text
     assert asdict(answer.rows[0]) == answer_in(folder)["rows"][0]
 
 
 def test_much_to_warn_of_leaves_room_for_the_rate(stored_run):
-    answer = replace(answered(stored_run), warnings=("a" * 120, "b", "c", "d", "e"))
-    text = lines(answer, None)
+    text = lines(replace(answered(stored_run), warnings=("a" * 120, "b", "c", "d", "e")), None)
     assert text[1].startswith("  crash rate ")
     assert "  ! 3 more warnings: see the report" in text
     assert sum(line.count("a") for line in text if set(line) <= set("  !a")) == 120  # nothing is cut off
     assert max(map(len, text)) <= WIDTH
 
 
-def test_vehicles_are_named_with_what_is_not_a_default():
-    for av, name, parameters in (
+@pytest.mark.parametrize(
+    ("av", "name", "parameters"),
+    [
         ("av={controller: 'm:C', parameters: {hard: 8, soft: {a: 1}}}", "m:C", [("hard", "8"), ("soft.a", "1")]),
         ("av.controller=my_av.py:MyAV", "my_av.py:MyAV", []),
         ("av={fmu: {file: x/brake.fmu, inputs: {s: speed_mps}, output: a}}", "brake.fmu", []),
         ("av={traci: {command: './my_av --port {port}'}}", "TraCI client my_av", []),
         ("av={sumo: {tau: 1}}", "SUMO’s Krauss", [("tau", "1")]),
         ("av.parameters.min_acceleration_mps2=-8", "idm", [("min_acceleration_mps2", "−8")]),
-    ):
-        campaign = load_campaign(BASE, ["testing.method=forced", av], check_files=False)
-        assert vehicle_words(campaign.av) == (name, parameters)
-
-
-@pytest.mark.parametrize(("name", "untested"), [("shells-inside", True), ("shells-twin", False)])
-def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, untested, stored_run):
-    content = estimates(stored_run(name))
-    rows = {row["key"]: row for row in answer_in(stored_run(name))["rows"]}
-    rate = rows["rate"]
-    shells = content["estimates"]["shells"]["details"]["shells"]
-    assert any(not each["n_episodes"] for each in shells) == untested
-    assert (rate["what"] == "crash rate so far") == untested
-    assert rate["remark"].endswith(" per million km")
-    assert not rows["ratio"]["value"].startswith("≥")
-    assert (rows["unavoidable"]["what"] == "unavoidable so far") == untested
+    ],
+)
+def test_vehicles_are_named_with_what_is_not_a_default(av, name, parameters):
+    campaign = load_campaign(BASE, ["testing.method=forced", av], check_files=False)
+    assert vehicle_words(campaign.av) == (name, parameters)
 
 
 @pytest.mark.parametrize(
@@ -161,15 +134,15 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
 )
 def test_of_a_vehicle_that_acts_it_says_whether_runs_or_tests_are_missing(alone, expected, row):
     campaign = golden("shells-acting-twin")
-    [found] = _whence(campaign, SimpleNamespace(rhw=0.5, details={"rhw_from_pool": alone}), expected)
+    [found] = width_row(campaign, SimpleNamespace(rhw=0.5, details={"rhw_from_pool": alone}), expected)
     runs = f"{campaign.pool.shadow_paths:,} baseline runs {row[1]}"
     assert (found.value, found.interval, found.remark) == (row[0], runs, row[2])
 
 
 def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what_to_raise(stored_run):
     run = read_run_folder(stored_run("shells-acting-twin"))
-    best = run.headline
-    best = replace(best, n_crashes=0, rhw=math.inf, cautions=(), details={**best.details, "references": []})
+    details = {**run.headline.details, "references": []}
+    best = replace(run.headline, n_crashes=0, rhw=math.inf, cautions=(), details=details)
     campaign = golden("shells-acting-twin", "stop.rhw=0.3")
     manifest = {"remedy": {"pool.events_per_shell": 3200}}
     answer = said(run, best, campaign, severity=None, stopped_by="pool", manifest=manifest)
@@ -181,21 +154,21 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
     assert "ratio" not in {row.key for row in answer.rows}
 
 
-def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time(stored_run):
-    for name, takes_time, warned in (
-        ("forced-krauss", True, True), ("forced-krauss", False, False), ("forced-twin", True, False)
-    ):  # fmt: skip
-        answer = said(read_run_folder(stored_run(name)), manifest={"events_take_time": takes_time})
-        assert any("cannot see BV come over" in each for each in answer.warnings) == warned
-
-
-@pytest.mark.parametrize(("name", "said"), [("shells-controller-sumo", True), ("shells-lateral-twin", False)])
-def test_only_of_a_vehicle_of_the_users_own_it_is_said_that_it_was_held(name, said, stored_run):
+@pytest.mark.parametrize(
+    ("name", "takes_time", "blind", "held"),
+    [
+        ("forced-krauss", True, True, False),
+        ("forced-krauss", False, False, False),
+        ("shells-lateral-twin", True, False, False),
+        ("shells-controller-sumo", True, False, True),
+    ],
+)
+def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(name, takes_time, blind, held, stored_run):
     run = read_run_folder(stored_run(name))
-    diagnostics = {**run.estimates.diagnostics, "n_asked_to_speed_up": 1234}
-    told = replace(run.estimates, diagnostics=diagnostics)
-    answer = short_answer(golden(name), {"events_take_time": True}, told)
-    assert any("1,234 tests it asked to speed up" in each for each in answer.warnings) == said
+    asked = {**run.estimates.diagnostics, "n_asked_to_speed_up": 1234 * (name != "forced-krauss")}
+    warnings = "".join(said(run, manifest={"events_take_time": takes_time}, diagnostics=asked).warnings)
+    assert ("cannot see BV come over" in warnings) == blind
+    assert ("1,234 tests it asked to speed up" in warnings) == held
 
 
 @pytest.mark.parametrize(
@@ -209,14 +182,13 @@ def test_only_of_a_vehicle_of_the_users_own_it_is_said_that_it_was_held(name, sa
 def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, value, ends, stored_run):
     """An upper limit, where the interval is wide or nothing crashed; the ratio's, where it says something."""
     run = read_run_folder(stored_run("shells-lateral-twin"))
-    best = run.headline
-    [beside, *_] = best.details["references"]
+    [beside, *_] = run.headline.details["references"]
     low = 0.0 if seen == 0.0 else 0.05
     beside = {**beside, "reference": "r157-cc", "crash_rate": 3e-8, "ratio": seen, "ratio_low": low, "ratio_high": high}
     rate = {"crash_rate": 1e-9 * (seen > 0.0), "ci_low": 5e-10 * (seen > 0.0), "ci_high": 3e-8, "rhw": 15.0}
-    tested = [{**each, "n_episodes": 9} for each in best.details["shells"]]
-    details = {**best.details, "references": [beside], "shells": tested}
-    best = replace(best, **rate, n_crashes=2 * (seen > 0.0), details=details)
+    tested = [{**each, "n_episodes": 9} for each in run.headline.details["shells"]]
+    details = {**run.headline.details, "references": [beside], "shells": tested}
+    best = replace(run.headline, **rate, n_crashes=2 * (seen > 0.0), details=details)
     rows = said(run, best, golden("shells-lateral-twin", "stop.rhw=0.3"), severity=None).rows
     assert (rows[0].key, rows[0].value, rows[0].interval) == (first, value, ends)
 
@@ -225,47 +197,37 @@ def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, va
 def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     """Where a limit is rejected, or the upper end is what has not been tested: the lower end alone says something."""
     run = read_run_folder(stored_run("shells-accepted"))
-    decision = {**run.manifest["decision"], "verdict": verdict}
-    shells = [{**each, "n_episodes": each["n_episodes"] * (not untested)} for each in run.headline.details["shells"]]
-    [beside, *others] = run.headline.details["references"]
-    details = {
-        **run.headline.details,
-        "references": [{**beside, "ratio": 3.98, "ratio_low": 2.0, "ratio_high": 980.0}, *others],
-    }
+    decision, details = {**run.manifest["decision"], "verdict": verdict}, run.headline.details
+    shells = [{**each, "n_episodes": each["n_episodes"] * (not untested)} for each in details["shells"]]
+    beside = {**details["references"][0], "ratio": 3.98, "ratio_low": 2.0, "ratio_high": 980.0}
     rate = {"crash_rate": 2e-7, "ci_low": 1e-7, "ci_high": 5e-5, "rhw": 100.0}
-    best = replace(run.headline, **rate, details={**details, "shells": shells})
+    best = replace(run.headline, **rate, details={**details, "references": [beside], "shells": shells})
     limits = {"limits_above_5_mps": (0.0, 1.0), "limits_below_1_mps": (0.001, 0.41)}
     severity = replace(run.estimates.severity, **limits, share_below_1_mps=0.0)
     rows = said(run, best, severity=severity, decision=decision).rows
-    found = {row.key: (row.value, row.interval) for row in rows}
-    assert found["rate"] == ("> 1.00 × 10⁻⁷ per test", "2.00 × 10⁻⁷ seen")
-    assert found["ratio"] == ("> 2.00 (crashes more)", "3.98 seen")
-    assert found["impact"][1] == ""
-    assert [row.remark for row in rows if row.key == "impact"] == ["0 % (0–41 %) < 1 m/s"]
+    found = {row.key: row.texts[1:] for row in rows}
+    assert found["rate"][:2] == ("> 1.00 × 10⁻⁷ per test", "2.00 × 10⁻⁷ seen")
+    assert found["ratio"][:2] == ("> 2.00 (crashes more)", "3.98 seen")
+    assert found["impact"][1:] == ("", "0 % (0–41 %) < 1 m/s")
 
 
-def severe(stored_run, cut_off=0.0, **of_rate):
+def severe(stored_run, cut_off=0.0, driver="brakes-8", **of_rate):
     """The answer of a run, if its tests that were cut off, and ends of its interval, are so many times its rate."""
     run = read_run_folder(stored_run("shells-twin"))
-    rate = run.headline.crash_rate
+    rate, unavoidable = run.headline.crash_rate, replace(run.estimates.severity.unavoidable, driver=driver)
     best = replace(run.headline, **{name: times * rate for name, times in of_rate.items()})
-    severity = replace(run.estimates.severity, cut_off=cut_off * rate)
-    return lambda **other: said(run, best, severity=replace(severity, **other))
+    return said(run, best, severity=replace(run.estimates.severity, cut_off=cut_off * rate, unavoidable=unavoidable))
 
 
 @pytest.mark.parametrize(("cut_off", "high", "warned"), [(0.19, 1.1, False), (0.3, 1.2, True), (0.3, 1.4, False)])
 def test_tests_whose_time_was_up_are_warned_of_where_the_interval_leaves_them_out(cut_off, high, warned, stored_run):
     """They are many, and had they crashed the rate would be above its upper end."""
-    warnings = severe(stored_run, cut_off, ci_high=high)().warnings
-    assert any("time was up" in each for each in warnings) == warned
+    assert any("time was up" in each for each in severe(stored_run, cut_off, ci_high=high).warnings) == warned
 
 
 @pytest.mark.parametrize(("driver", "told"), [("brakes-8", True), ("brakes-6", False)])
 def test_only_what_the_hardest_brakes_do_not_avoid_is_called_unavoidable(driver, told, stored_run):
-    answered = severe(stored_run)
-    of = read_run_folder(stored_run("shells-twin")).estimates.severity.unavoidable
-    keys = [row.key for row in answered(unavoidable=replace(of, driver=driver)).rows]
-    assert ("unavoidable" in keys) == told
+    assert ("unavoidable" in [row.key for row in severe(stored_run, driver=driver).rows]) == told
 
 
 def test_a_comparison_is_as_short():
@@ -297,16 +259,15 @@ def test_a_comparison_is_as_short():
         assert said in " ".join(shown.split())
 
 
+NEW_FOLDER = {"pairs": 1000, "settings": {}, "new_folder": True}
+
+
 @pytest.mark.parametrize(
     ("verdict", "needed", "said"),
     [
         ("proven", None, None),
         ("open", None, "too much alike"),
-        (
-            "open",
-            {"pairs": 1000, "settings": {}, "new_folder": True},
-            "--margin 0 and a new --out: some 1,000",
-        ),
+        ("open", NEW_FOLDER, "--margin 0 and a new --out: some 1,000"),
     ],
 )
 def test_what_would_decide(verdict, needed, said):
@@ -315,16 +276,13 @@ def test_what_would_decide(verdict, needed, said):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("verdict", "sign", "margin"),
     [
-        (None, ""),
-        ({}, "; no pool gives as much: ask for a wider stop.rhw"),
-        ({"pool.shadow_paths": None}, "; raise pool.shadow_paths"),
-        (
-            {"pool.relative_error": 0.0123, "pool.events_per_shell": 12000},
-            "; lower pool.relative_error to 0.0123 and raise pool.events_per_shell to 12,000",
-        ),
+        ("proven", "B crashes less often than A", "B is at most 10 % worse than A"),
+        ("refuted", "B crashes more often than A", "B is more than 10 % worse than A"),
+        ("open", "Not told apart", "Open whether B is more than 10 % worse than A"),
     ],
 )
-def test_what_leads_further(changes, told):
-    assert remedy_words(changes) == told
+def test_the_verdict_of_a_comparison(verdict, sign, margin):
+    told = [pair_words({"margin": of, "verdict": verdict}) for of in (0.0, 0.1)]
+    assert told == [sign, margin]

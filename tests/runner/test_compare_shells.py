@@ -118,7 +118,7 @@ def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_c
     found = compare_campaigns(a, b, tmp_path, workers=1, margin=0.1)
     assert (found.content["decision"]["verdict"], found.exit_code) == (verdict, exit_code)
     assert "10 %" in pair_words(found.content["decision"])
-    assert manifest(tmp_path / "a")["unmet"] == ["--margin (0.1)"]
+    assert manifest(tmp_path / "a")["unmet"] == [{"key": "margin", "numbers": {"margin": 0.1}}]
 
 
 def test_it_ends_when_it_is_known_who_crashes_less_often(campaigns, done, tmp_path):

@@ -20,7 +20,7 @@ from harness.pool import moved
 from harness.pool.moved import assumed
 from harness.progress import Progress
 from harness.report.pair_words import pair_warnings
-from harness.report.words import too_few
+from harness.report.traffic_words import too_few
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns

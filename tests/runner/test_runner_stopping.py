@@ -96,7 +96,7 @@ def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, 
     found = decided.estimates["decision"]
     assert (decided.exit_code, found["verdict"]) == (code, verdict)
     row, key = answer_in(decided.folder)["rows"][0], "times_reference" if "r157-cc" in changes[0] else "crash_rate"
-    assert decided.estimates["unmet"][0].startswith(f"accept.{key}")
+    assert decided.estimates["unmet"][0]["numbers"]["asked"].startswith(key)
     assert (found["driver"] == "r157-cc") == ("r157-cc" in row["value"]) == ("r157-cc" in changes[0])
     assert (decided.stopped_by == "accept") == (code != 4)
     assert estimate(decided.folder)["decision"] == found
@@ -112,7 +112,7 @@ def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(campaign, run_h
     asked = partial(campaign, *SHELLS, "world.engine=twin", "stop.rhw=0.01", "stop.episodes=2000")
     far = run_here(asked("stop.below_reference=2"), tmp_path / "far")
     assert (far.exit_code, far.stopped_by, far.estimates["decision"]) == (0, "below_reference", None)
-    assert far.estimates["unmet"] == ["stop.below_reference (2)"]
+    assert far.estimates["unmet"] == [{"key": "below_reference", "numbers": {"limit": 2.0}}]
     assert answer_in(far.folder)["scope"].endswith("ended by: far enough below the competent driver")
     n = far.estimates["n_episodes"]
     others = run_here(asked("stop.below_reference=0.3"), tmp_path / "other")

@@ -16,6 +16,7 @@ from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
 from harness.report.page import write_report
 from harness.sampling.baseline import run_baseline
+from harness.sampling.shells import Shells
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.conftest import SHELLS
@@ -86,7 +87,7 @@ def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_
     campaign, out, other = golden(ACTS, AS_NEEDED), tmp_path / "run", tmp_path / "other"
     run_golden(campaign, out)
     assert "learned" in json.loads((out / "shells.json").read_text())["strata"]
-    assert "pilot tests" in estimates(out)["estimates"]["shells"]["details"]["learned"]
+    assert "pilot tests" in Shells.stored_design(out).learned
     [pilot] = (out / "pilot").glob("*.parquet")
     assert pq.read_table(pilot).num_rows == manifest(out)["pilot_tests"]["n_runs"] >= 300
     learned = [row for row in stored_table(out, "episodes").to_pylist() if row["outcome"] == "crash"]

@@ -45,7 +45,7 @@ def test_of_the_prefix_that_counts_what_is_asked_and_the_headline_are_estimated(
     assert content["n_episodes"] == content["convergence"][-1]["n"] == 200
     assert asked["estimates"] == {name: content["estimates"][name] for name in ("nade", "scv")}
     assert content["estimates"]["scv"]["crash_rate"] is None
-    assert "records.moments" in content["estimates"]["scv"]["reason"]
+    assert content["estimates"]["scv"]["why"]["key"] == "needs_moments"
 
 
 @pytest.mark.parametrize("size", [1, 79, 400])

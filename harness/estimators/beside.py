@@ -1,0 +1,166 @@
+"""A vehicle beside others in the same traffic: the ratio of its rate to theirs, and shares of its crashes, with limits.
+
+Ratio x = μ/μ_R and preventable share y are tested as the contrasts of docs/estimators.md; each limit is a root of
+`harness.estimators.likelihood.ratio_limits`. Of the pool's part of their variance:
+
+- with X and R a path's probabilities that the vehicle and the reference crash, `crash_square` is E[X²], the pool
+  knows E[R²], and E[XR] follows from the crashed tests: one of stratum s is a draw in proportion to X there, so that
+  Σ p_s/n_s times the sum of R over them has that mean;
+- paths may carry preventable and unavoidable crashes, of rates P and U, which makes the contrast's variance smaller;
+  how many do is not known, so that E[PU] is taken for its least value, 0.
+
+Given how many tests fell into each cell of a stratum, those of each cell are independent binomials, so that cells take
+the place of strata. Tests that failed count as whatever makes an interval wider.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness.estimators.estimate import Number
+from harness.estimators.likelihood import CRASH, Level, ratio_limits
+from harness.estimators.tally import Tally, crash_square, pool_variance
+from harness.strata import ShellDesign, weight_of_a_test
+from harness.vocabulary import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class BesideReference:
+    """A vehicle beside a reference driver.
+
+    ``crash_rate`` is the reference's, with its standard error. ``ratio`` is the vehicle's crash rate over it, and
+    ``preventable`` the share of the vehicle's crashes that the reference would have avoided; NaN where it is not
+    defined. ``delay_s`` (s) is when the reference begins to brake after the cut-in, None if it has no delay of its own.
+    """
+
+    reference: str
+    delay_s: float | None
+    crash_rate: float
+    std_error: Number
+    ratio: Number
+    ratio_low: Number
+    ratio_high: Number
+    preventable: Number
+    preventable_low: Number
+    preventable_high: Number
+
+
+@dataclass(frozen=True)
+class Unavoidable:
+    """The share of a rate, with limits, on whose cut-ins the most careful driver of the library crashes, too."""
+
+    driver: str
+    share: float
+    share_low: float
+    share_high: float
+
+
+def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideReference, ...]:
+    """The vehicle beside each reference that crashes at all; ``cells`` are its tests by the design's cells."""
+    found, own = [], float(design.p @ cells.joined(design.joined).share)
+    for r, reference in enumerate(design.references):
+        if (rate := float(design.reference_rate[r])) == 0.0:
+            continue
+        ratio = own / rate if rate > 0.0 else math.nan, *beside(design, cells, r, design.p.size, level)
+        prevented = ~design.crashes_too(r)
+        preventable = preventable_share(design.cell_p, cells, prevented, design.n_independent, level)
+        error = math.sqrt(max(float(design.reference_square[r]) - rate * rate, 0.0) / design.n_independent)
+        found.append(BesideReference(reference.name, reference.delay_s, rate, error, *ratio, *preventable))
+    return tuple(found)
+
+
+def unavoidable(design: ShellDesign, cells: Tally, level: Level) -> Unavoidable | None:
+    """See there; None without a crash, and where that driver crashes nowhere."""
+    if not design.n_inside or not cells.crashes.any():
+        return None
+    avoids = np.asarray(design.cell_stratum) > 0
+    share, low, high = preventable_share(design.cell_p, cells, avoids, design.n_independent, level)
+    return Unavoidable(design.strata[0], 1.0 - share, 1.0 - high, 1.0 - low)
+
+
+def beside(design: ShellDesign, cells: Tally, r: int, n_strata: int, level: Level) -> tuple[float, float]:
+    """Limits of the rate of the first strata over that of a reference."""
+    strata, p = slice(0, n_strata), design.p[:n_strata]
+    moments = float(design.reference_rate[r]), float(design.reference_square[r])
+
+    def limits(tests: Tally) -> tuple[float, float]:
+        with_reference = design.joined.T @ (tests.crash_mass @ design.crashes_too(r))
+        own = tests.joined(design.joined).part(strata)
+        return rate_ratio_limits(p, own, with_reference[strata], moments, design.n_independent, level)
+
+    low, high = limits(cells)
+    return low, high if (worst := cells.failed_as_crashes()) is cells else limits(worst)[1]
+
+
+def rate_ratio_limits(
+    p: FloatArray, tally: Tally, with_reference: FloatArray, moments: tuple[float, float], n_paths: float, level: Level
+) -> tuple[float, float]:
+    """Limits of Σ p_s θ_s over the crash rate of a reference.
+
+    Of that ``moments`` has the rate and the mean square of a path's probability of a crash; ``with_reference`` (S,) is,
+    over the crashed tests of each stratum, the sum of their paths' probability that the reference crashes.
+    """
+    rate, square = moments
+    own, of_paths = float(p @ tally.share), pool_variance(p, tally, n_paths)
+    product = float(weight_of_a_test(p, tally.tests) @ with_reference)
+    covariance, of_reference = (product - own * rate) / n_paths, (square - rate * rate) / n_paths
+
+    def variance(x: float) -> float:
+        return max(of_paths - 2.0 * x * covariance + x * x * of_reference, 0.0)
+
+    # A constant as a sum over strata: the same for either outcome.
+    below = np.full((p.size, 2), rate / p.size)
+    return ratio_limits(np.outer(p, CRASH), below, tally.outcomes, level, variance)
+
+
+def preventable_share(
+    p: FloatArray, cells: Tally, prevented: BoolArray, n_paths: float, level: Level
+) -> tuple[float, float, float]:
+    """Share of Σ p_c θ_c that lies in the ``prevented`` ones of all cells (C,), with limits; NaN without a crash."""
+
+    def limits(tests: Tally) -> tuple[float, float]:
+        scale, rates = weight_of_a_test(p, tests.tests), p * tests.share
+        first, second = (crash_square(scale * part, tests) for part in (prevented, ~prevented))
+        of_prevented, of_others = float(rates[prevented].sum()), float(rates[~prevented].sum())
+
+        def variance(y: float) -> float:
+            rest = 1.0 - y
+            mean = rest * of_prevented - y * of_others
+            return max(rest * rest * first + y * y * second - mean * mean, 0.0) / n_paths
+
+        return ratio_limits(np.outer(p * prevented, CRASH), np.outer(p, CRASH), tests.outcomes, level, variance)
+
+    contributions = p * cells.share
+    total = float(contributions.sum())
+    share = float(contributions[prevented].sum()) / total if total > 0.0 else math.nan
+    low, high = limits(cells.failed_as_crashes(~prevented))[0], limits(cells.failed_as_crashes(prevented))[1]
+    return share, min(low, 1.0), min(high, 1.0)
+
+
+def share_of_crashes(
+    design: ShellDesign, every: Tally, some: Tally, level: Level, *, of_the_others: bool
+) -> tuple[float, float]:
+    """Limits of the share of the rate that is of ``some`` of its crashes, or of the others, of the same tests.
+
+    A path's parts in both are taken to exclude each other, which makes the variance no smaller.
+    """
+    p, n_paths = design.p, design.n_independent
+    others = every._replace(crashes=every.crashes - some.crashes, crash_mass=every.crash_mass - some.crash_mass)
+    first, second = (others, some) if of_the_others else (some, others)
+    rates = [float(p @ each.share) for each in (first, second)]
+    of_paths = [pool_variance(p, each, n_paths) for each in (first, second)]
+
+    def variance(x: float) -> float:
+        both = 2.0 * x * (1.0 - x) * rates[0] * rates[1] / n_paths
+        return max((1.0 - x) ** 2 * of_paths[0] + x * x * of_paths[1] + both, 0.0)
+
+    def limits(failed_first: int) -> tuple[float, float]:
+        """Failed tests may have been crashes of either kind."""
+        a, b = first.crashes + failed_first * every.failed, second.crashes + (1 - failed_first) * every.failed
+        counts = np.stack((a, b, every.tests - a - b), axis=1)
+        return ratio_limits(np.outer(p, (1.0, 0.0, 0.0)), np.outer(p, (1.0, 1.0, 0.0)), counts, level, variance)
+
+    return min(limits(0)[0], 1.0), min(limits(1)[1], 1.0)

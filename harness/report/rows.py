@@ -1,0 +1,152 @@
+"""The rows of an answer, in words: rate, ratio, impact, and what else is known of a run, from ``estimates.json``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from harness.campaign.campaign import Campaign
+from harness.estimators.answer import Estimates
+from harness.estimators.estimate import Estimate
+from harness.estimators.severity import HARD_MPS, TOUCH_MPS, Severity
+from harness.numbers import count, interval, number, plain, ratio, share, tenths
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
+
+ANY_SHARE = 0.95
+"""Width of the interval of a share from which on it says nothing [assumed]."""
+_BRAKES_HARDEST = "brakes-8"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the answer: what, how much, its interval, a remark; ``key`` tells the page which it is."""
+
+    key: str
+    what: str
+    value: str
+    interval: str = ""
+    remark: str = ""
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """What is shown of it."""
+        return self.what, self.value, self.interval, self.remark
+
+
+def end(value: float | None) -> float:
+    """What JSON has as null, because it was infinite."""
+    return math.inf if value is None else value
+
+
+def rows_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[Row]:
+    """All but those of the traffic's replicates."""
+    best, decision, assumed, distance_km = told.best, told.decision, told.assumed, told.distance_per_test_km
+    if decision is not None:
+        yield _decided(decision)
+    from_mps, high = campaign.crash.counts_above_mps, best.ci_high if best.n_crashes else best.upper_bound
+    counted, wide = f"crash rate > {plain(from_mps)} m/s" if from_mps else "crash rate", best.is_wide
+    from_below = wide and (best.is_open_above or (decision is not None and decision["verdict"] == "rejected"))
+    unseen = assumed if assumed is not None and assumed.no_lower_limit else None
+    less, shown, ends = "", best.crash_rate, interval(best.ci_low, best.ci_high)
+    seen = f"{number(best.crash_rate)} seen" if best.n_crashes else "no crash seen"
+    if unseen is not None:
+        less, shown, ends = "< ", unseen.most * high, f"{number(best.crash_rate)} as fitted"
+        ends = ends if best.n_crashes else seen
+    elif from_below:  # the other end says nothing
+        less, shown, ends = "> ", best.ci_low, seen
+    elif not best.n_crashes or wide:
+        less, shown, ends = "< ", high, seen
+    per_km = "" if not distance_km else f"{less}{number(shown * 1e6 / distance_km)} per million km"
+    remark = per_km if unseen is None else f"none seen at {unseen.where}"
+    so_far = " so far" if best.untested and best.n_crashes else ""
+    rows = [Row("rate", f"{counted}{so_far}", f"{less}{number(shown)} per test", ends, remark)]
+    beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
+    acts = campaign.av.acts_before_event
+    rows += [_beside(each, acts=acts, wide=wide, from_below=from_below) for each in beside]
+    # Where little else is known of the rate than a limit, what is known comes first: the ratio.
+    yield from reversed(rows) if unseen or (wide and beside and end(beside[0]["ratio_high"]) < 1.0) else rows
+    if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
+        yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
+    if assumed is not None and assumed.highest is not None and assumed.times is not None:
+        ends = "" if from_below else f"up to {number(assumed.most * high)}"
+        value = f"at most × {number(assumed.most, 2)} (assumed)"
+        yield Row("assumed", "traffic", value, ends, f"if {share(assumed.highest)} do not look")
+    if campaign.has_baseline_runs and best.n_crashes:
+        yield from width_row(campaign, best, manifest.get("expected"))
+    if told.severity is not None:
+        yield from _severity(told.severity, so_far)
+    if "within" in best.details and campaign.testing.shells.statement != ASSUMPTION_FREE:
+        yield within(best.details["within"])
+
+
+def width_row(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | None) -> Iterator[Row]:
+    """Which of baseline runs and tests makes the interval as wide as it is, and how many of both may do."""
+    whole, runs = best.rhw, end(best.details.get("rhw_from_pool"))
+    if not (math.isfinite(whole) and math.isfinite(runs)):
+        return
+    which = "runs" if 2.0 * runs * runs > whole * whole else "tests"
+    remark = "" if expected is None else f"try {count(expected['runs'])} runs, {count(expected['tests'])} tests"
+    alone = f"{count(campaign.pool.shadow_paths)} baseline runs ± {share(runs)}"
+    yield Row("width", "half-width", f"± {share(whole)}, most by {which}", alone, remark)
+
+
+def _severity(found: Severity, so_far: str) -> Iterator[Row]:
+    above = _share_within(found.share_above_5_mps, found.limits_above_5_mps, f" > {plain(HARD_MPS)} m/s")
+    below = _share_within(found.share_below_1_mps, found.limits_below_1_mps, f" < {plain(TOUCH_MPS)} m/s")
+    yield Row("impact", f"impact{so_far}", f"median {tenths(found.median_mps)} m/s", above, below)
+    # What a driver who brakes less hard does not avoid another one may.
+    if (of := found.unavoidable) is not None and of.driver == _BRAKES_HARDEST:
+        ends, why = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}", "not even 8 m/s² avoids it"
+        yield Row("unavoidable", f"unavoidable{so_far}", f"{share(of.share)} of the rate", ends, why)
+
+
+def _share_within(value: float, limits: tuple[float, float] | None, of: str) -> str:
+    """A share with its interval in whole per cent, where there is one; nothing where that may be nearly any."""
+    if limits is None:
+        return share(value) + of
+    low, high = limits
+    return "" if high - low > ANY_SHARE else f"{share(value)} ({100.0 * low:.0f}–{100.0 * high:.0f} %){of}"
+
+
+def _decided(decision: Mapping[str, Any]) -> Row:
+    driver, verdict = decision.get("driver"), decision["verdict"]
+    limit = f"{plain(decision['limit'])} × {driver}" if driver else f"{plain(decision['limit'])} per test"
+    low, high = (ratio(decision[end]) if driver else number(decision[end]) for end in ("low", "high"))
+    value, ends = {
+        "accepted": (f"below {limit}", f"upper limit {high}"),
+        "rejected": (f"above {limit}", f"lower limit {low}"),
+    }.get(verdict, (f"limit {limit}", f"it may be {low} to {high}"))
+    given = "" if decision["statement"] == ASSUMPTION_FREE else f", given {decision['statement']}"
+    return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
+
+
+def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: bool) -> Row:
+    low, high, seen = found["ratio_low"], end(found["ratio_high"]), found["ratio"]
+    who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
+    if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
+        who = f"{found['reference']}, same approach"
+    if not seen:
+        value, ends = f"< {ratio(high)}", "no crash seen"
+    elif wide and high < 1.0:
+        value, ends = f"< {ratio(high)} (crashes less)", f"{ratio(seen)} seen, ≥ {ratio(low)}"
+    elif from_below and low > 1.0:
+        value, ends = f"> {ratio(low)} (crashes more)", f"{ratio(seen)} seen"
+    else:
+        apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
+        value = f"{ratio(seen)} ({apart})"
+        ends = f"≥ {ratio(low)}" if from_below else f"{ratio(low)} to {ratio(high)}"
+    return Row("ratio", "× competent driver", value, ends, who)
+
+
+def within(found: Mapping[str, Any]) -> Row:
+    """What holds if the vehicle crashes only within the library's boundary, and whether it does."""
+    n, outside = found["n_crashes_outside"], count(found["n_episodes_outside"])
+    what = f"keeping to {LIBRARY_STATEMENT}"
+    if found["refuted"]:
+        return Row("within", what, "does NOT keep to it", "", f"{count(n)} crashes in {outside} beyond it")
+    beyond = f"no crash in {outside} beyond it" if found["n_episodes_outside"] else "nothing tested beyond it"
+    if not found["n_crashes"]:
+        return Row("within", what, f"< {number(found['ci_high'])}", "", beyond)
+    return Row("within", what, number(found["crash_rate"]), interval(found["ci_low"], found["ci_high"]), beyond)

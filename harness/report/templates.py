@@ -1,0 +1,37 @@
+"""Templates of pages: with the style and script that all have, and numbers, notes and sentences as filters."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from inspect import getmembers, isfunction
+from pathlib import Path
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from harness import numbers
+from harness.report.notes import method_words, note_words
+
+
+def sentence(text: str) -> str:
+    """Write a phrase as a sentence: capital first, full stop last."""
+    text = text.strip()
+    return text[:1].upper() + text[1:] + ("" if text[-1:] in ".!?" else ".")
+
+
+def templates() -> Environment:
+    """Templates of this package."""
+    place = Path(__file__).parent
+    css, more_css, script = (
+        (place / name).read_text(encoding="utf-8") for name in ("report.css", "player.css", "player.js")
+    )
+    loader = PackageLoader("harness.report", ".")
+    found = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    # Our own files, of which the policy of the page lets this one script run, by its hash.
+    found.globals.update(style=Markup(css + more_css), script=Markup(script), script_hash=Markup(digest))  # noqa: S704
+    found.filters.update(getmembers(numbers, isfunction), sentence=sentence, note=note_words, method=method_words)
+    found.policies["json.dumps_kwargs"] = {"default": np.ndarray.tolist, "separators": (",", ":")}
+    return found
