@@ -241,8 +241,9 @@ def _run_in_another_order(source: Source, n_episodes: int) -> dict[int, Bits]:
     if has_foreign_code(source.campaign.av):
         return dict(zip(order, run_elsewhere(source, halves, OTHER_CELLS).bits, strict=True))
     with _opened(source, OTHER_CELLS) as loop:
-        shards = [(loop.run(*tests), row) for tests in halves for row in range(len(tests.traffic))]
-    return {i: bits_of(shard, row) for i, (shard, row) in zip(order, shards, strict=True)}
+        shards = [loop.run(*tests) for tests in halves]
+    bits = [bits_of(shard, row) for shard in shards for row in range(shard.episode.size)]
+    return dict(zip(order, bits, strict=True))
 
 
 def _moved_by_warm_up(source: Source, n: int) -> dict[float, float]:
@@ -313,15 +314,15 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
             braking = np.flatnonzero(commanded[onset + 1 :] < BRAKING_MPS2)
             reactions.append(float(braking[0]) * STEP_S if braking.size else np.inf)
     a = np.concatenate([*acted, np.empty(0)])
+    a = a if a.size else np.array([np.nan])
     reaction = np.array(reactions)
     braked = np.isfinite(reaction)
-    some = a if a.size else np.array([np.nan])
     return Behaviour(
-        mean_acceleration_mps2=float(some.mean()),
-        min_acceleration_mps2=float(some.min()),
-        max_acceleration_mps2=float(some.max()),
-        share_at_min=float(np.mean(some <= limits[0] + AT_LIMIT_MPS2)),
-        share_at_max=float(np.mean(some >= limits[1] - AT_LIMIT_MPS2)),
+        mean_acceleration_mps2=float(a.mean()),
+        min_acceleration_mps2=float(a.min()),
+        max_acceleration_mps2=float(a.max()),
+        share_at_min=float(np.mean(a <= limits[0] + AT_LIMIT_MPS2)),
+        share_at_max=float(np.mean(a >= limits[1] - AT_LIMIT_MPS2)),
         reaction_s=float(np.median(reaction[braked])) if braked.any() else np.nan,
         braking_share=float(braked.mean()) if reaction.size else np.nan,
         n_events=len(reactions),

@@ -74,7 +74,9 @@ class OnMachine:
     def begin(self, cached: Files) -> tuple[dict[str, str | None], str] | Exception:
         """Fill the cache, and say what there is."""
         try:
-            _fill_cache(cached)
+            for name, content in cached.items():
+                if cache.find(name) is None:
+                    cache.keep(name, ray.get(content).data)
             return this_machine(self._resolved, require_controller(self._resolved.campaign.av))
         except Exception as error:  # noqa: BLE001 - see the class
             return fit_to_travel(error)
@@ -99,12 +101,6 @@ class OnMachine:
             self._worker.dismiss()
             self._worker.wait(CLOSING_S)
         self._workers.close()
-
-
-def _fill_cache(files: Files) -> None:
-    for name, content in files.items():
-        if cache.find(name) is None:
-            cache.keep(name, ray.get(content).data)
 
 
 # -- where the run is --

@@ -122,16 +122,6 @@ def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:
         ends = np.quantile(known, [tail, 1.0 - tail], axis=0) if enough else nowhere
         nearest = [int(np.argmin(np.abs(known[:, 0] - end))) for end in ends[:, 0]] if enough else []
         off = off[told][nearest] if enough else nowhere[0]
-    (rate_low, ratio_low), (rate_high, ratio_high) = ends.tolist()
-    off_low, off_high = off.tolist()
-    return Bar(
-        what=move.what,
-        known=move.known,
-        values=move.values,
-        rate=(rate_low, rate_high),
-        ratio=(ratio_low, ratio_high),
-        off=(off_low, off_high),
-        n=len(results),
-        no_laws=no_laws,
-        unlike=unlike,
-    )
+    rate, ratio, most_off = ((float(low), float(high)) for low, high in (*ends.T, off))
+    told_by = {"n": len(results), "no_laws": no_laws, "unlike": unlike}
+    return Bar(move.what, move.known, move.values, rate, ratio, most_off, **told_by)

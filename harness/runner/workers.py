@@ -178,11 +178,6 @@ class _Job:
     suspected: int | None = None
     fatal: dict[int, str] = field(default_factory=dict)
 
-    @property
-    def work(self) -> tuple[ShardRequest, dict[int, str], bool]:
-        """What a worker is given."""
-        return self.request, self.fatal, self.alone
-
 
 class Workers:
     """``n_workers`` at most; one that dies takes nothing but its unfinished shard along.
@@ -254,7 +249,7 @@ class Workers:
             worker = self._idle.pop() if self._idle else self.new_worker()
             if worker is None:
                 return
-            if worker.give(*waiting[0].work):
+            if worker.give(waiting[0].request, waiting[0].fatal, waiting[0].alone):
                 self._busy[worker] = waiting.popleft()
             else:
                 worker.kill()  # it died while it was idle
