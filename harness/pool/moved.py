@@ -19,7 +19,7 @@ from harness import cache
 from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.pool.aim import PILOT_PATHS, Enumerator
-from harness.pool.build import campaign_pool, take_aim
+from harness.pool.build import take_aim
 from harness.pool.kept import Pool
 from harness.pool.shells import acceleration_limit, shells_in_strata, shells_of
 from harness.progress import Progress
@@ -131,10 +131,12 @@ def environment_with(there: Resolved, values: Mapping[str, float]) -> Environmen
     return there.family.traffic_with(there.campaign.environment, there.parameters, values)
 
 
-def assumed_in(resolved: Resolved, design: ShellDesign | None, progress: Progress) -> dict[str, Any] | None:
+def assumed_in(
+    resolved: Resolved, pool: Pool | None, design: ShellDesign | None, progress: Progress
+) -> dict[str, Any] | None:
     """Fields of `Assumed` for a campaign; without strata of this traffic there are no factors."""
-    if design is not None and not resolved.campaign.has_baseline_runs:
-        found = assumed(resolved, campaign_pool(resolved, progress), design, progress)
+    if pool is not None and design is not None:
+        found = assumed(resolved, pool, design, progress)
     else:
         found = Assumed(resolved.parameters.unseen) if resolved.parameters.unseen else None
     return None if found is None else asdict(found)

@@ -167,7 +167,9 @@ class Run:
         )
         run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
         if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or run.n_rows >= PART_ROWS:
-            return replace(run.written(), open=(), n_rows=0)
+            n = len(run.open)  # small tables cost more than their rows
+            shown = (*run.shown[:-n], ShownTests.joined(run.shown[-n:], run.folder))
+            return replace(run.written(), open=(), n_rows=0, shown=shown)
         return run if run.is_behind else run.written_if_due()
 
     def with_baseline(self, name: str, result: BaselineResult) -> Run:

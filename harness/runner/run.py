@@ -113,7 +113,7 @@ def begun(out: Path, resolved: Resolved, earlier: dict[str, Any], crew: Workers,
     run = take_over(out, resolved, source, earlier, began, **facts)
     try:
         keep_design(run)
-        return run.noting(assumed=assumed_in(resolved, source.design, progress))
+        return run.noting(assumed=assumed_in(resolved, source.pool, source.design, progress))
     except BaseException:
         run.written("interrupted")
         raise

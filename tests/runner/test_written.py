@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import harness
+from harness import cache
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.report.page import write_report
 from harness.resolved import require_ready
@@ -79,6 +80,14 @@ def test_workers_and_page_need_no_file_once_it_is_resolved(stored_run, tmp_path)
     assert harness.run(resolved, tmp_path / "run", workers=2).report.is_file()
     tables = (stored_table(folder, "episodes") for folder in (tmp_path / "run", stored_run("shells-twin")))
     assert next(tables).equals(next(tables))
+
+
+def test_a_pool_is_read_once_by_the_run_and_once_by_each_worker(stored_run, tmp_path):
+    stored_run("shells-twin")  # has built it
+    with opens_below(cache.own_folder()) as reads:
+        run_here(golden("shells-twin"), tmp_path / "run")
+        pools = {path: n for path, n in reads.items() if path.startswith("pools/")}
+    assert list(pools.values()) == [2]
 
 
 def test_what_an_earlier_run_has_left_is_read_once(tmp_path):
