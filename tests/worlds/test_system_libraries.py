@@ -141,13 +141,20 @@ def test_a_libsumo_of_the_right_version_is_taken_from_another_place_and_that_is_
     assert str(tmp_path) in capsys.readouterr().err
 
 
+@pytest.fixture(autouse=True)
+def compiled_before(monkeypatch):
+    """`tests/runner/test_setup.py` compiles."""
+    monkeypatch.setattr("harness.runner.setup.compile_kernels", lambda _: False)
+
+
 def test_setup_does_nothing_where_nothing_is_missing(programs, capsys):
     for name in ("sudo", *MANAGERS):
         programs(name)
     programs.user(1000)
     assert main(["setup"]) == 0
     assert main(["setup", "--dry-run"]) == 0
-    assert capsys.readouterr().out.splitlines() == ["SUMO's system libraries are there.", "Nothing to install."]
+    told = ["SUMO's system libraries are there.", "Kernels were compiled before.", "Nothing to install."]
+    assert capsys.readouterr().out.splitlines() == told
     assert programs.calls() == []
 
 
