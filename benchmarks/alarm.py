@@ -63,7 +63,7 @@ def asked(method: Method, n: int) -> Asked:
     campaign = Campaign.model_validate({"name": "alarm", "seed": SEED, **content})
     ready, pool = prepare(resolve(campaign)), campaign_pool(resolve(campaign))
     table = episodes_table(ready.loop(TwinWorld(256)).run(0, ready.tests(0, n)), SEED)
-    block = block_from_tables(table, None, method=method, alpha=campaign.mixture_weights)
+    block = block_from_tables(campaign, table)
     return Asked(block, surrogates_crash(table, resolve(campaign), pool), KnownRates.of(pool))
 
 

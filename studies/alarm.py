@@ -239,13 +239,13 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
         mend = "Choose another run; SUMO's positions are held against the twin's in each step."
         raise HarnessError(str(folder), found, expected, mend)
     pool = campaign_pool(resolved, progress)
-    alarm, alpha = Alarm(KnownRates.of(pool)), campaign.mixture_weights
+    alarm = Alarm(KnownRates.of(pool))
     lead = [LEAD] if resolved.environment.lateral.present else []
     columns = [*dict.fromkeys([*EPISODE_COLUMNS, *path_columns(CUT_IN), *lead])]
 
     def replayed(part: Part) -> tuple[Block, BoolArray]:
         episodes = read_kept(folder, part, "episodes", columns)
-        block = block_from_tables(episodes, None, method=campaign.testing.method, alpha=alpha)
+        block = block_from_tables(campaign, episodes)
         return block, surrogates_crash(episodes, resolved, pool)
 
     progress.stage("surrogates in the AV's place", manifest["n_episodes"])

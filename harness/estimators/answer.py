@@ -113,27 +113,19 @@ def estimate_blocks(
     best = done.headline_estimate
     level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
     distance_km = None if distance_m is None else distance_m / 1000.0
-    return finite_json(
-        Estimates(
-            campaign=campaign.name,
-            campaign_hash=manifest["campaign_hash"],
-            lane_change_level=level,
-            confidence=best.confidence,
-            n_episodes=best.n_episodes,
-            n_crashes=best.n_crashes,
-            headline=done.headline,
-            distance_per_test_km=distance_km,
-            crash_rate_per_1e6_km=None if distance_km is None else _per_1e6_km(best, distance_km),
-            estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in done.estimates.items()},
-            diagnostics=done.diagnostics.result(campaign.importance_names),
-            convergence=tuple(done.convergence),
-            severity=done.severity,
-            assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
-            stopped_by=manifest.get("stopped_by"),
-            unmet=tuple(Note(**each) for each in manifest.get("unmet", ())),
-            decision=manifest.get("decision"),
-        )
-    )
+    told = Estimates(
+        campaign=campaign.name, campaign_hash=manifest["campaign_hash"], lane_change_level=level,
+        confidence=best.confidence, n_episodes=best.n_episodes, n_crashes=best.n_crashes, headline=done.headline,
+        distance_per_test_km=distance_km,
+        crash_rate_per_1e6_km=None if distance_km is None else _per_1e6_km(best, distance_km),
+        estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in done.estimates.items()},
+        diagnostics=done.diagnostics.result(campaign.importance_names), convergence=tuple(done.convergence),
+        severity=done.severity,
+        assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
+        stopped_by=manifest.get("stopped_by"), unmet=tuple(Note(**each) for each in manifest.get("unmet", ())),
+        decision=manifest.get("decision"),
+    )  # fmt: skip
+    return finite_json(told)
 
 
 def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:

@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.records.folder import MEND_PART
 from harness.strata import ShellDesign
@@ -188,21 +189,15 @@ def joined(blocks: Sequence[Block]) -> Block:
 
 
 def block_from_tables(
-    episodes: pa.Table,
-    moments: pa.Table | None,
-    *,
-    method: Method,
-    alpha: Sequence[float],
-    shells: ShellDesign | None = None,
-    counts_above_mps: float = 0.0,
-    epsilon: float = 0.0,
+    campaign: Campaign, episodes: pa.Table, moments: pa.Table | None = None, shells: ShellDesign | None = None
 ) -> Block:
     """Block of one shard; rows that are missing, out of order, or contradict each other are a `RunFolderError`.
 
     ``episodes`` are rows of that table, consecutive and in index order, with `EPISODE_COLUMNS`, of ``shells`` also
     `SHELL_COLUMNS`; ``moments``, of the step mixture, are the control steps of the same episodes, sorted by episode and
-    step, with `MOMENT_COLUMNS`. ``alpha`` (M,) are mixture weights in the order of ``log_q``; for the rest see `Drawn`.
+    step, with `MOMENT_COLUMNS`.
     """
+    sampling, alpha = campaign.sampling, np.array(campaign.mixture_weights, dtype=np.float64)
     index = _integers(episodes, "episode")
     if not index.size:
         raise _damaged("episodes", "no rows", "at least one episode per shard")
@@ -224,9 +219,9 @@ def block_from_tables(
         "took_over_early": pc.fill_null(early, fill_value=False).to_numpy(),
         "asked_to_speed_up": episodes["asked_to_speed_up"].to_numpy(),
     }
-    if SAMPLING[method].mixes:
+    if sampling.mixes:
         columns["log_q"] = _nested(episodes, "log_q", len(alpha))
-    if moments is not None and SAMPLING[method].mixes_steps:
+    if moments is not None and sampling.mixes_steps:
         columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     if np.all(_known(episodes, "log_p_event") | failed):
         columns["log_p_event"] = np.asarray(pc.fill_null(episodes.column("log_p_event"), -np.inf).to_numpy())
@@ -237,10 +232,10 @@ def block_from_tables(
             columns |= {name: episodes.column(name).to_numpy() for name in BASELINE_COLUMNS}
             step = pc.fill_null(episodes.column("event_step"), -1).to_numpy()
             columns["step"] = np.where(columns["cut_in"], step, -1 - index).astype(np.int64)
-    cap = None if SAMPLING[method].controlled else 1.0
-    drawn = Drawn(method, np.asarray(alpha, dtype=np.float64), cap, shells, counts_above_mps, epsilon)
+    cap, above_mps = None if sampling.controlled else 1.0, campaign.crash.counts_above_mps
+    drawn = Drawn(campaign.testing.method, alpha, cap, shells, above_mps, campaign.testing.epsilon)
     block = Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
-    return block.harder_than(counts_above_mps) if counts_above_mps > 0.0 else block
+    return block.harder_than(above_mps) if above_mps > 0.0 else block
 
 
 def _damaged(where: str, found: str, expected: str) -> RunFolderError:

@@ -106,12 +106,11 @@ def contrast_limit(weights: FloatArray, counts: Counts, level: Level, side: floa
 
 
 def spread(weights: FloatArray, lower: Counts, upper: Counts, level: Level, size: int, most: IntArray) -> IntArray:
-    """Divide further tests among strata, shape (S,), so that they narrow the interval of Σ w_sj θ_sj most.
+    """Divide ``size`` further tests among strata, shape (S,), so that they narrow the interval of Σ w_sj θ_sj most.
 
-    Portions of ``size`` tests are given one after the other, at most so many (S,) of each stratum, and none where no
-    further test narrows anything. With shares and threshold as they are one more test of a stratum moves a limit by
-    KL(c_s ‖ θ_s)/ν, by the envelope theorem; one without a test comes first. The counts (S, J) that either limit is
-    from differ by what failed tests may have been.
+    They are given in portions, ``most`` (S,) to each stratum, and none where no test narrows anything. One more test of
+    a stratum moves a limit by KL(c_s ‖ θ_s)/ν, by the envelope theorem; one without a test comes first. The counts
+    (S, J) that either limit is from differ by what failed tests may have been.
     """
     given = np.zeros_like(most)
     below, above = WeightedSum.of(weights, lower, -1.0), WeightedSum.of(weights, upper, 1.0)
@@ -126,11 +125,11 @@ def ratio_limits(
     level: Level,
     variance: Callable[[float], float] = lambda _: 0.0,
 ) -> tuple[float, float]:
-    """Limits of x = Σ a_sj θ_sj / Σ b_sj θ_sj: the ratios x for which Σ (a - x b)θ may be 0.
+    """Limits of x = Σ a_sj θ_sj / Σ b_sj θ_sj: the ratios x for which the contrast Σ (a - x b)θ may be 0.
 
-    Both limits of that contrast fall as x grows, so that the set is an interval: from 0 where the sum above may be
-    nothing, to infinity where the one below may. Factors ``above`` and ``below`` (S, J) are not negative; ``variance``
-    is that of the further error of the contrast at a ratio.
+    Both its limits fall as x grows, so that these are an interval: from 0 where the sum above may be nothing, to
+    infinity where the one below may. Factors ``above`` and ``below`` (S, J) are not negative; ``variance`` is that of
+    the further error of the contrast at a ratio.
     """
 
     def limit(side: float, x: float) -> float:

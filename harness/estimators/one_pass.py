@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ ACCUMULATORS: dict[EstimatorName, Callable[[], Accumulator]] = {
 }
 SPACING = 1.01
 """Prefixes closer than 1 % are one dot on a logarithmic axis; thinning them keeps long campaigns' files small."""
+UNKNOWN_MEAN = {"mean": math.nan, "std_error": math.inf}
 BEFORE_OVERLAP = ("took_over_early", "asked_to_speed_up")
 """What AVs do, or ask for in vain, while BV comes over; columns of blocks."""
 
@@ -68,9 +70,8 @@ class Diagnostics:
         }
 
     def _mean(self, sums: Moments) -> dict[str, float]:
-        if self._sampling.strata:
-            return {"mean": math.nan, "std_error": math.inf}
-        return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)}
+        known = not self._sampling.strata
+        return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)} if known else UNKNOWN_MEAN
 
 
 def refusal(block: Block, estimator: EstimatorName) -> Note | None:
@@ -108,21 +109,18 @@ def one_pass(
 
     Blocks are contiguous and in index order, from episode 0; a gap, or no episode at all, is a `ValueError`.
     """
-    own: EstimatorName | None = None
-    impacts: Impacts | None = None
-    states: dict[EstimatorName, FailureBounds] = {}
-    refusals: dict[EstimatorName, Note | None] = {}
+    blocks = iter(blocks)
+    if (first := next(blocks, None)) is None:
+        raise ValueError("an estimate needs at least one episode")
+    own = first.drawn.sampling.headline
+    refusals = {name: refusal(first, name) for name in (own, *names)}
+    states = {name: accumulator(name) for name, why in refusals.items() if why is None}
+    empty = SeenShells if own == "shells" else partial(accumulator, own)
+    impacts = Impacts(empty, first.drawn.counts_above_mps) if "impact_mps" in first.columns else None
     diagnostics, convergence, n = Diagnostics(), list[Point](), 0
-    for block in blocks:
+    for block in chain((first,), blocks):
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
-        if own is None:
-            own = block.drawn.sampling.headline
-            refusals = {name: refusal(block, name) for name in (own, *names)}
-            states = {name: accumulator(name) for name, why in refusals.items() if why is None}
-            if "impact_mps" in block.columns:
-                empty = SeenShells if own == "shells" else partial(accumulator, own)
-                impacts = Impacts(empty, block.drawn.counts_above_mps)
         n += len(block)
         diagnostics.add(block)
         for state in states.values():
@@ -131,8 +129,6 @@ def one_pass(
             impacts.add(block)
         if not convergence or n >= convergence[-1].n * SPACING:
             convergence.append(_point(states[own].result(confidence)))
-    if own is None:
-        raise ValueError("an estimate needs at least one episode")
     results = {name: state.result(confidence) for name, state in states.items()}
     if convergence[-1].n != n:
         convergence.append(_point(results[own]))

@@ -46,7 +46,7 @@ PairVerdict = Literal["proven", "refuted", "open"]
 class PairDecision:
     """Whether B's rate is at most 1 + ``margin`` times A's: at no margin, who crashes less often.
 
-    A verdict holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
+    It holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
     """
 
     margin: float
@@ -257,8 +257,7 @@ def contrast(pairs: PairCounts, level: Level) -> dict[str, Any]:
 def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
     """Content of ``compare.json`` that comes from pairs, at least one: each vehicle, what lies between, all shells.
 
-    What lies between them is told over all strata, and as ``conditional`` over those inside: if neither vehicle crashes
-    beyond the boundary, ``refuted`` once one has.
+    ``conditional`` is what lies between if neither crashes beyond the boundary, ``refuted`` once one has.
     """
     level, design, inside = Level.two_sided(confidence), pairs.design, pairs.inside()
     each, tallies = [_own(pairs, side, confidence) for side in (0, 1)], [pairs.tally(side) for side in (0, 1)]

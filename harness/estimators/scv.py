@@ -53,10 +53,7 @@ _DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12)(
 
 
 class MixtureCv(Nade):
-    """Triangular factor of [1, H, Y], and Σ x_i x_j x_k over its rows: (M + 2)³ numbers however many episodes.
-
-    From the latter the skewness of any linear combination of the columns is known afterwards.
-    """
+    """Triangular factor of [1, H, Y], and Σ x_i x_j x_k over its rows, for the skewness of any combination of them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,27 +83,17 @@ class MixtureCv(Nade):
         if self.n_crashes and y.n_effective < FEW_FOR_RESIDUALS and residual < plain:
             std_error, third_moment = plain, y.third_moment(n)
             warnings.append(note("plain_width", least=FEW_FOR_RESIDUALS))
-        return self.estimate(
-            float(coefficients[0]),
-            std_error,
-            third_moment,
-            confidence,
-            warnings=warnings,
-            details={
-                "beta": coefficients[1:].tolist(),
-                "rank": rank,
-                "residual_std_error": residual,
-                "plain_mean": y.mean(n),
-                "plain_std_error": plain,
-            },
-        )
+        details = {"beta": coefficients[1:].tolist(), "rank": rank, "residual_std_error": residual}
+        details |= {"plain_mean": y.mean(n), "plain_std_error": plain}
+        rate = float(coefficients[0])
+        return self.estimate(rate, std_error, third_moment, confidence, warnings=warnings, details=details)
 
 
 def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
-    """Least squares of Y on [1, H] from their factor (k, k), of the smallest norm where columns depend on each other.
+    """Least squares of Y on [1, H] from the factor (k, k) of ``n`` rows, of the smallest norm where columns depend.
 
-    Gives intercept and β, (1 + M,), the rank of [1, H], and the variance of the intercept from that of the residuals.
-    ``n`` rows scale the tolerance for the rank (Σ_j alpha_j h_j = 0 always costs one).
+    Gives intercept and β, (1 + M,), the rank of [1, H] (Σ_j alpha_j h_j = 0 always costs one), and the variance of the
+    intercept from that of the residuals.
     """
     design, target = factor[:-1, :-1], factor[:-1, -1]
     left, singular, right = np.linalg.svd(design)
@@ -155,24 +142,15 @@ class Scv(Nade):
         var_z = (within + between) / (n - 1) if n > 1 else math.inf
         var_y = self.y.variance(n)
         gain = self._gain(levels, fits, between)
+        details = {"var_z": var_z, "var_y": var_y, "nade_std_error": math.sqrt(var_y / n), "gain": gain}
+        strata = [
+            {"n_control_steps": level, "n": fit.n, "columns": fit.n_columns, "rank": fit.rank}
+            for level, fit in zip(levels, fits, strict=True)
+        ]
         return self.estimate(
-            rate,
-            math.sqrt(var_z / n),
-            None,
-            confidence,
-            cautions=[note("published_scv")],
-            warnings=_saturated(gain),
-            details={
-                "var_z": var_z,
-                "var_y": var_y,
-                "nade_std_error": math.sqrt(var_y / n),
-                "gain": gain,
-                "strata": [
-                    {"n_control_steps": level, "n": fit.n, "columns": fit.n_columns, "rank": fit.rank}
-                    for level, fit in zip(levels, fits, strict=True)
-                ],
-            },
-        )
+            rate, math.sqrt(var_z / n), None, confidence, cautions=[note("published_scv")],
+            warnings=_saturated(gain), details={**details, "strata": strata},
+        )  # fmt: skip
 
     def _gain(self, levels: Sequence[int], fits: Sequence[StratumFit], between: float) -> dict[str, Any]:
         """NADE's variance over that of adjusted results, in all and by stratum: as claimed, and as corrected."""
@@ -200,9 +178,9 @@ class Scv(Nade):
 class StratumFit(NamedTuple):
     """Regression of Y_l on H_l: episodes, columns, rank of the centred columns, η_l, Σ(Z - η_l)² and Σ(Y - η_l)².
 
-    ``means`` are of the columns, shape (d,), and ``beta``, shape (k, d), are of as many of their principal components,
-    the largest, as leave so many tests to each. ``left_out_squares`` is the sum of squared errors of each Y
-    as the regression on the other tests predicts it; NaN where that was not asked for.
+    ``means`` (d,) are of the columns, ``beta`` (k, d) of as many of their largest principal components as leave so many
+    tests to each. ``left_out_squares`` is the sum of squared errors of each Y as the regression on the other tests
+    predicts it; NaN where that was not asked for.
     """
 
     n: int
@@ -228,8 +206,7 @@ class StratumFit(NamedTuple):
     def squares(self) -> dict[str, float]:
         """Σ(Z - η_l)² as claimed; free of what a fit explains by chance; and of tests that the fit has not seen.
 
-        All to be compared with Σ(Y - η_l)². A saturated stratum says nothing of what columns explain: its results count
-        as they are.
+        A saturated stratum says nothing of what columns explain: its results count as they are, with Σ(Y - η_l)².
         """
         n, free = self.n, self.n - self.rank - 1
         fair, unseen = self.total_squares, self.total_squares
@@ -255,9 +232,9 @@ def _saturated(gain: Mapping[str, Any]) -> list[Note]:
 class Stratum:
     """Episodes with `level` control steps: a triangular factor of [1, H, Y] and the rows that wait.
 
-    Episodes wait as compact rows (27 numbers for J = 3) until a chunk is full; only then are they expanded to up to 729
-    columns and folded into the factor. Chunks are cut by the count of the stratum's episodes alone, so the result does
-    not depend on how the episodes came in blocks, and small strata never hold a large factor.
+    They wait as compact rows (27 numbers for J = 3) until a chunk is full; only then are they expanded to up to 729
+    columns and folded. Chunks are cut by the count of the stratum's episodes alone, so that how these came in blocks
+    makes no difference, and small strata never hold a large factor.
     """
 
     def __init__(self, level: int) -> None:
@@ -280,7 +257,6 @@ class Stratum:
             self._n_folded = 0
 
     def _waiting_rows(self) -> FloatArray:
-        """Rows [1, H, Y] that wait, shape (m, d + 2), in Fortran order."""
         return self._expanded(*map(np.concatenate, zip(*self._rows[self._n_folded :], strict=True)))
 
     def _expanded(self, first_ratios: FloatArray, y: FloatArray) -> FloatArray:
@@ -291,11 +267,7 @@ class Stratum:
         return rows
 
     def _with_waiting_rows(self) -> FloatArray:
-        """Triangular factor of all rows so far; the state stays as it is.
-
-        Fewer rows than columns have a factor of as many rows; the square one would be filled up with zeros, and its
-        decomposition would take hundreds of times as long.
-        """
+        """Triangular factor of all rows so far; of fewer rows than columns it has as many, which is far quicker."""
         if self._factor is not None:
             waiting = len(self._rows) > self._n_folded
             return fold_rows(self._factor.copy(order="F"), self._waiting_rows()) if waiting else self._factor
@@ -305,10 +277,9 @@ class Stratum:
     def fit(self, *, leave_one_out: bool = False, tests_each: Sequence[int] = (1,)) -> StratumFit:
         """Solve the regression by SVD of the centred columns' triangular factor.
 
-        The tolerance for the rank is the customary one of least-squares solvers, machine epsilon times the larger
-        dimension times the largest singular value; or times √n_l·|(1, means of the columns)| where that is larger,
-        which is the norm of what centring has taken away. Else columns that never vary would be fitted as if their
-        rounding errors were data.
+        The tolerance for the rank is machine epsilon times the larger dimension times the largest singular value, as
+        is customary, or times √n_l·|(1, means of the columns)| if larger, the norm of what centring has taken away:
+        else rounding errors of columns that never vary would be fitted.
         """
         factor = self._with_waiting_rows()
         intercept, means = float(factor[0, -1] / factor[0, 0]), factor[0, 1:-1] / factor[0, 0]

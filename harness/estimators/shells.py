@@ -178,34 +178,21 @@ class SeenShells:
         n, n_crashes, _ = tally.totals
         free, y, cautions = self._limits(design.p.size, level), self.weight_of_a_crash(), self._cautions()
         squares = float((tally.crashes * y * y).sum())
+        details = ShellDetails(
+            design.pool, *free.from_pool_relative(), design.p_event, design.p_unreachable,
+            references=() if cautions else compared(design, self.cells, level), within=self.within(confidence),
+            shells=self._shells((1.0 - confidence) / 2.0),
+        )  # fmt: skip
         return Estimate(
-            crash_rate=free.rate,
-            std_error=self.std_error(),
-            ci_low=free.low,
-            ci_high=free.high,
-            upper_bound=self._limits(design.p.size, Level.of_bound(confidence, n)).high,
-            confidence=confidence,
-            rhw=free.rhw,
-            n_episodes=n,
-            n_crashes=n_crashes,
+            crash_rate=free.rate, std_error=self.std_error(), ci_low=free.low, ci_high=free.high,
+            upper_bound=self._limits(design.p.size, Level.of_bound(confidence, n)).high, confidence=confidence,
+            rhw=free.rhw, n_episodes=n, n_crashes=n_crashes,
             n_effective=free.rate**2 / squares if squares > 0.0 else 0.0,
             largest_weight_share=float(np.max(y[tally.crashes > 0], initial=0.0)) / free.rate if free.rate > 0 else 0.0,
-            interval="likelihood_ratio",
-            bound="two_sided",
-            warnings=(*cautions, *self._warnings(free)),
+            interval="likelihood_ratio", bound="two_sided", warnings=(*cautions, *self._warnings(free)),
             cautions=cautions,
-            details=asdict(
-                ShellDetails(
-                    design.pool,
-                    *free.from_pool_relative(),
-                    design.p_event,
-                    design.p_unreachable,
-                    references=() if cautions else compared(design, self.cells, level),
-                    within=self.within(confidence),
-                    shells=self._shells((1.0 - confidence) / 2.0),
-                )
-            ),
-        )
+            details=asdict(details),
+        )  # fmt: skip
 
     def std_error(self, n_strata: int | None = None) -> float:
         """Of the rate of the first strata, all by default, with the pool's own error."""
@@ -297,39 +284,27 @@ class SeenShells:
         counts: dict[str, Any] = dict(zip(named, inside.totals, strict=True))
         counts |= zip((f"{name}_outside" for name in named), outside.totals, strict=True)
         return Within(
-            boundary=design.boundary,
-            n_shells=n,
-            crash_rate=limits.rate,
-            ci_low=limits.low,
-            ci_high=limits.high,
-            rhw=limits.rhw,
-            rhw_from_pool=limits.from_pool_relative()[0],
+            boundary=design.boundary, n_shells=n, crash_rate=limits.rate, ci_low=limits.low, ci_high=limits.high,
+            rhw=limits.rhw, rhw_from_pool=limits.from_pool_relative()[0],
             rhw_from_pool_at_least=limits.from_pool_relative()[1],
             crash_rate_if_failed_had_crashed=float(design.p[:n] @ inside.failed_as_crashes().share),
-            refuted=outside.totals[1] > 0,
-            refuted_by=tuple(crashed[:MOST_NAMED]),
-            upper_bound_outside=combined(design.p[n:], outside, design.n_independent, level).high,
-            **counts,
-        )
+            refuted=outside.totals[1] > 0, refuted_by=tuple(crashed[:MOST_NAMED]),
+            upper_bound_outside=combined(design.p[n:], outside, design.n_independent, level).high, **counts,
+        )  # fmt: skip
 
     def _shells(self, tail: float) -> tuple[Shell, ...]:
         design, tally = self.design, self.tally
         low, high = clopper_pearson(tally.crashes, tally.tests, tail, tally.failed)
-        return tuple(
-            Shell(
-                shell=name,
-                inside=s < design.n_inside,
-                p=float(design.p[s]),
-                n_episodes=int(tally.tests[s]),
-                n_crashes=int(tally.crashes[s]),
-                n_failed=int(tally.failed[s]),
-                crash_share=float(tally.share[s]),
-                crash_share_low=float(low[s]),
-                crash_share_high=float(high[s]),
-                contribution=float(design.p[s] * tally.share[s]),
-            )
-            for s, name in enumerate(design.strata)
-        )
+
+        def shell(s: int, name: str) -> Shell:
+            p, share = float(design.p[s]), float(tally.share[s])
+            return Shell(
+                shell=name, inside=s < design.n_inside, p=p, n_episodes=int(tally.tests[s]),
+                n_crashes=int(tally.crashes[s]), n_failed=int(tally.failed[s]), crash_share=share,
+                crash_share_low=float(low[s]), crash_share_high=float(high[s]), contribution=p * share,
+            )  # fmt: skip
+
+        return tuple(shell(s, name) for s, name in enumerate(design.strata))
 
     def _warnings(self, free: RateLimits) -> list[Note]:
         design, tally, found = self.design, self.tally, []

@@ -223,9 +223,9 @@ class StopRule(Rule):
 class RoundRule(Rule):
     """Looks at the crash rate from shells after each round, or whether it is below a limit.
 
-    ``held`` is the number of tests that the run folder holds: before them nothing is given up, whatever is asked for
-    now. A limit is decided by ``level_at`` an expected number of crashes and a confidence, whatever the budget: a run
-    that is continued is looked at where it would have been without the break, and once more where that was.
+    Before the tests ``held`` by the run folder nothing is given up, whatever is asked for now. A limit is decided by
+    ``level_at`` an expected number of crashes and a confidence, whatever the budget: a run that is continued is looked
+    at where it would have been without the break, and once more where that was.
     """
 
     seen: SeenShells

@@ -37,9 +37,8 @@ class Moments:
     """Number of values, Σx (exact for counts), Σ(x - x̄)² and Σ(x - x̄)³; of numbers that come in blocks, by adding up.
 
     Moments are joined without the cancellation of Σx² - (Σx)²/n (T. F. Chan, G. H. Golub and R. J. LeVeque, The
-    American Statistician 37, 1983, 242; third moments: P. Pébay, Sandia report SAND2008-6212). How numbers are cut into
-    blocks shows in the last digits only; a run's blocks are its shards, which follow from the campaign alone. Numbers
-    that were never added count as zeros where a larger n is asked for.
+    American Statistician 37, 1983, 242; third moments: P. Pébay, Sandia report SAND2008-6212); how numbers are cut into
+    blocks shows in the last digits. Where a larger n is asked for, what was never added counts as zeros.
     """
 
     n: int = 0
@@ -200,10 +199,9 @@ class Nade:
     ) -> Estimate:
         """Estimate with an interval around `rate` that is as skewed as its error, and a one-sided upper bound.
 
-        The bound is the interval's own, one-sided, where crashes are many enough for it, else Hoeffding's for the mean
-        of capped Y, which holds at every n and is in ``details`` in any case. Without a crash moments say nothing; the
-        interval is then [0, two-sided Hoeffding bound]. ``third_moment`` is that of the error of ``rate``; None for a
-        plain normal interval.
+        The bound is the interval's own where crashes are many enough, else Hoeffding's for the mean of capped Y, which
+        holds at every n. Without a crash the interval is [0, two-sided Hoeffding bound]. ``third_moment`` is that of
+        the error of ``rate``; None for a plain normal interval.
         """
         cap, origin = self.cap()
         hoeffding = capped_mean_upper(self.y.mean(self.n), cap, self.n, confidence)
@@ -217,25 +215,14 @@ class Nade:
         negative = () if rate >= 0.0 else (note("negative"),)
         cautions = (*cautions, *negative, *self.cautions())
         return Estimate(
-            crash_rate=rate,
-            std_error=std_error,
-            ci_low=low,
-            ci_high=high,
-            upper_bound=upper,
-            confidence=confidence,
-            rhw=half / rate if rate > 0.0 else math.inf,
-            n_episodes=self.n,
-            n_crashes=self.n_crashes,
-            n_effective=self.y.n_effective,
-            largest_weight_share=self.largest_share(),
-            interval="normal" if third_moment is None else "skewed",
-            bound="one_sided" if settled else "hoeffding",
-            cap=origin,
-            weight_cap=self.known_cap(),
-            cautions=cautions,
+            crash_rate=rate, std_error=std_error, ci_low=low, ci_high=high, upper_bound=upper, confidence=confidence,
+            rhw=half / rate if rate > 0.0 else math.inf, n_episodes=self.n, n_crashes=self.n_crashes,
+            n_effective=self.y.n_effective, largest_weight_share=self.largest_share(),
+            interval="normal" if third_moment is None else "skewed", bound="one_sided" if settled else "hoeffding",
+            cap=origin, weight_cap=self.known_cap(), cautions=cautions,
             warnings=(*cautions, *self.warnings(half), *warnings),
             details={"upper_bound_hoeffding": hoeffding, **(details or {})},
-        )
+        )  # fmt: skip
 
 
 class Nde(Nade):
@@ -246,20 +233,10 @@ class Nde(Nade):
         rate = self.n_crashes / self.n
         low, high = map(float, clopper_pearson(self.n_crashes, self.n, (1.0 - confidence) / 2.0))
         return Estimate(
-            crash_rate=rate,
-            std_error=math.sqrt(rate * (1.0 - rate) / self.n),
-            ci_low=low,
-            ci_high=high,
-            upper_bound=float(clopper_pearson(self.n_crashes, self.n, 1.0 - confidence)[1]),
-            confidence=confidence,
-            rhw=(high - low) / 2.0 / rate if rate > 0.0 else math.inf,
-            n_episodes=self.n,
-            n_crashes=self.n_crashes,
-            n_effective=float(self.n_crashes),
-            largest_weight_share=1.0 / self.n_crashes if self.n_crashes else 0.0,
-            interval="clopper_pearson",
-            bound="one_sided",
-            cap="design",
-            weight_cap=1.0,
+            crash_rate=rate, std_error=math.sqrt(rate * (1.0 - rate) / self.n), ci_low=low, ci_high=high,
+            upper_bound=float(clopper_pearson(self.n_crashes, self.n, 1.0 - confidence)[1]), confidence=confidence,
+            rhw=(high - low) / 2.0 / rate if rate > 0.0 else math.inf, n_episodes=self.n, n_crashes=self.n_crashes,
+            n_effective=float(self.n_crashes), largest_weight_share=1.0 / self.n_crashes if self.n_crashes else 0.0,
+            interval="clopper_pearson", bound="one_sided", cap="design", weight_cap=1.0,
             warnings=tuple(self._few_crashes()),
-        )
+        )  # fmt: skip

@@ -1,6 +1,7 @@
-"""The report: one self-contained HTML page per run or comparison, and its plots as SVG.
+"""The report: what a run or comparison says, in words and rows; one self-contained HTML page of it, with plots as SVG.
 
-The page is made from a finished run folder alone, so it can be made again at any time and on any machine. ``summary``
-reads, ``rate_plots``, ``test_plots`` and ``crashes`` draw (in one ``style``), ``page`` puts all together;
-``pairs_map`` and ``compare_page`` do so of a comparison, ``player`` plays a test, ``openscenario`` writes one.
+All is made from a finished folder alone, so it can be made again at any time and on any machine. ``summary`` reads;
+``notes``, ``rows``, ``words``, ``traffic_words`` and ``pair_words`` say it, ``lines`` for a terminal and ``junit`` for
+a gate; ``plots`` and ``crashes`` draw (with ``drawing``), ``page`` and ``compare_page`` put all together by
+``templates``; ``player`` plays a test, ``motion`` and ``openscenario`` write one.
 """

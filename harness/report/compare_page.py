@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
-from harness.errors import HarnessError, RunFolderError, printable
+from harness.errors import HarnessError, RunFolderError
 from harness.numbers import count, tenths
-from harness.records.folder import read_as, write_bytes
+from harness.records.folder import read_as
+from harness.report.crashes import rows_of
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
 from harness.report.player import Scene, Scenes, beside_other
 from harness.report.plots import WHO, pairs_plot
 from harness.report.summary import RunFolder, floats, read_run_folder
-from harness.report.templates import templates
+from harness.report.templates import write_page
 from harness.report.words import short_answer
 from harness.runner.stored import replay_episode
 from harness.strata import weight_of_a_test
@@ -42,14 +42,15 @@ def write_comparison(folder: str | Path) -> Path:
         if (found := run.manifest["campaign_hash"]) != of["campaign_hash"]:
             expected = f"campaign {of['campaign_hash']} ({COMPARISON})"
             raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, MEND)
-    return write_page(folder, stored, runs)
+    return write_page_of(folder, stored, runs)
 
 
-def write_page(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder]) -> Path:
+def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder]) -> Path:
     """Write the page of a comparison in hand."""
     pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
     plot = pairs_plot(pairs.who, pairs.weight, pairs.gap_m, pairs.closing_mps)
-    page = templates().get_template("compare.html.j2").render(
+    return write_page(
+        folder / "report.html", "compare.html.j2",
         compared=stored, asked=asked, given=asked is not stored,
         verdict=pair_words(stored["decision"]), warnings=list(pair_warnings(stored)),
         answers=[short_answer(run.campaign, run.manifest, run.estimates) for run in runs],
@@ -57,8 +58,6 @@ def write_page(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder]) 
         sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
         plot=plot, scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
     )  # fmt: skip
-    write_bytes(folder / "report.html", printable(page).encode("utf-8"))
-    return folder / "report.html"
 
 
 class Pairs(NamedTuple):
@@ -130,4 +129,4 @@ def motion_of(run: RunFolder, episode: int) -> tuple[pa.Table, pa.Table | None]:
     if trace is None:
         with suppress(HarnessError):  # of another version, a vehicle that is gone or does not do the same again
             trace = replay_episode(run.path, episode).trace
-    return run.tests.crashes.filter(pc.equal(run.tests.crashes["episode"], episode)), trace
+    return rows_of(run, {episode}), trace

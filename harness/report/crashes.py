@@ -64,7 +64,7 @@ def crash_gallery(
         chosen = sorted(enumerate(ranked, 1), key=lambda item: episode[item[1]] not in traced)[:SHOWN]
         for rank, place in sorted(chosen):
             reasons.setdefault(place, []).append(reason.format(rank) if "{}" in reason else f"{reason} no. {rank}")
-    total, stored = float(crashes["weight"].sum()), _rows(run, {int(episode[place]) for place in reasons} & traced)
+    total, stored = float(crashes["weight"].sum()), rows_of(run, {int(episode[place]) for place in reasons} & traced)
     rows, shown = list[GalleryRow](), list[Scene]()
     for place, why in reasons.items():
         crash = {name: float(crashes[name][place]) for name in SHOWN_COLUMNS}
@@ -103,11 +103,11 @@ def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArra
     judged = np.sort(np.argsort(-impact, kind="stable")[: MOST_TRACED if acts else MOST_JUDGED])
     asked = {int(each) for each in episode[judged]}
     if asked:
-        ends[judged] = scenes.ends(_rows(run, asked), run.traces(asked) if acts else None)
+        ends[judged] = scenes.ends(rows_of(run, asked), run.traces(asked) if acts else None)
     return ends
 
 
-def _rows(run: RunFolder, episodes: set[int]) -> pa.Table:
+def rows_of(run: RunFolder, episodes: set[int]) -> pa.Table:
     """What scenes need of episodes, in index order."""
     return run.tests.crashes.filter(pc.field("episode").isin(sorted(episodes)))
 

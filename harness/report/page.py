@@ -8,7 +8,6 @@ from typing import Any
 
 from harness.arguments import checked
 from harness.campaign.files import dump_campaign
-from harness.errors import printable
 from harness.estimators.traffic import Sensitivity
 from harness.families import family_named
 from harness.families.protocol import Environment
@@ -19,7 +18,7 @@ from harness.report.crashes import crash_gallery
 from harness.report.drawing import Plot
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
-from harness.report.templates import templates
+from harness.report.templates import write_page
 from harness.report.words import short_answer
 from harness.vocabulary import OUTCOMES
 
@@ -37,39 +36,26 @@ def write_report(folder: str | Path) -> Path:
 
     Raises `RunFolderError`: if the folder misses a file, or a file is damaged or belongs to another run.
     """
-    return write_page(read_run_folder(Path(folder)))
+    return write_page_of(read_run_folder(Path(folder)))
 
 
-def write_page(run: RunFolder) -> Path:
+def write_page_of(run: RunFolder) -> Path:
     """Write the page of a run in hand: none of its files is read but traces of crashes."""
     folder, summary, traffic = run.path, summarise(run), run.traffic
     plots = _plots(run, summary, traffic)
     gallery, scenes = crash_gallery(run, summary, traffic)
     answer = short_answer(run.campaign, run.manifest, run.estimates)
-    page = (
-        templates()
-        .get_template("report.html.j2")
-        .render(
-            run=run,
-            answer=answer,
-            summary=summary,
-            sizes=table_sizes(run.manifest["parts"]),
-            gallery=gallery,
-            scenes=scenes,
-            figures={plot.name: plot for plot in plots},
-            lateral=lateral_facts(run),
-            tabled=traffic is not None and traffic.accepted.size > 0,
-            estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
-            outcomes=outcome_rows(summary),
-            warnings=[*answer.warnings, *uncovered(run, summary)],
-            diagnostics=diagnostics(run),
-            settings=dump_campaign(run.campaign),
-            folder=run.typed,
-        )
-    )
+    page = write_page(
+        folder / "report.html", "report.html.j2",
+        run=run, answer=answer, summary=summary, gallery=gallery, scenes=scenes, lateral=lateral_facts(run),
+        sizes=table_sizes(run.manifest["parts"]), figures={plot.name: plot for plot in plots},
+        tabled=traffic is not None and traffic.accepted.size > 0, outcomes=outcome_rows(summary),
+        estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
+        warnings=[*answer.warnings, *uncovered(run, summary)], diagnostics=diagnostics(run),
+        settings=dump_campaign(run.campaign), folder=run.typed,
+    )  # fmt: skip
     _write_plots(folder / "plots", plots)
-    write_bytes(folder / "report.html", printable(page).encode("utf-8"))
-    return folder / "report.html"
+    return page
 
 
 def _plots(run: RunFolder, summary: RunSummary, traffic: Environment | None) -> list[Plot]:

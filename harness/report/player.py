@@ -15,15 +15,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.campaign.campaign import Campaign
-from harness.errors import printable
 from harness.families import family_named
 from harness.families.protocol import Driven, Environment
 from harness.numbers import tenths
 from harness.pool.kept import onset_steps
-from harness.records.folder import write_bytes
 from harness.records.schemas import chosen_from
 from harness.report.summary import floats
-from harness.report.templates import templates
+from harness.report.templates import write_page
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import LibraryDriver, library_records
 from harness.vocabulary import FloatArray, IntArray
@@ -246,5 +244,4 @@ def _when(step: int, cut: int) -> str:
 
 def write_player(scene: Scene, file: str | Path) -> None:
     """Write a page with nothing but the player of a scene."""
-    page = templates().get_template("replay.html.j2").render(scene=scene, scenes=[scene])
-    write_bytes(Path(file), printable(page).encode("utf-8"))
+    write_page(Path(file), "replay.html.j2", scene=scene, scenes=[scene])

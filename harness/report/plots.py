@@ -29,7 +29,6 @@ IN_ROUNDS = (
 DASHED, DOTTED = "4 3", "1 3"
 SHARES = {0.0: "grid", 0.25: "red-1", 0.5: "red-2", 0.75: "red-4", 1.0: "red-6"}
 """Up to which share of cut-ins that crash a cell of the map has a colour."""
-"""Index of the maneuver 0 m/s²."""
 WHO = {"both": "grey", "only A": "blue", "only B": "reference"}
 """Who crashes, and the colour: on the page the player draws B in that of reference drivers."""
 MOST_BARS = 16

@@ -100,13 +100,6 @@ class RunFolder:
         return cls(path, campaign, manifest, told, tests, traffic, shells, typed_folder(path))
 
     @property
-    def headline(self) -> Estimate:
-        """The estimate that answers the campaign's question."""
-        found = self.estimates.estimates[self.estimates.headline]
-        assert isinstance(found, Estimate)  # of a folder that has been read
-        return found
-
-    @property
     def asked_statement(self) -> str | None:
         """The statement `library` where that should reach ``stop.rhw``; None for the assumption-free one."""
         asked = ASSUMPTION_FREE if self.shells is None else self.campaign.testing.shells.statement

@@ -6,12 +6,15 @@ import base64
 import hashlib
 from inspect import getmembers, isfunction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from harness import numbers
+from harness.errors import printable
+from harness.records.folder import write_bytes
 from harness.report.notes import method_words, note_words
 
 
@@ -35,3 +38,10 @@ def templates() -> Environment:
     found.filters.update(getmembers(numbers, isfunction), sentence=sentence, note=note_words, method=method_words)
     found.policies["json.dumps_kwargs"] = {"default": np.ndarray.tolist, "separators": (",", ":")}
     return found
+
+
+def write_page(file: Path, template: str, **content: Any) -> Path:
+    """Write a page, which is self-contained, and return its file."""
+    page = templates().get_template(template).render(**content)
+    write_bytes(file, printable(page).encode("utf-8"))
+    return file

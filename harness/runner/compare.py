@@ -128,10 +128,10 @@ def compare_campaigns(
     if margin is not None:
         code = EXIT_OF[rule.decision.verdict]
     write_sealed(out / COMPARISON, content)
-    from harness.report.compare_page import write_page  # noqa: PLC0415 - draws
+    from harness.report.compare_page import write_page_of  # noqa: PLC0415 - draws
 
     took_s = shown[1].manifest["wall_time_s"] / found["n_pairs"]
-    return Comparison(out, content, code, write_page(out, content, shown), took_s)
+    return Comparison(out, content, code, write_page_of(out, content, shown), took_s)
 
 
 def _compared(

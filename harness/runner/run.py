@@ -198,12 +198,12 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     manifest = run.content("done", **ended)
     estimates = estimate_blocks(even(run.blocks), campaign, manifest)
     write_sealed(run.folder / ESTIMATES, estimates)
-    from harness.report.page import write_page  # noqa: PLC0415 - draws
+    from harness.report.page import write_page_of  # noqa: PLC0415 - draws
     from harness.report.summary import RunFolder  # noqa: PLC0415
 
     tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
     shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
-    return RunResult(run.folder, write_page(shown), estimates, stopped_by, code, shown)
+    return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:

@@ -18,7 +18,7 @@ from harness.campaign.campaign import Campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, joined
+from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables, joined
 from harness.estimators.one_pass import SPACING
 from harness.families.protocol import Environment
 from harness.files import write_atomically
@@ -31,7 +31,6 @@ from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
-from harness.sampling.protocol import block_of
 from harness.vocabulary import ESTIMATORS, EstimatorName
 from harness.worlds import build_world
 from harness.worlds.system_libraries import require_libraries
@@ -83,7 +82,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
 
     def read(part: Part) -> Block:
         steps = read_kept(folder, part, "moments", ratios) if ratios and "moments" in part.files else none
-        return block_of(campaign, read_kept(folder, part, "episodes", needed), steps, design)
+        return block_from_tables(campaign, read_kept(folder, part, "episodes", needed), steps, design)
 
     n = 0
     for block in made_ahead(read, manifest["parts"], N_READERS):

@@ -175,17 +175,4 @@ class Source:
     def block(self, tables: ShardTables) -> Block:
         """What the stop rule and estimates read of a shard."""
         steps = tables.moments if self.campaign.sampling.mixes_steps else None
-        return block_of(self.campaign, tables.episodes, steps, self.design)
-
-
-def block_of(campaign: Campaign, episodes: pa.Table, moments: pa.Table | None, design: ShellDesign | None) -> Block:
-    """What estimators read of the tables of a campaign's shard."""
-    return block_from_tables(
-        episodes,
-        moments,
-        method=campaign.testing.method,
-        alpha=campaign.mixture_weights,
-        shells=design,
-        counts_above_mps=campaign.crash.counts_above_mps,
-        epsilon=campaign.testing.epsilon,
-    )
+        return block_from_tables(self.campaign, tables.episodes, steps, self.design)

@@ -10,14 +10,14 @@ from itertools import pairwise, product
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.estimators.block import Block
+from harness.estimators.block import Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import StopRule
 from harness.loop.loop import EpisodeLoop
 from harness.records.schemas import shard_tables
 from harness.resolved import resolve
 from harness.sampling import prepare
-from harness.sampling.protocol import Source, block_of
+from harness.sampling.protocol import Source
 from harness.vocabulary import EstimatorName, Method
 from harness.worlds.twin import TwinWorld
 from studies.chains.chain import Chain
@@ -48,7 +48,7 @@ def twin_episodes(campaign: Campaign, seed: int, estimators: Sequence[EstimatorN
 def _twin_block(campaign: Campaign, first: int, n: int) -> Block:
     prepared, loop = prepared_twin(campaign.model_dump_json())
     tables = shard_tables(loop.run(first, prepared.tests(first, n)), campaign.seed, keep_traces=False)
-    return block_of(campaign, tables.episodes, None if campaign.records.moments == "none" else tables.moments, None)
+    return block_from_tables(campaign, tables.episodes, None if campaign.records.moments == "none" else tables.moments)
 
 
 @cache

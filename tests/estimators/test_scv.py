@@ -8,14 +8,7 @@ import pytest
 from harness.estimators.block import Block
 from harness.estimators.likelihood import Level
 from harness.estimators.limits import skewed_distances
-from harness.estimators.scv import (
-    CHUNK_ROWS,
-    MixtureCv,
-    Scv,
-    Stratum,
-    n_columns,
-    steps_used,
-)
+from harness.estimators.scv import CHUNK_ROWS, MixtureCv, Scv, Stratum, n_columns, steps_used
 from harness.estimators.weighted import Nade
 from harness.report.notes import note_words
 from studies.chains.chain import DECISIVE, PANEL, overtaking
@@ -91,13 +84,8 @@ def test_strata_above_nine_control_steps_use_nine_and_may_have_more_columns_than
     levels, n, columns, rank = np.array([list(s.values()) for s in estimate.details["strata"]]).T
     assert np.all(columns[levels > 9] == 2**9)
     assert levels[columns > n].max() > 9
-    assert [(steps_used(9, j), n_columns(9, j)) for j in (1, 2, 3, 4, 10)] == [
-        (9, 0),
-        (9, 1),
-        (9, 512),
-        (6, 729),
-        (3, 729),
-    ]
+    expected = [(9, 0), (9, 1), (9, 512), (6, 729), (3, 729)]
+    assert [(steps_used(9, j), n_columns(9, j)) for j in (1, 2, 3, 4, 10)] == expected
     assert np.all(rank < np.maximum(1, n))
     assert estimate.crash_rate == pytest.approx(np.mean(parts[0].weighted_crashes()), rel=1e-12, abs=1e-300)
 

@@ -88,17 +88,6 @@ def test_two_looks_in_turn_must_pass_and_what_was_missing_is_remembered(looks, r
     assert (rule.look.stopped, tuple(each.key for each in rule.look.unmet)) == (reached, unmet)
 
 
-RATES = st.floats(1e-9, 1e-3)
-
-
-@given(limit=RATES, one=RATES, other=RATES)
-def test_a_verdict_says_that_the_whole_interval_is_on_one_side(limit, one, other):
-    low, high = sorted((one, other))
-    found = Decision(limit, "library", 0.95, low, high)
-    assert (found.verdict == "rejected") == (low > limit)
-    assert (found.verdict == "accepted") == (high < limit)
-
-
 # -- decisions about a limit that is the truth, where an error rate is defined: both verdicts are wrong there --
 
 

@@ -94,16 +94,8 @@ def test_hostile_texts_are_escaped_and_no_formula(folders, tmp_path):
     (folder / "campaign.yaml").write_text(described)
     path = folder / "estimates.json"
     estimates = edit(path, campaign=hostile, headline=hostile)["estimates"]
-    edit(
-        path,
-        estimates=estimates
-        | {
-            hostile: {
-                **estimates["nade"],
-                "warnings": [{"key": hostile}, {"key": "untested", "numbers": {"shells": [hostile]}}],
-            }
-        },
-    )
+    warnings = [{"key": hostile}, {"key": "untested", "numbers": {"shells": [hostile]}}]
+    edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": warnings}})
     write_report(folder)
     page = Page(folder)
     assert hostile not in page.html
@@ -189,12 +181,7 @@ def content(**within):
 @pytest.mark.parametrize(("code", "kind"), [(0, None), (4, "Error"), (5, "Failure"), (3, "Failure")])
 def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     file, report = tmp_path / "gate.xml", tmp_path / "report.html"
-    write_junit(
-        file,
-        "smoke",
-        [statement_case(content(), "REJECTED  <above> & beyond\x1b[31m", "assumption_free", code)],
-        [report],
-    )
+    write_junit(file, "smoke", [statement_case(content(), ABOVE, "assumption_free", code)], [report])
     (suite,) = JUnitXml.fromfile(str(file))
     assert (suite.name, suite.tests, suite.skipped) == ("smoke", 1, 0)
     assert (suite.failures, suite.errors) == (int(kind == "Failure"), int(kind == "Error"))
@@ -206,16 +193,19 @@ def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     assert file.read_text().count("REJECTED") == 1
 
 
+NO_SHELLS = {**content(), "estimates": {"shells": {"details": {}}}}
+"""A method without shells may still carry a statement's name in its settings."""
+
+
 @pytest.mark.parametrize(
-    ("refuted", "code", "outcome"), [(False, 0, "passed"), (True, 0, "failure"), (True, 4, "failure")]
+    ("told", "code", "name", "outcome"),
+    [
+        (content(), 0, "library", "passed"),
+        (content(refuted=True), 0, "library", "failure"),
+        (content(refuted=True), 4, "library", "failure"),
+        (NO_SHELLS, 4, "assumption_free", "error"),
+    ],
 )
-def test_a_refuted_assumption_that_was_asked_about_fails(refuted, code, outcome):
-    case = statement_case(content(refuted=refuted), "", "library", code)
-    assert (case.name, case.outcome) == ("library", outcome)
-
-
-def test_a_gate_never_passes_because_nothing_was_asked():
-    """A method without shells may still carry a statement's name in its settings."""
-    none = {**content(), "estimates": {"shells": {"details": {}}}}
-    case = statement_case(none, "", "library", 4)
-    assert (case.name, case.outcome) == ("assumption_free", "error")
+def test_a_refuted_assumption_fails_and_no_gate_passes_because_nothing_was_asked(told, code, name, outcome):
+    case = statement_case(told, "", "library", code)
+    assert (case.name, case.outcome) == (name, outcome)

@@ -60,7 +60,7 @@ def blocks_of(folder):
 
 def said(run, best=None, campaign=None, manifest=None, **changes):
     """The answer of a run, had its estimate, or others of its numbers, been other ones."""
-    found = {run.estimates.headline: best or run.headline}
+    found = {run.estimates.headline: best or run.estimates.best}
     return short_answer(campaign or run.campaign, manifest or {}, replace(run.estimates, estimates=found, **changes))
 
 
@@ -141,8 +141,8 @@ def test_of_a_vehicle_that_acts_it_says_whether_runs_or_tests_are_missing(alone,
 
 def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what_to_raise(stored_run):
     run = read_run_folder(stored_run("shells-acting-twin"))
-    details = {**run.headline.details, "references": []}
-    best = replace(run.headline, n_crashes=0, rhw=math.inf, cautions=(), details=details)
+    details = {**run.estimates.best.details, "references": []}
+    best = replace(run.estimates.best, n_crashes=0, rhw=math.inf, cautions=(), details=details)
     campaign = golden("shells-acting-twin", "stop.rhw=0.3")
     manifest = {"remedy": {"pool.events_per_shell": 3200}}
     answer = said(run, best, campaign, severity=None, stopped_by="pool", manifest=manifest)
@@ -150,7 +150,7 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
     assert (row.value, row.remark) == ("no ratio", "such drivers never crash here")
     assert answer.scope.endswith("would narrow it, no crash seen, asked: ± 30 %; raise pool.events_per_shell to 3,200")
     run = read_run_folder(stored_run("forced-acting-twin"))
-    answer = said(run, replace(run.headline, cautions=()))  # asks no other driver
+    answer = said(run, replace(run.estimates.best, cautions=()))  # asks no other driver
     assert "ratio" not in {row.key for row in answer.rows}
 
 
@@ -182,13 +182,13 @@ def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(nam
 def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, value, ends, stored_run):
     """An upper limit, where the interval is wide or nothing crashed; the ratio's, where it says something."""
     run = read_run_folder(stored_run("shells-lateral-twin"))
-    [beside, *_] = run.headline.details["references"]
+    [beside, *_] = run.estimates.best.details["references"]
     low = 0.0 if seen == 0.0 else 0.05
     beside = {**beside, "reference": "r157-cc", "crash_rate": 3e-8, "ratio": seen, "ratio_low": low, "ratio_high": high}
     rate = {"crash_rate": 1e-9 * (seen > 0.0), "ci_low": 5e-10 * (seen > 0.0), "ci_high": 3e-8, "rhw": 15.0}
-    tested = [{**each, "n_episodes": 9} for each in run.headline.details["shells"]]
-    details = {**run.headline.details, "references": [beside], "shells": tested}
-    best = replace(run.headline, **rate, n_crashes=2 * (seen > 0.0), details=details)
+    tested = [{**each, "n_episodes": 9} for each in run.estimates.best.details["shells"]]
+    details = {**run.estimates.best.details, "references": [beside], "shells": tested}
+    best = replace(run.estimates.best, **rate, n_crashes=2 * (seen > 0.0), details=details)
     rows = said(run, best, golden("shells-lateral-twin", "stop.rhw=0.3"), severity=None).rows
     assert (rows[0].key, rows[0].value, rows[0].interval) == (first, value, ends)
 
@@ -197,11 +197,11 @@ def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, va
 def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     """Where a limit is rejected, or the upper end is what has not been tested: the lower end alone says something."""
     run = read_run_folder(stored_run("shells-accepted"))
-    decision, details = {**run.manifest["decision"], "verdict": verdict}, run.headline.details
+    decision, details = {**run.manifest["decision"], "verdict": verdict}, run.estimates.best.details
     shells = [{**each, "n_episodes": each["n_episodes"] * (not untested)} for each in details["shells"]]
     beside = {**details["references"][0], "ratio": 3.98, "ratio_low": 2.0, "ratio_high": 980.0}
     rate = {"crash_rate": 2e-7, "ci_low": 1e-7, "ci_high": 5e-5, "rhw": 100.0}
-    best = replace(run.headline, **rate, details={**details, "references": [beside], "shells": shells})
+    best = replace(run.estimates.best, **rate, details={**details, "references": [beside], "shells": shells})
     limits = {"limits_above_5_mps": (0.0, 1.0), "limits_below_1_mps": (0.001, 0.41)}
     severity = replace(run.estimates.severity, **limits, share_below_1_mps=0.0)
     rows = said(run, best, severity=severity, decision=decision).rows
@@ -214,8 +214,8 @@ def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
 def severe(stored_run, cut_off=0.0, driver="brakes-8", **of_rate):
     """The answer of a run, if its tests that were cut off, and ends of its interval, are so many times its rate."""
     run = read_run_folder(stored_run("shells-twin"))
-    rate, unavoidable = run.headline.crash_rate, replace(run.estimates.severity.unavoidable, driver=driver)
-    best = replace(run.headline, **{name: times * rate for name, times in of_rate.items()})
+    rate, unavoidable = run.estimates.best.crash_rate, replace(run.estimates.severity.unavoidable, driver=driver)
+    best = replace(run.estimates.best, **{name: times * rate for name, times in of_rate.items()})
     return said(run, best, severity=replace(run.estimates.severity, cut_off=cut_off * rate, unavoidable=unavoidable))
 
 

@@ -55,9 +55,7 @@ def drive(campaign: Campaign, n: int = N) -> pa.Table:
 
 def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> tuple[Block, BoolArray]:
     """The episodes, and which surrogates would have crashed in them."""
-    method = campaign.testing.method
-    block = block_from_tables(table, None, method=method, alpha=campaign.mixture_weights)
-    return block, surrogates_crash(table, resolve(campaign), pool)
+    return block_from_tables(campaign, table), surrogates_crash(table, resolve(campaign), pool)
 
 
 @pytest.fixture(scope="module")
