@@ -110,7 +110,7 @@ DESIGN = replace(
 )
 LEVEL = Level.two_sided(0.9)
 BUDGET = 3_000
-REPLICATIONS = 500
+REPLICATIONS = 250
 
 
 def rule(limit: float, held: int = 0) -> RoundRule:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 
 import numpy as np
@@ -15,7 +14,6 @@ from harness.errors import RunFolderError, TooManyFailedError
 from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
-from harness.report.page import write_report
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.conftest import SHELLS
@@ -184,18 +182,7 @@ def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
     assert estimate(folder) == estimates(folder)  # needs no path
 
 
-def test_a_page_is_written_where_so_few_paths_crashed_that_the_pool_s_error_is_not_known(stored_run, tmp_path):
-    folder = copy_of(stored_run(ACTS), tmp_path / "run")
-    content = estimates(folder)["estimates"]
-    details = content["shells"]["details"]
-    for part in (details, details["within"]):
-        part.update(rhw_from_pool=None, rhw_from_pool_at_least=None)
-    edit(folder, "estimates.json", estimates=content)
-    page = write_report(folder).read_text()
-    assert "pool’s own error is not known" in page
-    assert "nan" not in set(re.findall(r"[a-z]+", (folder / "plots" / "shells.svg").read_text().lower()))
-
-
+@pytest.mark.slow
 def test_a_vehicle_that_ends_its_process_in_a_shadow_run_fails_there(campaign, run, tmp_path):
     """Nothing else is lost, and the tests under the same numbers are run."""
     exits = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Exits')}", "run.max_failed_share=0.05", "stop.rhw=9")
