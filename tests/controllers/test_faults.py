@@ -67,6 +67,12 @@ def undisturbed(tmp_path_factory):
     return _episodes(folder)
 
 
+def quick(n, cases):
+    """The first n for every run of the tests, the others for .ci/full."""
+    rows = [each if isinstance(each, tuple) else (each,) for each in cases]
+    return [pytest.param(*row, marks=[pytest.mark.slow] * (k >= n)) for k, row in enumerate(rows)]
+
+
 MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
 IN_PROCESS = {
     **dict.fromkeys(("rounds_down", "flushes_to_zero", "traps_division"), f"step: {MODES}"),
@@ -101,7 +107,12 @@ OF_THE_PROCESS = {
 }
 
 
-@pytest.mark.parametrize("faults", [IN_PROCESS, OF_THE_PROCESS], ids=["in_process", "of_the_process"])
+FIRST = {fault: OF_THE_PROCESS[fault] for fault in ("is_killed", "hangs_for_good")}
+
+
+@pytest.mark.parametrize(
+    "faults", quick(2, [IN_PROCESS, FIRST, OF_THE_PROCESS]), ids=["in it", "a kill and a hang", "of it"]
+)
 def test_a_fault_ends_its_episode_and_changes_no_other(faults, tmp_path, undisturbed):
     bad = {3 + 7 * i: fault for i, fault in enumerate(faults)}
     assert _run(tmp_path, _misbehaving(bad, SHORT)) == EXIT_DONE
@@ -144,12 +155,6 @@ NO_FAULT = {
 }
 
 
-def quick(n, cases):
-    """The first n for every run of the tests, the others for .ci/full."""
-    rows = [each if isinstance(each, tuple) else (each,) for each in cases]
-    return [pytest.param(*row, marks=[pytest.mark.slow] * (k >= n)) for k, row in enumerate(rows)]
-
-
 @pytest.mark.parametrize(("av", "noted"), quick(3, NO_FAULT.values()), ids=NO_FAULT)
 def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undisturbed):
     note = tmp_path / "note"
@@ -158,7 +163,7 @@ def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undist
     assert noted is None or note.read_text().count("closed") >= noted
 
 
-@pytest.mark.parametrize(("episodes", "n", "share"), [(400, 200, 0.005), (40, 40, 0.04)])
+@pytest.mark.parametrize(("episodes", "n", "share"), quick(1, [(400, 200, 0.005), (40, 40, 0.04)]))
 def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
     """They end a campaign halfway; one with fewer tests than that takes has no answer either."""
     av = _misbehaving({5: "raises", 6: "raises"})

@@ -158,9 +158,9 @@ def test_the_built_in_idm_is_fine():
         ("Steady", ""),
         ("Noisy", ""),
         ("tests.controllers.misbehaving:Global", "random numbers of its own"),
-        ("Remembering", "it remembers the last one"),
+        pytest.param("Remembering", "it remembers the last one", marks=pytest.mark.slow),
         pytest.param("Sharing", "they share something", marks=pytest.mark.slow),
-        ("LooksAtTheClock", ""),
+        pytest.param("LooksAtTheClock", "", marks=pytest.mark.slow),
         ("KeepsItsAnswer", "It depends on the clock (time.monotonic, test_av_check.py:"),
         pytest.param("ReadsTheTimeOfDay", "on the clock (time.time, test_av_check.py:", marks=pytest.mark.slow),
         pytest.param("OfItsProcess", "It differs from process to process: ", marks=pytest.mark.slow),
@@ -236,7 +236,11 @@ def test_the_command_line(capfd):
     ("av", "code"),
     [
         ("{sumo: {carFollowModel: EIDM}}", 0),
-        (f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}", 0),
+        pytest.param(
+            f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}",
+            0,
+            marks=pytest.mark.slow,
+        ),
         ("{traci: {command: 'false', connect_time_s: 5, restarts: 0}}", 3),
     ],
     ids=["SUMO's EIDM", "a program", "a program that dies"],
@@ -305,6 +309,7 @@ def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
 LEAD = "environment.cut_in_lead_s=0.5"
 
 
+@pytest.mark.slow
 def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_at_one_that_acts_before_in_one_step(campaign):
     with_lead, without = (check_av(campaign("world.engine=twin", *lead), 48) for lead in ((LEAD,), ()))
     assert (with_lead.exit_code, with_lead.take_time, without.take_time) == (0, True, False)

@@ -101,6 +101,7 @@ def test_the_folder_keeps_the_answer_of_its_own_traffic_alone(stored_run, tmp_pa
     assert "with other numbers" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_ratio_of_two_vehicles_hardly_moves(tmp_path, capsys):
     shared, other = COMPARED
     with one_process(), without_page():

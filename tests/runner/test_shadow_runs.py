@@ -90,7 +90,9 @@ def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_
 NOISY = "parameters: {noise_mps2: 0.2}"
 
 
-@pytest.mark.parametrize("method", [SHELLS, FORCED], ids=["shells", "forced"])
+@pytest.mark.parametrize(
+    "method", [pytest.param(SHELLS, id="shells"), pytest.param(FORCED, id="forced", marks=pytest.mark.slow)]
+)
 def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(method, campaign, run_here, tmp_path):
     asked = (*method, SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
@@ -103,6 +105,7 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
     assert replay(seeded, 123).bit_equal
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_acts_is_tested_in_the_default_traffic(campaign, run_here, tmp_path):
     """Cut-ins take time there, in baseline runs and in tests that follow from them."""
     traffic = "environment.parameters=ndd-overtaking-2", "stop.episodes=80", "pool.pilot_tests=0"
@@ -134,6 +137,7 @@ def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp
     assert any("no test in failed shadow runs" in note_words(warning) for warning in shells["warnings"])
 
 
+@pytest.mark.slow
 def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_path):
     """A vehicle that gives way, but on three paths of 120: the run ends, and says that it knows too little."""
     lonely = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('YieldsMostly')}", "stop.rhw=0.3", "stop.episodes=20000")
@@ -147,6 +151,7 @@ def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_
     assert shells["details"]["references"] == []
 
 
+@pytest.mark.slow
 def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(campaign, run_here, tmp_path):
     """The same paths, weights and ends, with and without a shadow run before each test."""
     plain = run_here(campaign(*FORCED, TWIN, "av={controller: 'tests.controllers.early:HoldsThenIdm'}"), tmp_path / "a")

@@ -156,7 +156,7 @@ def test_the_example_client_drives_like_the_built_in_idm_in_every_bit(n):
     assert_same_motion(shard, expected, range(n))
 
 
-@pytest.mark.parametrize("client", ["pushes_held_avs", "connects_late"])
+@pytest.mark.parametrize("client", ["pushes_held_avs", pytest.param("connects_late", marks=pytest.mark.slow)])
 def test_commands_to_an_av_that_must_hold_its_speed_are_overruled_and_connecting_late_is_no_fault(client):
     shard, expected = run(program(MISBEHAVING, client), 0, 6, cells=2), run_idm(0, 6)
     assert not shard.failures
@@ -311,6 +311,7 @@ def test_it_does_in_tests_what_it_did_in_its_baseline_runs(av):
     assert np.all(shard.episode["event_step"] >= 0)
 
 
+@pytest.mark.slow
 def test_models_that_are_recycled_otherwise_remember_the_last_cut_in():
     """Why they get a simulation per episode when they act from the start: in one, tests are not the same again."""
     campaign = acting("{sumo: {carFollowModel: Krauss}" + EARLY, "sumo")
