@@ -38,7 +38,7 @@ WORLD_SOURCES = (
     "worlds/twin.py",
 )
 """All files that decide what happens in a test; pools and tables are made again when one changes."""
-KERNEL_SOURCES = (*WORLD_SOURCES, "estimators/likelihood.py")
+KERNEL_SOURCES = (*WORLD_SOURCES, "pool/learned.py", "estimators/likelihood.py")
 """All files that compiled code may come from, or take constants from (a test holds this against the imports)."""
 
 
@@ -57,7 +57,7 @@ import numba  # noqa: E402  (its settings are read at import)
 import numpy as np  # noqa: E402
 from llvmlite import ir  # noqa: E402
 from numba import extending  # noqa: E402
-from numba.core import caching, cgutils, codegen, compiler, serialize, types  # noqa: E402
+from numba.core import caching, cgutils, compiler, serialize, types  # noqa: E402
 from numba.core.registry import cpu_target  # noqa: E402
 from numba.core.typing.templates import AttributeTemplate  # noqa: E402
 
@@ -106,42 +106,6 @@ class _KernelCache(caching.NullCache):
         return cache.has(f"{self._name}*")
 
 
-class _NoMachineCode:
-    """In the place of a code generator that is asked to tell machine code where it stands."""
-
-    @staticmethod
-    def set_env(name: str, environment: Any) -> None:
-        """Nothing to be told."""
-
-
-class _PartLibrary(codegen.JITCodeLibrary):
-    """Code of a part, to be linked into kernels, and made fast and turned into machine code only there."""
-
-    codegen: Any = _NoMachineCode
-
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
-        self._finalized = True
-
-    def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
-        """Nowhere, but numba asks for it when the part is complete."""
-        self._ensure_finalized()  # type: ignore[no-untyped-call]
-        return 0
-
-
-class PartCompiler(compiler.Compiler):
-    """Numba's compiler, for parts of kernels."""
-
-    def define_pipelines(self) -> Any:
-        """Numba's own, which add to this library."""
-        state: Any = self.state
-        state.library = _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)  # type: ignore[no-untyped-call]
-        return super().define_pipelines()  # type: ignore[no-untyped-call]
-
-
 _SETTINGS: dict[str, Any] = {"fastmath": False, "error_model": "numpy", "no_cfunc_wrapper": True}
 _register: Any = extending.register_jitable
 """Untyped, because ``_nrt`` is not among the options that numba's own types know."""
@@ -163,13 +127,8 @@ def compiled(function: _Function) -> _Function:
 
 
 def compiled_inline(function: _Function) -> _Function:
-    """Let kernels inline a small function; elsewhere it is what it is, a function of Python.
-
-    A process compiles it once for all kernels, half of the way: what LLVM does takes most of the time, and is left to
-    the kernels that it becomes part of.
-    """
-    settings = {**_SETTINGS, "no_cpython_wrapper": True, "pipeline_class": PartCompiler}
-    result: _Function = _register(forceinline=True, _nrt=False, **settings)(function)
+    """Let kernels inline a small function; elsewhere it is what it is, a function of Python."""
+    result: _Function = _register(forceinline=True, _nrt=False, **_SETTINGS)(function)
     return result
 
 

@@ -106,7 +106,7 @@ def beside_published(environment: str, published: Path = PUBLISHED) -> list[dict
 
 def model_figures(environment: Environment, approach: Approach) -> dict[str, float]:
     """What an environment says of the figures, by name."""
-    return {**_leads(environment), **_cut_ins(environment, approach), **_scenario(environment, approach)}
+    return {**_leads(environment), **_kept(environment, approach), **_scenario(environment, approach)}
 
 
 def _leads(environment: Environment) -> dict[str, float]:
@@ -127,7 +127,7 @@ def _leads(environment: Environment) -> dict[str, float]:
     }
 
 
-def _cut_ins(environment: Environment, approach: Approach) -> dict[str, float]:
+def _kept(environment: Environment, approach: Approach) -> dict[str, float]:
     """The law of acceptance at published closing speeds, with equally likely gaps up to the sensor's view."""
     low, high = approach.closing_mps.p5, approach.closing_mps.p95
     sd = (high - low) / (2.0 * stats.norm.isf(0.05))

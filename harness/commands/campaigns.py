@@ -349,21 +349,22 @@ def schema() -> None:
 
 
 @click.command(
-    short_help="Install the system libraries that SUMO needs.",
+    short_help="Install the system libraries that SUMO needs, and compile.",
     epilog=examples(
-        "harness setup             # does and asks nothing where nothing is missing",
+        "harness setup             # once per machine and version; asks nothing where nothing is missing",
         "harness setup --dry-run   # only print the commands",
     ),
 )
 @click.option("--dry-run", is_flag=True, help="Print the commands that would be run, and run none.")
 def setup(*, dry_run: bool) -> None:
-    """Install the system libraries that SUMO needs, where they are missing: once per machine.
+    """Install the system libraries that SUMO needs, where they are missing, and compile what a first run needs.
 
     pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get, dnf or apk, directly as
     root and else by sudo, which may ask for your password at a terminal. A campaign with world.engine twin needs none.
 
     Exit code 2 says that they could not be installed; the message names the packages.
     """
+    from harness.runner.setup import compile_kernels  # noqa: PLC0415 - keeps --help fast
     from harness.worlds.system_libraries import (  # noqa: PLC0415 - keeps --help fast
         install,
         install_commands,
@@ -381,3 +382,6 @@ def setup(*, dry_run: bool) -> None:
         install(missing, commands)
     require_libsumo()
     click.echo("SUMO's system libraries are installed." if missing else "SUMO's system libraries are there.")
+    with progress_bar() as bar:
+        compiled = compile_kernels(bar)
+    click.echo("Kernels are compiled." if compiled else "Kernels were compiled before.")

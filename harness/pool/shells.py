@@ -169,7 +169,7 @@ class PrescribedEpisodes:
         campaign, self._resolved = resolved.campaign, resolved
         limit = acceleration_limit(campaign.av)
         design, groups = design_shells(pool, limit), shells_in_strata(pool, limit)
-        self._cut_ins, self._shell, self._shell_p = pool.events, pool.shell, pool.shell_p
+        self._kept, self._shell, self._shell_p = pool.events, pool.shell, pool.shell_p
         self._n_inside = boundary_shell(pool) + 1
         self._cells = cells_in_strata(pool, groups)[0]
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
@@ -211,13 +211,13 @@ class PrescribedEpisodes:
     def events(self, rows: IntArray) -> PrescribedEvents:
         """What records say of given cut-ins of the pool (n,)."""
         joined = np.eye(len(self.design.cell_stratum) + 1)[self._cells, :-1]  # the last row is for what is not tested
-        c, mass = self._cut_ins, self._cut_ins.path_mass[rows] @ joined
+        c, mass = self._kept, self._kept.path_mass[rows] @ joined
         acts = slice(None) if self.design.shadow_runs else slice(0)
         return PrescribedEvents(rows, self._cells[c.cell[rows]], mass, c.row[rows[acts]], c.mass[rows[acts]])
 
     def of_rows(self, rows: IntArray, stratum: IntArray) -> Traffic:
         """Tests of given cut-ins of the pool (n,), for given strata (n,)."""
-        c, resolved = self._cut_ins, self._resolved
+        c, resolved = self._kept, self._resolved
         chosen = Chosen(c.facts[rows], c.at[rows], c.lead[rows])
         script = resolved.family.script(resolved.environment, chosen)
         log_weight = np.log(self.design.p[stratum])

@@ -23,12 +23,12 @@ import numpy as np
 from harness import cache
 from harness.campaign.sections import PoolSettings
 from harness.errors import HarnessError
-from harness.families.cut_in.learned import Learned, learned_crashes
 from harness.families.protocol import Environment, Family, Paths, Recorded
 from harness.loop.judge import motion_hashes
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, contributions
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.kept import Pool
+from harness.pool.learned import Learned
 from harness.pool.shells import CANDIDATES, conservative_first, shells_of
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
@@ -168,10 +168,10 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded, learn
     order, crashes = paths.order, found.crashes
     if learned is not None:
         asked = (crashes != 0) & (mass > 0.0)
-        given = paths.seed, paths.index, paths.start, environment, runs, asked, followers.counts_above_mps
+        given = environment, paths.seed, paths.paths, learned, runs, asked, followers.counts_above_mps
         place = order.tolist().index(list(library.surrogates).index(library.boundary)) + 1
         beyond = shells_of(crashes, order) >= place
-        own = learned_crashes(learned, *given)
+        own = resolved.family.learned_crashes(*given)
         if mass[own & beyond].sum() > LEAST_LEARNED * mass[own].sum():
             n, more, known = order.size, [LEARNED], [*known, learned.digest()]
             of_library = crashes & ((1 << n) - 1)

@@ -13,9 +13,7 @@ All have one shape (`protocol`); what is to be known of every method, such as wh
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 from harness.campaign.campaign import Campaign
@@ -44,30 +42,18 @@ def source_of(campaign: Campaign) -> type[Source]:
 
 
 def prepare(resolved: Resolved, progress: Progress | None = None) -> Source:
-    """Build (or read) what a campaign's tests are drawn from, while kernels are compiled if they have to be."""
+    """Build (or read) what a campaign's tests are drawn from, after kernels are compiled if they have to be."""
     progress, build = progress or Progress(), source_of(resolved.campaign)
-    if is_cached(build.kernel):
-        return build(resolved, progress)
-    progress.stage("compiling, once per version", None)
-    with ThreadPoolExecutor(1) as thread:
-        building = thread.submit(build, resolved, progress)
-        try:
-            gc.disable()  # a compiler makes many small objects, and next to no garbage
-            try:
-                compile_kernels(resolved)
-            finally:
-                gc.enable()
-            return building.result()
-        except BaseException:
-            progress.cancelled = True  # or leaving would wait until all is built
-            raise
+    if not is_cached(build.kernel):
+        progress.stage("compiling, once per version", None)
+        compile_kernels(resolved)
+    return build(resolved, progress)
 
 
 def compile_kernels(resolved: Resolved) -> None:
-    """Compile what tests will need, while threads build tables: neither waits for the other.
+    """Compile what tests will need, into the cache, where worker processes find it.
 
-    Kernels are the same for all worlds, so one naturalistic test in the twin compiles them into the cache, where worker
-    processes find them.
+    Kernels are the same for all worlds: one naturalistic test in the twin compiles them.
     """
     from harness.worlds.twin import TwinWorld  # noqa: PLC0415 - only a cold start needs it
 

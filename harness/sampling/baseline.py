@@ -20,10 +20,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.errors import RunFolderError
-from harness.families.cut_in.learned import Following, Learned, learn
 from harness.families.protocol import Paths, Recorded
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
+from harness.pool.learned import Following, Learned, learn
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.records.folder import parquet, read_table
 from harness.records.schemas import baseline_table, padded, pilot_table

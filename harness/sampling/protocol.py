@@ -22,11 +22,11 @@ from harness.controllers.hosts import BeforeTest
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator
 from harness.estimators.stopping import Rule, StopRule
-from harness.families.cut_in.learned import Learned
 from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import judge
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
+from harness.pool.learned import Learned
 from harness.pool.shells import Draw
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress

@@ -24,13 +24,13 @@ from harness.estimators.pairs import PairCounts
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
-from harness.families.cut_in.learned import Learned
 from harness.families.protocol import Recorded
 from harness.loop.loop import EpisodeLoop, Shard
 from harness.loop.repeat import Traffic
 from harness.numbers import plain
 from harness.pool.build import campaign_pool, campaign_pool_key, pool_name
 from harness.pool.kept import Pool
+from harness.pool.learned import Learned
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_paths, vehicle_pool
 from harness.progress import Progress

@@ -28,13 +28,13 @@ from harness.controllers.find import build_host
 from harness.errors import CampaignError, HarnessError
 from harness.families import family_named
 from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.learned import Learned, learned_crashes
 from harness.families.protocol import Paths
 from harness.loop.judge import motion_hashes
 from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.loop.repeat import Traffic
 from harness.pool.aim import PILOT_PATHS, STRIDE, Enumerator
 from harness.pool.kept import onset_steps
+from harness.pool.learned import Learned
 from harness.pool.shells import CANDIDATES, PrescribedEpisodes, acceleration_limit
 from harness.pool.vehicle_pool import BaselinePaths, vehicle_pool, walk_candidates
 from harness.progress import Progress
@@ -348,10 +348,10 @@ def _walk(
         raise HarnessError(f"avs: {campaign.av.controller or campaign.av.fmu}", found, expected, mend)
     crashes = tests.episode["outcome"] == CRASH
     of_cut_ins = bits[row, step] | (crashes.astype(np.int64) << library.n_drivers)  # the vehicle comes after these
-    where = paths.seed, paths.index, paths.start, environment
     for k, one in enumerate(learned):
         asked = (bits != 0) & (mass > 0.0)
-        own = learned_crashes(one, *where, runs, asked, campaign.crash.counts_above_mps)
+        least = campaign.crash.counts_above_mps
+        own = resolved.family.learned_crashes(environment, paths.seed, paths.paths, one, runs, asked, least)
         of_cut_ins |= own[row, step].astype(np.int64) << (library.n_drivers + 1 + k)
     somebody = of_cut_ins != 0
     row, step = row[somebody], step[somebody]

@@ -94,7 +94,7 @@ def source():
 def driven(source, name):
     """Whether the vehicle crashes on each cut-in of the pool, and how hard; one only touches but for one in fifty."""
     campaign = golden("shells-twin", VEHICLES[name])
-    events = source.prescribed._cut_ins
+    events = source.prescribed._kept
     n, environment = events.step.size, source.resolved.environment
     script = maneuvers_of(Chosen(events.facts, events.at, events.lead))
     stored = StoredPaths(1, np.arange(n), states_of(events.facts), np.full(n, 200), events.step, script)

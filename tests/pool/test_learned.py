@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from harness.families.cut_in.learned import Learned, learned_crashes
+from harness.pool.learned import Learned
 from harness.pool.vehicle_pool import vehicle_pool
 from harness.sampling.baseline import learned_from, pilot_requests, run_baseline
 from harness.strata import LEARNED, OUTSIDE
@@ -65,10 +65,14 @@ def test_where_a_table_without_the_dead_time_says_otherwise_the_vehicle_does_as_
     learned = learned_from(tests, runs)
     paths, environment = ready.baseline_paths, ready.resolved.environment
     asked = np.zeros((len(paths), int(environment.numbers["max_steps"])), np.bool_)
-    row, step = ready.prescribed._cut_ins.row, ready.prescribed._cut_ins.step
+    row, step = ready.prescribed._kept.row, ready.prescribed._kept.step
     asked[row, step] = True
-    where = paths.seed, paths.index, paths.start, environment, runs, asked, 0.0
-    own, other = (learned_crashes(each, *where)[row, step] for each in (learned, learned._replace(dead_steps=0)))
+
+    def crashes(one):
+        family = ready.resolved.family
+        return family.learned_crashes(environment, paths.seed, paths.paths, one, runs, asked, 0.0)[row, step]
+
+    own, other = crashes(learned), crashes(learned._replace(dead_steps=0))
     rows = np.flatnonzero(own != other)
     shard = loop.run(0, ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
     crashed = shard.episode["outcome"] == CRASH

@@ -74,18 +74,19 @@ def test_the_list_is_what_the_wheels_need():
     assert {soname for soname in needed if not soname.startswith(ALWAYS_THERE)} == known
 
 
-COMMANDS = {
-    "check": "",
-    "run": "--out runs/x",
-    "compare": "--set testing.method=forced --against av.model=fvdm --out runs/x",
-    "av-check": "--set av.sumo.carFollowModel=ACC",
-}
+ACC, AGAINST = "av={sumo: {carFollowModel: ACC}}", ("--set", "testing.method=forced", "--against", "av.model=fvdm")
+COMMANDS = [
+    ("check",),
+    ("run", "--out", "runs/x"),
+    ("compare", *AGAINST, "--out", "runs/x"),
+    ("av-check", "--set", ACC),
+]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_commands_that_open_sumo_name_what_is_missing(command, bare_machine, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("command", "options"), [(command, options) for command, *options in COMMANDS])
+def test_commands_that_open_sumo_name_what_is_missing(command, options, bare_machine, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main([command, SMOKE, *COMMANDS[command].split()]) == EXIT_BAD_INPUT
+    assert main([command, SMOKE, *options]) == EXIT_BAD_INPUT
     said = capsys.readouterr()
     assert said.out == ""
     for words in ("libnowhere.so.7", "harness setup", "libnowhere7", "dnf install -y nowhere-libs", "apk add nowhere"):
@@ -111,14 +112,6 @@ def test_a_libsumo_that_does_not_load_for_another_reason_is_told_too(monkeypatch
         system_libraries.require_libsumo()
 
 
-@pytest.fixture
-def libsumo_of(tmp_path, monkeypatch):
-    """Put a module in libsumo's place."""
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "libsumo", raising=False)
-    return (tmp_path / "libsumo.py").write_text
-
-
 @pytest.mark.parametrize(
     ("code", "where", "said"),
     [
@@ -128,9 +121,11 @@ def libsumo_of(tmp_path, monkeypatch):
     ],
 )
 def test_a_libsumo_of_another_place_is_named_and_must_be_of_the_version_that_is_pinned(
-    code, where, said, libsumo_of, tmp_path, capsys
+    tmp_path, monkeypatch, capsys, code, where, said
 ):
-    libsumo_of(code)
+    (tmp_path / "libsumo.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "libsumo", raising=False)
     assert main(["run", SMOKE, "--out", str(tmp_path / "run")]) == EXIT_BAD_INPUT
     err = capsys.readouterr().err
     assert f"error: {where}" in err
@@ -138,18 +133,28 @@ def test_a_libsumo_of_another_place_is_named_and_must_be_of_the_version_that_is_
     assert str(tmp_path / "libsumo.py") in err
 
 
-def test_a_libsumo_of_the_right_version_is_taken_from_another_place_and_that_is_said(libsumo_of, tmp_path, capsys):
-    libsumo_of(f"def getVersion():\n    return 22, 'SUMO {system_libraries.SUMO_VERSION}'")
+def test_a_libsumo_of_the_right_version_is_taken_from_another_place_and_that_is_said(tmp_path, monkeypatch, capsys):
+    (tmp_path / "libsumo.py").write_text(f"def getVersion():\n    return 22, 'SUMO {system_libraries.SUMO_VERSION}'")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "libsumo", raising=False)
     system_libraries.require_libraries()
     assert str(tmp_path) in capsys.readouterr().err
+
+
+@pytest.fixture(autouse=True)
+def compiled_before(monkeypatch):
+    """`tests/runner/test_setup.py` compiles."""
+    monkeypatch.setattr("harness.runner.setup.compile_kernels", lambda _: False)
 
 
 def test_setup_does_nothing_where_nothing_is_missing(programs, capsys):
     for name in ("sudo", *MANAGERS):
         programs(name)
     programs.user(1000)
-    assert (main(["setup"]), main(["setup", "--dry-run"])) == (0, 0)
-    assert capsys.readouterr().out.splitlines() == ["SUMO's system libraries are there.", "Nothing to install."]
+    assert main(["setup"]) == 0
+    assert main(["setup", "--dry-run"]) == 0
+    told = ["SUMO's system libraries are there.", "Kernels were compiled before.", "Nothing to install."]
+    assert capsys.readouterr().out.splitlines() == told
     assert programs.calls() == []
 
 

@@ -1,0 +1,41 @@
+"""Compile what a first campaign needs, by running two small ones in the twin: once per version of the harness."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from harness import cache
+from harness.campaign.campaign import Campaign
+from harness.compiled import KERNELS
+from harness.progress import Progress
+from harness.runner.run import run_campaign
+
+_CONTROLLER = """class Holds:
+    def step(self, seen):
+        return 0.0
+"""
+
+
+def compile_kernels(progress: Progress | None = None) -> bool:
+    """Compile all kernels of the default method, for built-in vehicles and for controllers; False where it was done.
+
+    The cache keeps them. Where it cannot be written this says nothing: the first run compiles them again.
+    """
+    done = f"{KERNELS}/all"
+    if cache.has(done):
+        return False
+    with TemporaryDirectory() as folder:
+        controller = Path(folder) / "holds.py"
+        controller.write_text(_CONTROLLER)
+        for number, av in enumerate(({}, {"controller": f"{controller}:Holds"})):
+            content = {
+                "name": "setup",
+                "av": av,
+                "world": {"engine": "twin"},
+                "pool": {"relative_error": 0.2, "events_per_shell": 100},
+                "stop": {"episodes": 200},
+            }
+            run_campaign(Campaign.model_validate(content), Path(folder) / str(number), workers=1, progress=progress)
+    cache.keep(done, b"")
+    return True
