@@ -216,7 +216,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
     assert not Path("called").exists()
 
 
-@pytest.mark.parametrize("at", ["constructor", "step"])
+@pytest.mark.parametrize("at", quick(1, ["constructor", "step"]))
 @pytest.mark.parametrize(
     "what",
     [

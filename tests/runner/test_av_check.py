@@ -194,12 +194,12 @@ def test_what_winds_up_in_a_longer_warm_up_is_seen(overrides, moves):
 
 
 @pytest.mark.parametrize(
-    ("name", "n"), [("Slow", 16), ("LoadsOnce", 16), ("tests.controllers.misbehaving:OnlyStepBatch", 1)]
+    ("name", "n"), [("Slow", 8), ("LoadsOnce", 8), ("tests.controllers.misbehaving:OnlyStepBatch", 1)]
 )
 def test_a_slow_constructor_is_measured_and_counted(name, n):
-    found = check(name, "world.cells=16")
+    found = check(name, "world.cells=8")
     assert found.speed.constructions == n
-    assert (found.speed.construction_s > 0.1, "calls it 16 times" in found.verdict) == (name == "Slow",) * 2
+    assert (found.speed.construction_s > 0.1, "calls it 8 times" in found.verdict) == (name == "Slow",) * 2
 
 
 def test_failures_that_differ_in_digits_are_one_and_name_line_and_what_was_meant():

@@ -67,6 +67,7 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(stored_run, tmp_path):
 AS_NEEDED = "av.controller=examples.acting:CarefulAsNeeded"
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_is_stored(tmp_path):
     """Ended among the pilot tests and going on: the same bits."""
     campaign, out, other = golden(ACTS, AS_NEEDED), tmp_path / "run", tmp_path / "other"
@@ -91,7 +92,7 @@ NOISY = "parameters: {noise_mps2: 0.2}"
 
 
 @pytest.mark.parametrize(
-    "method", [pytest.param(SHELLS, id="shells"), pytest.param(FORCED, id="forced", marks=pytest.mark.slow)]
+    "method", [pytest.param(SHELLS, id="shells", marks=pytest.mark.slow), pytest.param(FORCED, id="forced")]
 )
 def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(method, campaign, run_here, tmp_path):
     asked = (*method, SHADOWS, TWIN)

@@ -35,7 +35,7 @@ class RaisesBeforeContact(IDM):
 
 
 @pytest.mark.parametrize(
-    "method", ["shells", "forced", *(pytest.param(each, marks=pytest.mark.slow) for each in ("episode_mixture", "nde"))]
+    "method", [pytest.param(each, marks=[pytest.mark.slow] * (each != "shells")) for each in METHODS]
 )
 def test_the_interval_holds_what_may_have_happened(method, campaign, run_here, tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)

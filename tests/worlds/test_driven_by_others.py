@@ -301,7 +301,13 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("av", [av + EARLY for av in FORMS.values()], ids=FORMS)
+@pytest.mark.parametrize(
+    "av",
+    [
+        pytest.param(av + EARLY, id=name, marks=[pytest.mark.slow] * (name not in ("SUMO's ACC", "TraCI style")))
+        for name, av in FORMS.items()
+    ],
+)
 def test_it_does_in_tests_what_it_did_in_its_baseline_runs(av):
     failures, shard, runs = driven(av)
     assert not failures
