@@ -135,7 +135,7 @@ def test_json_is_strict(tmp_path):
 # -- a bit that flips, or a file of another run, changes no number without a word --
 
 
-NAME, ACTS, FLIPS = "mixture-twin", "shells-acting-twin", 200
+NAME, ACTS, FLIPS = "mixture-twin", "shells-acting-twin", 100
 TABLES = ("episodes", "moments", "traces")
 
 

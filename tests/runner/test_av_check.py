@@ -159,12 +159,12 @@ def test_the_built_in_idm_is_fine():
         ("Steady", ""),
         ("Noisy", ""),
         ("tests.controllers.misbehaving:Global", "random numbers of its own"),
-        ("Remembering", "it remembers the last one"),
-        ("Sharing", "they share something"),
-        ("LooksAtTheClock", ""),
+        pytest.param("Remembering", "it remembers the last one", marks=pytest.mark.slow),
+        pytest.param("Sharing", "they share something", marks=pytest.mark.slow),
+        pytest.param("LooksAtTheClock", "", marks=pytest.mark.slow),
         ("KeepsItsAnswer", "It depends on the clock (time.monotonic, test_av_check.py:"),
-        ("ReadsTheTimeOfDay", "It depends on the clock (time.time, test_av_check.py:"),
-        ("OfItsProcess", "It differs from process to process: "),
+        pytest.param("ReadsTheTimeOfDay", "on the clock (time.time, test_av_check.py:", marks=pytest.mark.slow),
+        pytest.param("OfItsProcess", "It differs from process to process: ", marks=pytest.mark.slow),
     ],
 )
 def test_a_controller_that_is_not_reproduced_is_found_out(name, why):
@@ -195,23 +195,18 @@ def test_what_winds_up_in_a_longer_warm_up_is_seen(overrides, moves):
 
 
 @pytest.mark.parametrize(
-    ("name", "n"), [("Slow", 80), ("LoadsOnce", 80), ("tests.controllers.misbehaving:OnlyStepBatch", 1)]
+    ("name", "n"), [("Slow", 8), ("LoadsOnce", 8), ("tests.controllers.misbehaving:OnlyStepBatch", 1)]
 )
 def test_a_slow_constructor_is_measured_and_counted(name, n):
-    found = check(name, "world.cells=80")
+    found = check(name, "world.cells=8")
     assert found.speed.constructions == n
-    assert (found.speed.construction_s > 0.1, "calls it 80 times" in verdict(found)) == (name == "Slow",) * 2
+    assert (found.speed.construction_s > 0.1, "calls it 8 times" in verdict(found)) == (name == "Slow",) * 2
 
 
 def test_failures_that_differ_in_digits_are_one_and_name_line_and_what_was_meant():
     fast, misspelt = sorted(check("Misspelt").failures, reverse=True)
     assert re.fullmatch(r"step, warming up: ValueError: too fast: \d\d\.\d+ \(test_av_check\.py:\d+\)", fast)
     assert re.search(r"no attribute 'gap'. Did you mean 'gap_m'\? \(test_av_check\.py:\d+\)$", misspelt)
-
-
-def test_a_controller_that_acts_early_is_checked_without_forcing():
-    found = check("Steady", "av.before_event=controller", "testing.method=nde")
-    assert (found.method, found.exit_code) == ("step_mixture", 0)
 
 
 def test_the_command_line(capfd):
@@ -242,7 +237,11 @@ def test_the_command_line(capfd):
     ("av", "code"),
     [
         ("{sumo: {carFollowModel: EIDM}}", 0),
-        (f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}", 0),
+        pytest.param(
+            f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}",
+            0,
+            marks=pytest.mark.slow,
+        ),
         ("{traci: {command: 'false', connect_time_s: 5, restarts: 0}}", 3),
     ],
     ids=["SUMO's EIDM", "a program", "a program that dies"],
@@ -311,6 +310,7 @@ def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
 LEAD = "environment.cut_in_lead_s=0.5"
 
 
+@pytest.mark.slow
 def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_at_one_that_acts_before_in_one_step(campaign):
     with_lead, without = (check_av(campaign("world.engine=twin", *lead), 48) for lead in ((LEAD,), ()))
     assert (with_lead.exit_code, with_lead.take_time, without.take_time) == (0, True, False)

@@ -169,17 +169,6 @@ def test_one_end_is_asked_for(campaigns, tmp_path):
         compare_campaigns(*campaigns, tmp_path / "out", margin=0.1, rhw=0.1)
 
 
-def test_a_run_that_nobody_limited_is_to_be_run_again(done, campaign, tmp_path):
-    """Which the folder of the comparison does not hinder: the run is not copied."""
-    early = "av={controller: 'tests.controllers.early:Speeds'}"
-    sides, stored = [campaign(*SHELLS, early), campaign(*SHELLS)], done.folder / "a"
-    with pytest.raises(CampaignError, match="so that it is run again"):
-        compare_campaigns(*sides, tmp_path / "out", stored=stored)
-    with pytest.raises(CampaignError, match=r"--against av\.limits\.max_acceleration_mps2=2, which limits B"):
-        compare_campaigns(*reversed(sides), tmp_path / "out", stored=stored)
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
     copy = Path(done.folder) / "a"
     call = ["compare", str(copy), "--against", HARDER, "--out", str(tmp_path / "out"), "--workers", "1"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -14,7 +13,6 @@ from harness.errors import RunFolderError, TooManyFailedError
 from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
-from harness.report.page import write_report
 from harness.sampling.baseline import run_baseline
 from harness.sampling.shells import Shells
 from tests.in_process import run_here as run_golden
@@ -23,7 +21,6 @@ from tests.runner.conftest import SHELLS
 from tests.stored_runs import (
     answer_in,
     copy_of,
-    edit,
     estimates,
     golden,
     manifest,
@@ -82,6 +79,7 @@ class Driven:
 AS_NEEDED = "av.controller=examples.acting:CarefulAsNeeded"
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_is_stored(tmp_path):
     """Ended among the pilot tests and going on: the same bits."""
     campaign, out, other = golden(ACTS, AS_NEEDED), tmp_path / "run", tmp_path / "other"
@@ -101,7 +99,9 @@ def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_
 NOISY = "parameters: {noise_mps2: 0.2}"
 
 
-@pytest.mark.parametrize("method", [SHELLS, FORCED], ids=["shells", "forced"])
+@pytest.mark.parametrize(
+    "method", [pytest.param(SHELLS, id="shells", marks=pytest.mark.slow), pytest.param(FORCED, id="forced")]
+)
 def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(method, campaign, run_here, tmp_path):
     asked = (*method, SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
@@ -114,6 +114,7 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
     assert replay(seeded, 123).bit_equal
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_acts_is_tested_in_the_default_traffic(campaign, run_here, tmp_path):
     """Cut-ins take time there, in baseline runs and in tests that follow from them."""
     traffic = "environment.parameters=ndd-overtaking-2", "stop.episodes=80", "pool.pilot_tests=0"
@@ -145,6 +146,7 @@ def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp
     assert any("no test in failed shadow runs" in note_words(warning) for warning in shells["warnings"])
 
 
+@pytest.mark.slow
 def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_path):
     """A vehicle that gives way, but on three paths of 120: the run ends, and says that it knows too little."""
     lonely = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('YieldsMostly')}", "stop.rhw=0.3", "stop.episodes=20000")
@@ -158,6 +160,7 @@ def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_
     assert shells["details"]["references"] == []
 
 
+@pytest.mark.slow
 def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(campaign, run_here, tmp_path):
     """The same paths, weights and ends, with and without a shadow run before each test."""
     plain = run_here(campaign(*FORCED, TWIN, "av={controller: 'tests.controllers.early:HoldsThenIdm'}"), tmp_path / "a")
@@ -193,18 +196,7 @@ def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
     assert estimate(folder) == estimates(folder)  # needs no path
 
 
-def test_a_page_is_written_where_so_few_paths_crashed_that_the_pool_s_error_is_not_known(stored_run, tmp_path):
-    folder = copy_of(stored_run(ACTS), tmp_path / "run")
-    content = estimates(folder)["estimates"]
-    details = content["shells"]["details"]
-    for part in (details, details["within"]):
-        part.update(rhw_from_pool=None, rhw_from_pool_at_least=None)
-    edit(folder, "estimates.json", estimates=content)
-    page = write_report(folder).read_text()
-    assert "pool’s own error is not known" in page
-    assert "nan" not in set(re.findall(r"[a-z]+", (folder / "plots" / "shells.svg").read_text().lower()))
-
-
+@pytest.mark.slow
 def test_a_vehicle_that_ends_its_process_in_a_shadow_run_fails_there(campaign, run, tmp_path):
     """Nothing else is lost, and the tests under the same numbers are run."""
     exits = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Exits')}", "run.max_failed_share=0.05", "stop.rhw=9")
