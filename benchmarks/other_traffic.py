@@ -114,7 +114,7 @@ def moved(scenario: str, traffic: Mapping[str, Mapping[str, float]], error: floa
     """By how much rates come out wrong in each traffic."""
     with tempfile.TemporaryDirectory() as folder:
         base = with_drivers(folder, scenario, f"pool.relative_error={error}")
-        here, parameters = campaign_pool(base), load_parameters(base.campaign.environment)
+        here = campaign_pool(base)
         tested = design_shells(here, ENVELOPE_MPS2)
         names = [each.name for each in tested.references]
         shipped = [r for r, name in enumerate(names) if name not in DRIVERS]
@@ -127,7 +127,7 @@ def moved(scenario: str, traffic: Mapping[str, Mapping[str, float]], error: floa
         show("crashing share of shells", (p @ shares**2) / (p @ shares), ".2f")  # refused below `LEAST_SHARE`
         show("standard error of a rate", _error(tested), ".1%")
         for words, values in traffic.items():
-            environment = environment_with(base, parameters, values)
+            environment = environment_with(base, values)
             if environment is None:
                 print(f"{words:34}  no laws", flush=True)
                 continue
@@ -184,9 +184,8 @@ def spread(environment: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         traffic = with_drivers(folder, "scenarios/smoke.yaml", f"environment.parameters={environment}")
         pool = campaign_pool(traffic)
-        parameters = load_parameters(traffic.campaign.environment)
-        rows = read_replicates(environment, parameters)
-        environments = [environment_with(traffic, parameters, row) for row in rows]
+        rows = read_replicates(environment, traffic.parameters)
+        environments = [environment_with(traffic, row) for row in rows]
         sound = [each for each in environments if each is not None]
         paths = FewPaths(traffic, pool, design_shells(pool, ENVELOPE_MPS2), ENVELOPE_MPS2, Progress())
         first, *others = (each.references for each in paths.of([traffic.environment, *sound]))

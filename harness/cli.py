@@ -17,7 +17,7 @@ from harness.commands.options import examples, quiet_option
 from harness.commands.printing import go_on_unread, show_error, show_interrupted, system_error, usage_error
 from harness.commands.stored import estimate, replay, report, sensitivity
 from harness.errors import EXIT_DONE, HarnessError
-from harness.processes import Interruption, interruptible, open_streams
+from harness.signals import interruptible, open_streams
 
 
 @click.group(
@@ -54,19 +54,15 @@ def main(arguments: Sequence[str] | None = None, group: click.Group = cli, name:
     open_streams()
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     with interruptible() as interruption:
-        return _main(group, name, arguments, interruption)
-
-
-def _main(group: click.Group, name: str, arguments: list[str], interruption: Interruption) -> int:
-    try:
-        code = group.main(arguments, prog_name=name, standalone_mode=False)
-        sys.stdout.flush()
-    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - a library may make any of an interruption
-        if (sent := interruption.signal) is not None or isinstance(error, click.Abort | KeyboardInterrupt):
-            show_interrupted(next(iter(arguments), ""), None if sent is None else sent.name)
-            return interruption.exit_code
-        return _told(error, group, name)
-    return code if isinstance(code, int) else EXIT_DONE
+        try:
+            code = group.main(arguments, prog_name=name, standalone_mode=False)
+            sys.stdout.flush()
+        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - a library may make any of an interruption
+            if (sent := interruption.signal) is not None or isinstance(error, click.Abort | KeyboardInterrupt):
+                show_interrupted(next(iter(arguments), ""), None if sent is None else sent.name)
+                return interruption.exit_code
+            return _told(error, group, name)
+        return code if isinstance(code, int) else EXIT_DONE
 
 
 def _told(error: Exception, group: click.Group, name: str) -> int:

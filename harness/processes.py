@@ -3,9 +3,6 @@
 Workers are copies that `multiprocessing`'s fork server makes of itself, with all that takes long imported. Each leads a
 session of its own, so that a terminal's signals do not reach it and everything that it starts ends with it. It ends
 when its parent does, however that ends.
-
-Ctrl-C, SIGTERM and SIGHUP end a command in the same way: what is finished is kept. What the shell has set to be ignored
-stays ignored: SIGHUP under ``nohup``, SIGINT in the background of a script.
 """
 
 from __future__ import annotations
@@ -32,17 +29,15 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import FrameType, ModuleType
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from weakref import finalize
 
 from harness.cache import SAID
-from harness.progress import Progress
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
-FROM_USER = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 CLOSED_PIPE_EXIT_CODE = 76
 """Exit code of a process whose controller has closed its pipe."""
 PRINTED_BYTES = 65_536
@@ -50,82 +45,19 @@ PRINTED_BYTES = 65_536
 _ATTEMPTS = 3
 _LOOK_S, _DYING_S = 0.5, 1.0
 """Time between two looks, and how long a process may take to end once its pipe has."""
-_LEFT_TO_US = (signal.SIG_DFL, signal.default_int_handler)
-"""How Python begins: nobody else has asked for the signal."""
 _PRELOADED = "harness.runner.preloaded"
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
-# -- signals to a command --
-
-
-class Interruption:
-    """Which signal has asked for the end, if one has: as Ctrl-C does, so that every ``finally`` does its work."""
-
-    def __init__(self) -> None:
-        self.signal: signal.Signals | None = None
-
-    @property
-    def exit_code(self) -> int:
-        """128 and the number of the signal, as shells have it: 130, 143 or 129."""
-        return 128 + (self.signal or signal.SIGINT)
-
-    def arrive(self, number: int, _frame: FrameType | None) -> None:
-        """Handle the signal: only Ctrl-C may ask again, for somebody who cannot wait until all is tidied up."""
-        for other in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(other, signal.SIG_IGN)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        self.signal = signal.Signals(number)
-        Progress.cancelled = True  # a library may lose what is raised here: then the next report raises it again
-        raise KeyboardInterrupt(self.signal.name)
-
-
-@contextmanager
-def handlers_restored() -> Iterator[dict[signal.Signals, Any]]:
-    """Put back, afterwards, the handlers of `FROM_USER` that are there before: none where no thread may set them."""
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        before = {number: signal.getsignal(number) for number in FROM_USER}
-    try:
-        yield before
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def open_streams() -> None:
-    """Open what the shell has closed of the three standard streams: else a file or a pipe would take its number."""
-    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass
-    os.close(descriptor)
-    for name in ("stdin", "stdout", "stderr"):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115, PTH123
-
-
-@contextmanager
-def interruptible() -> Iterator[Interruption]:
-    """Let signals interrupt what is inside."""
-    interruption = Interruption()
-    with handlers_restored() as before:
-        for number, handler in before.items():
-            if handler in _LEFT_TO_US:
-                signal.signal(number, interruption.arrive)
-        try:
-            yield interruption
-        finally:
-            Progress.cancelled = False
+# -- processes --
 
 
 def leave_signals_to_parent() -> None:
     """Let this worker ignore what a terminal sends to all processes at once: its parent alone answers, and ends it."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-
-
-# -- processes --
 
 
 class SharedFile:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from harness.campaign.campaign import Campaign, Command, Use, refusal
 from harness.controllers.find import require_controller
@@ -25,12 +26,14 @@ from harness.worlds.system_libraries import require_libraries
 class Resolved:
     """A campaign, its library named if it left that to its traffic, and the content of the files that it names.
 
-    ``av`` (1,) is the record of a built-in AV, (0,) of any other; ``surrogates`` (J,) are the drivers that challenges
-    are computed for. ``content_hash`` is of all that changes an episode's bits, the environment's numbers included;
+    ``parameters`` are the numbers of its ``environment``, as its family has them. ``av`` (1,) is the record of a
+    built-in AV, (0,) of any other; ``surrogates`` (J,) are the drivers that challenges are computed for.
+    ``content_hash`` is of all that changes an episode's bits, the environment's numbers included;
     ``controller_sha256`` of the source of the AV's controller, None where there is none, or nobody has looked.
     """
 
     campaign: Campaign
+    parameters: Any
     environment: Environment
     av: RecordArray
     surrogates: RecordArray
@@ -103,6 +106,7 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[takes_time])
     return Resolved(
         campaign,
+        parameters,
         environment,
         av_records(campaign.av, see_onset=takes_time),
         driver_records([each.parameters for each in campaign.surrogates.values()]),

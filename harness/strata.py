@@ -69,38 +69,20 @@ class Assumed:
 
 @dataclass(frozen=True, eq=False)
 class ShellDesign:
-    """Strata of a campaign, the most conservative first.
+    """Strata (S,) of a campaign, the most conservative first, by the key of the ``pool`` and its ``n_paths``.
 
-    Attributes
-    ----------
-    pool, n_paths : str, int
-        Key of the pool, and its number of paths.
-    strata : tuple of str
-        The surrogate that is the first to crash in each; the last is everything outside.
-    cell_stratum, cell_references : tuple of int, length C
-        Cells divide strata by what the reference drivers do: of each its stratum, and one bit per reference that
-        crashes.
-    cell_p : ndarray, shape (C,)
-        Probability per test that a cut-in of the cell happens.
-    references : tuple of Reference, length R
-    reference_rate, reference_square : ndarray, shape (R,)
-        Crash rate of each reference in the pool, and the mean square of a path's probability that it crashes.
-    boundary, assumes : str
-        The most aggressive surrogate inside the library's boundary, and what is assumed of a vehicle that crashes only
-        there: the end of a sentence that begins with "If this vehicle".
-    n_inside : int
-        Strata up to the boundary, which are shells.
-    p_event, p_unreachable : float
-        Probability of a cut-in, and the part of it on which no vehicle within the envelope's acceleration can crash,
-        and which is not tested.
-    available : tuple of int, length S
-        Cut-ins that the pool has kept of each; empty if that is no limit.
-    shadow_runs : bool
-        Whether the pool's paths are the few that the vehicle has walked itself.
-    learned : str
-        How that surrogate was learned, in words; empty if there is none.
-    candidates : int
-        Of how many paths these were chosen; 0 where the AV holds its speed.
+    ``strata`` are named by the surrogate that is the first to crash in each; the last is everything outside. Cells (C,)
+    divide them by what the reference drivers (R,) do: ``cell_stratum``, one bit in ``cell_references`` for each that
+    crashes, and ``cell_p``, the probability per test that a cut-in of the cell happens. ``reference_rate`` are crash
+    rates in the pool, ``reference_square`` the mean squares of a path's probability that they crash.
+
+    ``boundary`` is the most aggressive surrogate inside the library's boundary, up to which ``n_inside`` strata are
+    shells; ``assumes`` ends the sentence that begins with "If this vehicle". ``p_event`` is the probability of a
+    cut-in, ``p_unreachable`` the part of it on which no vehicle within the envelope's acceleration can crash, and which
+    is not tested. ``available`` are cut-ins that the pool has kept of each stratum; empty if that is no limit.
+
+    With ``shadow_runs`` the paths are the few that the vehicle has walked itself, chosen from so many ``candidates``
+    (else 0); ``learned`` says how that surrogate was learned, empty if there is none.
     """
 
     pool: str

@@ -65,36 +65,19 @@ ESTIMATORS: tuple[EstimatorName, ...] = get_args(EstimatorName)
 class Sampling:
     """One method of drawing tests.
 
-    Attributes
-    ----------
-    estimators : tuple of str
-        Those that its records allow, the first being the method's own, which answers the campaign's question; `scv`
-        needs control steps on record besides.
-    mixes_steps, mixes_episodes : bool
-        Whether it mixes importance functions of the surrogates, in every critical step or one per episode.
-    forces : bool
-        Whether forced cut-ins are among what it draws from.
-    holds_speed : bool
-        Whether the AV must hold its speed until the cut-in, because what is drawn before the episode depends on it.
-    baseline_runs : bool
-        Whether an AV that does not is driven along each path without a cut-in first.
-    bounded : bool
-        Whether weights are bounded whatever ``testing.epsilon`` is; else no precision can be promised.
-    strata : bool
-        Whether tests are cut-ins of the pool, counted within strata of known probability.
-    controlled : bool
-        Whether anything is drawn otherwise than the environment would; else every test weighs 1.
+    ``estimators`` are those that its records allow, the first being the method's own, which answers the campaign's
+    question; `scv` needs control steps on record besides.
     """
 
     estimators: tuple[EstimatorName, ...]
-    mixes_steps: bool = False
-    mixes_episodes: bool = False
-    forces: bool = False
-    holds_speed: bool = False
-    baseline_runs: bool = False
-    bounded: bool = True
-    strata: bool = False
-    controlled: bool = True
+    mixes_steps: bool = False  # importance functions of the surrogates, in every critical step
+    mixes_episodes: bool = False  # or one per episode
+    forces: bool = False  # forced cut-ins are among what it draws from
+    holds_speed: bool = False  # the AV must, until the cut-in: what is drawn before the episode depends on it
+    baseline_runs: bool = False  # an AV that does not is driven along each path without a cut-in first
+    bounded: bool = True  # weights are, whatever testing.epsilon is; else no precision can be promised
+    strata: bool = False  # tests are cut-ins of the pool, counted within strata of known probability
+    controlled: bool = True  # something is drawn otherwise than the environment would; else every test weighs 1
 
     @property
     def headline(self) -> EstimatorName:

@@ -39,8 +39,7 @@ from harness.pool.build import campaign_pool
 from harness.pool.kept import Pool
 from harness.processes import made_ahead
 from harness.progress import Progress
-from harness.records.folder import MEND_PART, Part, read_manifest
-from harness.records.reader import read_part
+from harness.records.folder import MEND_PART, Part, read_kept, read_manifest
 from harness.records.schemas import LEAD, chosen_from, path_columns
 from harness.resolved import Resolved, resolve
 from harness.vehicles.drivers import Followers
@@ -245,7 +244,7 @@ def alarm_of_run(folder: Path, progress: Progress | None = None) -> dict[str, An
     columns = [*dict.fromkeys([*EPISODE_COLUMNS, *path_columns(CUT_IN), *lead])]
 
     def replayed(part: Part) -> tuple[Block, BoolArray]:
-        episodes = read_part(folder, part, columns)
+        episodes = read_kept(folder, part, "episodes", columns)
         block = block_from_tables(campaign, episodes)
         return block, surrogates_crash(episodes, resolved, pool)
 

@@ -27,8 +27,8 @@ from harness.sampling.protocol import ShardRequest
 def without_page() -> Iterator[None]:
     """It takes longer than small campaigns; test_api.py looks at it."""
     with pytest.MonkeyPatch.context() as patch:
-        for write in ("page.write_report", "compare_page.write_comparison"):
-            patch.setattr(f"harness.report.{write}", lambda folder, **_: folder / "report.html")
+        patch.setattr("harness.report.page.write_page_of", lambda run: run.path / "report.html")
+        patch.setattr("harness.report.compare_page.write_page_of", lambda folder, *_: folder / "report.html")
         yield
 
 

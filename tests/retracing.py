@@ -85,9 +85,9 @@ def retraced(episodes: pa.Table, resolved: Resolved) -> list[str]:
     stored = stored_paths(episodes, resolved.campaign.seed)
     twin, scratch = np.zeros(episodes.num_rows, RETRACED_DTYPE), empty_trajectory(resolved.environment)
     retrace(unboxed(stored), unboxed(resolved.environment), resolved.av, unboxed(scratch), twin)
-    where, built_in = "onset" if resolved.environment.lateral.present else "cut_in", resolved.av.size > 0
+    where, built_in = "onset" if resolved.environment.lateral.present else "event", resolved.av.size > 0
     outcome = np.asarray(pc.index_in(episodes.column("outcome").cast(pa.string()), pa.array(OUTCOMES))).astype(np.int64)
-    names = f"{where}_r2_m", f"{where}_r2dot_mps", "impact_speed_mps", "crash_time_s"
+    names = f"{where}_gap_m", f"{where}_rate_mps", "impact_speed_mps", "crash_time_s"
     columns = (episodes.column(name).to_numpy() for name in names)  # NaN for null
     r2, r2dot, impact, time = (np.ascontiguousarray(column, np.float64) for column in columns)
     unknown = (twin["outcome"] == RUNNING) & ((outcome == FAILED) | ((stored.cut_step >= 0) & (not built_in)))

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
-from harness.records.folder import SEAL, write_sealed
+from harness.records.folder import SEAL, read_kept, read_manifest, write_part, write_sealed
 from harness.records.reader import read_campaign
 from harness.report.words import answer_of
 from tests.golden.campaigns import BASE, RUNS
@@ -54,7 +54,7 @@ def unnoted(folder: Path) -> Path:
     parts = manifest(folder)["parts"]
     for file in (file for part in parts for file in part["files"].values()):
         file["crc32"] = None
-    edit(folder, parts=parts, campaign_crc32=None, baseline_crc32=[])
+    edit(folder, parts=parts, campaign_crc32=None)
     return folder
 
 
@@ -73,6 +73,16 @@ def answer(content: dict[str, Any], campaign: Campaign, of: dict[str, Any] | Non
 def answer_in(folder: Path) -> dict[str, Any]:
     """That of a run."""
     return answer(estimates(folder), read_campaign(folder, manifest(folder)), manifest(folder))
+
+
+def with_fewer_before(folder: Path, name: str, n: int) -> None:
+    """Let a run have been ended after so many baseline runs, or pilot tests, and before any test."""
+    for table in ("episodes", "traces"):
+        shutil.rmtree(folder / table)
+    before = read_manifest(folder)["before"]
+    part = write_part(folder, [{name: read_kept(folder, before[name], name).slice(0, n)}], 0, n)
+    kept = {key: asdict(each) for key, each in {**before, name: part}.items()}
+    edit(folder, n_episodes=0, parts=[], before=kept, status="interrupted")
 
 
 def part_files(folder: Path, table: str = "episodes") -> list[Path]:

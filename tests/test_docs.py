@@ -100,6 +100,7 @@ def test_links_and_named_files_lead_somewhere():
     assert missing == []
 
 
+@pytest.mark.slow
 def test_python_lines_run(tmp_path, monkeypatch, capsys):
     """README first, then the other pages, in one folder: later lines use the runs of earlier ones."""
     monkeypatch.chdir(tmp_path)

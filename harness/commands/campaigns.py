@@ -25,12 +25,7 @@ from harness.commands.options import (
     set_option,
     workers_option,
 )
-from harness.commands.printing import (
-    answer_lines,
-    print_json,
-    print_table,
-    say,
-)
+from harness.commands.printing import answer_lines, print_either, print_json, print_table, say
 from harness.numbers import leaves, words
 from harness.processes import start_server
 
@@ -134,16 +129,14 @@ def run(
         start_server()
     with named_if_written(folder, chosen=chosen), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
+    of = result.shown.campaign, result.shown.manifest, result.estimates
     if junit is not None:
         from harness.report.junit import statement_case, write_junit  # noqa: PLC0415 - keeps --help fast
 
-        told = "\n".join(answer_lines(result.estimates, folder, timed=False))
+        told = "\n".join(answer_lines(*of, timed=False))
         case = statement_case(result.estimates, told, campaign.testing.shells.statement, result.exit_code)
         write_junit(junit, campaign.name, case, [result.report])
-    if as_json:
-        print_json(result.estimates)
-    else:
-        say(*answer_lines(result.estimates, folder, result.report))
+    print_either(result.estimates, answer_lines(*of, result.report), as_json=as_json)
     ctx.exit(result.exit_code)
 
 
@@ -200,14 +193,15 @@ def av_check(
     controller is wrong.
     """
     campaign = harness.load_campaign(campaign_file, overrides, av=av)
-    from harness.runner.look import check_av_apart  # noqa: PLC0415 - slow to import: only once the campaign is right
+    from harness.report.av_check import rows, verdict  # noqa: PLC0415 - slow to import: only once the campaign is right
+    from harness.runner.look import check_av_apart  # noqa: PLC0415
 
     found = check_av_apart(campaign, episodes)
     if as_json:
         print_json(found.to_json())
     else:
-        print_table("What the AV is like", found.rows)
-        say(found.verdict)
+        print_table("What the AV is like", rows(found))
+        say(verdict(found))
     ctx.exit(found.exit_code)
 
 
@@ -287,20 +281,15 @@ def compare(
         found = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )
-    from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
     from harness.report.lines import pair_lines  # noqa: PLC0415 - keeps --help fast
 
-    took_s = (read_manifest(folder / "b")["wall_time_s"] or 0.0) / found.content["n_pairs"]
-    told = pair_lines(found.content, a.crash.counts_above_mps, found.report, took_s)
+    told = pair_lines(found.content, a.crash.counts_above_mps, found.report, found.s_per_pair)
     if junit is not None:
         from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
 
         case = Case("difference", "\n".join(told), outcome_of(found.exit_code))
         write_junit(junit, " and ".join(labels), case, [found.report, folder / "compare.json"])
-    if as_json:
-        print_json(found.content)
-    else:
-        say(*told)
+    print_either(found.content, told, as_json=as_json)
     ctx.exit(found.exit_code)
 
 

@@ -6,15 +6,18 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import click
 
 from harness.errors import HarnessError, printable
 from harness.numbers import half_width, interval, share, words
+
+if TYPE_CHECKING:
+    from harness.campaign.campaign import Campaign
 
 _WIDTH_OF_FILES = 140
 _PARTS = "found", "expected", "mend"
@@ -61,24 +64,26 @@ def show_interrupted(command: str, signal_name: str | None) -> None:
         click.echo(f"Interrupted{by}.{_HOW_TO_GO_ON.get(command, '')}", err=True)
 
 
+_OF_THE_SYSTEM = (
+    (("ENOSPC", "EDQUOT"), "no space left", "room for what is written there", f"Free some space. {_AGAIN}"),
+    (("EFBIG", "EIO"), "a file that cannot be written or read on ({})",
+     "a sound disk, and no limit on the size of files (`ulimit -f`)",
+     f"Lift the limit or choose another disk. {_AGAIN}"),
+    (("ENAMETOOLONG", "ELOOP", "ENOTDIR"), "a name that the system refuses ({})", "the name of a file or folder",
+     "Correct it."),
+    (("EACCES", "EPERM", "EROFS"), "no permission ({})", "a place that may be read and written",
+     "Change its permissions, or choose another place."),
+    (("EISDIR",), "a path that leads to no file ({})", "a file, or a place for one", "Correct the path."),
+)  # fmt: skip
+"""Errors that a user can mend: which, what was found and expected, and how."""
+
+
 def system_error(error: OSError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
-    where = str(error.filename or "disk of the output folder")
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return HarnessError(where, "no space left", "room for what is written there", f"Free some space. {_AGAIN}")
-    if error.errno in (errno.EFBIG, errno.EIO):
-        found = f"a file that cannot be written or read on ({error.strerror})"
-        expected = "a sound disk, and no limit on the size of files (`ulimit -f`)"
-        return HarnessError(where, found, expected, f"Lift the limit or choose another disk. {_AGAIN}")
-    if error.errno in (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR):
-        found = f"a name that the system refuses ({error.strerror})"
-        return HarnessError(where, found, "the name of a file or folder", "Correct it.")
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        mend = "Change its permissions, or choose another place."
-        return HarnessError(where, f"no permission ({error.strerror})", "a place that may be read and written", mend)
-    if error.errno == errno.EISDIR:
-        found = f"a path that leads to no file ({error.strerror})"
-        return HarnessError(where, found, "a file, or a place for one", "Correct the path.")
+    name, where = errno.errorcode.get(error.errno or 0), str(error.filename or "disk of the output folder")
+    for names, found, expected, mend in _OF_THE_SYSTEM:
+        if name in names:
+            return HarnessError(where, found.format(error.strerror), expected, mend)
     return None
 
 
@@ -92,6 +97,14 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
 def print_json(content: Any) -> None:
     """Print strict JSON (no NaN) on stdout."""
     say(json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def print_either(content: Any, lines: Iterable[object], *, as_json: bool) -> None:
+    """Print an answer as JSON, or in lines."""
+    if as_json:
+        print_json(content)
+    else:
+        say(*lines)
 
 
 def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -136,13 +149,16 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
         print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])
 
 
-def answer_lines(content: dict[str, Any], folder: Path, report: Path | None = None, *, timed: bool = True) -> list[str]:
+def answer_lines(
+    campaign: Campaign,
+    manifest: dict[str, Any],
+    content: dict[str, Any],
+    report: Path | None = None,
+    *,
+    timed: bool = True,
+) -> list[str]:
     """The answer of a run in a few lines, with where its page is, and how long it took."""
-    from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
-    from harness.records.reader import read_campaign  # noqa: PLC0415
-    from harness.report.lines import lines  # noqa: PLC0415
+    from harness.report.lines import lines  # noqa: PLC0415 - keeps --help fast
     from harness.report.words import answer_of  # noqa: PLC0415
 
-    manifest = read_manifest(folder)
-    answer = answer_of(read_campaign(folder, manifest), manifest, content)
-    return lines(answer, manifest.get("wall_time_s") if timed else None, report)
+    return lines(answer_of(campaign, manifest, content), manifest.get("wall_time_s") if timed else None, report)

@@ -10,7 +10,7 @@ import click
 
 import harness
 from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar
-from harness.commands.printing import answer_lines, print_estimates, print_json, print_table, say
+from harness.commands.printing import answer_lines, print_either, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share
 from harness.vocabulary import COMPARISON, ESTIMATORS
@@ -94,7 +94,12 @@ def estimate(
         print_estimates(content, estimators)
     else:
         page = folder / "report.html"  # of the run's own traffic
-        say(*answer_lines(content, folder, page if environment is None and page.is_file() else None))
+        from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
+        from harness.records.reader import read_campaign  # noqa: PLC0415
+
+        manifest = read_manifest(folder)
+        shown = page if environment is None and page.is_file() else None
+        say(*answer_lines(read_campaign(folder, manifest), manifest, content, shown))
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
 
@@ -249,15 +254,13 @@ def replay(
     result = harness.replay(folder, episode, gui=gui, fcd=fcd, stored=stored, trust=trust)
     written = [] if fcd is None else [fcd]
     written += [each for file in files if file.suffix != FCD for each in harness.write_motion(result, file)]
-    if as_json:
-        content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
-        content |= {"files": [str(file) for file in written]}
-        print_json({**content, **{name: result.row[name] for name in LATERAL if name in result.row}})
-    else:
-        compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
-        words = "as the run has traced it" if stored else compared[result.bit_equal]
-        facts = [f"  {name:<13} {fact}" for name, fact in result.scene["facts"]]
-        say(f"episode {episode}: {result.outcome}; {words}", *facts, *written)
+    content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
+    content |= {"files": [str(file) for file in written]}
+    content |= {name: result.row[name] for name in LATERAL if name in result.row}
+    compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
+    words = "as the run has traced it" if stored else compared[result.bit_equal]
+    facts = [f"  {name:<13} {fact}" for name, fact in result.scene["facts"]]
+    print_either(content, [f"episode {episode}: {result.outcome}; {words}", *facts, *written], as_json=as_json)
     if result.bit_equal is False:
         found = "a replay that differs from the stored trace"
         raise WorldDisagreementError(f"episode {episode} of {folder}", found, "the same bits", str(result.suspects))

@@ -19,7 +19,7 @@ from harness import cache
 from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.pool.aim import PILOT_PATHS, Enumerator
-from harness.pool.build import campaign_pool, take_aim
+from harness.pool.build import take_aim
 from harness.pool.kept import Pool
 from harness.pool.shells import acceleration_limit, shells_in_strata, shells_of
 from harness.progress import Progress
@@ -126,18 +126,19 @@ def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
     return found
 
 
-def environment_with(there: Resolved, parameters: Any, values: Mapping[str, float]) -> Environment | None:
+def environment_with(there: Resolved, values: Mapping[str, float]) -> Environment | None:
     """The traffic ``there`` with other numbers; None where they give no laws."""
-    return there.family.traffic_with(there.campaign.environment, parameters, values)
+    return there.family.traffic_with(there.campaign.environment, there.parameters, values)
 
 
-def assumed_in(resolved: Resolved, design: ShellDesign | None, progress: Progress) -> dict[str, Any] | None:
+def assumed_in(
+    resolved: Resolved, pool: Pool | None, design: ShellDesign | None, progress: Progress
+) -> dict[str, Any] | None:
     """Fields of `Assumed` for a campaign; without strata of this traffic there are no factors."""
-    if design is not None and not resolved.campaign.has_baseline_runs:
-        found = assumed(resolved, campaign_pool(resolved, progress), design, progress)
+    if pool is not None and design is not None:
+        found = assumed(resolved, pool, design, progress)
     else:
-        parameters = resolved.family.parameters(resolved.campaign.environment)
-        found = Assumed(parameters.unseen) if parameters.unseen else None
+        found = Assumed(resolved.parameters.unseen) if resolved.parameters.unseen else None
     return None if found is None else asdict(found)
 
 
@@ -147,10 +148,9 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
     That is the range that is stated for who does not look, or shares of lane changes at times to collision where none
     was seen, which are anything up to what that many vehicles without one refuse.
     """
-    parameters = traffic.family.parameters(traffic.campaign.environment)
-    if (left := traffic.family.left_open(parameters)) is None:
+    if (left := traffic.family.left_open(traffic.parameters)) is None:
         return None
-    ends = [environment_with(traffic, parameters, each) for each in left.ends]
+    ends = [environment_with(traffic, each) for each in left.ends]
     if None in ends:
         return None
     paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)

@@ -20,12 +20,10 @@ from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
-from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.processes import made_ahead
 from harness.records.folder import (
     CAMPAIGN,
-    MEND_PART,
     SHELLS,
     TABLES,
     Part,
@@ -34,9 +32,10 @@ from harness.records.folder import (
     read_as,
     read_kept,
     read_manifest,
-    require_unchanged,
+    require_sum,
 )
 from harness.records.schemas import traces_schema
+from harness.resolved import resolve
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ TableName = Literal["episodes", "moments", "traces"]
 
 _MOST_SHELLS = 128
 """More than an int8 counts."""
-_READERS = 2
+N_READERS = 2
 """Threads; each holds a part."""
 _WEIGHT = pa.field(
     "weight", pa.float64(), metadata={"unit": "1", "doc": "the mean of weight times crash is the crash rate"}
@@ -67,11 +66,10 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
         expected = "a campaign with all its sections, as the run has written it"
         raise RunFolderError(str(path), found, expected, mend) from error
     crc32 = manifest.get("campaign_crc32")
-    require_unchanged(path, crc32, mend)
+    require_sum(path, crc32, path.read_bytes(), mend)
     if crc32 is None:  # its run was killed as it began
         with suppress(CampaignError):  # its environment file is gone: nobody can tell
-            parameters = family_named(campaign.scenario).parameters(campaign.environment)
-            require_campaign(path, campaign.content_hash(parameters.content_hash()), manifest)
+            require_campaign(path, resolve(campaign).content_hash, manifest)
     return campaign
 
 
@@ -85,46 +83,22 @@ def require_campaign(path: Path, content_hash: str, manifest: Mapping[str, Any])
 
 def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment | None:
     """The run's traffic, where its parameters are still what they were; else others cannot be driven."""
-    try:
-        family = family_named(campaign.scenario)
-        parameters = family.parameters(campaign.environment)
-    except CampaignError:
-        return None
-    known = campaign.content_hash(parameters.content_hash()) == manifest["campaign_hash"]
-    return family.traffic(campaign.environment, parameters) if known else None
+    with suppress(CampaignError):
+        resolved = resolve(campaign)
+        return resolved.environment if resolved.content_hash == manifest["campaign_hash"] else None
+    return None
 
 
-def read_parts(folder: Path, columns: list[str] | None = None) -> Iterator[pa.Table]:
-    """Episodes of every part that the manifest lists, see `read_part`."""
-    yield from made_ahead(partial(read_part, folder, columns=columns), read_manifest(folder)["parts"], _READERS)
-
-
-def read_part(folder: Path, part: Part, columns: list[str] | None = None) -> pa.Table:
-    """Episodes of one part, which must be as many as the manifest says; all columns by default."""
-    episodes = read_kept(folder, part, "episodes", columns)
-    if episodes.num_rows != part.n_episodes:
-        expected = f"{part.n_episodes} rows (manifest.json)"
-        found = f"{episodes.num_rows} rows"
-        raise RunFolderError(str(folder / part.files["episodes"].path), found, expected, MEND_PART)
-    return episodes
-
-
-def read_traces(folder: Path, episodes: Collection[int], columns: list[str]) -> pa.Table | None:
+def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) -> pa.Table | None:
     """Trace rows of a few episodes; None where none of them was traced."""
     wanted = pc.field("episode").isin(sorted(episodes))
     tables = [
-        read_kept(folder, part, "traces", columns, wanted)
-        for part in read_manifest(folder)["parts"]
+        read_kept(folder, part, "traces", rows=wanted)
+        for part in parts
         if "traces" in part.files and any(part.first_episode <= episode < part.end for episode in episodes)
     ]
     found = [table for table in tables if table.num_rows]
     return concatenated(found, folder) if found else None
-
-
-def stored_columns(folder: Path) -> set[str]:
-    """Columns of the episodes table of a run; none if it has no test."""
-    parts = read_manifest(folder)["parts"]
-    return set(read_kept(folder, parts[0], "episodes").column_names) if parts else set()
 
 
 class TableSize(NamedTuple):
@@ -136,9 +110,8 @@ class TableSize(NamedTuple):
     n_bytes: int
 
 
-def table_sizes(folder: Path) -> list[TableSize]:
+def table_sizes(parts: Sequence[Part]) -> list[TableSize]:
     """Files, rows and bytes per table."""
-    parts = read_manifest(folder)["parts"]
     kept = {table: [part.files[table] for part in parts if table in part.files] for table in TABLES}
     return [
         TableSize(table, len(files), sum(file.n_rows for file in files), sum(file.n_bytes for file in files))
@@ -214,7 +187,7 @@ class StoredRun:
         if weighed and (self.folder / SHELLS).is_file():
             components = (read(part, columns=["component"])["component"] for part in parts)
             per_shell = np.sum([np.bincount(shells, minlength=_MOST_SHELLS) for shells in components], axis=0)
-        for piece in made_ahead(partial(read, columns=needed), parts, _READERS):
+        for piece in made_ahead(partial(read, columns=needed), parts, N_READERS):
             if not weighed:
                 yield piece
                 continue

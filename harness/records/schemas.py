@@ -7,7 +7,6 @@ first, then the surrogates; for the others the surrogates alone. Values are from
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from harness.loop.loop import Shard
 from harness.vocabulary import CRASH, OUTCOMES, FloatArray, Int8Array, IntArray, RecordArray
 
 _F8, _I1, _I2, _I8 = pa.float64(), pa.int8(), pa.int16(), pa.int64()
-_NAME = pa.dictionary(_I1, pa.string())
+_NAME, _MOTION = pa.dictionary(_I1, pa.string()), pa.list_(_F8)
 
 
 def _field(name: str, kind: pa.DataType, unit: str, doc: str, *, nullable: bool = False) -> pa.Field:
@@ -38,14 +37,6 @@ def _per(n: int) -> pa.DataType:
     return pa.list_(_F8, n) if n else pa.list_(_F8)
 
 
-_OF_BASELINE_RUNS = (
-    _or_null("shadow", _I8, "1", "baseline run that the test repeats (method shells, vehicles that act before)"),
-    _or_null(
-        "event_mass", _F8, "1", "P of the test's own cut-in, or of those it stands for, in the measure of cell_mass"
-    ),
-)
-
-
 def episodes_schema(
     columns: Sequence[Column],
     n_importance: int = 0,
@@ -63,6 +54,11 @@ def episodes_schema(
     of_shells = [
         _field("cell", _I2, "1", "cell of shells.json: shell, and which references crash (method shells alone)"),
         _field("cell_mass", _per(n_cells), "1", "P of a cut-in of each cell on the same path (method shells alone)"),
+    ]
+    own = "P of the test's own cut-in, or of those it stands for, in the measure of cell_mass"
+    of_baseline_runs = [
+        _or_null("shadow", _I8, "1", "baseline run that the test repeats (method shells, vehicles that act before)"),
+        _or_null("event_mass", _F8, "1", own),
     ]
     return pa.schema(
         [
@@ -88,7 +84,7 @@ def episodes_schema(
             _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_(t-1) V_j (q_j,t/q_alpha,t - 1)"),
             _or_null("pool_row", _I8, "1", "row of the pool's cut-in (method shells), else null"),
             *(of_shells if n_cells else ()),
-            *(_OF_BASELINE_RUNS if acts else ()),
+            *(of_baseline_runs if acts else ()),
             *(_lateral_fields() if takes_time else ()),
             _or_null("failure", pa.string(), "", "cause, for failed episodes"),
         ]
@@ -151,28 +147,23 @@ def baseline_schema(columns: Sequence[Column]) -> pa.Schema:
             *_facts(columns),
             _field("outcome", _NAME, "", "passed, timeout, bv_lv_contact or failed"),
             _field("n_steps", _I2, "0.1 s", "steps simulated until the run ended"),
-            _field("av_position_m", pa.list_(_F8), "m", "front bumper of the AV, initially and after each step"),
-            _field("av_speed_mps", pa.list_(_F8), "m/s", "speed of the AV, initially and after each step"),
+            _field("av_position_m", _MOTION, "m", "front bumper of the AV, initially and after each step"),
+            _field("av_speed_mps", _MOTION, "m/s", "speed of the AV, initially and after each step"),
             _or_null("failure", pa.string(), "", "cause, for failed runs"),
         ]
     )
 
 
-_WHO = "av", "bv"
-
-
 def pilot_schema() -> pa.Schema:
     """Schema of the ``pilot`` table: one row per test from which the vehicle was learned."""
+    who, of_steps = ("av", "bv"), "at first and after each step"
     return pa.schema(
         [
             _field("shadow", _I8, "1", "baseline run that the test repeats"),
             _field("onset_step", _I2, "0.1 s", "step from which on the vehicle may have seen the cut-in"),
             _field("outcome", _NAME, "", "crash, timeout, bv_lv_contact or failed"),
-            *(
-                _field(f"{who}_position_m", pa.list_(_F8), "m", "front bumper, at first and after each step")
-                for who in _WHO
-            ),
-            *(_field(f"{who}_speed_mps", pa.list_(_F8), "m/s", "at first and after each step") for who in _WHO),
+            *(_field(f"{each}_position_m", _MOTION, "m", f"front bumper, {of_steps}") for each in who),
+            *(_field(f"{each}_speed_mps", _MOTION, "m/s", of_steps) for each in who),
             _or_null("failure", pa.string(), "", "cause, for failed tests"),
         ]
     )
@@ -184,11 +175,6 @@ class ShardTables(NamedTuple):
     episodes: pa.Table
     moments: pa.Table | None
     traces: pa.Table | None
-
-    @property
-    def n_rows(self) -> int:
-        """Of all tables."""
-        return sum(table.num_rows for table in self if table is not None)
 
 
 def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> ShardTables:
@@ -265,9 +251,8 @@ def facts_from(table: pa.Table, columns: Sequence[Column]) -> RecordArray:
             found[column.name], found[column.length] = padded(values)
         else:
             found[column.name] = np.asarray(values)
-    facts: RecordArray = np.zeros(
-        table.num_rows, np.dtype([(name, values.dtype, values.shape[1:]) for name, values in found.items()])
-    )
+    kind = np.dtype([(name, values.dtype, values.shape[1:]) for name, values in found.items()])
+    facts: RecordArray = np.zeros(table.num_rows, kind)
     for name, values in found.items():
         facts[name] = values
     return facts
@@ -317,22 +302,17 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
         columns |= {"cell": prescribed.cell.astype(np.int16), "cell_mass": rows(prescribed.cell_mass)}
         columns |= {"shadow": prescribed.shadow, "event_mass": prescribed.mass}
     if shard.scenario.shows:
-        columns |= _lateral_columns(e)
+        side = np.where(e["n_steps"] == e["event_step"] + 1, "side", "rear")
+        columns |= {
+            LEAD: pa.array(e["lead_steps"], mask=e["onset_step"] < 0),
+            "onset_ttc_s": _time_to_collision(e["onset_gap_m"], e["onset_rate_mps"]),
+            "overlap_ttc_s": _time_to_collision(e["event_gap_m"], e["event_rate_mps"]),
+            "contact": pa.array(side, pa.string(), mask=e["outcome"] != CRASH),
+        }
     of_all = log_q.shape[1], martingale.shape[1], 0 if prescribed is None else prescribed.cell_mass.shape[1]
     acts = prescribed is not None and prescribed.shadow.size > 0
     schema = episodes_schema(shard.scenario.columns, *of_all, acts=acts, takes_time=shard.scenario.shows)
     return _table(schema, columns, e)
-
-
-def _lateral_columns(e: RecordArray) -> dict[str, Any]:
-    """What BV's lateral motion was like; `onset_step` and the like are in ``e`` itself."""
-    side = np.where(e["n_steps"] == e["event_step"] + 1, "side", "rear")
-    return {
-        "lead_steps": pa.array(e["lead_steps"], mask=e["onset_step"] < 0),
-        "onset_ttc_s": _time_to_collision(e["onset_gap_m"], e["onset_rate_mps"]),
-        "overlap_ttc_s": _time_to_collision(e["event_gap_m"], e["event_rate_mps"]),
-        "contact": pa.array(side, pa.string(), mask=e["outcome"] != CRASH),
-    }
 
 
 def _time_to_collision(r2_m: FloatArray, r2dot_mps: FloatArray) -> FloatArray:
@@ -411,8 +391,9 @@ def pilot_table(shard: Shard) -> pa.Table:
 
 def _motion(shard: Shard, who: Mapping[str, int]) -> dict[str, pa.Array]:
     """Positions and speeds of vehicles, by their places, in each test."""
-    traces, kind = [shard.traces[row] for row in range(shard.episode.size)], pa.list_(pa.float64())
-    asked = product(who.items(), enumerate(("position_m", "speed_mps")))
+    traces = [shard.traces[row] for row in range(shard.episode.size)]
     return {
-        f"{name}_{what}": pa.array([each[:, place, k] for each in traces], kind) for (name, place), (k, what) in asked
+        f"{name}_{what}": pa.array([each[:, place, k] for each in traces], _MOTION)
+        for name, place in who.items()
+        for k, what in enumerate(("position_m", "speed_mps"))
     }

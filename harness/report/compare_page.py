@@ -13,7 +13,7 @@ import pyarrow as pa
 from harness.errors import HarnessError, RunFolderError
 from harness.numbers import count, tenths
 from harness.records.folder import read_as
-from harness.report.crashes import rows_of, traces_of
+from harness.report.crashes import rows_of
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
 from harness.report.player import Scene, Scenes, beside_other
 from harness.report.plots import WHO, pairs_plot
@@ -31,7 +31,7 @@ SHOWN = 2
 
 
 def write_comparison(folder: str | Path) -> Path:
-    """Write ``report.html`` into the folder of a comparison, and return the page, which is self-contained.
+    """Write ``report.html`` into the folder of a comparison anew, and return the page, which is self-contained.
 
     Raises `RunFolderError`: a file of the comparison or of one of its runs is missing, damaged, or of another run.
     """
@@ -42,6 +42,11 @@ def write_comparison(folder: str | Path) -> Path:
         if (found := run.manifest["campaign_hash"]) != of["campaign_hash"]:
             expected = f"campaign {of['campaign_hash']} ({COMPARISON})"
             raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, MEND)
+    return write_page_of(folder, stored, runs)
+
+
+def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder]) -> Path:
+    """Write the page of a comparison in hand."""
     pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
     plot = pairs_plot(pairs.who, pairs.weight, pairs.gap_m, pairs.closing_mps)
     return write_page(
@@ -80,7 +85,7 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
     columns = ("episode", "component", "impact_speed_mps", "event_gap_m", "event_rate_mps")
     n_pairs, found = [shell["n_pairs"] for shell in shells], []
     for run in runs:
-        rows = pa.Table.from_batches(run.episodes(*columns, "outcome"))
+        rows = run.tests.rows
         component = rows["component"].to_numpy()
         first = [np.flatnonzero(component == s)[:n] for s, n in enumerate(n_pairs)]
         if [each.size for each in first] != n_pairs:
@@ -119,8 +124,8 @@ def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:
 
 
 def motion_of(run: RunFolder, episode: int) -> tuple[pa.Table, pa.Table | None]:
-    """Row and trace of an episode: the stored one, or of the test run again; None where that cannot be done."""
-    trace = traces_of(run, {episode})
+    """Row of a crash, and the trace of any episode: the stored one, or of the test run again; None if it cannot be."""
+    trace = run.traces({episode})
     if trace is None:
         with suppress(HarnessError):  # of another version, a vehicle that is gone or does not do the same again
             trace = replay_episode(run.path, episode).trace

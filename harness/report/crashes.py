@@ -10,12 +10,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.estimators.severity import weighted_quantiles
-from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.numbers import tenths
-from harness.records.reader import read_traces, stored_columns
-from harness.records.schemas import LEAD, path_columns
-from harness.report.player import OTHERS, TRACE_COLUMNS, UNKNOWN, Scene, Scenes
+from harness.report.player import OTHERS, UNKNOWN, Scene, Scenes
 from harness.report.summary import RunFolder, RunSummary
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
@@ -59,7 +56,7 @@ def crash_gallery(
     avoided = (ends < 0) & (ends != UNKNOWN)
     rankings = _rankings(summary, avoided, avoided.any(axis=1) | (ends == UNKNOWN).any(axis=1))
     asked = {int(episode[place]) for ranked in rankings.values() for place in ranked}
-    traces = traces_of(run, asked)
+    traces = run.traces(asked)
     traced = set() if traces is None else set(traces.column("episode").unique().to_pylist())
     reasons: dict[int, list[str]] = {}
     for reason, ranked in rankings.items():
@@ -104,21 +101,13 @@ def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArra
     judged = np.sort(np.argsort(-impact, kind="stable")[: MOST_TRACED if acts else MOST_JUDGED])
     asked = {int(each) for each in episode[judged]}
     if asked:
-        ends[judged] = scenes.ends(rows_of(run, asked), traces_of(run, asked) if acts else None)
+        ends[judged] = scenes.ends(rows_of(run, asked), run.traces(asked) if acts else None)
     return ends
 
 
 def rows_of(run: RunFolder, episodes: set[int]) -> pa.Table:
     """What scenes need of episodes, in index order."""
-    columns = (*path_columns(family_named(run.campaign.scenario)), "outcome", *({LEAD} & stored_columns(run.path)))
-    wanted = pc.field("episode").isin(sorted(episodes))
-    return pa.concat_tables([pa.table(batch).filter(wanted) for batch in run.episodes(*columns)])
-
-
-def traces_of(run: RunFolder, episodes: set[int]) -> pa.Table | None:
-    """Their traces, as far as they are stored; None without any."""
-    lateral = ["lateral_m"] if LEAD in stored_columns(run.path) else []
-    return read_traces(run.path, episodes, [*TRACE_COLUMNS, *lateral])
+    return run.tests.crashes.filter(pc.field("episode").isin(sorted(episodes)))
 
 
 def _component_name(run: RunFolder, component: int) -> str:

@@ -13,7 +13,7 @@ from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
-from harness.records.reader import table_sizes, traffic_of
+from harness.records.reader import table_sizes
 from harness.report.crashes import crash_gallery
 from harness.report.drawing import Plot
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
@@ -27,7 +27,7 @@ PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")
 
 @checked("harness.write_report")
 def write_report(folder: str | Path) -> Path:
-    """Write ``report.html`` and ``plots/`` (SVG) into a run folder, and return the page.
+    """Write ``report.html`` and ``plots/`` (SVG) into a run folder anew, and return the page.
 
     The page is self-contained: it can be mailed, archived and opened offline. The same folder gives the same bytes if
     it is reached from the working directory by the same relative path, by which the commands on the page name it;
@@ -36,16 +36,19 @@ def write_report(folder: str | Path) -> Path:
 
     Raises `RunFolderError`: if the folder misses a file, or a file is damaged or belongs to another run.
     """
-    folder = Path(folder)
-    run = read_run_folder(folder)
-    sizes, summary, traffic = table_sizes(folder), summarise(run), traffic_of(run.campaign, run.manifest)
+    return write_page_of(read_run_folder(Path(folder)))
+
+
+def write_page_of(run: RunFolder) -> Path:
+    """Write the page of a run in hand: none of its files is read but traces of crashes."""
+    folder, summary, traffic = run.path, summarise(run), run.traffic
     plots = _plots(run, summary, traffic)
     gallery, scenes = crash_gallery(run, summary, traffic)
     answer = short_answer(run.campaign, run.manifest, run.estimates)
     page = write_page(
         folder / "report.html", "report.html.j2",
-        run=run, answer=answer, summary=summary, sizes=sizes, gallery=gallery, scenes=scenes,
-        figures={plot.name: plot for plot in plots}, lateral=lateral_facts(run),
+        run=run, answer=answer, summary=summary, gallery=gallery, scenes=scenes, lateral=lateral_facts(run),
+        sizes=table_sizes(run.manifest["parts"]), figures={plot.name: plot for plot in plots},
         tabled=traffic is not None and traffic.accepted.size > 0,
         outcomes=list(zip(OUTCOMES, summary.count, summary.weight, strict=True)),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),

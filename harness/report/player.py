@@ -37,7 +37,6 @@ OTHERS = {
 UNKNOWN = -9
 """How it ends for them where the AV acts before the cut-in and its motion is not on record."""
 MOTION = ("x_m", "v_mps")
-TRACE_COLUMNS = ("episode", "step", "vehicle", "lane", *MOTION)
 LANE_M = 3.6
 BRAKES_MPS2 = 0.5
 """Who slows down by less only coasts."""

@@ -9,7 +9,6 @@ import math
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,23 +22,20 @@ from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.estimators.answer import Estimates
 from harness.estimators.block import outcome_places
-from harness.estimators.estimate import Estimate, Unavailable
+from harness.estimators.estimate import Estimate
 from harness.estimators.shells import ShellDetails
 from harness.families import family_named
-from harness.records.folder import concatenated, read_as, read_manifest
-from harness.records.reader import read_campaign, read_parts, stored_columns
+from harness.families.protocol import Environment
+from harness.records.folder import read_as, read_manifest
+from harness.records.reader import read_campaign, read_traces, traffic_of
+from harness.records.schemas import LEAD
+from harness.records.shown import ShownTests
 from harness.sampling.shells import Shells
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
 
-ROWS_TOGETHER = 5_000
-"""Of small shards: each batch costs a millisecond."""
-MOST_CAUSES = 1_000
-COLUMNS = (
-    "episode", "component", "log_weight", "impact_speed_mps", "crash_time_s", "event_step",
-    "event_gap_m", "event_rate_mps",
-)  # fmt: skip
+_ESTIMATES = TypeAdapter(Estimates)
 
 
 @dataclass(frozen=True)
@@ -73,30 +69,44 @@ class ShownShells(ShellDetails):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A finished run: its campaign, manifest and estimates; ``shells`` is None where tests were drawn otherwise.
+    """A finished run: its campaign, manifest, estimates and tests; ``shells`` is None where these were drawn otherwise.
 
-    ``typed`` is how commands on the page name it.
+    ``traffic`` is None where that can no longer be driven in. ``typed`` is how commands on the page name the folder.
     """
 
     path: Path
     campaign: Campaign
     manifest: dict[str, Any]
     estimates: Estimates
+    tests: ShownTests
+    traffic: Environment | None
     shells: ShownShells | None
     typed: str
 
-    def episodes(self, *columns: str) -> Iterator[pa.RecordBatch]:
-        """Columns of the tests that count, in index order; small shards come together."""
-        counted = int(self.manifest["n_episodes"])
-        together: list[pa.Table] = []
-        for table in read_parts(self.path, list(columns)):
-            together.append(table.slice(0, counted))
-            counted -= together[-1].num_rows
-            if sum(part.num_rows for part in together) >= ROWS_TOGETHER:
-                yield from concatenated(together, self.path).to_batches()
-                together = []
-        if together:
-            yield from concatenated(together, self.path).to_batches()
+    @classmethod
+    def of(
+        cls,
+        path: Path,
+        campaign: Campaign,
+        manifest: dict[str, Any],
+        estimates: Estimates | dict[str, Any],
+        design: ShellDesign | None,
+        tests: ShownTests,
+        traffic: Environment | None,
+    ) -> RunFolder:
+        """A run in hand; ``estimates`` as they are written, or read."""
+        told = _ESTIMATES.validate_python(estimates)
+        shells = None if design is None else _shells(path, told.best, design)
+        return cls(path, campaign, manifest, told, tests, traffic, shells, typed_folder(path))
+
+    @property
+    def sees(self) -> bool:
+        """Whether events can be seen before they happen."""
+        return LEAD in self.tests.rows.column_names
+
+    def traces(self, episodes: set[int]) -> pa.Table | None:
+        """Their stored motion; None where none of them was traced."""
+        return read_traces(self.path, self.manifest["parts"], episodes)
 
 
 def typed_folder(folder: Path) -> str:
@@ -114,12 +124,12 @@ def typed_folder(folder: Path) -> str:
 
 
 def read_run_folder(path: Path) -> RunFolder:
-    """Read campaign, manifest and estimates of a run."""
+    """Read campaign, manifest, estimates and tests of a run."""
     manifest = read_manifest(path)
-    estimates = _read_estimates(path, manifest["campaign_hash"])
-    shells = _shells(path, estimates.estimates[estimates.headline])
-    campaign = read_campaign(path, manifest)
-    return RunFolder(path, campaign, manifest, estimates, shells, typed_folder(path))
+    estimates, campaign = _read_estimates(path, manifest["campaign_hash"]), read_campaign(path, manifest)
+    tests = ShownTests.stored(path, manifest, family_named(campaign.scenario))
+    design = Shells.stored_design(path) if campaign.sampling.strata else None
+    return RunFolder.of(path, campaign, manifest, estimates, design, tests, traffic_of(campaign, manifest))
 
 
 def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:
@@ -135,11 +145,9 @@ def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:
     return estimates
 
 
-def _shells(folder: Path, headline: Estimate | Unavailable) -> ShownShells | None:
-    if isinstance(headline, Unavailable) or "shells" not in headline.details:
-        return None
+def _shells(folder: Path, headline: Estimate, design: ShellDesign) -> ShownShells:
     try:
-        of_run = {"rate": headline.crash_rate, "design": Shells.stored_design(folder)}
+        of_run = {"rate": headline.crash_rate, "design": design}
         return TypeAdapter(ShownShells).validate_python({**headline.details, **of_run})
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
@@ -156,9 +164,8 @@ class RunSummary:
     ``count``, ``weight`` (5,) are episodes and sum of weights per outcome, in the order of `OUTCOMES`; ``causes`` are
     failed episodes per cause. A weight is what a test adds to the sum that is the estimate: its likelihood ratio or, of
     tests from shells, p_s/n_s. Failed tests are counted and have no weight. ``rows`` (m,) are ``outcome``, ``weight``
-    and `COLUMNS`, NaN where there is none, of tests that had a cut-in or a weight other than 1: of the others, most in
-    plain naturalistic driving, there is nothing to draw. ``all_weights_one`` says whether no maneuver was drawn from an
-    importance function: plain naturalistic driving.
+    and the numbers in those of `ShownTests`, NaN where there is none. ``all_weights_one`` says whether no maneuver was
+    drawn from an importance function: plain naturalistic driving.
     """
 
     count: FloatArray
@@ -201,32 +208,24 @@ def floats(column: pa.Array) -> FloatArray:
 
 
 def summarise(run: RunFolder) -> RunSummary:
-    """One pass over all episodes of a run; a `RunFolderError` where one has an unknown outcome."""
-    count, causes = np.zeros(len(OUTCOMES)), Counter[str]()
-    kept: list[dict[str, FloatArray]] = []
-    of_family = [each.name for each in family_named(run.campaign.scenario).columns if not each.length]
-    asked = (*COLUMNS, *of_family)
-    for batch in run.episodes(*asked, "outcome", "failure"):
-        outcome = outcome_places(pa.table(batch).column("outcome"), str(run.path / "episodes"))
-        if (counted := run.campaign.crash.counts_above_mps) > 0.0:  # no harder is none here, as in the estimates
-            outcome[(outcome == CRASH) & (floats(batch.column("impact_speed_mps")) <= counted)] = TIMEOUT
-        count += np.bincount(outcome, minlength=len(OUTCOMES))
-        for item in batch.column("failure").drop_null().value_counts():
-            # Causes may hold numbers and so be all different: memory stays bounded, the count per outcome is exact.
-            if (cause := item["values"].as_py()) in causes or len(causes) < MOST_CAUSES:
-                causes[cause] += item["counts"].as_py()
-        columns = {name: floats(batch.column(name)) for name in asked} | {"outcome": outcome.astype(np.float64)}
-        shown = np.isfinite(columns["event_step"]) | (columns["log_weight"] != 0.0)
-        kept.append({name: column[shown] for name, column in columns.items()})
-    rows = {name: np.concatenate([part[name] for part in kept] or [np.zeros(0)]) for name in (*asked, "outcome")}
-    outcome = rows["outcome"].astype(np.int64)
+    """Count and weigh the tests of a run; a `RunFolderError` where one has an unknown outcome."""
+    tests, where = run.tests, str(run.path / "episodes")
+    places = outcome_places(pa.chunked_array([[*tests.outcomes]]), where)
+    count: FloatArray = np.bincount(places, [*tests.outcomes.values()], len(OUTCOMES)).astype(np.float64)
+    names = [name for name in tests.rows.column_names if name not in ("outcome", "contact")]
+    rows = {name: floats(tests.rows[name]) for name in names}
+    outcome = outcome_places(tests.rows["outcome"], where).astype(np.int64)
+    left_out: FloatArray = count - np.bincount(outcome, minlength=len(OUTCOMES))  # those weigh 1 each
+    if (counted := run.campaign.crash.counts_above_mps) > 0.0:  # no harder is none here, as in the estimates
+        outcome[(outcome == CRASH) & (rows["impact_speed_mps"] <= counted)] = TIMEOUT
+    count = left_out + np.bincount(outcome, minlength=len(OUTCOMES))
+    rows["outcome"] = outcome.astype(np.float64)
     weight = np.exp(rows["log_weight"]) if run.shells is None else run.shells.weight[rows["component"].astype(np.int64)]
     rows["weight"] = np.where(outcome == FAILED, 0.0, weight)
-    left_out = count - np.bincount(outcome, minlength=len(OUTCOMES))  # those weigh 1 each
     weight = left_out + np.bincount(outcome, weights=rows["weight"], minlength=len(OUTCOMES))
     weight[FAILED] = 0.0
     all_one = not rows["log_weight"][outcome != FAILED].any()
-    return RunSummary(count, weight, causes, rows, all_one, run.shells is not None)
+    return RunSummary(count, weight, tests.causes, rows, all_one, run.shells is not None)
 
 
 def lateral_facts(run: RunFolder) -> dict[str, Any] | None:
@@ -235,13 +234,11 @@ def lateral_facts(run: RunFolder) -> dict[str, Any] | None:
     ``lead_s`` are 5 %, 50 % and 95 % quantiles of the leads of ``n_events``; ``n_side`` of ``n_crashes`` were side
     contacts.
     """
-    if "lead_steps" not in stored_columns(run.path):
+    if not run.sees:
         return None
-    leads, contacts = [np.zeros(0)], Counter[str]()
-    for batch in run.episodes("lead_steps", "event_step", "contact"):
-        leads.append(floats(batch.filter(pc.is_valid(batch.column("event_step"))).column("lead_steps")))
-        contacts.update(batch.column("contact").drop_null().to_pylist())
-    lead_s = STEP_S * np.concatenate(leads)
+    rows = run.tests.rows
+    lead_s = STEP_S * floats(rows.filter(pc.is_valid(rows["event_step"]))[LEAD])
+    contacts = Counter(rows["contact"].drop_null().to_pylist())
     quantiles = np.quantile(lead_s, (0.05, 0.5, 0.95)).tolist() if lead_s.size else [math.nan] * 3
     crashes = {"n_crashes": contacts.total(), "n_side": contacts["side"]}
     return {"n_events": lead_s.size, "lead_s": quantiles, **crashes}

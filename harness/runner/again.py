@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.clock import Clock
 from harness.controllers.find import build_host, has_foreign_code, run_apart
@@ -66,12 +67,7 @@ def run_elsewhere(source: Source, tests: Sequence[Tests], n_cells: int = 1, *, h
 
 
 def _run_here(
-    av: AutomatedVehicle,
-    scenario: Scenario,
-    keep: RecordPolicy,
-    tests: Sequence[Tests],
-    n_cells: int,
-    held: bool,
+    av: AutomatedVehicle, scenario: Scenario, keep: RecordPolicy, tests: Sequence[Tests], n_cells: int, held: bool
 ) -> Again:
     clock, found = Clock(held=held), list[Bits]()
     with clock.shown():
@@ -85,18 +81,14 @@ def _run_here(
 
 def repeat(loop: EpisodeLoop, source: Source, shard: Shard) -> Repeated:
     """Run some tests of a loop's shard again, each alone: a user's code elsewhere, what SUMO drives after the shard."""
-    rows = _rows_to_repeat(shard, source.campaign.seed, acts_early=source.campaign.av.acts_before_event)
-    tests = [_test_of(shard, row) for row in rows]
+    rows = _rows_to_repeat(shard, source.campaign)
+    tests = [Tests(shard.first_episode + row, shard.traffic.rows(slice(row, row + 1))) for row in rows]
     if has_foreign_code(source.campaign.av):
         again = _each_elsewhere(source, tests)
     else:
         again = [bits_of(loop.run(*test), 0) for test in tests]
     pairs = zip(rows, again, strict=True)
     return Repeated(len(rows), sorted(shard.first_episode + row for row, bits in pairs if bits != bits_of(shard, row)))
-
-
-def _test_of(shard: Shard, row: int) -> Tests:
-    return Tests(shard.first_episode + row, shard.traffic.rows(slice(row, row + 1)))
 
 
 def _each_elsewhere(source: Source, tests: list[Tests]) -> list[Bits | None]:
@@ -108,11 +100,11 @@ def _each_elsewhere(source: Source, tests: list[Tests]) -> list[Bits | None]:
         return [None] if not half else _each_elsewhere(source, tests[:half]) + _each_elsewhere(source, tests[half:])
 
 
-def _rows_to_repeat(shard: Shard, seed: int, *, acts_early: bool) -> list[int]:
+def _rows_to_repeat(shard: Shard, campaign: Campaign) -> list[int]:
     """Rows by a hash of their index, among those in which the AV had to act."""
     episode = shard.episode
-    acted = (episode["outcome"] != FAILED) & (acts_early | (episode["event_step"] >= 0))
+    acted = (episode["outcome"] != FAILED) & (campaign.av.acts_before_event | (episode["event_step"] >= 0))
     rows = np.flatnonzero(acted)
-    order = np.argsort(hash_of_index(seed, shard.first_episode + rows), kind="stable")
+    order = np.argsort(hash_of_index(campaign.seed, shard.first_episode + rows), kind="stable")
     n = min(MOST_REPEATED, max(FEWEST_REPEATED, episode.size // ONE_OF))
     return [int(row) for row in rows[order[:n]]]

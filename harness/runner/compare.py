@@ -13,7 +13,7 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -27,7 +27,6 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import ended_by
 from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
 from harness.estimators.stopping import PairRule
-from harness.families import family_named
 from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
@@ -41,6 +40,9 @@ from harness.sampling.shells import PairRounds, Shells, round_requests
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import COMPARISON
 
+if TYPE_CHECKING:
+    from harness.report.summary import RunFolder
+
 SIDES = ("a", "b")
 MAY_DIFFER = frozenset({"av", "name", "description"})
 EXIT_OF: Mapping[PairVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
@@ -53,13 +55,15 @@ class Comparison:
     """Two finished campaigns, in run folders ``a`` and ``b``, and the difference.
 
     ``content`` is that of ``compare.json``, ``report`` the page. The exit code is 4 when budget or pool were spent
-    before what was asked was known, and 5 when B is worse than A by more than the margin.
+    before what was asked was known, and 5 when B is worse than A by more than the margin. ``s_per_pair`` is what a
+    pair takes.
     """
 
     folder: Path
     content: dict[str, Any]
     exit_code: int
     report: Path
+    s_per_pair: float
 
 
 @checked("harness.compare")
@@ -101,10 +105,8 @@ def compare_campaigns(
     folders = out / "a", out / "b"
     if stored is not None:
         _take_over(Path(stored), folders[0], sides[0])
-    for side, folder in zip(sides, folders, strict=True):  # both, before either is touched
-        require_own_folder(folder, side, resume=True)
     rule = PairRule(sides[0].campaign, margin, rhw)
-    rounds, pairs = _compared(sides, folders, rule, workers, progress or Progress())
+    rounds, pairs, shown = _compared(sides, folders, rule, workers, progress or Progress())
     found = paired_estimate(pairs, a.stop.confidence)
     labels = labels or (a.name, b.name)
     content = {
@@ -120,29 +122,30 @@ def compare_campaigns(
         "to_decide": _to_decide(sides[0].campaign, rounds, pairs),
         "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
         "ended": ended_by(a, rule, found["n_pairs"]),
-        "unseen": family_named(a.scenario).parameters(a.environment).unseen,
+        "unseen": sides[0].parameters.unseen,
     }
     code = EXIT_DONE if rule.look.stopped else EXIT_BUDGET_SPENT
     if margin is not None:
         code = EXIT_OF[rule.decision.verdict]
     write_sealed(out / COMPARISON, content)
-    from harness.report.compare_page import write_comparison  # noqa: PLC0415
+    from harness.report.compare_page import write_page_of  # noqa: PLC0415 - draws
 
-    return Comparison(out, content, code, write_comparison(out))
+    took_s = shown[1].manifest["wall_time_s"] / found["n_pairs"]
+    return Comparison(out, content, code, write_page_of(out, content, shown), took_s)
 
 
 def _compared(
     sides: Both, folders: tuple[Path, Path], rule: PairRule, workers: int | None, progress: Progress
-) -> tuple[PairRounds, PairCounts]:
-    """Rounds of pairs until the rule is content: what those say that it has seen."""
+) -> tuple[PairRounds, PairCounts, list[RunFolder]]:
+    """Rounds of pairs until the rule is content: what those say that it has seen, and what pages show of both runs."""
     campaign = sides[0].campaign
     with ExitStack() as held, ExitStack() as working:
-        runs, crews = [], []
-        for resolved, folder in zip(sides, folders, strict=True):
+        for folder in folders:
             held.enter_context(sole_use(folder))
-            earlier = require_own_folder(folder, resolved, resume=True)
-            crews.append(working.enter_context(closing(workers_of(resolved, workers, n_runs=2))))
-            runs.append(begun(folder, resolved, earlier, crews[-1], progress))
+        both = list(zip(folders, sides, strict=True))
+        earlier = [require_own_folder(*each, resume=True) for each in both]  # both, before either is touched
+        crews = [working.enter_context(closing(workers_of(side, workers, n_runs=2))) for side in sides]
+        runs = [begun(*each, found, crew, progress) for each, found, crew in zip(both, earlier, crews, strict=True)]
         source = runs[0].source  # the other's is the same: one environment and one library make one pool
         if not isinstance(source, Shells):
             raise TypeError("the campaigns do not draw from shells")
@@ -179,9 +182,8 @@ def _compared(
                 run.written("interrupted")
             raise
         working.close()
-        for run, crew in zip(runs, crews, strict=True):
-            finish(run, rule, crew.cpus(), progress)
-    return rounds, counts
+        done = zip(runs, crews, strict=True)
+        return rounds, counts, [finish(run, rule, crew.cpus(), progress).shown for run, crew in done]
 
 
 def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: PairCounts) -> dict[str, Any] | None:

@@ -11,7 +11,7 @@ import platform
 import time
 import zlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib import metadata
@@ -21,12 +21,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from harness.campaign.campaign import Campaign
 from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
+    PILOT,
+    SHADOW,
     SHELLS,
     TABLES,
     Part,
@@ -42,8 +45,10 @@ from harness.records.folder import (
 )
 from harness.records.origin import signature
 from harness.records.schemas import ShardTables
+from harness.records.shown import ShownTests
 from harness.resolved import Resolved
-from harness.runner.workers import ShardResult, finished
+from harness.runner.workers import ShardResult
+from harness.sampling.baseline import BaselineResult
 from harness.sampling.protocol import ShardRequest, Source
 
 SMALLEST_FAILED_SAMPLE = 200
@@ -51,27 +56,20 @@ SMALLEST_FAILED_SAMPLE = 200
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
 _INTERVAL_S, _SHARE = 5.0, 0.05
 """Time between two writes, and the share of the time that they may take."""
+COUNTED = {SHADOW: "shadow_runs", PILOT: "pilot_tests"}
+"""Keys of how many there were of what comes before tests."""
 PART_TESTS, PART_ROWS = 50_000, 2_000_000
 """Tests, or rows of all tables, from which on they go on in other files: so many are kept in memory."""
 
 
 class Earlier:
-    """What an earlier run has left in a folder: its manifest, and its tests by their index, one part read at a time."""
+    """The tests that an earlier run has left in a folder: ``parts`` of them, of which one is read at a time."""
 
     def __init__(self, folder: Path, manifest: Mapping[str, Any]) -> None:
-        self.manifest, self._folder = manifest, folder
+        self._folder = folder
+        self.parts: list[Part] = manifest["parts"]
+        self.n_episodes: int = manifest["n_episodes"]
         self._read: tuple[Part, dict[str, pa.Table] | None] | None = None
-
-    @property
-    def n_episodes(self) -> int:
-        """How many tests it has left."""
-        return int(self.manifest["n_episodes"])
-
-    @property
-    def parts(self) -> list[Part]:
-        """Their files, in order."""
-        found: list[Part] = self.manifest["parts"]
-        return found
 
     def tables(self, first: int, n: int) -> ShardTables | None:
         """Tables of consecutive tests; None where there are not so many, or one of their files is gone.
@@ -83,8 +81,12 @@ class Earlier:
             return None
         tables: dict[str, pa.Table | None] = dict.fromkeys(TABLES)
         for name in TABLES:
-            if kept := [_between(part[name], first, first + n) for part in found if part is not None and name in part]:
-                tables[name] = pa.concat_tables(kept)
+            for part in found:
+                if part is not None and name in part:
+                    index = part[name].column("episode").to_numpy()
+                    low, high = np.searchsorted(index, (first, first + n)).tolist()
+                    rows = part[name].slice(low, high - low)
+                    tables[name] = rows if tables[name] is None else pa.concat_tables([tables[name], rows])
         return ShardTables(**tables)
 
     def _tables(self, part: Part) -> dict[str, pa.Table] | None:
@@ -92,11 +94,6 @@ class Earlier:
             there = all((self._folder / file.path).exists() for file in part.files.values())
             self._read = part, {name: read_kept(self._folder, part, name) for name in part.files} if there else None
         return self._read[1]
-
-
-def _between(table: pa.Table, first: int, end: int) -> pa.Table:
-    low, high = np.searchsorted(table.column("episode").to_numpy(), (first, end)).tolist()
-    return table.slice(low, high - low)
 
 
 @dataclass(frozen=True)
@@ -116,11 +113,16 @@ class Run:
     parts: tuple[Part, ...] = ()
     open: tuple[ShardResult, ...] = ()
     blocks: tuple[Block, ...] = ()
+    shown: tuple[ShownTests, ...] = ()
+    """What the page shows of them."""
     n_rows: int = 0
     """Of all tables of those that are open."""
     n_crashes: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     repeated: Repeated | None = None
+    before: Mapping[str, tuple[pa.Table, ...]] = field(default_factory=dict)
+    """What comes before tests that count, by table; ``parts_before`` are written, by an earlier run if need be."""
+    parts_before: Mapping[str, Part] = field(default_factory=dict)
     wrote: tuple[float, float] = (0.0, 0.0)
     """When it was written last, and how long that took (s)."""
     is_named: bool = False
@@ -144,7 +146,7 @@ class Run:
         tables = self.earlier.tables(request.first_episode, request.n_episodes)
         if tables is None or not self.source.is_shard(request, tables.episodes):
             return None
-        return replace(finished(self.source, request, tables), is_new=False)
+        return ShardResult(request, tables, self.source.block(tables), is_new=False)
 
     def noting(self, **facts: Any) -> Run:
         """More keys of the manifest."""
@@ -157,44 +159,68 @@ class Run:
             self,
             open=(*self.open, shard),
             blocks=(*self.blocks, replace(shard.block, drawn=drawn)),
-            n_rows=self.n_rows + shard.tables.n_rows,
+            shown=(*self.shown, ShownTests.of(shard.tables.episodes, self.resolved.family)),
+            n_rows=self.n_rows + sum(table.num_rows for table in shard.tables if table is not None),
             n_crashes=self.n_crashes + int(shard.block.crash.sum()),
             failures=self.failures + shard.failures,
             repeated=self.repeated or shard.repeated,
         )
         run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
         if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or run.n_rows >= PART_ROWS:
-            return replace(run.written(), open=(), n_rows=0)
+            n = len(run.open)  # small tables cost more than their rows
+            shown = (*run.shown[:-n], ShownTests.joined(run.shown[-n:], run.folder))
+            return replace(run.written(), open=(), n_rows=0, shown=shown)
+        return run if run.is_behind else run.written_if_due()
+
+    def with_baseline(self, name: str, result: BaselineResult) -> Run:
+        """The next baseline runs or pilot tests, written as tests are."""
+        before = {**self.before, name: (*self.before.get(name, ()), result.table)}
+        return replace(self, before=before).written_if_due()
+
+    def written_if_due(self) -> Run:
+        """All that there is, every few seconds."""
         when, took = self.wrote
-        if run.is_behind or time.monotonic() - when < max(_INTERVAL_S, took / _SHARE):
-            return run
-        return run.written()
+        return self if time.monotonic() - when < max(_INTERVAL_S, took / _SHARE) else self.written()
 
     def written(self, status: str = "running", **of_the_end: Any) -> Run:
         """All that there is, and the manifest with it."""
         began = time.monotonic()
         run = self._kept()
         if status == "done" or not run.is_behind:
-            run._write_manifest(run.content(status, **of_the_end))
-            remove_unlisted(run.folder, run.parts)
+            before = {name: asdict(part) for name, part in run.parts_before.items()}
+            content = run.content(status, **of_the_end)
+            content |= {"parts": [asdict(part) for part in run.parts], "before": before}
+            if not run.is_named:
+                # Until it is there no checksum is told: not of the old one, nor of this.
+                write_sealed(run.folder / MANIFEST, {**content, "campaign_crc32": None})
+                write_bytes(run.folder / CAMPAIGN, dump_campaign(run.resolved.campaign).encode())
+            write_sealed(run.folder / MANIFEST, content)
+            remove_unlisted(run.folder, [*run.parts, *run.parts_before.values()])
             run = replace(run, is_named=True)
         return replace(run, wrote=(time.monotonic(), time.monotonic() - began))
 
     def _kept(self) -> Run:
         """The last part as far as it goes, in the place of one that held less of it."""
+        parts_before = dict(self.parts_before)
+        for name, tables in self.before.items():
+            n = sum(table.num_rows for table in tables)
+            if name not in parts_before or n > parts_before[name].n_episodes:
+                parts_before[name] = write_part(self.folder, [{name: table} for table in tables], 0, n)
         if not self.open:
-            return self
+            return replace(self, parts_before=parts_before)
         first = self.open[0].request.first_episode
         listed = [part for part in self.earlier.parts if (part.first_episode, part.end) == (first, self.n_episodes)]
         if any(shard.is_new for shard in self.open) or not listed:
-            listed = [write_part(self.folder, [shard.tables for shard in self.open], first, self.n_episodes - first)]
-        return replace(self, parts=(*(part for part in self.parts if part.first_episode < first), *listed))
+            listed = [
+                write_part(self.folder, [each.tables._asdict() for each in self.open], first, self.n_episodes - first)
+            ]
+        parts = (*(part for part in self.parts if part.first_episode < first), *listed)
+        return replace(self, parts=parts, parts_before=parts_before)
 
     def require_few_failed(self, *, at_least: int = 0) -> None:
         """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many."""
         if self.n_episodes >= at_least:
-            most = self.resolved.campaign.run.max_failed_share
-            require_few_failed(self.failures.total(), self.n_episodes, self.failures, most)
+            require_few_failed(self.failures, self.n_episodes, self.resolved.campaign)
 
     def content(self, status: str, **of_the_end: Any) -> dict[str, Any]:
         """What the manifest says."""
@@ -210,15 +236,9 @@ class Run:
             "wall_time_s": round(time.monotonic() - self.began, 3),
             "n_episodes": self.n_episodes,
             "parts": self.parts,
+            "before": self.parts_before,
+            **{COUNTED[name]: _counted(tables) for name, tables in self.before.items()},
         }
-
-    def _write_manifest(self, content: dict[str, Any]) -> None:
-        content = {**content, "parts": [asdict(part) for part in self.parts]}
-        if not self.is_named:
-            # Until it is there no checksum is told: not of the old one, nor of this.
-            write_sealed(self.folder / MANIFEST, {**content, "campaign_crc32": None})
-            write_bytes(self.folder / CAMPAIGN, dump_campaign(self.resolved.campaign).encode())
-        write_sealed(self.folder / MANIFEST, content)
 
 
 def take_over(
@@ -242,7 +262,14 @@ def take_over(
         **facts,
     }
     began -= float(earlier.get("wall_time_s") or 0.0)
-    return Run(folder, resolved, source, Earlier(folder, earlier), began, of_run).written()
+    listed = earlier["before"].items()
+    there = {name: part for name, part in listed if (folder / part.files[name].path).exists()}
+    return Run(folder, resolved, source, Earlier(folder, earlier), began, of_run, parts_before=there).written()
+
+
+def _counted(tables: Sequence[pa.Table]) -> dict[str, int]:
+    failed = [len(table) - table.column("failure").null_count for table in tables]
+    return {"n_runs": sum(map(len, tables)), "n_failed": sum(failed)}
 
 
 def versions() -> dict[str, str]:
@@ -260,14 +287,14 @@ def cpu_name() -> str:
 
 
 def require_few_failed(
-    n_failed: int, n: int, causes: Counter[str], most: float, what: str = "episodes", where: str = "the episodes table"
+    causes: Counter[str], n: int, campaign: Campaign, what: str = "episodes", where: str = "the episodes table"
 ) -> None:
-    """Refuse (`TooManyFailedError`) an answer where more than the share ``most`` of tests, or ``what`` else, failed."""
-    if n_failed > most * n:
+    """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
+    if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in causes.most_common(1))
         raise TooManyFailedError(
             "run.max_failed_share",
-            f"{n_failed} of {n} {what} failed{cause}",
+            f"{causes.total()} of {n} {what} failed{cause}",
             f"a share of at most {most:g}",
             "Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
             f"are in the column 'failure' of {where}.",
@@ -286,7 +313,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
 
     require_place(folder)
     if not folder.exists() or not any(folder.iterdir()):
-        return {"n_episodes": 0, "parts": []}
+        return {"n_episodes": 0, "parts": [], "before": {}}
     elsewhere = "Choose another folder with --out."
     if not (folder / MANIFEST).exists():
         expected = "a new or empty folder, or one that a run has left"

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -42,10 +42,11 @@ BRAKING_MPS2 = -0.1
 AT_LIMIT_MPS2 = 1e-9
 WARM_UP_EPISODES, LONGER, LONGEST_S = 12, 10.0, 60.0
 """Tests in which the warm-up is left out, or made ten times as long."""
-MOVES_MPS2 = 0.5
-"""Change of a first answer that says: the warm-up leaves something behind."""
 SLOW_S = 0.1
 """Time of a constructor that is worth a word."""
+Cause = Literal["process", "clock", "random", "remembers", "shares"]
+"""Why a test is not the same again: which process it is in, what a clock says, nothing that is known (as random numbers
+of its own), another test before it, or beside it."""
 
 
 @dataclass(frozen=True)
@@ -67,23 +68,6 @@ class Behaviour:
     n_crashes: int
 
 
-IN_WORDS = {
-    "mean_acceleration_mps2": "mean acceleration, m/s²",
-    "min_acceleration_mps2": "hardest braking, m/s²",
-    "max_acceleration_mps2": "hardest acceleration, m/s²",
-    "share_at_min": "share of steps at its hardest allowed braking",
-    "share_at_max": "share of steps at its hardest allowed acceleration",
-    "reaction_s": "from the onset of a cut-in to the first braking, median, s",
-    "braking_share": "share of cut-ins after which it braked",
-    "n_events": "cut-ins",
-    "n_crashes": "crashes (no rate: cut-ins are forced)",
-    "us_per_step": "time per step, µs",
-    "episodes_per_s": "tests per second",
-    "construction_s": "time that its constructor takes, median, s",
-    "constructions": "times that each worker of a run calls it",
-}
-
-
 @dataclass(frozen=True)
 class Speed:
     """Time per episode step, episodes per second, and what a worker of a run constructs before its cells are full."""
@@ -100,11 +84,11 @@ class AvCheck:
 
     ``failures`` are numbers of episodes of the first run by the cause that they failed with, where one stands for all
     that differ from it in digits alone; ``differing`` are those whose motion was not the same bits in the two layouts,
-    with the ``likely_cause`` if there are any; ``limits_mps2`` are the accelerations that count as its limits;
-    ``moved_mps2`` says by how much first answers move at most if the warm-up takes so many seconds (key) instead of
-    ``av.warm_up_s``. The built-in IDM has driven the same episodes in the same cells. Cut-ins are of one step, also
-    where they ``take_time`` in the campaign, for a vehicle that acts before them: a look makes no baseline runs, which
-    would tell the onset.
+    with the ``likely_cause`` if there are any, and where a clock was read; ``limits_mps2`` are the accelerations that
+    count as its limits; ``moved_mps2`` says by how much first answers move at most if the warm-up takes so many seconds
+    (key) instead of ``av.warm_up_s``. The built-in IDM has driven the same episodes in the same cells. Cut-ins are of
+    one step, also where they ``take_time`` in the campaign, for a vehicle that acts before them: a look makes no
+    baseline runs, which would tell the onset.
     """
 
     source: str
@@ -114,7 +98,8 @@ class AvCheck:
     n_episodes: int
     failures: dict[str, int]
     differing: tuple[int, ...]
-    likely_cause: str
+    likely_cause: Cause | None
+    clock_read_at: Sequence[str]
     limits_mps2: tuple[float, float]
     moved_mps2: dict[float, float]
     behaviour: Behaviour
@@ -127,71 +112,13 @@ class AvCheck:
         """0 when all is well, 3 when episodes failed or were not reproduced."""
         return EXIT_TOO_MANY_FAILED if self.failures or self.differing else EXIT_DONE
 
-    @property
-    def verdict(self) -> str:
-        """What is to be done next, in a sentence."""
-        n, seen = self.n_episodes, self.behaviour
-        if self.failures:
-            return f"NOT READY: {sum(self.failures.values())} of {n} tests failed: {next(iter(self.failures))}."
-        if self.differing:
-            return f"NOT REPRODUCIBLE: {len(self.differing)} of {n} tests came out otherwise. {self.likely_cause}"
-        if not seen.n_events or not seen.braking_share > 0.0:
-            return f"LOOK AGAIN: it braked after none of {seen.n_events} cut-ins. Does it see BV?"
-        longest, moved = max(self.moved_mps2.items(), default=(0.0, 0.0))
-        if longest and moved > MOVES_MPS2:
-            return (
-                f"LOOK AGAIN: its first answer moves by up to {moved:.1f} m/s² where the warm-up takes {longest:g} s. "
-                "State winds up while its answers are not used, as an integral does: limit it (anti-windup), or begin "
-                "it when BV comes; then av.warm_up_s need be no longer than its filters."
-            )
-        slower = self.speed.us_per_step / self.idm_speed.us_per_step
-        return (
-            f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
-            f"cut-ins, {seen.reaction_s:.1f} s after they began (median, also where it had no need to brake sooner); "
-            f"a step takes {slower:.1f} times that of IDM.{self._advice}"
-        )
-
-    @property
-    def _advice(self) -> str:
-        of = self.speed
-        if of.construction_s <= SLOW_S or of.constructions == 1:
-            return ""
-        return (
-            f" Its constructor takes {of.construction_s:.1f} s, and each worker of a run calls it {of.constructions} "
-            "times: what all may share, load once (`load`, see docs/controllers.md)."
-        )
-
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        """A table for people: what was found, beside the built-in IDM."""
-        found = self.to_json()
-        own, idm = ({**found[f"{who}behaviour"], **found[f"{who}speed"]} for who in ("", "idm_"))
-        lowest, highest = found["limits_mps2"]
-        cut_ins = "cut-ins that take time" if self.take_time else "cut-ins of one step"
-        rows = [
-            ("kind of vehicle, engine, method", f"{self.source}, {self.engine}, {self.method}, {cut_ins}", ""),
-            ("tests", self.n_episodes, ""),
-            *((f"failed: {cause}", n, "") for cause, n in (found["failures"] or {"none": 0}).items()),
-            ("tests that came out otherwise", found["differing"] or "none", ""),
-            ("accelerations allowed, m/s²", [lowest, highest], ""),
-            *((text, own[name], idm[name]) for name, text in IN_WORDS.items()),
-            *(
-                (f"its first answer with a warm-up of {s:g} s moves by up to, m/s²", moved, "")
-                for s, moved in self.moved_mps2.items()
-            ),
-        ]
-        return [{"what": text, "found": value, "built-in IDM": of_idm} for text, value, of_idm in rows]
-
     def to_json(self) -> dict[str, Any]:
         """Plain JSON content; undefined numbers become null."""
         return finite_json({**asdict(self), "deterministic": not self.differing, "exit_code": self.exit_code})
 
 
 @checked("harness.av_check")
-def check_av(
-    campaign: Campaign | str | Path,
-    n_episodes: Annotated[int, Field(ge=2)] = EPISODES,
-) -> AvCheck:
+def check_av(campaign: Campaign | str | Path, n_episodes: Annotated[int, Field(ge=2)] = EPISODES) -> AvCheck:
     """Run a few dozen episodes with a campaign's AV, twice, and say what is to be seen.
 
     The second run has other cells, begins in the middle, and follows episodes of its own: a controller that remembers
@@ -215,6 +142,7 @@ def check_av(
     own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
     limits = own.min_acceleration_mps2, own.max_acceleration_mps2
     differing = tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i])
+    cause, clock_read_at = _likely_cause(source, differing[0]) if differing else (None, ())
     early = tested.av.acts_before_event
     return AvCheck(
         source=tested.av.source,
@@ -224,7 +152,8 @@ def check_av(
         n_episodes=n_episodes,
         failures=_by_cause(first.failures.values()),
         differing=differing,
-        likely_cause=_likely_cause(source, differing[0]) if differing else "",
+        likely_cause=cause,
+        clock_read_at=clock_read_at,
         limits_mps2=limits,
         moved_mps2=_moved_by_warm_up(source, min(n_episodes, WARM_UP_EPISODES)),
         behaviour=_behaviour(first, limits, early=early),
@@ -312,8 +241,9 @@ def _run_in_another_order(source: Source, n_episodes: int) -> dict[int, Bits]:
     if has_foreign_code(source.campaign.av):
         return dict(zip(order, run_elsewhere(source, halves, OTHER_CELLS).bits, strict=True))
     with _opened(source, OTHER_CELLS) as loop:
-        shards = [(loop.run(*tests), row) for tests in halves for row in range(len(tests.traffic))]
-    return {i: bits_of(shard, row) for i, (shard, row) in zip(order, shards, strict=True)}
+        shards = [loop.run(*tests) for tests in halves]
+    bits = [bits_of(shard, row) for shard in shards for row in range(shard.episode.size)]
+    return dict(zip(order, bits, strict=True))
 
 
 def _moved_by_warm_up(source: Source, n: int) -> dict[float, float]:
@@ -346,45 +276,28 @@ def _by_cause(causes: Iterable[str]) -> dict[str, int]:
     return dict(Counter(shown.setdefault(re.sub(r"\d[\d.]*(e[-+]?\d+)?", "0", cause), cause) for cause in causes))
 
 
-def _likely_cause(source: Source, episode: int) -> str:
-    """Why an episode is not the same again, by what it takes: a clock, nothing, another one before or beside it."""
+def _likely_cause(source: Source, episode: int) -> tuple[Cause | None, Sequence[str]]:
+    """Why an episode is not the same again, by what it takes; and where a clock was read, if it is that."""
 
-    def bits(n_cells: int, begin: int, n_before: int) -> Bits:
-        with _opened(source, n_cells) as loop:
-            for each in range(begin, begin + n_before):
+    def bits_after(before: Sequence[int]) -> Bits:
+        with _opened(source, 1) as loop:
+            for each in before:
                 loop.run(each, source.tests(each, 1))
-            n = min(n_cells, source.campaign.stop.episodes - episode)
-            return bits_of(loop.run(episode, source.tests(episode, n)), 0)
+            return bits_of(loop.run(episode, source.tests(episode, 1)), 0)
 
-    if has_foreign_code(source.campaign.av) and (cause := _cause_outside(source, episode)):
-        return cause
-    alone, begin = bits(1, episode, 0), max(0, episode - OTHER_CELLS)
-    if any(bits(1, episode, 0) != alone for _ in range(2)):
-        return _OF_ITS_OWN
-    if any(bits(1, first, episode - first or 1) != alone for first in (begin, episode)):
-        return "It differs after another episode: it remembers the last one. Set all its state in start."
-    return "It differs beside other vehicles: they share something. Keep state in self, not in the class or module."
-
-
-_OF_ITS_OWN = (
-    "It differs also when nothing does: random numbers of its own (random, numpy.random), or a variable of its module "
-    "or class that outlives the object. Draw from episode.random; keep state in self."
-)
-
-
-def _cause_outside(source: Source, episode: int) -> str:
-    """Whether it is the process, or the clock, which is the same in the first two runs and another in the last."""
-    test = [Tests(episode, source.tests(episode, 1))]
-    one, other, later = (run_elsewhere(source, test, held=held) for held in (True, True, False))
-    if one.bits != other.bits:
-        return (
-            "It differs from process to process: random numbers of its own (random, numpy.random), the number of the "
-            "process, hash() of a text (the order of a set), or an id(). Draw from episode.random."
-        )
-    if one.bits != later.bits:
-        where = "; ".join(later.clock_read_at[:3]) or "in a library"
-        return f"It depends on the clock ({where}): a test may run at any speed. Use time_s of what it sees, or step_s."
-    return ""
+    if has_foreign_code(source.campaign.av):
+        test = [Tests(episode, source.tests(episode, 1))]
+        one, other, later = (run_elsewhere(source, test, held=held) for held in (True, True, False))
+        if one.bits != other.bits:
+            return "process", ()
+        if one.bits != later.bits:  # the clock is the same in the first two, and another in the last
+            return "clock", later.clock_read_at
+    alone = bits_after([])
+    if any(bits_after([]) != alone for _ in range(2)):
+        return "random", ()
+    if any(bits_after(before) != alone for before in (range(max(0, episode - OTHER_CELLS), episode), [episode])):
+        return "remembers", ()
+    return "shares", ()
 
 
 def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
@@ -401,15 +314,15 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
             braking = np.flatnonzero(commanded[onset + 1 :] < BRAKING_MPS2)
             reactions.append(float(braking[0]) * STEP_S if braking.size else np.inf)
     a = np.concatenate([*acted, np.empty(0)])
+    a = a if a.size else np.array([np.nan])
     reaction = np.array(reactions)
     braked = np.isfinite(reaction)
-    some = a if a.size else np.array([np.nan])
     return Behaviour(
-        mean_acceleration_mps2=float(some.mean()),
-        min_acceleration_mps2=float(some.min()),
-        max_acceleration_mps2=float(some.max()),
-        share_at_min=float(np.mean(some <= limits[0] + AT_LIMIT_MPS2)),
-        share_at_max=float(np.mean(some >= limits[1] - AT_LIMIT_MPS2)),
+        mean_acceleration_mps2=float(a.mean()),
+        min_acceleration_mps2=float(a.min()),
+        max_acceleration_mps2=float(a.max()),
+        share_at_min=float(np.mean(a <= limits[0] + AT_LIMIT_MPS2)),
+        share_at_max=float(np.mean(a >= limits[1] - AT_LIMIT_MPS2)),
         reaction_s=float(np.median(reaction[braked])) if braked.any() else np.nan,
         braking_share=float(braked.mean()) if reaction.size else np.nan,
         n_events=len(reactions),

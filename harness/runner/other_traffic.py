@@ -23,22 +23,13 @@ from harness.estimators.answer import Elsewhere as OfOtherTraffic
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
 from harness.estimators.traffic import ONE_LAW, Ends, TrafficError, Uncertain, Unseen, uncertain
-from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
 from harness.families.cut_in.unseen import STEP, as_if_unseen
 from harness.pool.moved import assumed
 from harness.progress import Progress
 from harness.records.folder import read_table
 from harness.resolved import resolve
-from harness.runner.stored_shells import (
-    ELSEWHERE,
-    OPTION,
-    Elsewhere,
-    Nearby,
-    StoredShells,
-    moved_to,
-    require_shares,
-)
+from harness.runner.stored_shells import ELSEWHERE, OPTION, Elsewhere, Nearby, StoredShells, moved_to, require_shares
 from harness.vocabulary import EstimatorName, FloatArray
 
 
@@ -72,8 +63,7 @@ def estimate_in_other_traffic(
         "campaign_hash": there.content_hash,
         "distance_per_test_m": there.family.mean_distance_m(there.environment),
     }
-    parameters = there.family.parameters(there.campaign.environment)
-    if parameters.replicates is not None and parameters.unseen:
+    if there.parameters.replicates is not None and there.parameters.unseen:
         told.pop("assumed", None)  # replicates say it better
     elif not moved.is_same:
         found = assumed(there, tested.pool, tested.design, progress)
@@ -134,10 +124,9 @@ def compare_in_other_traffic(
     if (found := _replicated(moved, confidence, progress)) is None:
         expected = "an environment that names replicates, as `harness fit` writes them"
         raise CampaignError(OPTION, f"{environment}, which names none", expected, "Compare in that environment.")
+    below = found.unseen is None
     a, b = (
-        found.uncertain(
-            of["crash_rate"], (of["ci_low"], of["ci_high"]), found.times(side), from_below=found.unseen is None
-        )
+        found.uncertain(of["crash_rate"], (of["ci_low"], of["ci_high"]), found.times(side), from_below=below)
         for side, of in enumerate((told["a"], told["b"]))
     )
     moves, ratios = found.times(0) / found.times(1), {}
@@ -177,7 +166,7 @@ class Replicated:
 def _replicated(sides: Sequence[Elsewhere], confidence: float, progress: Progress) -> Replicated | None:
     """Answers of stored runs in the replicates of one traffic; None without any."""
     settings = sides[0].traffic.campaign.environment
-    parameters = load_parameters(settings)
+    parameters = sides[0].traffic.parameters
     if parameters.replicates is None:
         return None
     values, unseen = read_replicates(settings.parameters, parameters), _unseen(sides[0], parameters, progress)

@@ -27,18 +27,12 @@ from harness.campaign.sections import RaySettings
 from harness.compiled import source_hash
 from harness.controllers.find import require_controller
 from harness.errors import CampaignError, HarnessError
-from harness.processes import WorkerDeath, fit_to_travel, handlers_restored, usable_cpus
+from harness.processes import WorkerDeath, fit_to_travel, usable_cpus
 from harness.resolved import Resolved
 from harness.runner.kept import cpu_name
-from harness.runner.workers import (
-    CLOSING_S,
-    LocalWorkers,
-    Result,
-    WorkerLostError,
-    WorkerProcess,
-    Workers,
-)
+from harness.runner.workers import CLOSING_S, LocalWorkers, Result, WorkerLostError, WorkerProcess, Workers
 from harness.sampling import source_of
+from harness.signals import handlers_restored
 
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""
@@ -80,7 +74,9 @@ class OnMachine:
     def begin(self, cached: Files) -> tuple[dict[str, str | None], str] | Exception:
         """Fill the cache, and say what there is."""
         try:
-            _fill_cache(cached)
+            for name, content in cached.items():
+                if cache.find(name) is None:
+                    cache.keep(name, ray.get(content).data)
             return this_machine(self._resolved, require_controller(self._resolved.campaign.av))
         except Exception as error:  # noqa: BLE001 - see the class
             return fit_to_travel(error)
@@ -105,12 +101,6 @@ class OnMachine:
             self._worker.dismiss()
             self._worker.wait(CLOSING_S)
         self._workers.close()
-
-
-def _fill_cache(files: Files) -> None:
-    for name, content in files.items():
-        if cache.find(name) is None:
-            cache.keep(name, ray.get(content).data)
 
 
 # -- where the run is --

@@ -6,10 +6,10 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
@@ -19,10 +19,11 @@ from harness.campaign.files import campaign_of
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import ended_by, estimate_blocks, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
-from harness.files import checksum, remove_unfinished
+from harness.files import remove_unfinished
 from harness.pool.moved import assumed_in
 from harness.progress import Progress
-from harness.records.folder import SHELLS, StoppedBy, parquet, sole_use, write_bytes, write_sealed
+from harness.records.folder import SHELLS, StoppedBy, parquet, sole_use, write_sealed
+from harness.records.shown import ShownTests
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import (
     Run,
@@ -36,9 +37,12 @@ from harness.runner.kept import (
 from harness.runner.stored import even
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
-from harness.sampling.baseline import IN_MANIFEST, baseline_file, begin, stored_baseline
+from harness.sampling.baseline import IN_WORDS, begin, stored_baseline, stored_table
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
+
+if TYPE_CHECKING:
+    from harness.report.summary import RunFolder
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
 ESTIMATES = "estimates.json"
@@ -58,6 +62,8 @@ class RunResult:
     estimates: dict[str, Any]
     stopped_by: StoppedBy
     exit_code: int
+    shown: RunFolder = field(repr=False)
+    """What its page is made of."""
 
 
 @checked("harness.run")
@@ -107,7 +113,7 @@ def begun(out: Path, resolved: Resolved, earlier: dict[str, Any], crew: Workers,
     run = take_over(out, resolved, source, earlier, began, **facts)
     try:
         keep_design(run)
-        return run.noting(assumed=assumed_in(resolved, source.design, progress))
+        return run.noting(assumed=assumed_in(resolved, source.pool, source.design, progress))
     except BaseException:
         run.written("interrupted")
         raise
@@ -141,34 +147,27 @@ def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
     """Drive the vehicle along all paths without a cut-in, and in pilot tests, if tests follow from some."""
     if (paths := run.source.baseline_paths) is None:
         return run
-    noted: dict[str, Any] = {}
 
-    def drive(what: str, requests: Sequence[ShardRequest]) -> pa.Table:
-        """What comes before tests that count, but for what an earlier run has done of it; the manifest follows."""
-        n, (counted, listed) = sum(each.n_episodes for each in requests), IN_MANIFEST[what]
+    def drive(name: str, requests: Sequence[ShardRequest]) -> pa.Table:
+        """What comes before tests that count, but for what an earlier run has done of it."""
+        nonlocal run
+        n, what, causes = sum(each.n_episodes for each in requests), IN_WORDS[name], Counter[str]()
         progress.stage(f"{what}{crew.where}", n)
-        tables, causes, crc32 = [], Counter[str](), []
-        known = partial(stored_baseline, run.folder, paths, run.earlier.manifest.get(listed, ()))
+        known = partial(stored_baseline, stored_table(run.folder, run.parts_before, name), paths)
         for result in crew.run(iter(requests), known):
-            file = baseline_file(run.folder, result.request)
-            if result.parquet:
-                write_bytes(file, result.parquet)
-            crc32.append(checksum(file))
-            tables.append(result.table)
+            run = run.with_baseline(name, result)
             causes += result.failures
             progress.advance(result.request.n_episodes)
-        noted.update({counted: {"n_runs": sum(map(len, tables)), "n_failed": causes.total()}, listed: crc32})
-        most, where = run.resolved.campaign.run.max_failed_share, f"the run folder's {file.parent.name}/ tables"
-        require_few_failed(causes.total(), n, causes, most, what, where)
-        return pa.concat_tables(tables)
+        require_few_failed(causes, n, run.resolved.campaign, what, f"the run folder's {name}/ table")
+        return pa.concat_tables(run.before[name])
 
     try:
         table, runs = begin(run.source, drive)
     except BaseException:
-        run.noting(**noted).written("interrupted")
+        run.written("interrupted")
         raise
     crew.follow_from(parquet(table))
-    run = run.noting(**noted, distance_per_test_m=runs.mean_distance_m(paths.weight)).written()
+    run = run.noting(distance_per_test_m=runs.mean_distance_m(paths.weight)).written()
     keep_design(run)
     return run
 
@@ -196,11 +195,15 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
     run = run.written("done", **ended)
     progress.stage("writing estimates and report", None)
-    estimates = estimate_blocks(even(run.blocks), campaign, run.content("done", **ended))
+    manifest = run.content("done", **ended)
+    estimates = estimate_blocks(even(run.blocks), campaign, manifest)
     write_sealed(run.folder / ESTIMATES, estimates)
-    from harness.report.page import write_report  # noqa: PLC0415
+    from harness.report.page import write_page_of  # noqa: PLC0415 - draws
+    from harness.report.summary import RunFolder  # noqa: PLC0415
 
-    return RunResult(run.folder, write_report(run.folder), estimates, stopped_by, code)
+    tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
+    shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
+    return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:

@@ -21,13 +21,12 @@ from harness.arguments import checked
 from harness.errors import CampaignError
 from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
-from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.families.cut_in.unseen import as_if_unseen
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
 from harness.runner.other_traffic import read_replicates
-from harness.runner.stored_shells import Nearby, StoredShells, require_shares
+from harness.runner.stored_shells import Elsewhere, Nearby, StoredShells, require_shares
 
 BLOCKS = {
     "initial state": ("initial_state",),
@@ -66,23 +65,18 @@ def sensitivity(
     tested = StoredShells.of(folder, progress, _OPTION)
     require_shares(tested)
     settings = tested.here.campaign.environment
-    parameters = load_parameters(settings)
+    parameters = tested.here.parameters
     asked = list(moves(settings.parameters, parameters, ranges or {}))
     if not asked:
         found = f"{settings.parameters}, of which no number has a standard error (se) or a range"
         mend = "State one, e.g. --range cut_in.ignore_share=0.001:0.08."
         raise CampaignError(_OPTION, found, "numbers that are said to be uncertain", mend)
-    results = tested.itself.nearby([each for move in asked for each in move.settings], progress)
+    itself = Elsewhere(tested, tested.here, tested.design)
+    results = itself.nearby([each for move in asked for each in move.settings], progress)
     bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
-    drivers = [each.name for each in tested.design.references]
-    content = finite_json(
-        Sensitivity(
-            tested.manifest["campaign_hash"],
-            Path(settings.parameters).stem,
-            drivers[0] if drivers else "",
-            tuple(sorted(bars, key=lambda bar: -bar.span)),
-        )
-    )
+    driver = next((each.name for each in tested.design.references), "")
+    ordered, traffic = tuple(sorted(bars, key=lambda bar: -bar.span)), Path(settings.parameters).stem
+    content = finite_json(Sensitivity(tested.manifest["campaign_hash"], traffic, driver, ordered))
     write_sealed(folder / SENSITIVITY, content)
     return content
 
@@ -128,16 +122,6 @@ def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:
         ends = np.quantile(known, [tail, 1.0 - tail], axis=0) if enough else nowhere
         nearest = [int(np.argmin(np.abs(known[:, 0] - end))) for end in ends[:, 0]] if enough else []
         off = off[told][nearest] if enough else nowhere[0]
-    (rate_low, ratio_low), (rate_high, ratio_high) = ends.tolist()
-    off_low, off_high = off.tolist()
-    return Bar(
-        what=move.what,
-        known=move.known,
-        values=move.values,
-        rate=(rate_low, rate_high),
-        ratio=(ratio_low, ratio_high),
-        off=(off_low, off_high),
-        n=len(results),
-        no_laws=no_laws,
-        unlike=unlike,
-    )
+    rate, ratio, most_off = ((float(low), float(high)) for low, high in (*ends.T, off))
+    told_by = {"n": len(results), "no_laws": no_laws, "unlike": unlike}
+    return Bar(move.what, move.known, move.values, rate, ratio, most_off, **told_by)

@@ -25,7 +25,7 @@ from harness.files import write_atomically
 from harness.processes import SharedFile, made_ahead
 from harness.records.folder import CAMPAIGN, Part, no_episodes, read_kept, read_manifest
 from harness.records.origin import require_trust
-from harness.records.reader import read_campaign, read_part, require_campaign, traffic_of
+from harness.records.reader import N_READERS, read_campaign, require_campaign, traffic_of
 from harness.records.schemas import moments_schema, shard_tables
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
@@ -37,8 +37,6 @@ from harness.worlds.system_libraries import require_libraries
 
 FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
 """Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
-_READERS = 2
-"""Threads; each holds a part."""
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
@@ -84,10 +82,10 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
 
     def read(part: Part) -> Block:
         steps = read_kept(folder, part, "moments", ratios) if ratios and "moments" in part.files else none
-        return block_from_tables(campaign, read_part(folder, part, needed), steps, design)
+        return block_from_tables(campaign, read_kept(folder, part, "episodes", needed), steps, design)
 
     n = 0
-    for block in made_ahead(read, manifest["parts"], _READERS):
+    for block in made_ahead(read, manifest["parts"], N_READERS):
         if block.first_episode != n:
             raise _incomplete(folder, f"a part that begins at episode {block.first_episode}", f"episode {n}")
         counted = block.take(slice(0, n_counted - n))
@@ -222,17 +220,12 @@ def _simulated(
 
 
 def _replay(
-    resolved: Resolved,
-    folder: Path,
-    episode: int,
-    stored: pa.Table,
-    gui: bool,
-    fcd: Path | None,
+    resolved: Resolved, folder: Path, episode: int, stored: pa.Table, gui: bool, fcd: Path | None
 ) -> dict[str, pa.Table]:
     """Row and trace of the episode, run again."""
     source = prepare(resolved)
     if source.baseline_paths is not None:
-        begin(source, partial(read_stored, folder, source.baseline_paths, read_manifest(folder)))
+        begin(source, partial(read_stored, folder, source.baseline_paths, read_manifest(folder)["before"]))
     require_same_pool(folder, source)
     options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
     world = build_world(resolved.campaign, 1, in_sumo=gui or fcd is not None, gui=gui, options=options)

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from harness.campaign.campaign import Campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.likelihood import Level, likelihood_limit
@@ -72,26 +71,24 @@ class StoredShells:
         folder = Path(folder)
         manifest = read_manifest(folder)
         campaign = read_campaign(folder, manifest, check_files=True)
-        _require_shells(campaign, option)
+        if not campaign.sampling.strata or campaign.has_baseline_runs:
+            acts = "a vehicle that acts before the cut-in: its cut-ins follow from its own runs"
+            found = acts if campaign.sampling.strata else f"tests by {campaign.testing.method}"
+            expected = "tests of shells, of a vehicle that holds its speed until the cut-in"
+            raise CampaignError(option, found, expected, ELSEWHERE)
         here = resolve(campaign)
         design, pool = Shells.stored_design(folder), campaign_pool(here, progress)
         rebuilt = design_shells(pool, acceleration_limit(campaign.av))
         if design.strata != rebuilt.strata or not np.allclose(design.p, rebuilt.p, rtol=SAME_POOL):
+            expected = f"shells as those of pool {pool.key}"
             mend = "Use the version of the harness (manifest.json) and the surrogate library that it was made with."
-            raise RunFolderError(
-                str(folder), f"tests of pool {design.pool}", f"shells as those of pool {pool.key}", mend
-            )
+            raise RunFolderError(str(folder), f"tests of pool {design.pool}", expected, mend)
         return cls(folder, manifest, here, design, pool)
 
     @property
     def limit_mps2(self) -> float:
         """Hardest acceleration of the vehicle."""
         return acceleration_limit(self.here.campaign.av)
-
-    @property
-    def itself(self) -> Elsewhere:
-        """As it answers for its own traffic."""
-        return Elsewhere(self, self.here, self.design)
 
     @cached_property
     def blocks(self) -> list[Block]:
@@ -193,8 +190,7 @@ class Elsewhere:
 
         Of a vehicle whose shares may change with it, the factor is that of its upper limit.
         """
-        parameters = self.traffic.family.parameters(self.traffic.campaign.environment)
-        traffic = [environment_with(self.traffic, parameters, row) for row in rows]
+        traffic = [environment_with(self.traffic, row) for row in rows]
         known = [each for each in traffic if each is not None]
         progress.stage("other traffic", len(known))
         tested, p, shares = self.tested, self.design.p, reference_shares(self.tested.design)
@@ -223,7 +219,10 @@ def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progres
     """The strata with the probabilities of other traffic; refused where the tests say nothing of it."""
     if there.family.digest(there.environment) == tested.pool.environment:
         return Elsewhere(tested, there, tested.design)
-    _require_same_kind(tested.here, there, name)
+    was, now = ("take time" if each.scenario.shows else "are one step" for each in (tested.here, there))
+    if was != now:  # nobody sees those of one step beforehand: shells mean something else there
+        expected = f"traffic as that of the tests, in which they {was}"
+        raise CampaignError(OPTION, f"{name}, in which cut-ins {now}", expected, ELSEWHERE)
     require_shares(tested)
     progress.stage("pool of the other traffic", None)
     elsewhere = campaign_pool(there, progress, order=tested.pool.names)
@@ -242,16 +241,6 @@ def _share(part: FloatArray, whole: FloatArray) -> FloatArray:
     return np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0.0)
 
 
-def _require_shells(campaign: Campaign, option: str) -> None:
-    if campaign.sampling.strata and not campaign.has_baseline_runs:
-        return
-    found = f"tests by {campaign.testing.method}"
-    if campaign.sampling.strata:
-        found = "a vehicle that acts before the cut-in: its cut-ins follow from its own runs"
-    expected = "tests of shells, of a vehicle that holds its speed until the cut-in"
-    raise CampaignError(option, found, expected, ELSEWHERE)
-
-
 def require_shares(tested: StoredShells) -> None:
     """Raise a `CampaignError` where shares may not be taken to stay the same."""
     if tested.holds:
@@ -260,15 +249,6 @@ def require_shares(tested: StoredShells) -> None:
     expected = f"at least {share(LEAST_SHARE)}: else which these are may change with the traffic"
     mend = "Run it in that environment, or here with a surrogate close to it in the library (pool.library)."
     raise CampaignError(str(tested.folder), found, expected, mend)
-
-
-def _require_same_kind(here: Resolved, there: Resolved, name: str) -> None:
-    """Cut-ins of one step are seen by nobody beforehand: shells mean something else there."""
-    takes_time = [each.environment.lateral.present for each in (here, there)]
-    if takes_time[0] != takes_time[1]:
-        was, now = ("take time" if each else "are one step" for each in takes_time)
-        expected = f"traffic as that of the tests, in which they {was}"
-        raise CampaignError(OPTION, f"{name}, in which cut-ins {now}", expected, ELSEWHERE)
 
 
 def moved_design(tested: ShellDesign, new: ShellDesign, environment: str) -> ShellDesign:

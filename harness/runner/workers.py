@@ -18,7 +18,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
-import pyarrow as pa
 from scipy.special import bdtrc
 
 from harness.controllers.find import has_foreign_code
@@ -26,23 +25,14 @@ from harness.controllers.hosts import death_cause
 from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.loop.loop import EpisodeLoop
-from harness.processes import (
-    Began,
-    Child,
-    SharedFile,
-    WorkerDeath,
-    first_to_answer,
-    start_server,
-    tell,
-    usable_cpus,
-)
+from harness.processes import Began, Child, SharedFile, WorkerDeath, first_to_answer, start_server, tell, usable_cpus
 from harness.records.folder import Repeated, read_table
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.runner.again import repeat
 from harness.sampling import prepare
 from harness.sampling.baseline import BaselineResult, as_recorded, learned_in, run_baseline
-from harness.sampling.protocol import ShardRequest, Source
+from harness.sampling.protocol import ShardRequest
 from harness.worlds import build_world
 
 ATTEMPTS = 3
@@ -60,17 +50,23 @@ REPEATED = b"harness.repeated"
 
 @dataclass(frozen=True)
 class ShardResult:
-    """A finished shard: its tables, what the stop rule and estimates need of them, and causes of failures.
-
-    ``repeated`` is None where no test was run twice. One that ``is_new`` is not on disk.
-    """
+    """A finished shard: its tables, and what the stop rule and estimates need of them; a new one is not on disk."""
 
     request: ShardRequest
     tables: ShardTables
     block: Block
-    failures: Counter[str]
-    repeated: Repeated | None
     is_new: bool = True
+
+    @property
+    def failures(self) -> Counter[str]:
+        """Causes of failures."""
+        return Counter(self.tables.episodes.column("failure").drop_null().to_pylist())
+
+    @property
+    def repeated(self) -> Repeated | None:
+        """What tests have shown that were run twice: some of the first shard, or none."""
+        found = (self.tables.episodes.schema.metadata or {}).get(REPEATED)
+        return None if found is None else Repeated(**json.loads(found))
 
 
 Result = ShardResult | BaselineResult
@@ -103,8 +99,7 @@ def serve(connection: Connection, resolved: Resolved, baseline: Path) -> None:
 class ShardRunner:
     """Runs shards of one campaign in one world. It writes nothing: the process that runs the campaign does.
 
-    With a ``connection`` it runs tests one at a time, and says of each that it has begun: then the parent knows which
-    test has ended the process.
+    With a ``connection`` it runs tests one at a time, and says of each that it has begun: it may end the process.
     """
 
     def __init__(self, resolved: Resolved, baseline: Path, connection: Connection | None = None) -> None:
@@ -136,35 +131,15 @@ class ShardRunner:
             table = read_table(self._baseline)
             source.begin_after(as_recorded(table, source.scenario.max_steps), learned_in(table))
             self._loop = self._loop.beside()
-        return self._tests(request)
-
-    def _tests(self, request: ShardRequest) -> ShardResult:
-        campaign, shard = self._source.campaign, self._source.run(self._loop, request)
+        campaign, shard = source.campaign, source.run(self._loop, request)
         keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
         if request.index == 0 and campaign.av.model is None and campaign.av.traci is None:
-            tables = tables._replace(episodes=with_repeated(tables.episodes, repeat(self._loop, self._source, shard)))
-        return finished(self._source, request, tables)
-
-
-def finished(source: Source, request: ShardRequest, tables: ShardTables) -> ShardResult:
-    """What is to be known of a shard's tables."""
-    failures = Counter(tables.episodes.column("failure").drop_null().to_pylist())
-    return ShardResult(request, tables, source.block(tables), failures, repeated_of(tables.episodes))
-
-
-def with_repeated(episodes: pa.Table, repeated: Repeated) -> pa.Table:
-    """The table of the first shard, with what repeating has shown."""
-    return episodes.replace_schema_metadata(
-        {**(episodes.schema.metadata or {}), REPEATED: json.dumps(asdict(repeated))}
-    )
-
-
-def repeated_of(episodes: pa.Table) -> Repeated | None:
-    """What an episodes table says of tests that were run twice; None of all but the first shard's."""
-    found = (episodes.schema.metadata or {}).get(REPEATED)
-    return None if found is None else Repeated(**json.loads(found))
+            shown = {REPEATED: json.dumps(asdict(repeat(self._loop, source, shard)))}
+            told = {**(tables.episodes.schema.metadata or {}), **shown}
+            tables = tables._replace(episodes=tables.episodes.replace_schema_metadata(told))
+        return ShardResult(request, tables, source.block(tables))
 
 
 class WorkerLostError(HarnessError):
@@ -202,11 +177,6 @@ class _Job:
     alone: bool = False
     suspected: int | None = None
     fatal: dict[int, str] = field(default_factory=dict)
-
-    @property
-    def work(self) -> tuple[ShardRequest, dict[int, str], bool]:
-        """What a worker is given."""
-        return self.request, self.fatal, self.alone
 
 
 class Workers:
@@ -279,7 +249,7 @@ class Workers:
             worker = self._idle.pop() if self._idle else self.new_worker()
             if worker is None:
                 return
-            if worker.give(*waiting[0].work):
+            if worker.give(waiting[0].request, waiting[0].fatal, waiting[0].alone):
                 self._busy[worker] = waiting.popleft()
             else:
                 worker.kill()  # it died while it was idle

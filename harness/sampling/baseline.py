@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,35 +24,32 @@ from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
 from harness.pool.learned import Following, Learned, learn
 from harness.pool.vehicle_pool import BaselinePaths
-from harness.records.folder import parquet, read_table
+from harness.records.folder import PILOT, SHADOW, Part, read_kept
 from harness.records.schemas import baseline_table, padded, pilot_table
 from harness.resolved import Resolved
 from harness.sampling.protocol import ShardRequest, Source
 from harness.vocabulary import FAILED
 
-SHADOW = "shadow"
-"""Folder of the baseline runs within a run folder; it keeps its first name."""
 SHARD_RUNS = 50
-"""Baseline runs of one file and one task: half a second of a slow controller."""
-PILOT = "pilot"
-"""Folder of the pilot tests."""
-BASELINE_RUNS, PILOT_TESTS = "baseline runs", "pilot tests"
-IN_MANIFEST = {BASELINE_RUNS: ("shadow_runs", "baseline_crc32"), PILOT_TESTS: ("pilot_tests", "pilot_crc32")}
-"""Keys of their numbers, and of their checksums."""
+"""Baseline runs of one task: half a second of a slow controller."""
+IN_WORDS = {SHADOW: "baseline runs", PILOT: "pilot tests"}
+"""Of each table."""
 LEARNED = b"harness.learned"
 """Key in the metadata of the baseline runs as workers get them."""
 ALL_MOTION = RecordPolicy("all", 0.0)
-_MEND = "Delete this file and run again with --resume: the same baseline runs are made anew."
 
 
 @dataclass(frozen=True)
 class BaselineResult:
-    """A finished range: its table, as a file where it is not on disk yet, and the causes of failures."""
+    """A finished range: its table."""
 
     request: ShardRequest
     table: pa.Table
-    parquet: bytes
-    failures: Counter[str]
+
+    @property
+    def failures(self) -> Counter[str]:
+        """Causes of failures."""
+        return Counter(self.table.column("failure").drop_null().to_pylist())
 
 
 def baseline_requests(n: int) -> Iterator[ShardRequest]:
@@ -69,35 +65,29 @@ def pilot_requests(prescribed: Traffic) -> Iterator[ShardRequest]:
         yield ShardRequest(index, first, len(of_rows), baseline=True, prescribed=of_rows)
 
 
-def baseline_file(folder: Path, request: ShardRequest) -> Path:
-    """Where a range of baseline runs, or of pilot tests, is kept."""
-    return folder / (PILOT if request.prescribed else SHADOW) / f"shard-{request.index:06d}.parquet"
-
-
 def run_baseline(loop: EpisodeLoop, paths: BaselinePaths, resolved: Resolved, request: ShardRequest) -> BaselineResult:
     """Drive the loop's vehicle along a range of paths, or in pilot tests."""
     if request.prescribed is not None:
-        table = pilot_table(loop.beside(keep=ALL_MOTION).run(request.first_episode, request.prescribed))
-        return BaselineResult(request, table, parquet(table), _causes(table))
+        return BaselineResult(
+            request, pilot_table(loop.beside(keep=ALL_MOTION).run(request.first_episode, request.prescribed))
+        )
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     some = Paths(paths.index[rows], paths.start[rows])
     shard = without_event(loop, resolved, paths.seed, some, request.first_episode)
-    table = baseline_table(shard, some.number, paths.weight[rows])
-    return BaselineResult(request, table, parquet(table), _causes(table))
+    return BaselineResult(request, baseline_table(shard, some.number, paths.weight[rows]))
 
 
-def stored_baseline(
-    folder: Path, paths: BaselinePaths, listed: Sequence[int], request: ShardRequest
-) -> BaselineResult | None:
-    """A range that an earlier run has finished, or None; a `RunFolderError` if it is damaged, or of other paths.
+def stored_table(folder: Path, before: Mapping[str, Part], name: str) -> pa.Table | None:
+    """What an earlier run has made of a table, as the manifest lists it ``before`` tests; None of one that is gone."""
+    there = name in before and (folder / before[name].files[name].path).exists()
+    return read_kept(folder, before[name], name) if there else None
 
-    ``listed`` are checksums of the files, as far as the manifest lists them.
-    """
-    file = baseline_file(folder, request)
-    if not file.exists():
+
+def stored_baseline(stored: pa.Table | None, paths: BaselinePaths, request: ShardRequest) -> BaselineResult | None:
+    """A range that is ``stored``, or None; a `RunFolderError` if that is of other paths."""
+    if stored is None or stored.num_rows < request.first_episode + request.n_episodes:
         return None
-    crc32 = listed[request.index] if request.index < len(listed) else None
-    table = read_table(file, crc32=crc32, mend=_MEND)
+    table = stored.slice(request.first_episode, request.n_episodes)
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     name, wanted = "path", paths.index[rows]
     if request.prescribed is not None:
@@ -105,12 +95,8 @@ def stored_baseline(
     if not np.array_equal(table.column(name).to_numpy(), wanted):
         expected = "those of this campaign and this version of the harness"
         mend = "Use a new folder, or the version that the run was begun with (manifest.json)."
-        raise RunFolderError(str(file), "baseline runs on other paths", expected, mend)
-    return BaselineResult(request, table, b"", _causes(table))
-
-
-def _causes(table: pa.Table) -> Counter[str]:
-    return Counter(table.column("failure").drop_null().to_pylist())
+        raise RunFolderError(PILOT if request.prescribed else SHADOW, "runs on other paths", expected, mend)
+    return BaselineResult(request, table)
 
 
 def begin(source: Source, drive: Callable[[str, Sequence[ShardRequest]], pa.Table]) -> tuple[pa.Table, Recorded]:
@@ -118,11 +104,11 @@ def begin(source: Source, drive: Callable[[str, Sequence[ShardRequest]], pa.Tabl
 
     Returns the baseline runs: as workers get them, with what was learned (`learned_in`), and as arrays.
     """
-    table, learned = drive(BASELINE_RUNS, list(baseline_requests(len(source.baseline_paths or ())))), None
+    table, learned = drive(SHADOW, list(baseline_requests(len(source.baseline_paths or ())))), None
     runs = as_recorded(table, source.scenario.max_steps)
     source.begin_after(runs)
     if (pilot := source.pilot()) is not None:
-        learned = learned_from(drive(PILOT_TESTS, list(pilot_requests(pilot))), runs)
+        learned = learned_from(drive(PILOT, list(pilot_requests(pilot))), runs)
         source.begin_after(runs, learned)
     return table.replace_schema_metadata({LEARNED: pickle.dumps(learned)}), runs
 
@@ -134,17 +120,15 @@ def learned_in(table: pa.Table) -> Learned | None:
 
 
 def read_stored(
-    folder: Path, paths: BaselinePaths, manifest: Mapping[str, Any], what: str, requests: Sequence[ShardRequest]
+    folder: Path, paths: BaselinePaths, before: Mapping[str, Part], name: str, requests: Sequence[ShardRequest]
 ) -> pa.Table:
     """All of a run folder's; a `RunFolderError` if some are missing or damaged."""
-    listed = manifest.get(IN_MANIFEST[what][1], ())
-    found = [stored_baseline(folder, paths, listed, request) for request in requests]
-    if any(done is None for done in found):
-        there = f"{what} of {sum(done is not None for done in found)} of {len(found)} files"
-        expected = "all of them: they say what is tested, and how probable each test is"
-        where = str(baseline_file(folder, requests[0]).parent)
-        raise RunFolderError(where, there, expected, "Let `harness run` go on with --resume.")
-    return pa.concat_tables(done.table for done in found if done is not None)
+    stored = stored_table(folder, before, name)
+    if stored is None or any(stored_baseline(stored, paths, request) is None for request in requests):
+        there = f"{0 if stored is None else stored.num_rows} {IN_WORDS[name]}"
+        expected = f"all {sum(each.n_episodes for each in requests)}: they say what is tested, and how probable it is"
+        raise RunFolderError(str(folder / name), there, expected, "Let `harness run` go on with --resume.")
+    return stored
 
 
 def learned_from(table: pa.Table, runs: Recorded) -> Learned | None:

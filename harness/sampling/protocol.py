@@ -26,6 +26,7 @@ from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import judge
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
+from harness.pool.kept import Pool
 from harness.pool.learned import Learned
 from harness.pool.shells import Draw
 from harness.pool.vehicle_pool import BaselinePaths
@@ -91,7 +92,7 @@ class KnownRounds(Rounds):
 class Source:
     """What the tests of a campaign are drawn from, built or read from the cache; tests are independent by default.
 
-    ``scenario`` is what they have in common, and ``design`` has the strata of those that have some. Along
+    ``scenario`` is what they have in common, and ``design`` has the strata of the ``pool`` for those of one. Along
     ``baseline_paths`` the vehicle has to be driven without an event before tests can be drawn; see `begin_after`.
     """
 
@@ -103,6 +104,7 @@ class Source:
     def __init__(self, resolved: Resolved, progress: Progress) -> None:  # noqa: ARG002 - most build something
         self.resolved, self.campaign = resolved, resolved.campaign
         self.scenario = resolved.scenario
+        self.pool: Pool | None = None
         self.design: ShellDesign | None = None
         self.baseline_paths: BaselinePaths | None = None
 

@@ -62,7 +62,7 @@ class Shells(Source):
             progress.remark = ""
 
     def _draw_from(self, pool: Pool) -> None:
-        self.prescribed = PrescribedEpisodes(self.resolved, pool)
+        self.pool, self.prescribed = pool, PrescribedEpisodes(self.resolved, pool)
         self.design = self.prescribed.design
 
     @classmethod

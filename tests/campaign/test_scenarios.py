@@ -72,7 +72,7 @@ def test_scenario_is_valid(file):
 # -- written out, and the editor's schema --
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     file=st.sampled_from(SCENARIOS),
     changes=st.lists(st.sampled_from(CHANGES), unique_by=lambda change: change.partition("=")[0], max_size=4),
@@ -109,7 +109,7 @@ def test_texts_that_other_readers_misread_are_quoted(load, text):
 # -- broken --
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(data=st.sampled_from(CONTENTS), draw=st.data())
 def test_a_wrong_type_is_an_error_that_names_it(load, data, draw):
     leaves = [*_leaves(data := copy.deepcopy(data))]
@@ -122,7 +122,7 @@ def test_a_wrong_type_is_an_error_that_names_it(load, data, draw):
     assert "mutated.yaml:" in str(caught.value)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(text=st.sampled_from(TEXTS), draw=st.data())
 def test_damaged_text_loads_or_is_a_clear_error(load, text, draw):
     start = draw.draw(st.integers(0, len(text)))

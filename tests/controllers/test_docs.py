@@ -17,6 +17,8 @@ from harness.cli import main
 from tests.pool.conftest import SMALL_POOL
 from tests.stored_runs import ROOT, answer_in
 
+pytestmark = pytest.mark.slow
+
 PAGE = (ROOT / "docs/controllers.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 CAMPAIGN = """\

@@ -20,10 +20,10 @@ SMALL = """\
 name: faults
 environment: {parameters: ndd-overtaking-1}
 testing: {method: forced}
-world: {engine: twin, cells: 40}
+world: {engine: twin, cells: 20}
 records: {moments: none}
-stop: {episodes: 400}
-run: {shard_size: 200, max_failed_share: 0.1}
+stop: {episodes: 160}
+run: {shard_size: 80, max_failed_share: 0.15}
 """
 SHORT = ", limits: {step_time_s: 0.2}"
 LATE = "no answer within 0.2 s (av.limits.step_time_s)"
@@ -67,6 +67,12 @@ def undisturbed(tmp_path_factory):
     return _episodes(folder)
 
 
+def quick(n, cases):
+    """The first n for every run of the tests, the others for .ci/full."""
+    rows = [each if isinstance(each, tuple) else (each,) for each in cases]
+    return [pytest.param(*row, marks=[pytest.mark.slow] * (k >= n)) for k, row in enumerate(rows)]
+
+
 MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
 IN_PROCESS = {
     **dict.fromkeys(("rounds_down", "flushes_to_zero", "traps_division"), f"step: {MODES}"),
@@ -101,9 +107,14 @@ OF_THE_PROCESS = {
 }
 
 
-@pytest.mark.parametrize("faults", [IN_PROCESS, OF_THE_PROCESS], ids=["in_process", "of_the_process"])
+FIRST = {fault: OF_THE_PROCESS[fault] for fault in ("is_killed", "hangs_for_good")}
+
+
+@pytest.mark.parametrize(
+    "faults", quick(2, [IN_PROCESS, FIRST, OF_THE_PROCESS]), ids=["in it", "a kill and a hang", "of it"]
+)
 def test_a_fault_ends_its_episode_and_changes_no_other(faults, tmp_path, undisturbed):
-    bad = {3 + 17 * i: fault for i, fault in enumerate(faults)}
+    bad = {3 + 7 * i: fault for i, fault in enumerate(faults)}
     assert _run(tmp_path, _misbehaving(bad, SHORT)) == EXIT_DONE
     for row, without in zip(_episodes(tmp_path), undisturbed, strict=True):
         if row["episode"] in bad:
@@ -121,6 +132,7 @@ def test_a_fault_ends_its_episode_and_changes_no_other(faults, tmp_path, undistu
     assert headline["details"]["crash_rate_if_failed_had_crashed"] > headline["crash_rate"]
 
 
+@pytest.mark.slow
 def test_a_copy_of_the_process_does_not_go_on(tmp_path, undisturbed):
     copied = {3: "copies_the_process", 20: "copies_the_process_for_good"}
     assert _run(tmp_path, _misbehaving(copied)) == EXIT_DONE
@@ -133,17 +145,17 @@ def test_a_copy_of_the_process_does_not_go_on(tmp_path, undisturbed):
 
 NO_FAULT = {
     "a worker killed from outside": (_misbehaving({57: "is_killed"}, once="NOTE"), 0),
-    "a function that says which controller it makes": (_of("idm_of_a_function"), None),
     "a function that is the vehicle": (_of("only_a_function", min_acceleration_mps2=-4.0), None),
+    "a default timeout of sockets, and a signal ignored": (_of("ChangesItsProcess"), None),
+    "a function that says which controller it makes": (_of("idm_of_a_function"), None),
     "a class with nothing but step": (_of("OnlyStep"), None),
     "one with nothing but step_batch": (_of("OnlyStepBatch"), None),
-    "a default timeout of sockets, and a signal ignored": (_of("ChangesItsProcess"), None),
-    "close raises": (_of("RaisesInClose", note="NOTE"), 40),
+    "close raises": (_of("RaisesInClose", note="NOTE"), 20),
     "close ends the process": (_of("Always", where="close"), None),
 }
 
 
-@pytest.mark.parametrize(("av", "noted"), NO_FAULT.values(), ids=NO_FAULT)
+@pytest.mark.parametrize(("av", "noted"), quick(3, NO_FAULT.values()), ids=NO_FAULT)
 def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undisturbed):
     note = tmp_path / "note"
     assert _run(tmp_path, av.replace("NOTE", str(note))) == EXIT_DONE
@@ -151,11 +163,12 @@ def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undist
     assert noted is None or note.read_text().count("closed") >= noted
 
 
-@pytest.mark.parametrize(("episodes", "n", "share"), [(400, 200, 0.005), (40, 40, 0.04)])
+@pytest.mark.parametrize(("episodes", "n", "share"), quick(1, [(400, 200, 0.005), (40, 40, 0.04)]))
 def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
     """They end a campaign halfway; one with fewer tests than that takes has no answer either."""
     av = _misbehaving({5: "raises", 6: "raises"})
-    assert _run(tmp_path, av, f"stop.episodes={episodes}", f"run.max_failed_share={share}") == EXIT_TOO_MANY_FAILED
+    sizes = f"stop.episodes={episodes}", "run.shard_size=200", f"run.max_failed_share={share}"
+    assert _run(tmp_path, av, *sizes) == EXIT_TOO_MANY_FAILED
     err = capsys.readouterr().err
     assert "run.max_failed_share" in err
     assert f"2 of {n} episodes failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
@@ -203,7 +216,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
     assert not Path("called").exists()
 
 
-@pytest.mark.parametrize("at", ["constructor", "step"])
+@pytest.mark.parametrize("at", quick(1, ["constructor", "step"]))
 @pytest.mark.parametrize(
     "what",
     [
@@ -233,31 +246,37 @@ def test_what_is_loaded_is_loaded_once_a_process_and_shared_and_nothing_else_is(
     host.close()
 
 
+@pytest.mark.slow
 def test_a_constructor_has_a_time_limit_of_its_own_in_tests_too(tmp_path):
     """The first of a process, that says whether there is a controller at all, is made in time."""
-    av = _of("Always", SHORT_MADE, where="constructor", how="hangs", first=40)
-    assert _run(tmp_path, av, "stop.episodes=40") == EXIT_DONE
+    av = _of("Always", SHORT_MADE, where="constructor", how="hangs", first=20)
+    assert _run(tmp_path, av, "stop.episodes=20") == EXIT_DONE
     failed = [row["failure"] for row in _episodes(tmp_path) if row["outcome"] == "failed"]
     assert set(map(without_place, failed)) == {f"start: StepTimeoutError: {LATE_MADE}"}
 
 
 @pytest.mark.parametrize(
     ("wrong", "words"),
-    [
-        ({"wrong_shape": True}, "an array of shape ("),
-        ({"wrong_type": "complex"}, "an array of complex128, expected accelerations in m/s2 as numbers"),
-        ({"wrong_type": "<U3"}, "an array of <U3, expected accelerations in m/s2 as numbers"),
-    ],
+    quick(
+        1,
+        [
+            ({"wrong_shape": True}, "an array of shape ("),
+            ({"wrong_type": "complex"}, "an array of complex128, expected accelerations in m/s2 as numbers"),
+            ({"wrong_type": "<U3"}, "an array of <U3, expected accelerations in m/s2 as numbers"),
+        ],
+    ),
 )
 def test_a_batch_controllers_fault_is_laid_at_one_cell_or_else_fails_all_that_were_asked(wrong, words, tmp_path):
-    assert _run(tmp_path, _of("Batch", nan=357, **wrong), "run.max_failed_share=0.5") == EXIT_DONE
+    assert _run(tmp_path, _of("Batch", nan=137, **wrong), "run.max_failed_share=0.5") == EXIT_DONE
     failed = {row["episode"]: row["failure"] for row in _episodes(tmp_path) if row["outcome"] == "failed"}
-    assert failed.pop(357) == "step_batch: returned nan, expected a finite acceleration in m/s2"
+    assert failed.pop(137) == "step_batch: returned nan, expected a finite acceleration in m/s2"
     assert failed
     assert all(f"step_batch: returned {words}" in cause for cause in failed.values())
 
 
-@pytest.mark.parametrize(("where", "how"), [("step", "ends_the_process"), ("step_batch", "closes_descriptors")])
+@pytest.mark.parametrize(
+    ("where", "how"), quick(1, [("step", "ends_the_process"), ("step_batch", "closes_descriptors")])
+)
 def test_one_that_always_ends_its_process_is_named_after_a_few_workers(how, where, tmp_path, capsys, monkeypatch):
     started, start = [], LocalWorkers.new_worker
     monkeypatch.setattr(LocalWorkers, "new_worker", lambda self: (started.append(self), start(self))[1])
@@ -268,15 +287,15 @@ def test_one_that_always_ends_its_process_is_named_after_a_few_workers(how, wher
     assert "run.max_failed_share" in err
 
 
-@pytest.mark.parametrize("command", ["run", "check", "av-check --episodes 4"])
+@pytest.mark.parametrize("command", quick(1, ["run", "check", "av-check --episodes 4"]))
 def test_what_a_controller_starts_does_not_outlive_the_command(command, tmp_path):
     assert _main(command, tmp_path, _of("StartsPrograms", note=f"{tmp_path}/started")) == EXIT_DONE
     started = (tmp_path / "started").read_text().split()
-    assert len(started) >= (80 if command == "run" else 2)
+    assert len(started) >= (40 if command == "run" else 2)
     assert orphans(list(map(int, started)), 5.0) == []
 
 
-@pytest.mark.parametrize("command", ["run --json", "check --json", "av-check --json --episodes 4"])
+@pytest.mark.parametrize("command", quick(1, ["run --json", "check --json", "av-check --json --episodes 4"]))
 def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd):
     assert _main(command, tmp_path, _of("Prints")) == EXIT_DONE
     printed = capfd.readouterr()
@@ -290,6 +309,7 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
         assert "started, below Python" in printed.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["run", "av-check --episodes 20"])
 def test_of_much_that_is_printed_the_first_and_the_last_are_passed_on(command, tmp_path, capfd):
     assert _main(command, tmp_path, _of("PrintsMuch"), "stop.episodes=100") == EXIT_DONE

@@ -49,7 +49,7 @@ def test_one_that_sees_bv_come_over_is_the_built_in_model_and_one_that_waits_for
     """To the last bit; the sibling is the built-in model that is blind until then."""
     yields = "controller: 'examples.sees_lateral:Yields'"
     avs = "model: idm", yields, f"{yields}, parameters: {{perceives_m: 2.0}}", "reaction: {perceives_lateral_m: 2.0}"
-    built_in, sees, waits, blind = (motion(LATERAL, f"av={{{av}}}", n=400) for av in avs)
+    built_in, sees, waits, blind = (motion(LATERAL, f"av={{{av}}}", n=200) for av in avs)
     assert built_in == sees
     assert built_in != waits
     assert waits == blind
@@ -78,13 +78,13 @@ class ACCScript(TraciStyleController):
 def test_one_that_sees_nobody_keeps_its_speed_until_bv_is_on_its_lane_however_it_is_written(form):
     """It crashed three times as often as one that waits: it had sped up for 2 s. With ``onset`` it still does."""
     av = f"controller: 'tests.controllers.test_forms:{form}'"
-    held, waits = (drive(LATERAL, f"av={{{one}}}", n=400) for one in (av, "reaction: {perceives_lateral_m: 2.0}"))
-    assert [held.traces[row].tobytes() for row in range(400)] == [waits.traces[row].tobytes() for row in range(400)]
+    held, waits = (drive(LATERAL, f"av={{{one}}}", n=200) for one in (av, "reaction: {perceives_lateral_m: 2.0}"))
+    assert [held.traces[row].tobytes() for row in range(200)] == [waits.traces[row].tobytes() for row in range(200)]
     episode, early = held.episode, waits.episode["asked_to_speed_up"]
     assert episode["asked_to_speed_up"].mean() > 0.9
     assert not early.any()
     assert np.all(episode["took_over_step"] == episode["event_step"] + 1)
-    at_once = drive(LATERAL, f"av={{{av}, takes_over: onset}}", n=400).episode
+    at_once = drive(LATERAL, f"av={{{av}, takes_over: onset}}", n=200).episode
     assert (at_once["outcome"] == CRASH).sum() > 1.2 * (episode["outcome"] == CRASH).sum()
 
 
@@ -105,11 +105,11 @@ class Eager(IDM):
 def test_a_built_in_model_is_held_by_the_same_rule(takes_over):
     own = f"controller: 'tests.controllers.test_forms:Eager', takes_over: {takes_over}"
     built_in = f"reaction: {{perceives_lateral_m: 0.0}}, {EAGER}, takes_over: {takes_over}"
-    ours, theirs = (drive(LATERAL, f"av={{{av}}}", n=400) for av in (own, built_in))
+    ours, theirs = (drive(LATERAL, f"av={{{av}}}", n=200) for av in (own, built_in))
     assert ours.episode.tobytes() == theirs.episode.tobytes()
     asked = ours.episode["asked_to_speed_up"]
     assert (asked.sum() > 20) == (takes_over == "first_braking")
-    assert any((ours.traces[row][:-1, 2, 2] > 0.0).any() for row in range(400))
+    assert any((ours.traces[row][:-1, 2, 2] > 0.0).any() for row in range(200))
 
 
 # -- one that acts from the start meets the methods that do not need to know the AV's speed --

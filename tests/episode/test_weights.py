@@ -91,7 +91,7 @@ def test_martingale_sums_have_mean_zero(method):
 
 
 def test_without_control_the_weight_is_exactly_one():
-    assert (run("nde", level=1e6, n=100_000).log_weight == 0.0).all()
+    assert (plain().log_weight == 0.0).all()
     published = run("step_mixture", "immediate", n=4_000, moments="all", surrogates="two")
     uncritical = published.episode["n_control_steps"] == 0
     assert uncritical.sum() > 20
@@ -106,24 +106,21 @@ def test_without_control_the_weight_is_exactly_one():
 
 
 RAISED = 1e6
-OTHER_AVS = [
-    (method, {"n": 20_000, "av": av}) for av in ("never_brakes", "SM-II") for method in ("forced", "episode_mixture")
-]
+HARDLY_BRAKES = [(method, {"n": 20_000, "av": "SM-II"}) for method in ("forced", "episode_mixture")]
 EVERY_STEP = {"n": 10_000, "hold_s": 0.1, "surrogates": "SM-I"}  # the paper's sentence taken literally
 PUBLISHED = {"challenge": "immediate", "n": 100_000, "surrogates": "brakes with 2 g"}
 RAISED_RUNS = [
     ("forced", {"n": 40_000}),
     ("step_mixture", {"n": 20_000}),
     ("episode_mixture", {"n": 20_000}),
-    *OTHER_AVS,
-    *(
-        (method, EVERY_STEP) for method in ("forced", "step_mixture", "episode_mixture")
-    ),  # the paper's sentence taken literally
+    *((method, {"n": 20_000, "av": "never_brakes"}) for method in ("forced", "episode_mixture")),
+    *(pytest.param(*each, marks=pytest.mark.slow) for each in HARDLY_BRAKES),
+    *((method, EVERY_STEP) for method in ("forced", "step_mixture", "episode_mixture")),
     ("step_mixture", PUBLISHED),  # ε = 0.1, with a surrogate that is critical for a step or two
 ]
 
 
-def plain(n=100_000, **settings):
+def plain(n=50_000, **settings):
     """Simulation without control of the same vehicle."""
     done = run("nde", level=RAISED, n=n, **settings)
     assert done.crash.sum() >= n / 50
@@ -131,9 +128,9 @@ def plain(n=100_000, **settings):
 
 
 def test_methods_agree_at_the_default_level():
-    found = [run("forced", n=100_000), run("step_mixture", n=30_000), run("episode_mixture", n=30_000)]
+    found = [run("forced", n=50_000), run("step_mixture", n=30_000), run("episode_mixture", n=30_000)]
     for i, one in enumerate(found):
-        assert one.crash.sum() > 5_000
+        assert one.crash.sum() > 4_000
         for other in found[:i]:
             assert one.rate.errors_from(other.rate) < 4.0
     assert all(done.rate.std_error < 0.06 * done.rate.value for done in found)
@@ -143,7 +140,7 @@ def test_methods_agree_at_the_default_level():
 def test_methods_agree_with_plain_simulation(method, settings):
     done = run(method, level=RAISED, **settings)
     every_step = "hold_s" in settings
-    same = plain(50_000, hold_s=0.1) if every_step else plain(**({"av": settings["av"]} if "av" in settings else {}))
+    same = plain(25_000, hold_s=0.1) if every_step else plain(**({"av": settings["av"]} if "av" in settings else {}))
     assert done.rate.errors_from(same.rate) < 4.0
     assert done.rate.std_error < (0.05 if every_step else 0.03) * done.rate.value
     if "av" in settings:

@@ -98,7 +98,7 @@ DESIGN = replace(
 )
 LEVEL = Level.two_sided(0.9)
 BUDGET = 3_000
-REPLICATIONS = 500
+REPLICATIONS = 250
 
 
 def rule(limit: float, held: int = 0) -> RoundRule:
@@ -137,6 +137,7 @@ def test_either_verdict_is_wrong_in_at_most_one_of_twenty():
     assert all(binomtest(n, REPLICATIONS, 0.05, alternative="greater").pvalue > 1e-4 for n in wrong())
 
 
+@pytest.mark.slow
 def test_the_intervals_own_limits_after_each_round_are_wrong_far_more_often(monkeypatch):
     monkeypatch.setattr(RoundRule, "level_at", staticmethod(lambda *_: LEVEL))
     assert all(binomtest(n, REPLICATIONS, 0.05, alternative="greater").pvalue < 1e-9 for n in wrong())

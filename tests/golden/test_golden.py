@@ -22,7 +22,9 @@ def test_a_run_gives_the_same_bits(name, stored_run):
     assert record.unlike(record.seen_in(stored_run(name)), GOLDEN["runs"][name], digits=DIGITS) == []
 
 
-@pytest.mark.parametrize("name", CONTINUED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(each, marks=[pytest.mark.slow] * (each == "shells-acting-twin")) for each in CONTINUED]
+)
 def test_a_run_that_is_continued_ends_the_same(name, tmp_path):
     run_here(golden(name, BEGUN), tmp_path / "run")
     run_here(golden(name), tmp_path / "run", resume=True)

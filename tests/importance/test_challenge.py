@@ -165,10 +165,10 @@ def test_predicted_crash_rates(j, av, low, high):
     Measured: 1.03, 1.21 and 1.9 times the rate. Where crashes are rare (far cut-ins, tails of U) each interpolation of
     the induction smears probability outwards, so tables predict too much, never too little: it costs efficiency alone.
     """
-    sampled = run("episode_mixture", av=av, n=10_000, moments="first_9")
+    sampled = run("episode_mixture", av=av, n=5_000, moments="first_9")
     start = sampled.moment["step"] == 0
     predicted = np.zeros(len(sampled.episode))
     predicted[sampled.moment["row"][start]] = sampled.moment_v[start, j]
-    prediction, rate = Mean.of(predicted), run("forced", av=av, n=60_000).rate
+    prediction, rate = Mean.of(predicted), run("forced", av=av, n=20_000).rate
     margin = 4.0 * np.hypot(prediction.std_error, high * rate.std_error)
     assert low * rate.value - margin < prediction.value < high * rate.value + margin

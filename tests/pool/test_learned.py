@@ -13,6 +13,8 @@ from harness.strata import LEARNED, OUTSIDE
 from harness.vocabulary import CRASH
 from tests.pool.test_vehicle_pool import acting, prepared_after
 
+pytestmark = pytest.mark.slow
+
 AS_NEEDED = "av.controller=examples.acting:CarefulAsNeeded"
 
 

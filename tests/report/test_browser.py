@@ -20,7 +20,10 @@ OPTIONS = (
 )
 LENGTH_M, WIDTH_M, STEP_S = 5.0, 1.9, 0.1
 api = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="there is no Chromium or Chrome on this machine")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROWSER is None, reason="there is no Chromium or Chrome on this machine"),
+]
 
 
 @pytest.fixture(scope="module")

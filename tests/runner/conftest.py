@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.pool import moved
 from harness.runner.run import RunResult, run_campaign
 from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL
@@ -50,3 +52,11 @@ def twin_run(campaign, run_here, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("twin") / "run"
     run_here(campaign(*TWIN), out)
     return out
+
+
+@pytest.fixture
+def few_paths(monkeypatch) -> None:
+    """Paths of other traffic enough for tests, kept where no other test finds them."""
+    kept: dict[str, bytes] = {}
+    monkeypatch.setattr(moved, "N_PATHS", 512)
+    monkeypatch.setattr(moved, "cache", SimpleNamespace(read=kept.get, keep=kept.__setitem__))

@@ -16,6 +16,7 @@ from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import CampaignError
 from harness.records.folder import read_manifest
+from harness.report.av_check import cause, rows, verdict
 from harness.runner.look import check_av
 from harness.runner.stored import replay_episode, suspects
 from tests.pool.test_vehicle_pool import ACTING
@@ -153,22 +154,22 @@ def test_the_built_in_idm_is_fine():
 
 
 @pytest.mark.parametrize(
-    ("name", "cause"),
+    ("name", "why"),
     [
         ("Steady", ""),
         ("Noisy", ""),
         ("tests.controllers.misbehaving:Global", "random numbers of its own"),
-        ("Remembering", "it remembers the last one"),
-        ("Sharing", "they share something"),
-        ("LooksAtTheClock", ""),
+        pytest.param("Remembering", "it remembers the last one", marks=pytest.mark.slow),
+        pytest.param("Sharing", "they share something", marks=pytest.mark.slow),
+        pytest.param("LooksAtTheClock", "", marks=pytest.mark.slow),
         ("KeepsItsAnswer", "It depends on the clock (time.monotonic, test_av_check.py:"),
-        ("ReadsTheTimeOfDay", "It depends on the clock (time.time, test_av_check.py:"),
-        ("OfItsProcess", "It differs from process to process: "),
+        pytest.param("ReadsTheTimeOfDay", "on the clock (time.time, test_av_check.py:", marks=pytest.mark.slow),
+        pytest.param("OfItsProcess", "It differs from process to process: ", marks=pytest.mark.slow),
     ],
 )
-def test_a_controller_that_is_not_reproduced_is_found_out(name, cause):
-    found, differs = check(name), bool(cause)
-    assert cause in found.likely_cause
+def test_a_controller_that_is_not_reproduced_is_found_out(name, why):
+    found, differs = check(name), bool(why)
+    assert why in cause(found)
     assert (found.exit_code, bool(found.differing), bool(found.failures)) == (3 if differs else 0, differs, False)
     if name == "Steady":
         did = found.behaviour
@@ -188,29 +189,24 @@ def test_a_controller_that_is_not_reproduced_is_found_out(name, cause):
 def test_what_winds_up_in_a_longer_warm_up_is_seen(overrides, moves):
     found = check("WindsUp", *overrides)
     assert found.exit_code == 0
-    assert ("LOOK AGAIN" in found.verdict and "winds up" in found.verdict) == bool(moves)
+    assert ("LOOK AGAIN" in verdict(found) and "winds up" in verdict(found)) == bool(moves)
     assert set(found.moved_mps2) == (set() if moves is None else {0.0, 20.0})
     assert all(moved < 0.5 for seconds, moved in found.moved_mps2.items() if not moves or seconds == 0.0)
 
 
 @pytest.mark.parametrize(
-    ("name", "n"), [("Slow", 80), ("LoadsOnce", 80), ("tests.controllers.misbehaving:OnlyStepBatch", 1)]
+    ("name", "n"), [("Slow", 8), ("LoadsOnce", 8), ("tests.controllers.misbehaving:OnlyStepBatch", 1)]
 )
 def test_a_slow_constructor_is_measured_and_counted(name, n):
-    found = check(name, "world.cells=80")
+    found = check(name, "world.cells=8")
     assert found.speed.constructions == n
-    assert (found.speed.construction_s > 0.1, "calls it 80 times" in found.verdict) == (name == "Slow",) * 2
+    assert (found.speed.construction_s > 0.1, "calls it 8 times" in verdict(found)) == (name == "Slow",) * 2
 
 
 def test_failures_that_differ_in_digits_are_one_and_name_line_and_what_was_meant():
     fast, misspelt = sorted(check("Misspelt").failures, reverse=True)
     assert re.fullmatch(r"step, warming up: ValueError: too fast: \d\d\.\d+ \(test_av_check\.py:\d+\)", fast)
     assert re.search(r"no attribute 'gap'. Did you mean 'gap_m'\? \(test_av_check\.py:\d+\)$", misspelt)
-
-
-def test_a_controller_that_acts_early_is_checked_without_forcing():
-    found = check("Steady", "av.before_event=controller", "testing.method=nde")
-    assert (found.method, found.exit_code) == ("step_mixture", 0)
 
 
 def test_the_command_line(capfd):
@@ -241,7 +237,11 @@ def test_the_command_line(capfd):
     ("av", "code"),
     [
         ("{sumo: {carFollowModel: EIDM}}", 0),
-        (f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}", 0),
+        pytest.param(
+            f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}",
+            0,
+            marks=pytest.mark.slow,
+        ),
         ("{traci: {command: 'false', connect_time_s: 5, restarts: 0}}", 3),
     ],
     ids=["SUMO's EIDM", "a program", "a program that dies"],
@@ -310,9 +310,10 @@ def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
 LEAD = "environment.cut_in_lead_s=0.5"
 
 
+@pytest.mark.slow
 def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_at_one_that_acts_before_in_one_step(campaign):
     with_lead, without = (check_av(campaign("world.engine=twin", *lead), 48) for lead in ((LEAD,), ()))
     assert (with_lead.exit_code, with_lead.take_time, without.take_time) == (0, True, False)
     assert with_lead.behaviour.n_crashes <= without.behaviour.n_crashes
     early = check_av(campaign(LEAD, "testing.method=forced", f"av={ACTING.format('Speeds')}"), 4)
-    assert (early.exit_code, early.rows[0]["found"]) == (0, "controller, twin, step_mixture, cut-ins of one step")
+    assert (early.exit_code, rows(early)[0]["found"]) == (0, "controller, twin, step_mixture, cut-ins of one step")

@@ -10,7 +10,7 @@ import pytest
 
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
-from harness.records.reader import read_parts
+from harness.records.reader import read
 from harness.report.pair_words import pair_words
 from harness.runner.compare import compare_campaigns
 from harness.runner.workers import ShardRunner, Workers
@@ -58,9 +58,8 @@ def driven(monkeypatch):
 def by_stratum(folder):
     """Cut-in, initial range and outcome of each test, in order, by stratum."""
     found = defaultdict(list)
-    for episodes in read_parts(folder, ["component", "pool_row", "r2_m", "outcome"]):
-        for row in episodes.to_pylist():
-            found[row["component"]].append((row["pool_row"], row["r2_m"], row["outcome"]))
+    for row in read(folder).table("episodes", ["component", "pool_row", "r2_m", "outcome"]).to_pylist():
+        found[row["component"]].append((row["pool_row"], row["r2_m"], row["outcome"]))
     return found
 
 
@@ -168,17 +167,6 @@ def test_what_cannot_be_compared_is_refused(campaign, tmp_path, shared, other, s
 def test_one_end_is_asked_for(campaigns, tmp_path):
     with pytest.raises(CampaignError, match=r"--margin: found stop\.rhw=0\.1 beside it"):
         compare_campaigns(*campaigns, tmp_path / "out", margin=0.1, rhw=0.1)
-
-
-def test_a_run_that_nobody_limited_is_to_be_run_again(done, campaign, tmp_path):
-    """Which the folder of the comparison does not hinder: the run is not copied."""
-    early = "av={controller: 'tests.controllers.early:Speeds'}"
-    sides, stored = [campaign(*SHELLS, early), campaign(*SHELLS)], done.folder / "a"
-    with pytest.raises(CampaignError, match="so that it is run again"):
-        compare_campaigns(*sides, tmp_path / "out", stored=stored)
-    with pytest.raises(CampaignError, match=r"--against av\.limits\.max_acceleration_mps2=2, which limits B"):
-        compare_campaigns(*reversed(sides), tmp_path / "out", stored=stored)
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):

@@ -9,7 +9,7 @@ import pytest
 
 from harness.cli import main
 from harness.errors import RunFolderError
-from harness.records.folder import read_manifest, require_place, sole_use
+from harness.records.folder import read_manifest, sole_use
 from harness.resolved import resolve
 from harness.runner.kept import require_own_folder
 from tests.golden.campaigns import BASE, RUNS
@@ -83,16 +83,6 @@ def test_a_folder_that_cannot_be_made(place, tmp_path, complaint_of, monkeypatch
     for command in (RUN, compare):
         assert "found: a place where nothing can be written" in (said := complaint_of(*command, place))
         assert f"error: {place}" in said
-
-
-def test_a_place_is_tried_without_leaving_anything(tmp_path):
-    require_place(tmp_path / "a" / "b")
-    assert list(tmp_path.iterdir()) == []
-    (tmp_path / "there").mkdir()
-    for place in (tmp_path / "a" / "b", tmp_path / "there"):
-        with pytest.raises(ZeroDivisionError), sole_use(place):
-            _ = 1 / 0
-    assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
 def test_two_processes_do_not_run_into_one_folder(stored, complaint_of, whole):

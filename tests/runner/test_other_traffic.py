@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.cli import main
 from harness.errors import CampaignError
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.pool.moved import OnPaths
 from harness.progress import Progress
 from harness.runner import stored_shells
 from harness.runner.other_traffic import estimate_in_other_traffic
-from harness.runner.stored_shells import StoredShells
+from harness.runner.stored_shells import Elsewhere, StoredShells
 from tests.stored_runs import answer as words
-from tests.stored_runs import copy_of, estimates, golden
+from tests.stored_runs import estimates, golden
 
 SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
 
@@ -55,17 +54,6 @@ def test_the_rate_is_proportional_to_the_share_that_does_not_look(stored_run, tm
     assert "as there" in words(estimate_in_other_traffic(folder, mine), golden("shells-twin"))["scope"]
 
 
-def test_the_page_of_the_old_traffic_is_not_named_below_the_answer(stored_run, tmp_path, capsys):
-    folder = str(copy_of(stored_run("shells-twin"), tmp_path / "run"))
-    Path(folder, "report.html").touch()
-    assert main(["estimate", folder]) == 0
-    assert f"  report  {folder}/report.html\n" in capsys.readouterr().out
-    assert main(["estimate", folder, "--environment", "ndd-overtaking-1"]) == 0
-    told = capsys.readouterr().out
-    assert "crash rate" in told
-    assert "report.html" not in told
-
-
 def test_cut_ins_that_no_test_stands_for_are_refused(stored_run, tmp_path):
     with pytest.raises(CampaignError, match="unlike any that was tested"):
         answer(stored_run("shells-twin"), environment(tmp_path, r2dot_min_mps=-16.0))
@@ -94,7 +82,7 @@ def test_a_reference_driver_told_too_low_is_as_far_off_as_one_told_too_high(stor
     n_drivers, nothing = len(tested.design.references), np.zeros_like(tested.design.p)
     found = [OnPaths(tested.design.p, np.full(n_drivers, rate), nothing, np.zeros(())) for rate in (1.0, times)]
     monkeypatch.setattr(stored_shells.FewPaths, "of", lambda *_: iter([found.pop(0)]))
-    (near,) = tested.itself.nearby([{}], Progress())
+    (near,) = Elsewhere(tested, tested.here, tested.design).nearby([{}], Progress())
     assert (near.rate, near.off) == (1.0, pytest.approx(1.0))
     assert near.references == pytest.approx(times)
 

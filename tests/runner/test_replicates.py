@@ -7,7 +7,6 @@ import math
 import re
 from dataclasses import asdict
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,34 +18,23 @@ from harness.estimators.traffic import ONE_LAW, uncertain
 from harness.pool import moved
 from harness.pool.moved import assumed
 from harness.progress import Progress
-from harness.report.pair_words import pair_warnings
-from harness.report.traffic_words import too_few
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
 from harness.runner.other_traffic import estimate_in_other_traffic
-from harness.runner.run import run_campaign
-from harness.runner.stored_shells import StoredShells
+from harness.runner.stored_shells import Elsewhere, StoredShells
 from tests.golden.campaigns import COMPARED
 from tests.in_process import one_process, without_page
-from tests.stored_runs import answer, answer_in, copy_of, estimates, golden
+from tests.stored_runs import answer, copy_of, estimates, golden
 from tests.traffic.tables import TEXT as SHIPPED
 from tests.traffic.tables import fitted
 
+pytestmark = pytest.mark.usefixtures("few_paths")
 LOOK = "cut_in__ignore_share"
 
 
 def told(content):
     return answer(content, golden("shells-twin"))
-
-
-@pytest.fixture(autouse=True)
-def few(monkeypatch):
-    """Paths enough for these tests, kept where no other test does; returns what is kept."""
-    kept: dict[str, bytes] = {}
-    monkeypatch.setattr(moved, "N_PATHS", 512)
-    monkeypatch.setattr(moved, "cache", SimpleNamespace(read=kept.get, keep=kept.__setitem__))
-    return kept
 
 
 def test_the_rate_moves_with_the_share_that_does_not_look_and_the_ratio_does_not(stored_run, tmp_path):
@@ -69,7 +57,7 @@ def test_of_a_vehicle_whose_shares_may_change_there_is_an_upper_limit_alone(stor
     """All cut-ins of the shells that it crashes in may crash."""
     folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.01, 0.02]})
     tested = StoredShells.of(folder, Progress())
-    (near,) = tested.itself.nearby([{LOOK: 0.02}], Progress())
+    (near,) = Elsewhere(tested, tested.here, tested.design).nearby([{LOOK: 0.02}], Progress())
     monkeypatch.setattr(stored_shells, "LEAST_SHARE", 1.1)
     content = estimate_in_other_traffic(folder, mine)
     estimate, traffic = content["estimates"]["shells"], content["traffic"]
@@ -113,6 +101,7 @@ def test_the_folder_keeps_the_answer_of_its_own_traffic_alone(stored_run, tmp_pa
     assert "with other numbers" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_ratio_of_two_vehicles_hardly_moves(tmp_path, capsys):
     shared, other = COMPARED
     with one_process(), without_page():
@@ -181,19 +170,6 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
     assert content["assumed"]["times"][1] == pytest.approx(high / stored["ci_high"], rel=0.03)
 
 
-def test_runs_that_cannot_tell_by_how_much_and_comparisons_warn(tmp_path):
-    """Without shells of the traffic, and of two vehicles, there is a warning."""
-    (tmp_path / "mine.yaml").write_text(without_changes())
-    shared, other = COMPARED
-    mine, seen = f"environment.parameters={tmp_path / 'mine.yaml'}", "no lane change was seen at TTC < 2 s"
-    pair = golden("shells-twin", *shared, mine), golden("shells-twin", *shared, mine, other)
-    with one_process(), without_page():
-        run_campaign(golden("forced-twin", mine), tmp_path / "forced")
-        compared = compare_campaigns(*pair, tmp_path / "pair", workers=1)
-    for warnings in (answer_in(tmp_path / "forced")["warnings"], pair_warnings(compared.content)):
-        assert [text[: len(seen)] for text in warnings if "lane change" in text and "level" not in text] == [seen]
-
-
 def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
     """The rate is in proportion to the share that does not look, in its range; without a crash its limit is."""
     text = SHIPPED.replace("{value: 0.01, source: assumed}", "{value: 0.01, source: assumed, range: [0.005, 0.08]}")
@@ -225,13 +201,6 @@ def test_replicates_that_are_none_are_refused(stored_run, tmp_path, columns, fou
         (tmp_path / "replicates.parquet").unlink()
     with pytest.raises(HarnessError, match=found):
         estimate_in_other_traffic(stored_run("shells-twin"), mine)
-
-
-@pytest.mark.parametrize(("n", "said"), [(19, "needs 20 at least"), (20, "20 replicates: "), (100, "")])
-def test_few_replicates_are_warned_of(n, said):
-    words = "".join(too_few(n, 0.9))
-    assert said in words
-    assert bool(words) == bool(said)
 
 
 def test_both_errors_add_as_squares_of_distances_on_a_logarithmic_scale():

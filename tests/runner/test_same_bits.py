@@ -49,11 +49,6 @@ def test_any_split_into_shards(name, size, stored_run, tmp_path):
     assert set(unlike_columns(stored_run(name), tmp_path / "run")) <= {"estimates.json"}
 
 
-def test_two_workers(stored_run, tmp_path):
-    run_with_workers(golden("shells-acting-twin", "world.cells=64"), tmp_path / "run", workers=2)
-    assert unlike_columns(stored_run("shells-acting-twin"), tmp_path / "run") == []
-
-
 class KillOneWorker(Progress):
     """Kills a worker process when the fourth shard is handed back."""
 
@@ -193,6 +188,7 @@ def test_a_busy_worker_does_not_outlive_a_killed_parent_nor_does_what_it_has_sta
         wait_until_gone(Path(f"/proc/{pid}/stat"))
 
 
+@pytest.mark.slow
 def test_workers_begin_where_the_process_was_killed_that_they_are_copies_of():
     for delay_s in (0.0, 0.3, 0.0):
         start_server()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,24 +12,13 @@ import pytest
 from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.families.cut_in.loading import load_parameters
-from harness.families.cut_in.parameters import SHIPPED_FOLDER
-from harness.pool import moved
 from harness.report.traffic_words import bar_note
 from harness.runner.sensitivity import Move, bar_of, moves, sensitivity
 from harness.runner.stored_shells import Nearby
 from tests.stored_runs import copy_of, edit, manifest
 from tests.traffic.tables import TEXT, fitted
 
-SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
-
-
-@pytest.fixture(autouse=True)
-def few(monkeypatch):
-    """Paths enough for these tests, kept where no other test does; returns what is kept."""
-    kept: dict[str, bytes] = {}
-    monkeypatch.setattr(moved, "N_PATHS", 512)
-    monkeypatch.setattr(moved, "cache", SimpleNamespace(read=kept.get, keep=kept.__setitem__))
-    return kept
+pytestmark = pytest.mark.usefixtures("few_paths")
 
 
 @pytest.fixture

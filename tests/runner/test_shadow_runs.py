@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import shutil
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -15,7 +13,7 @@ from harness.errors import RunFolderError, TooManyFailedError
 from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
-from harness.report.page import write_report
+from harness.sampling.baseline import run_baseline
 from harness.sampling.shells import Shells
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
@@ -23,13 +21,13 @@ from tests.runner.conftest import SHELLS
 from tests.stored_runs import (
     answer_in,
     copy_of,
-    edit,
     estimates,
     golden,
     manifest,
     part_files,
     stored_table,
     unlike_columns,
+    with_fewer_before,
 )
 
 SHADOWS, TWIN = "pool.shadow_paths=120", "world.engine=twin"
@@ -45,47 +43,55 @@ def files_of(folder):
 
 
 ACTS = "shells-acting-twin"
-"""Its shadow runs are in two files."""
+"""Sixty shadow runs, in two tasks."""
 
 
 def test_a_run_that_was_interrupted_goes_on_where_it_was(stored_run, tmp_path):
     """Ended in the middle of the shadow runs, and again among the tests: the end is that of a run in one go."""
     out = copy_of(stored_run(ACTS), tmp_path / "run")
-    tables = [pq.read_table(path) for path in files_of(out)]
-    assert [table.num_rows for table in tables] == [50, 10]
-    assert all(table.schema.equals(baseline_schema(CUT_IN.columns)) for table in tables)
-    for table in ("episodes", "traces"):
-        shutil.rmtree(out / table)
-    files_of(out)[1].unlink()
-    kept = files_of(out)[0].stat().st_mtime_ns
-    edit(out, n_episodes=0, parts=[], status="interrupted")
-    run_golden(golden(ACTS), out, resume=True)
+    [table] = [pq.read_table(path) for path in files_of(out)]
+    assert table.num_rows == 60
+    assert table.schema.equals(baseline_schema(CUT_IN.columns))
+    with_fewer_before(out, "shadow", 50)
+    files_of(out)[-1].unlink()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("harness.runner.workers.run_baseline", driven := Driven())
+        run_golden(golden(ACTS), out, resume=True)
+    assert driven.first == [50]
     assert unlike_columns(stored_run(ACTS), out) == []
-    assert files_of(out)[0].stat().st_mtime_ns == kept
+    assert len(files_of(out)) == 1
     part_files(out)[-1].unlink()
     run_golden(golden(ACTS), out, resume=True)
     assert unlike_columns(stored_run(ACTS), out) == []
 
 
+class Driven:
+    """Baseline runs as they are, noting which."""
+
+    def __init__(self):
+        self.first = []
+
+    def __call__(self, loop, paths, resolved, request):
+        self.first.append(request.first_episode)
+        return run_baseline(loop, paths, resolved, request)
+
+
 AS_NEEDED = "av.controller=examples.acting:CarefulAsNeeded"
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_is_stored(tmp_path):
     """Ended among the pilot tests and going on: the same bits."""
     campaign, out, other = golden(ACTS, AS_NEEDED), tmp_path / "run", tmp_path / "other"
     run_golden(campaign, out)
     assert "learned" in json.loads((out / "shells.json").read_text())["strata"]
     assert "pilot tests" in Shells.stored_design(out).learned
-    pilot = sorted((out / "pilot").glob("*.parquet"))
-    assert sum(pq.read_table(file).num_rows for file in pilot) == manifest(out)["pilot_tests"]["n_runs"] >= 300
+    [pilot] = (out / "pilot").glob("*.parquet")
+    assert pq.read_table(pilot).num_rows == manifest(out)["pilot_tests"]["n_runs"] >= 300
     learned = [row for row in stored_table(out, "episodes").to_pylist() if row["outcome"] == "crash"]
     assert replay(out, learned[-1]["episode"]).bit_equal
     assert estimate(out)["estimates"]["shells"]["crash_rate"] == estimates(out)["estimates"]["shells"]["crash_rate"]
-    copy_of(out, other)
-    for table in ("episodes", "traces"):
-        shutil.rmtree(other / table)
-    (other / "pilot" / pilot[-1].name).unlink()
-    edit(other, n_episodes=0, parts=[], status="interrupted")
+    with_fewer_before(copy_of(out, other), "pilot", 200)
     run_golden(campaign, other, resume=True)
     assert unlike_columns(out, other) == []
 
@@ -93,7 +99,9 @@ def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_
 NOISY = "parameters: {noise_mps2: 0.2}"
 
 
-@pytest.mark.parametrize("method", [SHELLS, FORCED], ids=["shells", "forced"])
+@pytest.mark.parametrize(
+    "method", [pytest.param(SHELLS, id="shells", marks=pytest.mark.slow), pytest.param(FORCED, id="forced")]
+)
 def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(method, campaign, run_here, tmp_path):
     asked = (*method, SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
@@ -106,6 +114,7 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
     assert replay(seeded, 123).bit_equal
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_acts_is_tested_in_the_default_traffic(campaign, run_here, tmp_path):
     """Cut-ins take time there, in baseline runs and in tests that follow from them."""
     traffic = "environment.parameters=ndd-overtaking-2", "stop.episodes=80", "pool.pilot_tests=0"
@@ -137,6 +146,7 @@ def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp
     assert any("no test in failed shadow runs" in note_words(warning) for warning in shells["warnings"])
 
 
+@pytest.mark.slow
 def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_path):
     """A vehicle that gives way, but on three paths of 120: the run ends, and says that it knows too little."""
     lonely = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('YieldsMostly')}", "stop.rhw=0.3", "stop.episodes=20000")
@@ -150,6 +160,7 @@ def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_
     assert shells["details"]["references"] == []
 
 
+@pytest.mark.slow
 def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(campaign, run_here, tmp_path):
     """The same paths, weights and ends, with and without a shadow run before each test."""
     plain = run_here(campaign(*FORCED, TWIN, "av={controller: 'tests.controllers.early:HoldsThenIdm'}"), tmp_path / "a")
@@ -177,26 +188,15 @@ def test_a_forced_test_fails_where_its_shadow_run_did(campaign, run_here, tmp_pa
 def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
     folder = copy_of(stored_run(ACTS), tmp_path / "run")
     files_of(folder)[0].write_bytes(b"PAR1")
-    with pytest.raises(RunFolderError, match=r"shard-000000\.parquet.*Delete this file"):
+    with pytest.raises(RunFolderError, match=r"shadow/000000000-000000060\.parquet.*Delete this file"):
         replay(folder, 5)
     files_of(folder)[0].unlink()
-    with pytest.raises(RunFolderError, match="baseline runs of 1 of 2 files"):
+    with pytest.raises(RunFolderError, match="0 baseline runs; expected all 60"):
         replay(folder, 5)
     assert estimate(folder) == estimates(folder)  # needs no path
 
 
-def test_a_page_is_written_where_so_few_paths_crashed_that_the_pool_s_error_is_not_known(stored_run, tmp_path):
-    folder = copy_of(stored_run(ACTS), tmp_path / "run")
-    content = estimates(folder)["estimates"]
-    details = content["shells"]["details"]
-    for part in (details, details["within"]):
-        part.update(rhw_from_pool=None, rhw_from_pool_at_least=None)
-    edit(folder, "estimates.json", estimates=content)
-    page = write_report(folder).read_text()
-    assert "pool’s own error is not known" in page
-    assert "nan" not in set(re.findall(r"[a-z]+", (folder / "plots" / "shells.svg").read_text().lower()))
-
-
+@pytest.mark.slow
 def test_a_vehicle_that_ends_its_process_in_a_shadow_run_fails_there(campaign, run, tmp_path):
     """Nothing else is lost, and the tests under the same numbers are run."""
     exits = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Exits')}", "run.max_failed_share=0.05", "stop.rhw=9")

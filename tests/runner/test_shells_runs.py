@@ -19,7 +19,7 @@ from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import tally as counted
 from tests.in_process import run_here as run_golden
 from tests.runner.conftest import SHELLS
-from tests.stored_runs import answer_in, copy_of, edit, golden, manifest, part_files, stored_table
+from tests.stored_runs import answer_in, copy_of, edit, golden, part_files
 
 
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
@@ -48,18 +48,6 @@ def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
 
 SPENT, MORE = "stop.episodes=150", "stop.episodes=400"
 """A budget that ends within a round: its last shards are not those of a run that goes on."""
-
-
-def test_what_is_traced_may_change_when_a_run_goes_on(campaign, run_here, tmp_path):
-    traced, untraced = ("records.traces=all",), ("records.traces=none", "records.trace_share=0")
-    out = tmp_path / "run"
-    run_here(campaign(*SHELLS, "world.engine=twin", SPENT, *traced), out)
-    for _ in range(2):  # the second time all tests are taken over
-        run_here(campaign(*SHELLS, "world.engine=twin", MORE, *untraced), out, resume=True)
-    traced_tests = set(stored_table(out, "traces")["episode"].to_pylist())
-    assert 0 in traced_tests
-    assert len(traced_tests) < manifest(out)["n_episodes"]
-    assert replay(out, 0).bit_equal
 
 
 def test_a_continuation_that_dies_leaves_what_was_there(campaign, run_here, tmp_path, monkeypatch):

@@ -78,8 +78,9 @@ def test_the_weights_give_the_rate_of_every_method_as_docs_have_it(name, stored_
 
 
 REPLAYED = (
-    *("mixture-seven", "mixture-twin", "nde-twin", "shells-sumo", "shells-acting-sumo", "forced-acting-twin"),
+    *("mixture-seven", "mixture-twin", "nde-twin", "shells-sumo", "forced-acting-twin"),
     *("shells-lateral-sumo", "forced-krauss"),
+    pytest.param("shells-acting-sumo", marks=pytest.mark.slow),
 )
 
 

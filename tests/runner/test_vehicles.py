@@ -16,7 +16,7 @@ TRUTH = json.loads((ROOT / "tests/reference/default.json").read_text())["crash_r
 BUSY = json.loads((ROOT / "docs/validation/nde_1e4.json").read_text())["crash_rate"]
 METHODS = {
     "shells": (TRUTH, (*SHELLS, "stop.episodes=1500")),  # whose precision failed tests would soon have reached
-    "forced": (TRUTH, ("testing.method=forced", "stop.episodes=4000", "records.moments=none")),
+    "forced": (TRUTH, ("testing.method=forced", "stop.episodes=2000", "records.moments=none")),
     "episode_mixture": (TRUTH, ("testing.method=episode_mixture", "stop.episodes=2000")),
     "nde": (BUSY, ("testing.method=nde", "environment.lane_change_level=1e4", "stop.episodes=8000")),
 }
@@ -34,7 +34,9 @@ class RaisesBeforeContact(IDM):
         return super().step(seen)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [pytest.param(each, marks=[pytest.mark.slow] * (each != "shells")) for each in METHODS]
+)
 def test_the_interval_holds_what_may_have_happened(method, campaign, run_here, tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     truth, settings = METHODS[method]
@@ -81,6 +83,7 @@ class AtRandom(AtOneSpeed):
         return self.draw < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["AtOneSpeed", "AtRandom"])
 def test_what_crashes_share(vehicle, campaign, run_here, tmp_path):
     av = f"av={{controller: 'tests.runner.test_vehicles:{vehicle}', limits: {{max_acceleration_mps2: 2}}}}"

@@ -32,6 +32,8 @@ from tests.estimators.small_blocks import block as block_of
 from tests.pool.conftest import SMALL_POOL
 from tests.stored_runs import MIXTURE_FILE
 
+pytestmark = pytest.mark.slow
+
 
 def told(known: KnownRates, tests: Block, crashes: BoolArray) -> dict[str, Any]:
     """What the alarm says of some tests."""

@@ -1,7 +1,6 @@
 """The study as a user runs it: made once, resumed, refused where it is wrong, and every number of its page traced."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from studies.__main__ import main
 from studies.case_study import tested
 from studies.case_study.counted import KnownMeans, spread
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
-from studies.case_study.page import claim_rows, with_exponents
 from studies.case_study.repeated import variants_of
 from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
@@ -21,6 +19,8 @@ from studies.case_study.theorems import bound
 from studies.chains.chain import CHAINS, Episodes
 from studies.chains.sampler import blocks, with_optimal_function
 from tests.stored_runs import SCENARIOS
+
+pytestmark = pytest.mark.slow
 
 SHIPPED = SCENARIOS / "case_study" / "study.yaml"
 STUDY = f"""
@@ -90,12 +90,6 @@ def made(study):
         name: Made(place := folder / "steps" / f"{name}-{key}", json.loads((place / "result.json").read_text()))
         for name, key in keys.items()
     }
-
-
-def test_without_the_extra_its_locked_installation_is_said(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "studies.case_study.steps", None)
-    assert main(["case", str(SHIPPED), "--out", str(tmp_path / "case")]) == 2
-    assert "pip install -c requirements.lock -e '.[studies]'" in capsys.readouterr().err
 
 
 def test_a_second_run_changes_nothing(study, capsys):
@@ -176,21 +170,6 @@ def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
         variants = [step for step in study.steps.values() if step.kind == "variants"]
         assert quick or all(set(step.shown) <= set(variants_of(step)) for step in variants)
     assert len(study.claims) >= 15
-
-
-def test_neighbours_with_equal_answers_share_a_row():
-    says = {"gain for α 0.5": 1.0, "gain for α 1.0": 1.0, "gain for α 1.5": 2.0, "rate for α 2.0": 2.0}
-    rest = {"paper": 11.5, "at_most": False, "tolerance": None, "within": 2.0, "verdict": "not reproduced"}
-    claims = [{"says": words, "found": exactly(value), **rest} for words, value in says.items()]
-    rows = list(claim_rows([{**claims[0], "verdict": "reproduced"}, *claims], "not reproduced"))
-    assert rows[0] == ("2–3", "gain for α 0.5, 1.0", "11.5, 11.5", "1")
-    assert [row[0] for row in rows[1:]] == ["4", "5"]
-
-
-def test_powers_of_ten_are_written_as_on_other_pages():
-    page = "1.34 (1.33 to 1.36) × 10⁻⁷ † | 6.06 × 10⁻⁸ (1.03 × 10⁻⁹ to 1.20 × 10⁻⁷) | 2.24 × 10⁸ | 30.0 (3.0 to 32.0)"
-    expected = "1.34e-7 (1.33 to 1.36) † | 6.06e-8 (1.03e-9 to 1.20e-7) | 2.24e8 | 30.0 (3.0 to 32.0)"
-    assert with_exponents(page) == expected
 
 
 @pytest.mark.parametrize(

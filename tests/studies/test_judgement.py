@@ -116,6 +116,7 @@ def covered(rows):
     return np.mean([row.ci_low <= TRUTH <= row.ci_high for row in rows])
 
 
+@pytest.mark.slow
 def test_intervals_cover_at_the_stop_and_conditional_ones_do_not_where_vehicles_differ_outside():
     """Nine tenths of the difference lie beyond the boundary, which the conditional statement leaves out."""
     campaign = load_campaign(

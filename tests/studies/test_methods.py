@@ -51,6 +51,7 @@ def forced(chain) -> list[Row]:
     return WeightedCampaign(campaign("forced", 3000), episodes, ["nade"]).run(range(FEW))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("result", "repeated"), [(FREE, lambda chain: shells(chain, FEW, 1000)), ("nade", forced)], ids=["shells", "forced"]
 )
@@ -60,6 +61,7 @@ def test_right_methods_cover_and_are_unbiased(result, repeated):
         assert abs(one["bias"]) < 4.0 * one["bias_std_error"]
 
 
+@pytest.mark.slow
 def test_a_corrupted_shell_probability_is_caught():
     """The first shell counts one and a half times: where it carries much of the rate, coverage breaks down."""
     chain = CHAINS["good surrogates"]
@@ -69,6 +71,7 @@ def test_a_corrupted_shell_probability_is_caught():
     assert abs(one["bias"]) > max(LARGEST_BIAS, 8.0 * one["bias_std_error"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "caught"), [(1.0, False), (2.0, True)])
 def test_limits_are_decided_rightly_but_where_a_shell_counts_twice(wrong, caught):
     """At 0.5 to 2 times the crash rate; nominal: 95 of 100 are right. The second is the sibling that must fail."""

@@ -1,6 +1,5 @@
 """A made-up motorway: what was driven is found again on a bent road, and put beside the traffic that it was made by."""
 
-import importlib.util
 import zipfile
 from pathlib import Path
 
@@ -14,6 +13,8 @@ from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from studies.__main__ import main
 from studies.motorway import trajectories_of
 from studies.trajectories import Differences, simulate
+
+pytestmark = pytest.mark.slow
 
 MADE_OF = "ndd-overtaking-1-lateral"
 BEND_M = 3000.0
@@ -98,12 +99,3 @@ def test_traffic_agrees_with_the_environment_it_was_made_by_rather_than_with_ano
     assert not agrees["car following: mean square (m²/s⁴)"][1]
     assert not agrees["lead, median (s)"][1]
     assert len(pd.read_parquet(out / "trajectories.parquet")) > 0.7 * len(on_earth)
-
-
-def test_without_the_package_it_says_how_to_get_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
-    assert main(["motorway", "--out", str(tmp_path / "out"), "-e", MADE_OF]) == 2
-    assert "pip install tasi" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -36,6 +36,8 @@ from studies.roundtrip import (
 )
 from studies.trajectories import simulate, write
 
+pytestmark = pytest.mark.slow
+
 
 def test_traffic_is_fitted_whose_speed_differences_are_as_wide_as_on_motorways_and_that_hardly_brakes(
     tmp_path: Path,

@@ -24,6 +24,8 @@ from studies.replication.populations import Drivers, enumerate_paths
 from studies.replication.shells import Division, equals, looks
 from tests.golden.record import unlike
 
+pytestmark = pytest.mark.slow
+
 PATHS = 1024
 ENVIRONMENT = load_environment(EnvironmentSettings(parameters="ndd-overtaking-1"))
 LIBRARY = load_library("ladder-1")

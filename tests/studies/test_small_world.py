@@ -18,6 +18,8 @@ from tests.estimators.small_blocks import fed
 from tests.kernels import smallest_gaps
 from tests.studies.here import Here
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def world():

@@ -14,6 +14,8 @@ from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from studies.__main__ import main
 from studies.traffic import beside_published
 
+pytestmark = pytest.mark.slow
+
 SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-2.yaml").read_text(encoding="utf-8")
 
 

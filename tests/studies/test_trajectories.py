@@ -13,6 +13,8 @@ from harness.vocabulary import ACCELERATIONS_MPS2
 from studies.__main__ import main
 from studies.trajectories import ALIKE, CLOSEST_M, Differences, simulate
 
+pytestmark = pytest.mark.slow
+
 TRUE = ["v", "r1", "r1dot"]
 
 

@@ -20,6 +20,8 @@ from studies.replication.experiment import load_experiment
 from studies.work import worker_processes
 from tests.studies.here import Here
 
+pytestmark = pytest.mark.slow
+
 FOLDER = Path(__file__).parents[2] / "scenarios" / "validate"
 CHAINS = """
 format: validation-experiment

@@ -24,6 +24,8 @@ from studies.replication.populations import (
 from studies.replication.shells import FREE, Division, ShellCampaign
 from tests.studies.here import Here, wrong_shell
 
+pytestmark = pytest.mark.slow
+
 LIBRARY = load_library("ladder-2")
 PATHS = 1024
 FEW = 60

@@ -156,7 +156,7 @@ def test_the_example_client_drives_like_the_built_in_idm_in_every_bit(n):
     assert_same_motion(shard, expected, range(n))
 
 
-@pytest.mark.parametrize("client", ["pushes_held_avs", "connects_late"])
+@pytest.mark.parametrize("client", ["pushes_held_avs", pytest.param("connects_late", marks=pytest.mark.slow)])
 def test_commands_to_an_av_that_must_hold_its_speed_are_overruled_and_connecting_late_is_no_fault(client):
     shard, expected = run(program(MISBEHAVING, client), 0, 6, cells=2), run_idm(0, 6)
     assert not shard.failures
@@ -177,14 +177,14 @@ def test_with_before_cut_in_controller_the_program_drives_from_the_start():
     ("fault", "cause"),
     [
         ("exits", "exit code 7"),
-        ("is_killed", "killed by signal 9"),
-        ("hangs", "did not finish its step within 3 s"),
-        ("closes", "closed its connection, but goes on running"),
+        ("hangs", "did not finish its step within 1 s"),
+        pytest.param("is_killed", "killed by signal 9", marks=pytest.mark.slow),
+        pytest.param("closes", "closed its connection, but goes on running", marks=pytest.mark.slow),
     ],
 )
 def test_a_program_lost_in_mid_run_fails_what_ran_and_is_started_again(fault, cause):
     # Each start lives for 60 steps, some less than an episode: one restart, then the rest is given up.
-    av = program(MISBEHAVING, fault, restarts=1, step_time_s=3.0)
+    av = program(MISBEHAVING, fault, restarts=1, step_time_s=1.0)
     shard, expected = run(av, 0, 12, cells=4), run_idm(0, 12)
     outcome = shard.episode["outcome"]
     assert set(np.flatnonzero(outcome == FAILED)) == set(shard.failures)
@@ -301,7 +301,13 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("av", [av + EARLY for av in FORMS.values()], ids=FORMS)
+@pytest.mark.parametrize(
+    "av",
+    [
+        pytest.param(av + EARLY, id=name, marks=[pytest.mark.slow] * (name not in ("SUMO's ACC", "TraCI style")))
+        for name, av in FORMS.items()
+    ],
+)
 def test_it_does_in_tests_what_it_did_in_its_baseline_runs(av):
     failures, shard, runs = driven(av)
     assert not failures
@@ -311,6 +317,7 @@ def test_it_does_in_tests_what_it_did_in_its_baseline_runs(av):
     assert np.all(shard.episode["event_step"] >= 0)
 
 
+@pytest.mark.slow
 def test_models_that_are_recycled_otherwise_remember_the_last_cut_in():
     """Why they get a simulation per episode when they act from the start: in one, tests are not the same again."""
     campaign = acting("{sumo: {carFollowModel: Krauss}" + EARLY, "sumo")

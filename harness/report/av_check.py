@@ -1,0 +1,90 @@
+"""What a look at a vehicle has found (`harness.runner.look.AvCheck`), in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from harness.runner.look import SLOW_S, AvCheck, Cause
+
+MOVES_MPS2 = 0.5
+"""Change of a first answer that says: the warm-up leaves something behind."""
+IN_WORDS = {
+    "mean_acceleration_mps2": "mean acceleration, m/s²",
+    "min_acceleration_mps2": "hardest braking, m/s²",
+    "max_acceleration_mps2": "hardest acceleration, m/s²",
+    "share_at_min": "share of steps at its hardest allowed braking",
+    "share_at_max": "share of steps at its hardest allowed acceleration",
+    "reaction_s": "from the onset of a cut-in to the first braking, median, s",
+    "braking_share": "share of cut-ins after which it braked",
+    "n_events": "cut-ins",
+    "n_crashes": "crashes (no rate: cut-ins are forced)",
+    "us_per_step": "time per step, µs",
+    "episodes_per_s": "tests per second",
+    "construction_s": "time that its constructor takes, median, s",
+    "constructions": "times that each worker of a run calls it",
+}
+CAUSES: dict[Cause, str] = {
+    "remembers": "It differs after another episode: it remembers the last one. Set all its state in start.",
+    "shares": "It differs beside other vehicles: they share something. Keep state in self, not in the class or module.",
+    "random": "It differs also when nothing does: random numbers of its own (random, numpy.random), or a variable of "
+    "its module or class that outlives the object. Draw from episode.random; keep state in self.",
+    "process": "It differs from process to process: random numbers of its own (random, numpy.random), the number of "
+    "the process, hash() of a text (the order of a set), or an id(). Draw from episode.random.",
+    "clock": "It depends on the clock ({}): a test may run at any speed. Use time_s of what it sees, or step_s.",
+}
+
+
+def verdict(found: AvCheck) -> str:
+    """What is to be done next, in a sentence."""
+    n, seen = found.n_episodes, found.behaviour
+    if found.failures:
+        return f"NOT READY: {sum(found.failures.values())} of {n} tests failed: {next(iter(found.failures))}."
+    if found.differing:
+        return f"NOT REPRODUCIBLE: {len(found.differing)} of {n} tests came out otherwise. {cause(found)}"
+    if not seen.n_events or not seen.braking_share > 0.0:
+        return f"LOOK AGAIN: it braked after none of {seen.n_events} cut-ins. Does it see BV?"
+    longest, moved = max(found.moved_mps2.items(), default=(0.0, 0.0))
+    if longest and moved > MOVES_MPS2:
+        return (
+            f"LOOK AGAIN: its first answer moves by up to {moved:.1f} m/s² where the warm-up takes {longest:g} s. "
+            "State winds up while its answers are not used, as an integral does: limit it (anti-windup), or begin "
+            "it when BV comes; then av.warm_up_s need be no longer than its filters."
+        )
+    slower, speed, advice = found.speed.us_per_step / found.idm_speed.us_per_step, found.speed, ""
+    if speed.construction_s > SLOW_S and speed.constructions > 1:
+        advice = (
+            f" Its constructor takes {speed.construction_s:.1f} s, and each worker of a run calls it "
+            f"{speed.constructions} times: what all may share, load once (`load`, see docs/controllers.md)."
+        )
+    return (
+        f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
+        f"cut-ins, {seen.reaction_s:.1f} s after they began (median, also where it had no need to brake sooner); "
+        f"a step takes {slower:.1f} times that of IDM.{advice}"
+    )
+
+
+def cause(found: AvCheck) -> str:
+    """Why tests came out otherwise; empty if none did."""
+    if found.likely_cause is None:
+        return ""
+    return CAUSES[found.likely_cause].format("; ".join(found.clock_read_at[:3]) or "in a library")
+
+
+def rows(found: AvCheck) -> list[dict[str, Any]]:
+    """A table: what was found, beside the built-in IDM."""
+    told = found.to_json()
+    own, idm = ({**told[f"{who}behaviour"], **told[f"{who}speed"]} for who in ("", "idm_"))
+    cut_ins = "cut-ins that take time" if found.take_time else "cut-ins of one step"
+    shown = [
+        ("kind of vehicle, engine, method", f"{found.source}, {found.engine}, {found.method}, {cut_ins}", ""),
+        ("tests", found.n_episodes, ""),
+        *((f"failed: {why}", n, "") for why, n in (told["failures"] or {"none": 0}).items()),
+        ("tests that came out otherwise", told["differing"] or "none", ""),
+        ("accelerations allowed, m/s²", [*told["limits_mps2"]], ""),
+        *((text, own[name], idm[name]) for name, text in IN_WORDS.items()),
+        *(
+            (f"its first answer with a warm-up of {s:g} s moves by up to, m/s²", moved, "")
+            for s, moved in found.moved_mps2.items()
+        ),
+    ]
+    return [dict(zip(("what", "found", "built-in IDM"), row, strict=True)) for row in shown]

@@ -1,0 +1,77 @@
+"""Signals to a command: Ctrl-C, SIGTERM and SIGHUP end it in the same way, and what is finished is kept.
+
+What the shell has set to be ignored stays ignored: SIGHUP under ``nohup``, SIGINT in the background of a script.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+from harness.progress import Progress
+
+FROM_USER = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_LEFT_TO_US = (signal.SIG_DFL, signal.default_int_handler)
+"""How Python begins: nobody else has asked for the signal."""
+
+
+class Interruption:
+    """Which signal has asked for the end, if one has: as Ctrl-C does, so that every ``finally`` does its work."""
+
+    signal: signal.Signals | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """128 and the number of the signal, as shells have it: 130, 143 or 129."""
+        return 128 + (self.signal or signal.SIGINT)
+
+    def arrive(self, number: int, _frame: FrameType | None) -> None:
+        """Handle the signal: only Ctrl-C may ask again, for somebody who cannot wait until all is tidied up."""
+        for other in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(other, signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self.signal = signal.Signals(number)
+        Progress.cancelled = True  # a library may lose what is raised here: then the next report raises it again
+        raise KeyboardInterrupt(self.signal.name)
+
+
+@contextmanager
+def handlers_restored() -> Iterator[dict[signal.Signals, Any]]:
+    """Put back, afterwards, the handlers of `FROM_USER` that are there before: none where no thread may set them."""
+    may_set = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in FROM_USER if may_set}
+    try:
+        yield before
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def interruptible() -> Iterator[Interruption]:
+    """Let signals interrupt what is inside."""
+    interruption = Interruption()
+    with handlers_restored() as before:
+        for number, handler in before.items():
+            if handler in _LEFT_TO_US:
+                signal.signal(number, interruption.arrive)
+        try:
+            yield interruption
+        finally:
+            Progress.cancelled = False
+
+
+def open_streams() -> None:
+    """Open what the shell has closed of the three standard streams: else a file or a pipe would take its number."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115, PTH123
