@@ -92,6 +92,7 @@ def test_a_numba_that_compiles_nothing_is_refused(tmp_path):
     assert refused.stderr.startswith("error: NUMBA_DISABLE_JIT\n")
 
 
+@pytest.mark.slow
 def test_a_copy_of_the_package_finds_what_another_has_compiled_unless_it_is_damaged(tmp_path):
     (tmp_path / "of_a_user.py").write_text("import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n")
     say_hits = (

@@ -155,7 +155,7 @@ NO_FAULT = {
 }
 
 
-@pytest.mark.parametrize(("av", "noted"), quick(3, NO_FAULT.values()), ids=NO_FAULT)
+@pytest.mark.parametrize(("av", "noted"), quick(2, NO_FAULT.values()), ids=NO_FAULT)
 def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undisturbed):
     note = tmp_path / "note"
     assert _run(tmp_path, av.replace("NOTE", str(note))) == EXIT_DONE

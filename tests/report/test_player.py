@@ -60,6 +60,7 @@ def test_a_page_holds_the_motion_to_the_last_bit(name, stored_run, tmp_path):
         assert bool(touched) == (result.row.get("contact") == "side" and scene["onset"] < cut_in)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["forced-twin", "forced-lateral-twin"])
 def test_others_drive_as_they_would_if_they_were_tested(name, stored_run, tmp_path):
     """The same campaign with another vehicle has the same traffic: before the AV's crash and after it."""

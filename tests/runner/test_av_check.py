@@ -195,7 +195,12 @@ def test_what_winds_up_in_a_longer_warm_up_is_seen(overrides, moves):
 
 
 @pytest.mark.parametrize(
-    ("name", "n"), [("Slow", 8), ("LoadsOnce", 8), ("tests.controllers.misbehaving:OnlyStepBatch", 1)]
+    ("name", "n"),
+    [
+        ("Slow", 8),
+        pytest.param("LoadsOnce", 8, marks=pytest.mark.slow),
+        pytest.param("tests.controllers.misbehaving:OnlyStepBatch", 1, marks=pytest.mark.slow),
+    ],
 )
 def test_a_slow_constructor_is_measured_and_counted(name, n):
     found = check(name, "world.cells=8")

@@ -68,6 +68,7 @@ def test_of_a_vehicle_whose_shares_may_change_there_is_an_upper_limit_alone(stor
     assert (row["value"][:9], row["interval"][:2]) == ("at most ×", "< ")
 
 
+@pytest.mark.slow
 def test_what_was_found_once_is_not_looked_for_again(stored_run, tmp_path, monkeypatch):
     folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.005, 0.02]})
     first = estimate_in_other_traffic(folder, mine)
@@ -88,6 +89,7 @@ def test_replicates_that_tests_cannot_answer_leave_the_interval_open(stored_run,
     assert "∞" not in f"{answer}"
 
 
+@pytest.mark.slow
 def test_the_folder_keeps_the_answer_of_its_own_traffic_alone(stored_run, tmp_path, capsys):
     folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
     mine = fitted(tmp_path, **{LOOK: [0.005, 0.02]})
@@ -131,6 +133,7 @@ def without_changes() -> str:
     return "\n".join([*(line for line in SHIPPED.splitlines() if not replaced.match(line)), steps])
 
 
+@pytest.mark.slow
 def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run, tmp_path, monkeypatch):
     """Shares of the wishes that are much as those of the tests' traffic, none of them seen below 2 s."""
     text = without_changes()

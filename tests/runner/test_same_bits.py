@@ -34,8 +34,11 @@ def test_sumo_and_the_twin(name, stored_run):
     ("name", "cells"),
     [
         *(("step-recursive-sumo", 64), ("forced-inattentive", 7), ("forced-acting-twin", 5)),
-        *(("forced-lateral-twin", 7), ("shells-twin", 64), ("shells-lateral-twin", 5)),
-        *(("nde-twin", 256), ("mixture-twin", 1)),
+        *(("shells-lateral-twin", 5), ("mixture-twin", 1)),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in (("forced-lateral-twin", 7), ("shells-twin", 64), ("nde-twin", 256))
+        ),
     ],
 )
 def test_any_number_of_cells(name, cells, stored_run, tmp_path):
@@ -62,6 +65,7 @@ class KillOneWorker(Progress):
             os.kill(self.killed[0], signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_two_workers_of_which_one_is_killed(stored_run, tmp_path):
     progress = KillOneWorker()
     run_with_workers(golden(SEVEN, "world.cells=64"), tmp_path / "run", workers=2, progress=progress)
