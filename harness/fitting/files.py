@@ -84,7 +84,7 @@ def fit_files(
     """
     progress, out = progress or Progress(), Path(out)
     paths = [Path(file) for file in files]
-    read, where = load_mapping(mapping, mirror=mirror, leave_out=leave_out), places(paths)
+    read = load_mapping(mapping, mirror=mirror, leave_out=leave_out)
     beside, shown = out.with_name(f"{out.stem}.replicates.parquet"), out.with_suffix(".html")
     _require_ours({out: OF_YAML, beside: OF_REPLICATES, shown: OF_PAGE}, [*paths, Path(mapping or ".")], force=force)
     require_place(out.parent)
@@ -93,13 +93,13 @@ def fit_files(
     fit_range = FitRange(*(numbers[f"fit_range__{name}"] for name in FitRange._fields))
 
     progress.stage("reading trajectories", 1000)
-    gathered: list[Observations] = []
-    done = 0
+    gathered, done = list[Observations](), 0
     for each, share in observations(paths, read, fit_range):
         gathered.append(each)
         progress.advance(round(1000 * share) - done)
         done = round(1000 * share)
     require_distinct(gathered)
+    where = places(paths)
     tally = require_enough(gathered, where, read)
     fit = fit_traffic(Traffic.of(gathered), base, BASE, where, progress)
     rows = replicates(fit, n_replicates, seed, progress)

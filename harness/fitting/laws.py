@@ -165,7 +165,7 @@ def _fitted(
     centre = [LINKS[name][0](value) if name in LINKS else value for name, value in by_name.items()]
     prior, at = Prior.of(centre, list(spread.values())), np.array([name == kept for name in spread])
     members = traffic.members(rows, cell)
-    found = maximise(log_likelihood, data, designs, *members, prior, [prior.centre, *starts], kept=at)
+    found = maximise(log_likelihood, data, designs, *members, prior, starts, kept=at)
 
     def values(theta: FloatArray) -> FloatArray:
         out = np.array(theta)

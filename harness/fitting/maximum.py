@@ -94,12 +94,12 @@ def maximise(
 
     ``rows`` (n,) are the data; ``designs`` are (n, p_k), one per predictor, their coefficients one after the other in
     θ; ``members`` (vehicles, n) counts rows by vehicle, and ``clusters`` (vehicles,) is the cluster of each. The best
-    of several starts counts. Coefficients that are ``kept`` (p,) stay at the prior's centre.
+    of the prior's centre and other starts counts. Coefficients that are ``kept`` (p,) stay at the centre.
     """
     kept = np.zeros(prior.centre.size, np.bool_) if kept is None else kept.copy()
     whole = _Sum(log_likelihood, rows, designs, members, prior.fixed(kept))
     thinned = whole.thinned() if rows.size > 2 * _ROWS_AT_FIRST else whole
-    found = [thinned.climb(start) for start in (starts or [prior.centre])]
+    found = [thinned.climb(start) for start in (prior.centre, *starts)]
     best = max((each for each in found if each is not None), key=lambda each: each[1], default=None)
     if best is not None and thinned is not whole:
         best = whole.climb(best[0])

@@ -204,8 +204,8 @@ def recording_of(name: str, file: str, rows: pd.DataFrame, share_read: float) ->
         raise TrajectoryError(recording.where(np.argmax(odd)), found, "times in equal steps", mend)
     rows["frame"] = frame + round(time_s.min() * rate)
     if (same_place := rows.duplicated(["frame", "road", "lane", "s_m"]).to_numpy()).any():
-        where = recording.where(np.argmax(same_place))
-        raise TrajectoryError(where, "the time, lane and s_m of another vehicle", "one at a place", ONE_CLOCK)
+        found = "the time, lane and s_m of another vehicle"
+        raise TrajectoryError(recording.where(np.argmax(same_place)), found, "one at a place", ONE_CLOCK)
     recording = replace(recording, rate_hz=rate, frame=rows.frame.to_numpy())
     _check_motion(recording, rows)
     lane, flickers = _smoothed(recording.lane, recording.piece, recording.second)

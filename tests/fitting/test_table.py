@@ -40,6 +40,11 @@ def with_value(row: int, column: str, value: object) -> Callable[[], pd.DataFram
     return rows
 
 
+def first(column: str) -> pd.Series:
+    """The first value of each vehicle, in all of its rows."""
+    return ROWS.groupby(["recording_id", "vehicle_id"])[column].transform("first")
+
+
 def fast_lanes() -> pd.DataFrame:
     """The same traffic seen in a mirror."""
     return ROWS.assign(lane=1 - ROWS.lane)
@@ -71,6 +76,10 @@ def late_lanes() -> pd.DataFrame:
     """Lanes a second late."""
     late = ROWS.groupby(["recording_id", "vehicle_id"]).lane.shift(9)
     return ROWS.assign(lane=late).dropna()
+
+
+def congested() -> pd.DataFrame:
+    return ROWS.assign(speed_mps=ROWS.speed_mps - 15, s_m=ROWS.s_m - 15 * ROWS.time_s)
 
 
 def flickering() -> pd.DataFrame:
@@ -113,15 +122,9 @@ REFUSED = {
         lambda: ROWS[ROWS.recording_id < 12],
         r"\(of 12 in all\), in [\d.]+ vehicle-hours beside.*at least 20.*hours are needed",
     ),
-    "congested": (
-        lambda: ROWS.assign(s_m=ROWS.s_m - 15 * ROWS.time_s, speed_mps=ROWS.speed_mps - 15),
-        "outside the fit range",
-    ),
+    "congested": (congested, "outside the fit range"),
     "nobody closes in": (lambda: ROWS[ROWS.vehicle_id != 2].query("vehicle_id < 2"), "beside it|closes? in"),
-    "straight": (
-        changed(lateral_m=ROWS.groupby(["recording_id", "vehicle_id"]).lateral_m.transform("first")),
-        "without lateral motion",
-    ),
+    "straight": (changed(lateral_m=first("lateral_m")), "without lateral motion"),
     "lanes' middles": (changed(lateral_m=3.5 * ROWS.lane), "in one jump"),
     "late lanes": (late_lanes, r"more than 0\.8 s from the lane's marking"),
     "no length": (with_value(3, "length_m", 0.0), r"row 4 \(vehicle 0 of recording 0, t = 0\.3 s\): found no length"),
@@ -144,17 +147,10 @@ REFUSED = {
     ),
     "long": (with_value(7, "length_m", 70.0), r"row 8 .*found length_m 70"),
     "one recording stands still": (
-        changed(
-            s_m=ROWS.s_m.where(
-                ROWS.recording_id != 3, ROWS.groupby(["recording_id", "vehicle_id"]).s_m.transform("first")
-            )
-        ),
+        changed(s_m=ROWS.s_m.where(ROWS.recording_id != 3, first("s_m"))),
         r"of recording 3, t = 0 s\): found s_m -40, and -40 in row 4981, where speeds say -36.* such pairs of rows",
     ),
-    "all stand still": (
-        changed(s_m=ROWS.groupby(["recording_id", "vehicle_id"]).s_m.transform("first")),
-        r"row 1 .*found s_m 60, and 60 in row 11, where speeds say 8",
-    ),
+    "all stand still": (changed(s_m=first("s_m")), r"row 1 .*found s_m 60, and 60 in row 11, where speeds say 8"),
     "a vehicle twice": (
         lambda: pd.concat([ROWS, ROWS[(ROWS.vehicle_id == 1) & (ROWS.recording_id == 3)].assign(vehicle_id=9)]),
         "vehicle 9 of recording 3, t = 0 s.: found the time, lane and s_m of another vehicle",
@@ -293,19 +289,19 @@ def test_sites_need_not_be_sorted(tmp_path):
 
 
 def test_a_recording_is_named_and_left_out(tmp_path):
-    still = ROWS.assign(speed_mps=ROWS.speed_mps - 15, s_m=ROWS.s_m - 15 * ROWS.time_s)
+    still = congested()
     street = still[still.recording_id < 4].assign(recording_id="street")
     street["vehicle_id"] = street.vehicle_id + 5 * still.recording_id
     street["time_s"] += 100 * still.recording_id
-    pd.concat([ROWS[ROWS.recording_id > 3].astype({"recording_id": str})[:3000], street]).to_csv(
-        tmp_path / "all.csv", index=False
-    )
-    with pytest.raises(TrajectoryError, match=r"most of it in recording street.*--leave-out 'street'"):
-        judged(tmp_path / "all.csv")
-    with pytest.raises(TrajectoryError, match="lane changes to the target lane"):
-        judged(tmp_path / "all.csv", leave_out=("street",))
-    with pytest.raises(TrajectoryError, match=r"no recording stret; there are .*street"):
-        judged(tmp_path / "all.csv", leave_out=("stret",))
+    others = ROWS[ROWS.recording_id > 3].astype({"recording_id": str})[:3000]
+    pd.concat([others, street]).to_csv(tmp_path / "all.csv", index=False)
+    for left_out, words in {
+        (): r"most of it in recording street.*--leave-out 'street'",
+        ("street",): "lane changes to the target lane",
+        ("stret",): r"no recording stret; there are .*street",
+    }.items():
+        with pytest.raises(TrajectoryError, match=words):
+            judged(tmp_path / "all.csv", leave_out=left_out)
 
 
 @pytest.mark.parametrize("column", ["s_m", "speed_mps"])
