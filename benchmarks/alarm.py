@@ -3,7 +3,7 @@
     python -m benchmarks.alarm [REPLICATIONS]
 
 Drives tests in the twin once, asks the surrogates of the pool about them, and draws campaigns from them: their own
-means are then the known rates. Prints the numbers of docs/internals/alarm.md. The normal p-value that the alarm is
+means are then the known rates. Prints the numbers of docs/internals/validation.md. The normal p-value that the alarm is
 compared with takes its variance from the campaign itself, where that has 100 effective crashes; the smallest of the
 nine surrogates counts, nine times (Bonferroni).
 """

@@ -4,7 +4,7 @@ The stored maneuvers determine LV's and BV's motion, so that any surrogate k of 
 the twin; where the AV's crash ended an episode early, BV goes on under p with the episode's own random numbers. f_k
 says whether it would have crashed, and W f_k has mean μ_k whatever the tests were drawn from and whatever the AV is.
 μ_k is tested by bets (I. Waudby-Smith, A. Ramdas, JRSS B 86, 2024; why nothing is taken from the sample's variance:
-docs/internals/alarm.md): a capital of 1 is multiplied in every test by a factor that has mean 1 if μ_k is right. So has
+docs/internals/validation.md): a capital of 1 is multiplied in every test by a factor of mean 1 if μ_k is right. So has
 the product, which then exceeds 1/p with a probability of p at most, after any number of tests and for any weights.
 
 * Too many crashes: (1 + λ W f_k)/(1 + λ μ_k).
