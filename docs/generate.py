@@ -27,7 +27,7 @@ from pydantic.fields import FieldInfo
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import PARAMETERS
 from harness.families.cut_in.family import CUT_IN, STATE_FACTS
-from harness.records.schemas import baseline_schema, episodes_schema, moments_schema, pilot_schema, traces_schema
+from harness.records.schemas import baseline_schema, episodes_schema, moments_schema, traces_schema
 
 FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -37,7 +37,6 @@ SCHEMAS = {
     "moments": moments_schema(STATE_FACTS, 3),
     "traces": traces_schema(takes_time=True),
     "shadow": baseline_schema(CUT_IN.columns),
-    "pilot": pilot_schema(),
 }
 RESULTS = {
     "level_1": ("nde_1", "forced_1", "step_recursive_1", "episode_recursive_1"),
@@ -57,8 +56,8 @@ RELVAR_TO_TESTS = (1.6448536269514722 / 0.3) ** 2
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = ["| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *rows)]
-    return "\n".join(lines) + "\n"
+    first, *others = ["| " + " | ".join(row) + " |" for row in (head, *rows)]
+    return "\n".join([first, "|" + "---|" * len(head), *others]) + "\n"
 
 
 def _listed(rows: list[tuple[str, ...]]) -> str:
@@ -110,6 +109,8 @@ def settings_reference() -> str:
             text.append(f"### `{key}`\n\n{_listed(_settings_rows(below[0]))}\n")
     model_of: dict[tuple[str, ...], str] = {}
     for model, section in PARAMETERS.items():
+        if model.startswith("r157"):
+            continue
         rows = _settings_rows(section)
         shared = {row: model_of[row] for row in rows if row in model_of}
         text.append(f"### `av.parameters` of `{model}`\n\n{_own_words(section)}")
@@ -120,6 +121,7 @@ def settings_reference() -> str:
         new = [row for row in rows if row not in shared]
         text.append(f"\n\n{_listed(new)}\n")
         model_of = dict.fromkeys(new, model) | model_of
+    text.append("Those of `r157-cc` and `r157-fsm`, with the source of each, are in `harness/campaign/drivers.py`.\n")
     return "".join(text)
 
 
