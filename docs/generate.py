@@ -25,7 +25,6 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.drivers import PARAMETERS
 from harness.families.cut_in.family import CUT_IN, STATE_FACTS
 from harness.records.schemas import baseline_schema, episodes_schema, moments_schema, traces_schema
 
@@ -99,7 +98,7 @@ def _sections(annotation: Any) -> list[type[BaseModel]]:
 
 
 def settings_reference() -> str:
-    """A list for each section of a campaign and each driver model's parameters; a row shown already is only named."""
+    """A list for each section of a campaign; the parameters of driver models are told in their own file."""
     fields = Campaign.model_fields
     top = [_setting(name, field) for name, field in fields.items() if not _sections(field.annotation)]
     text = [f"\n{_listed(top)}\n"]
@@ -107,27 +106,7 @@ def settings_reference() -> str:
         if below := _sections(field.annotation):
             key = f"{name}.NAME" if get_origin(field.annotation) is dict else name
             text.append(f"### `{key}`\n\n{_listed(_settings_rows(below[0]))}\n")
-    model_of: dict[tuple[str, ...], str] = {}
-    for model, section in PARAMETERS.items():
-        if model.startswith("r157"):
-            continue
-        rows = _settings_rows(section)
-        shared = {row: model_of[row] for row in rows if row in model_of}
-        text.append(f"### `av.parameters` of `{model}`\n\n{_own_words(section)}")
-        for other in dict.fromkeys(shared.values()):
-            names = [row[0].split(":")[0].strip("`") for row in shared if shared[row] == other]
-            rest = PARAMETERS[other].model_fields.keys() - section.model_fields.keys()  # that it does not have
-            text.append(f" Others as of `{other}`." if not rest else f" As of `{other}`: {', '.join(names)}.")
-        new = [row for row in rows if row not in shared]
-        text.append(f"\n\n{_listed(new)}\n")
-        model_of = dict.fromkeys(new, model) | model_of
-    text.append("Those of `r157-cc` and `r157-fsm`, with the source of each, are in `harness/campaign/drivers.py`.\n")
     return "".join(text)
-
-
-def _own_words(section: type[BaseModel]) -> str:
-    """First line of a section's docstring."""
-    return str(section.__doc__).strip().splitlines()[0]
 
 
 def columns_table(name: str) -> str:
