@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 from harness.campaign.campaign import Campaign, Command, Use, refusal
 from harness.controllers.find import require_controller
 from harness.errors import CampaignError
 from harness.families import family_named
-from harness.families.protocol import Environment, Family
+from harness.families.protocol import Environment, Family, Parameters
 from harness.loop.loop import Scenario
 from harness.vehicles.drivers import av_records, driver_records
 from harness.vehicles.library import Library, load_library
@@ -33,7 +32,7 @@ class Resolved:
     """
 
     campaign: Campaign
-    parameters: Any
+    parameters: Parameters
     environment: Environment
     av: RecordArray
     surrogates: RecordArray

@@ -193,6 +193,7 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     if cpus:  # bits may have come from any of them
         run = run.noting(cpu=", ".join(sorted({cpu_name(), *cpus})))
     ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
+    ended["wall_time_s"] = run.took_s  # told as it is written
     run = run.written("done", **ended)
     progress.stage("writing estimates and report", None)
     manifest = run.content("done", **ended)
