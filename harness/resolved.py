@@ -99,15 +99,15 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     family = family_named(campaign.scenario)
     parameters = family.parameters(campaign.environment)
     environment = family.traffic(campaign.environment, parameters)
-    takes_time = family.shows(environment)
-    if (words := refusal(campaign, Use(command, takes_time))) is not None:
+    shows = family.shows(environment)
+    if (words := refusal(campaign, Use(command, shows))) is not None:
         raise CampaignError(*words)
-    campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[takes_time])
+    campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[shows])
     return Resolved(
         campaign,
         parameters,
         environment,
-        av_records(campaign.av, see_onset=takes_time),
+        av_records(campaign.av, see_onset=shows),
         driver_records([each.parameters for each in campaign.surrogates.values()]),
         campaign.content_hash(parameters.content_hash()),
         controller_sha256,

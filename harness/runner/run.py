@@ -107,7 +107,7 @@ def begun(out: Path, resolved: Resolved, earlier: dict[str, Any], crew: Workers,
     source = prepare(resolved, progress)
     facts = {
         "workers": crew.n_workers,
-        "events_take_time": resolved.family.shows(resolved.environment),
+        "events_show": resolved.family.shows(resolved.environment),
         "distance_per_test_m": resolved.family.mean_distance_m(resolved.environment),
     }
     run = take_over(out, resolved, source, earlier, began, **facts)
