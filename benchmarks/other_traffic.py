@@ -26,12 +26,13 @@ import yaml
 from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
 from harness.families.cut_in.loading import load_parameters
+from harness.families.replicates import read_replicates
 from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths, environment_with
 from harness.pool.shells import design_shells
 from harness.progress import Progress
 from harness.resolved import Resolved, resolve
-from harness.runner.other_traffic import estimate_in_other_traffic, read_replicates
+from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.runner.run import run_campaign
 from harness.runner.stored_shells import MOST_OFF, moved_design, reference_shares
 from harness.strata import ShellDesign
@@ -184,7 +185,7 @@ def spread(environment: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         traffic = with_drivers(folder, "scenarios/smoke.yaml", f"environment.parameters={environment}")
         pool = campaign_pool(traffic)
-        rows = read_replicates(environment, traffic.parameters)
+        rows = read_replicates(environment, traffic.parameters, traffic.family.shipped)
         environments = [environment_with(traffic, row) for row in rows]
         sound = [each for each in environments if each is not None]
         paths = FewPaths(traffic, pool, design_shells(pool, ENVELOPE_MPS2), ENVELOPE_MPS2, Progress())

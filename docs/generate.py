@@ -32,9 +32,9 @@ FOLDER = Path(__file__).parent
 _PART = re.compile(r"(<!-- generated: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 SCHEMAS = {
-    "episodes": episodes_schema(CUT_IN.columns, 4, 3, 2, acts=True, takes_time=True),
+    "episodes": episodes_schema(CUT_IN.columns, 4, 3, 2, acts=True, shows=True),
     "moments": moments_schema(STATE_FACTS, 3),
-    "traces": traces_schema(takes_time=True),
+    "traces": traces_schema(shows=True),
     "shadow": baseline_schema(CUT_IN.columns),
 }
 RESULTS = {

@@ -34,7 +34,8 @@ def own_folder() -> Path | None:
     if named := os.environ.get(FOLDER):
         return Path(named)
     with suppress(RuntimeError):  # nobody knows where this user is at home
-        return platformdirs.user_cache_path("harness")
+        path = platformdirs.user_cache_path("harness")
+        return path if path.is_absolute() else None  # so say older versions of that package
     return None
 
 

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 from harness.campaign.campaign import Campaign, Command, Use, refusal
 from harness.controllers.find import require_controller
 from harness.errors import CampaignError
 from harness.families import family_named
-from harness.families.protocol import Environment, Family
+from harness.families.protocol import Environment, Family, Parameters
 from harness.loop.loop import Scenario
 from harness.vehicles.drivers import av_records, driver_records
 from harness.vehicles.library import Library, load_library
@@ -33,7 +32,7 @@ class Resolved:
     """
 
     campaign: Campaign
-    parameters: Any
+    parameters: Parameters
     environment: Environment
     av: RecordArray
     surrogates: RecordArray
@@ -100,15 +99,15 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     family = family_named(campaign.scenario)
     parameters = family.parameters(campaign.environment)
     environment = family.traffic(campaign.environment, parameters)
-    takes_time = family.shows(environment)
-    if (words := refusal(campaign, Use(command, takes_time))) is not None:
+    shows = family.shows(environment)
+    if (words := refusal(campaign, Use(command, shows))) is not None:
         raise CampaignError(*words)
-    campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[takes_time])
+    campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[shows])
     return Resolved(
         campaign,
         parameters,
         environment,
-        av_records(campaign.av, see_onset=takes_time),
+        av_records(campaign.av, see_onset=shows),
         driver_records([each.parameters for each in campaign.surrogates.values()]),
         campaign.content_hash(parameters.content_hash()),
         controller_sha256,

@@ -140,7 +140,7 @@ class Use(NamedTuple):
     """What a campaign is for (no command while it is read), and whether its cut-ins are known to take time."""
 
     command: Command | None = None
-    takes_time: bool = False
+    shows: bool = False
 
 
 class Combination(NamedTuple):
@@ -168,7 +168,7 @@ REFUSED = (
     Combination(
         "av.before_event",
         lambda c, use: (
-            c.av.acts_before_event and (c.sampling.holds_speed or (use.takes_time and not c.sampling.baseline_runs))
+            c.av.acts_before_event and (c.sampling.holds_speed or (use.shows and not c.sampling.baseline_runs))
         ),
         "controller, with testing.method {testing.method}",
         "hold_speed: the method draws the cut-in, or its onset, ahead, which needs to know the AV's path",
@@ -215,7 +215,7 @@ REFUSED = (
     # -- cut-ins that take time --
     Combination(
         "testing.method",
-        lambda c, use: use.takes_time and c.sampling.mixes,
+        lambda c, use: use.shows and c.sampling.mixes,
         "{testing.method}, " + _TAKES_TIME,
         "shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at those that an "
         "attentive vehicle avoids",

@@ -9,9 +9,9 @@ scripts, judges, counts and shows them, and knows nothing else of it.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pyarrow as pa
@@ -109,6 +109,39 @@ class Chosen(NamedTuple):
     lead: IntArray
 
 
+@runtime_checkable
+class Parameters(Protocol):
+    """Numbers of a traffic, each with a ``value`` and its provenance, by flat names ``section__name``.
+
+    ``replicates`` names a ``file`` of numbers that other data would have given, with its ``sha256``; None without one.
+    ``unseen`` says where the data had no event, and is empty where they had. ``blocks`` are sections whose numbers are
+    fitted together, by what they are called.
+    """
+
+    blocks: ClassVar[Mapping[str, tuple[str, ...]]]
+
+    @property
+    def replicates(self) -> Any: ...
+
+    @property
+    def unseen(self) -> str: ...
+
+    def numbers(self) -> dict[str, Any]:
+        """All numbers; ``se`` is a standard error and ``range`` where an assumed one may lie, each None if not said."""
+
+    def content_hash(self) -> str:
+        """Hash of the numbers alone."""
+
+    def without_half(self) -> Mapping[int, Mapping[str, float]]:
+        """Numbers with which there are half as many events of each kind that the data have not."""
+
+    def unseen_in(self, kinds: Collection[int]) -> str:
+        """Where some of these kinds are."""
+
+    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
+        """A replicate with what no event at all leaves open upwards."""
+
+
 class LeftOpen(NamedTuple):
     """What data leave open of a traffic: numbers by name at the two ``ends`` of what they may be.
 
@@ -178,8 +211,8 @@ class Family(Protocol):
     shipped: Path
     ladders: Mapping[bool, str]
 
-    def parameters(self, settings: EnvironmentSettings) -> Any:
-        """The numbers that a campaign's environment names, with a ``content_hash()``, and where nothing was ``unseen``.
+    def parameters(self, settings: EnvironmentSettings) -> Parameters:
+        """The numbers that a campaign's environment names.
 
         Raises `CampaignError`: the file is missing or wrong, every place being named, or its laws are unsound.
         """

@@ -15,7 +15,8 @@ import yaml
 from harness.campaign.files import read_model
 from harness.campaign.yaml_text import yaml_text
 from harness.errors import HarnessError, printable
-from harness.families.cut_in.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
+from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
+from harness.families.replicates import OF_REPLICATES, content_hash
 from harness.fitting.fit import REPLICATES, Fit, fit_traffic, replicates
 from harness.fitting.laws import Traffic
 from harness.fitting.observations import Observations, Tally, observations, require_distinct, require_enough

@@ -63,11 +63,10 @@ class Script(NamedTuple):
     ``lanes`` (n, steps, O) on which lanes they then are; no steps if they are driven in the loop. The event is in step
     ``at`` (n,), -1 for none, and shows itself ``lead`` (n,) steps earlier. ``n_steps`` (n,) are the most of each test,
     ``acts_from`` (n,) the first in which the AV may act, at most the one after the onset, and ``visible_from`` (n, O)
-    those from which on it sees the others. ``stratum`` (n,) is what a test was drawn
-    from, ``log_weight`` (n,) its log weight, ``log_p_event`` (n,) the log probability of an event on its path, NaN
-    where nobody has asked. ``announced_index`` (n,) are the indices that AVs are told, ``motion_hash`` (n,) of what
-    they must have done when the step of the onset is over: those of their baseline runs; empty where an AV keeps its
-    speed until then.
+    those from which on it sees the others. ``stratum`` (n,) is what a test was drawn from, ``log_weight`` (n,) its log
+    weight, ``log_p_event`` (n,) the log probability of an event on its path, NaN where nobody has asked.
+    ``announced_index`` (n,) are the indices that AVs are told, -1 for the test's own, and ``motion_hash`` (n,) of what
+    they must have done when the step of the onset is over, as in their baseline runs; 0 where nobody has one.
     """
 
     x: FloatArray
@@ -116,7 +115,7 @@ def natural_script(
         visible_from = np.zeros((n, x.shape[1] - 1), np.int64)
     most, acts_from = (np.array(np.broadcast_to(each, n), np.int64) for each in (most, acts_from))
     stratum, weighs, unknown = np.full(n, -1), np.zeros(n), np.full(n, math.nan)
-    index, motion = np.zeros(0, np.int64), np.zeros(0, np.uint64)
+    index, motion = np.full(n, -1), np.zeros(n, np.uint64)
     moves = x, v, lane, speed, lanes, at, lead
     return Script(*moves, most, acts_from, visible_from, stratum, weighs, unknown, index, motion)
 

@@ -20,8 +20,6 @@ from harness.vocabulary import FloatArray, IntArray, read_only
 def drive(kernel: KernelState) -> None:
     """Acceleration of a built-in AV wherever it meets an event; it acts from the step after the onset at most."""
     x, v, cells, driver = kernel.x, kernel.v, kernel.cells, kernel.driver
-    if driver.size == 0:
-        return
     perceives_m, av, other = driver[0].perceives_lateral_m, x.shape[1] - 1, kernel.principal
     for k in range(cells.cell.size):
         cell = cells.cell[k]

@@ -48,7 +48,7 @@ def judge(kernel: KernelState, contact: BoolArray) -> int:
         outcome = outcome_of(k, kernel)
         if contact[k] != (outcome in (CRASH, CONTACT)):
             return -1 - k
-        if kernel.script.motion_hash.size > 0 and left_baseline(k, outcome, kernel):
+        if kernel.script.motion_hash[cell.row] != 0 and left_baseline(k, outcome, kernel):
             outcome = FAILED
         if outcome != RUNNING:
             end_test(k, outcome, ended, kernel)

@@ -131,10 +131,10 @@ class EpisodeLoop:
         while True:
             placed = refill(kernel, given)
             traffic.move(kernel, placed)
-            if self._av is None:
-                drive(kernel)
-            else:
+            if self._av is not None:
                 ended += self._ask(self._av, kernel, shard, placed)
+            elif not self._world.drives_av:
+                drive(kernel)
             command(kernel)
             if ended == n:
                 return shard

@@ -79,7 +79,7 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     cell.lead = cell.asked_to_speed_up = 0
     cell.acts_from = 0 if kernel.acts_early else script.acts_from[row]
     cell.cruises, cell.set_speed = kernel.av_cruises if cell.acts_from > 0 else 0, kernel.v[k, av]
-    cell.announced_index = script.announced_index[row] if script.announced_index.size > 0 else episode
+    cell.announced_index = script.announced_index[row] if script.announced_index[row] >= 0 else episode
     cell.component, cell.log_weight = script.stratum[row], script.log_weight[row]
     cell.log_p_event = script.log_p_event[row]
     cell.min_ttc = cell.danger = math.inf

@@ -56,6 +56,11 @@ class KeptEvents:
     mass: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
+    def acts(self) -> bool:
+        """Whether they are of one vehicle, which acts before the event."""
+        return self.motion.size > 0
+
+    @property
     def onset(self) -> IntArray:
         """Step of the onset of each, shape (n,)."""
         return onset_steps(self.at, self.lead)

@@ -102,7 +102,7 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
     groups = shells_in_strata(pool, limit_mps2)
     boundary = pool.library.boundary
     cells, stratum, references = cells_in_strata(pool, groups)
-    takes_time = bool(pool.events.lead.any())
+    shows = bool(pool.events.lead.any())
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
     design = ShellDesign(
         pool=pool.key,
@@ -111,7 +111,7 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         cell_p=p,
         cell_references=tuple(references.tolist()),
         references=tuple(
-            Reference(name, _REFERENCES.get(each.model, "the driver"), None if takes_time else each.delay_after_event_s)
+            Reference(name, _REFERENCES.get(each.model, "the driver"), None if shows else each.delay_after_event_s)
             for name, each in pool.library.references.items()
         ),
         reference_rate=pool.reference_rate,
@@ -122,7 +122,7 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         n_inside=sum(group[-1] <= boundary_shell(pool) for group in groups),
         p_event=pool.p_event,
         p_unreachable=pool.p_event - float(p.sum()),
-        shadow_runs=(acts := pool.events.motion.size > 0),
+        shadow_runs=(acts := pool.events.acts),
         candidates=CANDIDATES if acts else 0,
     )
     if pool.p_after_failure == 0.0:
@@ -222,7 +222,7 @@ class PrescribedEpisodes:
         script = resolved.family.script(resolved.environment, chosen)
         log_weight = np.log(self.design.p[stratum])
         script = script._replace(stratum=stratum.astype(np.int64), log_weight=log_weight)
-        if c.motion.size > 0:
+        if c.acts:
             script = script._replace(announced_index=c.row[rows], motion_hash=c.motion[rows])
         return Traffic(script, chosen.facts)
 

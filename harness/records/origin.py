@@ -44,11 +44,11 @@ def require_trust(folder: Path, manifest: Mapping[str, Any], av: AutomatedVehicl
 
 def _key() -> bytes | None:
     """The user's key, made when it is first asked for; None where there is no place for one."""
-    path = Path(platformdirs.user_config_dir("harness")) / "key"
-    if not path.is_absolute():
-        return None
-    unfinished = path.with_name(f".{uuid.uuid4().hex}.part")
-    with suppress(OSError):
+    with suppress(OSError, RuntimeError):  # nobody knows where this user is at home
+        path = platformdirs.user_config_path("harness") / "key"
+        if not path.is_absolute():  # so say older versions of that package
+            return None
+        unfinished = path.with_name(f".{uuid.uuid4().hex}.part")
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
             unfinished.touch(0o600)

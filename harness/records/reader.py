@@ -168,7 +168,7 @@ class StoredRun:
         manifest = read_manifest(self.folder)
         parts = [part for part in manifest["parts"] if name in part.files]
         if not parts and name == "traces" and read_campaign(self.folder, manifest).records.traces != "none":
-            yield traces_schema(takes_time=bool(manifest["events_take_time"])).empty_table()
+            yield traces_schema(shows=bool(manifest["events_show"])).empty_table()
             return
         if not parts and name == "episodes":
             raise no_episodes(self.folder)

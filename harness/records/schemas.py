@@ -44,7 +44,7 @@ def episodes_schema(
     n_cells: int = 0,
     *,
     acts: bool = False,
-    takes_time: bool = False,
+    shows: bool = False,
 ) -> pa.Schema:
     """Schema of the ``episodes`` table of a family, by numbers of importance functions, surrogates, cells of shells.
 
@@ -85,7 +85,7 @@ def episodes_schema(
             _or_null("pool_row", _I8, "1", "row of the pool's cut-in (method shells), else null"),
             *(of_shells if n_cells else ()),
             *(of_baseline_runs if acts else ()),
-            *(_lateral_fields() if takes_time else ()),
+            *(_lateral_fields() if shows else ()),
             _or_null("failure", pa.string(), "", "cause, for failed episodes"),
         ]
     )
@@ -120,7 +120,7 @@ def moments_schema(columns: Sequence[Column], n_surrogates: int) -> pa.Schema:
     )
 
 
-def traces_schema(*, takes_time: bool = False) -> pa.Schema:
+def traces_schema(*, shows: bool = False) -> pa.Schema:
     """Schema of the ``traces`` table: one row per step and vehicle, with how far BV has come over."""
     over = "how far it has come over to the right lane (where cut-ins take time alone)"
     return pa.schema(
@@ -132,7 +132,7 @@ def traces_schema(*, takes_time: bool = False) -> pa.Schema:
             _field("x_m", _F8, "m", "position of the front bumper along the road"),
             _field("v_mps", _F8, "m/s", "speed"),
             _or_null("a_mps2", _F8, "m/s2", "acceleration in the next step: of the AV what was commanded"),
-            *([_field("lateral_m", _F8, "m", over)] if takes_time else ()),
+            *([_field("lateral_m", _F8, "m", over)] if shows else ()),
         ]
     )
 
@@ -311,7 +311,7 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
         }
     of_all = log_q.shape[1], martingale.shape[1], 0 if prescribed is None else prescribed.cell_mass.shape[1]
     acts = prescribed is not None and prescribed.shadow.size > 0
-    schema = episodes_schema(shard.scenario.columns, *of_all, acts=acts, takes_time=shard.scenario.shows)
+    schema = episodes_schema(shard.scenario.columns, *of_all, acts=acts, shows=shard.scenario.shows)
     return _table(schema, columns, e)
 
 
@@ -336,7 +336,7 @@ def moments_table(shard: Shard) -> pa.Table:
 def traces_table(shard: Shard) -> pa.Table:
     """One row per step and vehicle of the traced episodes."""
     scenario, rows = shard.scenario, sorted(shard.traces)
-    schema, n_vehicles = traces_schema(takes_time=scenario.shows), len(scenario.vehicles)
+    schema, n_vehicles = traces_schema(shows=scenario.shows), len(scenario.vehicles)
     if not rows:
         return schema.empty_table()
     n_states = [shard.traces[row].shape[0] for row in rows]

@@ -54,7 +54,7 @@ class ShownTests:
     @classmethod
     def stored(cls, folder: Path, manifest: Mapping[str, Any], family: Family) -> ShownTests:
         """Those of a run folder; a `RunFolderError` where a file is damaged or missing, or no test is there."""
-        asked = {"failure", *(name for of in _columns(family, sees=manifest["events_take_time"]) for name in of)}
+        asked = {"failure", *(name for of in _columns(family, sees=manifest["events_show"]) for name in of)}
 
         def shown(part: Part) -> ShownTests:
             episodes = read_kept(folder, part, "episodes", sorted(asked))

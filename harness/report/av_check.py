@@ -74,7 +74,7 @@ def rows(found: AvCheck) -> list[dict[str, Any]]:
     """A table: what was found, beside the built-in IDM."""
     told = found.to_json()
     own, idm = ({**told[f"{who}behaviour"], **told[f"{who}speed"]} for who in ("", "idm_"))
-    cut_ins = "cut-ins that take time" if found.take_time else "cut-ins of one step"
+    cut_ins = "cut-ins that take time" if found.shows else "cut-ins of one step"
     shown = [
         ("kind of vehicle, engine, method", f"{found.source}, {found.engine}, {found.method}, {cut_ins}", ""),
         ("tests", found.n_episodes, ""),

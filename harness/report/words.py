@@ -131,7 +131,7 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
 
 def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> Iterator[str]:
     """What the vehicle did while BV came over, a line each."""
-    if not manifest.get("events_take_time") or campaign.av.acts_before_event:
+    if not manifest.get("events_show") or campaign.av.acts_before_event:
         return
     if campaign.av.source in ("sumo", "traci"):
         yield "SUMO switches lanes in one step: this vehicle cannot see BV come over, as other drivers do"

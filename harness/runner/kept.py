@@ -222,6 +222,11 @@ class Run:
         if self.n_episodes >= at_least:
             require_few_failed(self.failures, self.n_episodes, self.resolved.campaign)
 
+    @property
+    def took_s(self) -> float:
+        """Wall time so far, that of earlier runs into the folder included."""
+        return round(time.monotonic() - self.began, 3)
+
     def content(self, status: str, **of_the_end: Any) -> dict[str, Any]:
         """What the manifest says."""
         repeated, campaign = self.repeated, self.resolved.campaign
@@ -230,10 +235,10 @@ class Run:
             "status": status,
             "stopped_by": None,
             "unmet": [],
+            "wall_time_s": self.took_s,
             **of_the_end,
             "reproducible": campaign.av.reproducible and not (repeated and repeated.differing),
             "repeated": None if repeated is None else asdict(repeated),
-            "wall_time_s": round(time.monotonic() - self.began, 3),
             "n_episodes": self.n_episodes,
             "parts": self.parts,
             "before": self.parts_before,

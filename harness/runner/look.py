@@ -87,14 +87,14 @@ class AvCheck:
     with the ``likely_cause`` if there are any, and where a clock was read; ``limits_mps2`` are the accelerations that
     count as its limits; ``moved_mps2`` says by how much first answers move at most if the warm-up takes so many seconds
     (key) instead of ``av.warm_up_s``. The built-in IDM has driven the same episodes in the same cells. Cut-ins are of
-    one step, also where they ``take_time`` in the campaign, for a vehicle that acts before them: a look makes no
+    one step, also where they ``show`` before in the campaign, for a vehicle that acts before them: a look makes no
     baseline runs, which would tell the onset.
     """
 
     source: str
     engine: str
     method: str
-    take_time: bool
+    shows: bool
     n_episodes: int
     failures: dict[str, int]
     differing: tuple[int, ...]
@@ -148,7 +148,7 @@ def check_av(campaign: Campaign | str | Path, n_episodes: Annotated[int, Field(g
         source=tested.av.source,
         engine=tested.world.engine,
         method=tested.testing.method,
-        take_time=source.scenario.shows,
+        shows=source.scenario.shows,
         n_episodes=n_episodes,
         failures=_by_cause(first.failures.values()),
         differing=differing,

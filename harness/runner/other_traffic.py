@@ -13,21 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from harness.arguments import Confidence, checked
-from harness.campaign.files import shipped_or_own
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import CampaignError
 from harness.estimators.answer import CARRIES, estimate_blocks
 from harness.estimators.answer import Elsewhere as OfOtherTraffic
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
 from harness.estimators.traffic import ONE_LAW, Ends, TrafficError, Uncertain, Unseen, uncertain
-from harness.families.cut_in.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
-from harness.families.cut_in.unseen import STEP, as_if_unseen
+from harness.families.protocol import Parameters
+from harness.families.replicates import read_replicates
 from harness.pool.moved import assumed
 from harness.progress import Progress
-from harness.records.folder import read_table
 from harness.resolved import resolve
 from harness.runner.stored_shells import ELSEWHERE, OPTION, Elsewhere, Nearby, StoredShells, moved_to, require_shares
 from harness.vocabulary import EstimatorName, FloatArray
@@ -169,9 +166,9 @@ def _replicated(sides: Sequence[Elsewhere], confidence: float, progress: Progres
     parameters = sides[0].traffic.parameters
     if parameters.replicates is None:
         return None
-    values, unseen = read_replicates(settings.parameters, parameters), _unseen(sides[0], parameters, progress)
-    if unseen is not None and parameters.acceptance_steps is not None:
-        values = [as_if_unseen(row, parameters.acceptance_steps) for row in values]
+    values = read_replicates(settings.parameters, parameters, sides[0].traffic.family.shipped)
+    if (unseen := _unseen(sides[0], parameters, progress)) is not None:
+        values = [parameters.as_if_unseen(row) for row in values]
     found = [[each for each in of.nearby(values, progress) if each is not None] for of in sides]
     kept = [row for row in zip(*found, strict=True) if not any(each.refused for each in row)]
     if not kept:
@@ -181,47 +178,18 @@ def _replicated(sides: Sequence[Elsewhere], confidence: float, progress: Progres
     return Replicated(name, confidence, near, len(values) - len(kept), unseen)
 
 
-def _unseen(moved: Elsewhere, parameters: EnvironmentParameters, progress: Progress) -> Unseen | None:
-    """Steps of acceptance in which no lane change was seen, of those that carry a notable part of the rate.
+def _unseen(moved: Elsewhere, parameters: Parameters, progress: Progress) -> Unseen | None:
+    """Steps in which no event was seen, of those that carry a notable part of the rate.
 
-    What a step carries is what its share of the wishes moves: a rate is linear in it.
+    What a step carries is what its share of the events moves: a rate is linear in it.
     """
-    steps = parameters.acceptance_steps
-    if steps is None or steps.events is None or steps.exposure is None:
-        return None
-    empty = steps.without_events
-    found = moved.nearby([{f"{STEP}{step}": 0.5 * steps.share[step].value} for step in empty], progress)
-    carried = {step: 2.0 * (1.0 - near.rate) for step, near in zip(empty, found, strict=True) if near is not None}
+    halved = parameters.without_half()
+    found = moved.nearby(list(halved.values()), progress)
+    carried = {step: 2.0 * (1.0 - near.rate) for step, near in zip(halved, found, strict=True) if near is not None}
     carried = {step: part for step, part in carried.items() if part > CARRIES}
-    return Unseen(steps.where(carried), min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
+    where = parameters.unseen_in(carried)
+    return Unseen(where, min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
 
 
 def _ends(of: Mapping[str, Any]) -> Ends:
     return of["ratio_low"] or 0.0, math.inf if of["ratio_high"] is None else of["ratio_high"]
-
-
-def read_replicates(name: str, parameters: EnvironmentParameters) -> list[dict[str, float]]:
-    """Numbers that vary, of each replicate that an environment, a shipped name or a file, names.
-
-    Raises `HarnessError`: the file is missing or damaged, or is not of these numbers.
-    """
-    file, tied = shipped_or_own(name, SHIPPED_FOLDER, "environment.parameters"), parameters.replicates
-    if tied is None:
-        return []
-    path, again = file.parent / tied.file, "Write it anew with `harness fit`, or leave out the key replicates."
-    table = read_table(path, mend=again)
-    of, expected = (table.schema.metadata or {}).get(OF_REPLICATES), f"the replicates that {file.name} was written with"
-    if content_hash(path.read_bytes()) != tied.sha256:
-        raise RunFolderError(str(path), "replicates of another fit, or changed ones", expected, again)
-    if of != parameters.content_hash().encode():
-        raise RunFolderError(str(path), f"replicates of other numbers than those of {file.name}", expected, again)
-    wrong = [] if table.num_rows else ["no rows"]
-    for column, of in zip(table.column_names, table.columns, strict=True):
-        if column not in parameters.numbers():
-            wrong.append(f"column {column}")
-        elif of.null_count or not (pa.types.is_floating(of.type) or pa.types.is_integer(of.type)):
-            wrong.append(f"column {column} with something else than numbers")
-    if wrong:
-        raise RunFolderError(str(path), wrong[0], f"replicates of the numbers of {file.name}, by section__name", again)
-    rows: list[dict[str, float]] = table.to_pylist()
-    return rows

@@ -107,7 +107,7 @@ def begun(out: Path, resolved: Resolved, earlier: dict[str, Any], crew: Workers,
     source = prepare(resolved, progress)
     facts = {
         "workers": crew.n_workers,
-        "events_take_time": resolved.family.shows(resolved.environment),
+        "events_show": resolved.family.shows(resolved.environment),
         "distance_per_test_m": resolved.family.mean_distance_m(resolved.environment),
     }
     run = take_over(out, resolved, source, earlier, began, **facts)
@@ -193,6 +193,7 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     if cpus:  # bits may have come from any of them
         run = run.noting(cpu=", ".join(sorted({cpu_name(), *cpus})))
     ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
+    ended["wall_time_s"] = run.took_s  # told as it is written
     run = run.written("done", **ended)
     progress.stage("writing estimates and report", None)
     manifest = run.content("done", **ended)

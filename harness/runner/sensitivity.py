@@ -21,21 +21,12 @@ from harness.arguments import checked
 from harness.errors import CampaignError
 from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
-from harness.families.cut_in.parameters import EnvironmentParameters
-from harness.families.cut_in.unseen import as_if_unseen
+from harness.families.protocol import Parameters
+from harness.families.replicates import read_replicates
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
-from harness.runner.other_traffic import read_replicates
 from harness.runner.stored_shells import Elsewhere, Nearby, StoredShells, require_shares
 
-BLOCKS = {
-    "initial state": ("initial_state",),
-    "free driving": ("free_driving",),
-    "car following": ("car_following", "guard"),
-    "cut-in": ("cut_in", "hazard_table", "acceptance_steps"),
-    "lead of cut-ins": ("lateral",),
-}
-"""Sections whose numbers are fitted together."""
 N_REPLICATES = 50
 CONFIDENCE, QUANTILE = 0.9, 1.645
 _OPTION = "harness sensitivity"
@@ -66,7 +57,7 @@ def sensitivity(
     require_shares(tested)
     settings = tested.here.campaign.environment
     parameters = tested.here.parameters
-    asked = list(moves(settings.parameters, parameters, ranges or {}))
+    asked = list(moves(settings.parameters, parameters, tested.here.family.shipped, ranges or {}))
     if not asked:
         found = f"{settings.parameters}, of which no number has a standard error (se) or a range"
         mend = "State one, e.g. --range cut_in.ignore_share=0.001:0.08."
@@ -81,7 +72,9 @@ def sensitivity(
     return content
 
 
-def moves(name: str, parameters: EnvironmentParameters, ranges: Mapping[str, tuple[float, float]]) -> Iterator[Move]:
+def moves(
+    name: str, parameters: Parameters, shipped: Path, ranges: Mapping[str, tuple[float, float]]
+) -> Iterator[Move]:
     """What is said to be uncertain of an environment, a shipped name or a file, and numbers with stated ``ranges``."""
     known = parameters.numbers()
     stated = {key.replace(".", "__"): ends for key, ends in ranges.items()}
@@ -92,12 +85,10 @@ def moves(name: str, parameters: EnvironmentParameters, ranges: Mapping[str, tup
         if not -math.inf < low < high < math.inf:
             expected = "two finite numbers, the lower first"
             raise CampaignError(f"--range {key}", f"{low:g}:{high:g}", expected, "Correct them, or change places.")
-    blocks = {section: block for block, sections in BLOCKS.items() for section in sections}
+    blocks = {section: block for block, sections in parameters.blocks.items() for section in sections}
     if parameters.replicates is not None:
-        rows = read_replicates(name, parameters)[:N_REPLICATES]
-        if (steps := parameters.acceptance_steps) is not None and steps.exposure is not None:
-            rows = [as_if_unseen(row, steps) for row in rows]
-        for block in BLOCKS:
+        rows = [parameters.as_if_unseen(row) for row in read_replicates(name, parameters, shipped)[:N_REPLICATES]]
+        for block in parameters.blocks:
             columns = [key for key in rows[0] if blocks.get(key.split("__")[0]) == block]
             if columns:
                 yield Move(block, "fitted", None, [{key: row[key] for key in columns} for row in rows])

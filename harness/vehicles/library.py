@@ -129,9 +129,9 @@ class Library(Section):
         return self
 
 
-def load_library(name: str | None, *, takes_time: bool = False) -> Library:
+def load_library(name: str | None, *, shows: bool = False) -> Library:
     """Read a shipped library by name, or a file by its path; without either that for cut-ins that take time, or not.
 
     Raises `CampaignError`: names every place that is wrong.
     """
-    return read_model(shipped_or_own(name or OF_TRAFFIC[takes_time], SHIPPED_FOLDER, "pool.library"), Library)
+    return read_model(shipped_or_own(name or OF_TRAFFIC[shows], SHIPPED_FOLDER, "pool.library"), Library)

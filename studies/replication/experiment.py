@@ -186,8 +186,8 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
     Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
     """
     experiment = read_model(path, Experiment, [parse_override(text) for text in overrides])
-    takes_time = load_environment(experiment.campaign.environment).lateral.present
-    library = experiment.campaign.pool.library or OF_TRAFFIC[takes_time]
+    shows = load_environment(experiment.campaign.environment).lateral.present
+    library = experiment.campaign.pool.library or OF_TRAFFIC[shows]
     if "/" not in library and not library.endswith((".yaml", ".yml")):
         return experiment.replaced(("campaign", "pool", "library"), library)
     file = (path.parent / library).resolve()

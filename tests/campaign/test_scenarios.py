@@ -163,7 +163,7 @@ def test_a_library_that_is_not_named_is_that_of_the_traffic():
         resolve(load_campaign(SHELLS, ["pool.library=null"])).content_hash
         == resolve(load_campaign(SHELLS)).content_hash
     )
-    takes_time = "environment.cut_in_lead_s=0.5"
-    found, named = (load_campaign(SHELLS, [takes_time, f"pool.library={name}"]) for name in ("null", OF_TRAFFIC[True]))
+    shows = "environment.cut_in_lead_s=0.5"
+    found, named = (load_campaign(SHELLS, [shows, f"pool.library={name}"]) for name in ("null", OF_TRAFFIC[True]))
     assert resolve(found).campaign == named
     assert resolve(found).library == load_library(OF_TRAFFIC[True])

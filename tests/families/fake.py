@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -22,6 +21,27 @@ RATE = 0.5 * (0.02 + 0.01)
 STEPS = 60
 
 
+class Numbers:
+    """Of which none can be another; see `harness.families.protocol.Parameters`."""
+
+    blocks, replicates, unseen = {}, None, ""
+
+    def numbers(self):
+        return {}
+
+    def content_hash(self):
+        return "fake"
+
+    def without_half(self):
+        return {}
+
+    def unseen_in(self, kinds):
+        return ""
+
+    def as_if_unseen(self, row):
+        return dict(row)
+
+
 class Fake:
     """See `harness.families.protocol.Family`."""
 
@@ -37,7 +57,7 @@ class Fake:
     ladders = {False: "ladder-2", True: "ladder-2"}
 
     def parameters(self, settings):
-        return SimpleNamespace(content_hash=lambda: "fake", unseen=(), settings=settings)
+        return Numbers()
 
     def traffic_with(self, settings, parameters, values):
         return None

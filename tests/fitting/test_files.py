@@ -12,11 +12,12 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.errors import HarnessError, TrajectoryError
 from harness.families.cut_in.loading import load_parameters
+from harness.families.cut_in.parameters import SHIPPED_FOLDER
+from harness.families.replicates import read_replicates
 from harness.fitting.files import fit_files
 from harness.fitting.hazard import FREE_TTC_S
 from harness.fitting.laws import LAWS, FittedLaw
 from harness.fitting.maximum import Maximum
-from harness.runner.other_traffic import read_replicates
 from tests.fitting.trajectories import overtaking
 
 
@@ -30,7 +31,7 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
     assert main(["fit", "rows.parquet", "--out", "other.yaml", "--replicates", "5", "--quiet"]) == 0
     assert "! 5 replicates (a 90 % interval needs 20 at least)" in capsys.readouterr().out
     parameters = load_parameters(EnvironmentSettings(parameters="./a #1: b.yaml"))
-    assert len(read_replicates("./a #1: b.yaml", parameters)) == 5
+    assert len(read_replicates("./a #1: b.yaml", parameters, SHIPPED_FOLDER)) == 5
     page = (tmp_path / "a #1: b.html").read_text()
     assert "R1dot" in page
     assert (
@@ -117,7 +118,7 @@ def test_replicates_belong_to_one_environment(tmp_path):
 
     def read() -> int:
         name = str(mine.environment)
-        return len(read_replicates(name, load_parameters(EnvironmentSettings(parameters=name))))
+        return len(read_replicates(name, load_parameters(EnvironmentSettings(parameters=name)), SHIPPED_FOLDER))
 
     assert read() == 2
     mine.replicates.write_bytes(other.replicates.read_bytes())

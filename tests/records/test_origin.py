@@ -1,6 +1,7 @@
 """A folder that this user has not made on this machine runs no code unless asked to; to look at it takes none."""
 
 import json
+import pwd
 
 import pytest
 
@@ -122,8 +123,14 @@ def test_a_seal_that_is_missing_is_damage(file, seal, stored_run, tmp_path):
 
 
 def test_a_user_without_a_home_signs_nothing_and_leaves_nothing(tmp_path, monkeypatch):
-    """What ``~`` stands for then is itself."""
-    monkeypatch.setattr("platformdirs.user_config_dir", lambda _: "~/.config/harness")
+    """Neither by its environment nor by the system, as a user of a container that nobody has made."""
+
+    def unknown(_uid):
+        raise KeyError
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    for name in ("HOME", "XDG_CONFIG_HOME"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.chdir(tmp_path)
     assert signature(b"campaign") is None
     assert list(tmp_path.iterdir()) == []

@@ -155,7 +155,7 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
 
 
 @pytest.mark.parametrize(
-    ("name", "takes_time", "blind", "held"),
+    ("name", "shows", "blind", "held"),
     [
         ("forced-krauss", True, True, False),
         ("forced-krauss", False, False, False),
@@ -163,10 +163,10 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
         ("shells-controller-sumo", True, False, True),
     ],
 )
-def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(name, takes_time, blind, held, stored_run):
+def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(name, shows, blind, held, stored_run):
     run = read_run_folder(stored_run(name))
     asked = {**run.estimates.diagnostics, "n_asked_to_speed_up": 1234 * (name != "forced-krauss")}
-    warnings = "".join(said(run, manifest={"events_take_time": takes_time}, diagnostics=asked).warnings)
+    warnings = "".join(said(run, manifest={"events_show": shows}, diagnostics=asked).warnings)
     assert ("cannot see BV come over" in warnings) == blind
     assert ("1,234 tests it asked to speed up" in warnings) == held
 

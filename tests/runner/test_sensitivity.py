@@ -12,6 +12,7 @@ import pytest
 from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.families.cut_in.loading import load_parameters
+from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.report.traffic_words import bar_note
 from harness.runner.sensitivity import Move, bar_of, moves, sensitivity
 from harness.runner.stored_shells import Nearby
@@ -74,7 +75,7 @@ def test_what_was_fitted_together_moves_together(tmp_path):
     found = {}
     for name, file in (("one", str(tmp_path / "one.yaml")), ("both", fitted(tmp_path, text, **columns))):
         parameters = load_parameters(EnvironmentSettings(parameters=file))
-        found[name] = {move.what: move.settings for move in moves(file, parameters, {})}
+        found[name] = {move.what: move.settings for move in moves(file, parameters, SHIPPED_FOLDER, {})}
     assert found["one"] == {"free_driving.df": [{"free_driving__df": pytest.approx(16.0 + k * 3.29)} for k in (-1, 1)]}
     assert found["both"] == {
         "free driving": [{"free_driving__df": 15.0}, {"free_driving__df": 17.0}],

@@ -120,7 +120,7 @@ def test_a_vehicle_that_acts_is_tested_in_the_default_traffic(campaign, run_here
     traffic = "environment.parameters=ndd-overtaking-2", "stop.episodes=80", "pool.pilot_tests=0"
     folder = run_here(campaign(*SHELLS, SHADOWS, TWIN, *traffic, f"av={of('Yields')}"), tmp_path / "run").folder
     tests = stored_table(folder, "episodes").to_pandas()
-    assert manifest(folder)["events_take_time"]
+    assert manifest(folder)["events_show"]
     assert tests.failure.isna().all()
     assert (tests.lead_steps > 0).all()
     assert (tests.onset_step == np.maximum(tests.event_step - tests.lead_steps, 0)).all()

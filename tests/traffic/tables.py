@@ -10,8 +10,9 @@ import pyarrow.parquet as pq
 
 from harness.campaign.files import read_model
 from harness.campaign.yaml_text import read_yaml
-from harness.families.cut_in.parameters import OF_REPLICATES, SHIPPED_FOLDER, EnvironmentParameters, content_hash
+from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.sections import REPLACED
+from harness.families.replicates import OF_REPLICATES, content_hash
 
 SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
 DATA, _ = read_yaml(SHIPPED)

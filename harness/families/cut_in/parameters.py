@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -18,15 +17,14 @@ from harness.campaign.problems import broken_rule, describe_found
 from harness.campaign.sections import Section
 from harness.campaign.yaml_text import read_yaml
 from harness.families.cut_in import sections
-from harness.families.cut_in.sections import REPLACED, Number
+from harness.families.cut_in.sections import REPLACED, STEP, Number
+from harness.families.replicates import content_hash
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import Record
 
 SHIPPED_FOLDER = Path(__file__).parent
 FIXED = {"step_s": STEP_S, "vehicle_length_m": VEHICLE_LENGTH_M}
 """What the compiled motion and SUMO's network are made for: no file can change it, but campaigns' hashes contain it."""
-OF_REPLICATES = b"harness fit"
-"""Key in the metadata of a file of replicates: hash of the numbers that they belong to."""
 _NOT_IN_RECORD = ("lateral__", "hazard_table__", "acceptance_steps__")
 
 
@@ -97,11 +95,38 @@ class EnvironmentParameters(Section):
             raise broken_rule("initial_state", found, f"speeds from 0 to {MAX_CONFIGURED_SPEED_MPS:g} m/s", mend)
         return self
 
+    blocks: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "initial state": ("initial_state",),
+        "free driving": ("free_driving",),
+        "car following": ("car_following", "guard"),
+        "cut-in": ("cut_in", "hazard_table", "acceptance_steps"),
+        "lead of cut-ins": ("lateral",),
+    }
+
+    @property
+    def _counted(self) -> sections.AcceptanceSteps | None:
+        """Steps of acceptance that say how many lane changes were seen."""
+        steps = self.acceptance_steps
+        return None if steps is None or steps.events is None or steps.exposure is None else steps
+
     @property
     def unseen(self) -> str:
         """Times to collision at which the data that it was fitted to have no lane change; empty without such."""
-        steps = self.acceptance_steps
-        return "" if steps is None or steps.exposure is None else steps.where(steps.without_events)
+        return "" if (steps := self._counted) is None else steps.where(steps.without_events)
+
+    def without_half(self) -> dict[int, dict[str, float]]:
+        """Numbers with which half as many change lanes in a step, of each step without events."""
+        if (steps := self._counted) is None:
+            return {}
+        return {step: {f"{STEP}{step}": 0.5 * steps.share[step].value} for step in steps.without_events}
+
+    def unseen_in(self, steps: Collection[int]) -> str:
+        """Times to collision of some of these steps."""
+        return "" if self._counted is None else self._counted.where(steps)
+
+    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
+        """A replicate with what zero events leave open upwards; see `AcceptanceSteps`."""
+        return dict(row) if self._counted is None else self._counted.as_if_unseen(row)
 
     def numbers(self) -> dict[str, Number]:
         """Flat ``section__name``, of those in a list ``section__name__0`` and so on → number, with its provenance."""
@@ -132,11 +157,6 @@ class EnvironmentParameters(Section):
     def content_hash(self) -> str:
         """Hash of the numbers alone: a corrected note does not change a campaign."""
         return content_hash(json.dumps(self.values(), sort_keys=True).encode())
-
-
-def content_hash(content: bytes) -> str:
-    """Hash of some bytes, as files name it."""
-    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: float, hold_s: float) -> Record:

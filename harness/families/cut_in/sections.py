@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, model_validator
+from scipy.special import gammainc, gammaincinv
 
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
@@ -22,6 +23,9 @@ from harness.vocabulary import ACCELERATIONS_MPS2, FloatArray
 LONGEST_LEAD_S = 10.0
 SMALLEST_SHARE = 1e-12
 """Of lane changes that are accepted."""
+STEP = "acceptance_steps__share__"
+ONE_SIDED = 0.95
+"""Quantile of a step's share that no replicate has drawn."""
 _SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
 _AXES = (("v_mps", "v_log"), ("r1_m", "r1_log"), ("r1dot_mps", "r1dot_log"))
 
@@ -286,6 +290,19 @@ class AcceptanceSteps(Section):
     def without_events(self) -> list[int]:
         """Steps in which no lane change was seen."""
         return [step for step, events in enumerate(self.events or ()) if not events]
+
+    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
+        """A replicate with what zero events leave open upwards, in place of the draw that is right in the mean.
+
+        In all steps without events, whichever carry a vehicle's rate: so what is found serves others, too. Draws are of
+        (½)-gamma quantiles over the exposure; the same quantile of 1-gamma is what no event at all refuses.
+        """
+        moved = dict(row)
+        for step in self.without_events:
+            name, exposure = f"{STEP}{step}", (self.exposure or ())[step]
+            below = float(gammainc(0.5, row[name] * exposure)) if name in row else ONE_SIDED
+            moved[name] = min(float(gammaincinv(1.0, below)) / exposure, 1.0) if exposure > 0.0 else 1.0
+        return moved
 
     def where(self, some: Collection[int]) -> str:
         """Times to collision of steps, neighbours together: ``TTC < 2 s``, ``TTC 3 to 5 s``."""
