@@ -43,14 +43,14 @@ def _shipped(value: Any) -> Any:
         return value
     from harness.vehicles.library import shipped_drivers  # noqa: PLC0415 - libraries read campaigns' sections
 
-    if value in (known := shipped_drivers()):
-        return known[value].model_dump()
-    if ":" in value:
-        expected = "a driver that compiled code knows: it is driven from millions of states before any test"
-        mend = "Write name or model, parameters and reaction of one that is like yours: any leaves rates unbiased."
-        raise broken_rule("", f"{value}, a class of one's own", expected, mend)
-    mend = did_you_mean(value, list(known)) or "Write {model: idm, parameters: {…}, reaction: {…}} for another."
-    raise broken_rule("", f"'{value}'", f"a shipped driver: {listed(known)}", mend)
+    if value not in (known := shipped_drivers()):
+        expected = (
+            "model, parameters and reaction of a driver, or the name of a shipped one: it is driven from millions "
+        )
+        expected += f"of states in compiled code, so no class of Python's ({listed(known)})"
+        mend = did_you_mean(value, list(known)) or "Write one that is like yours: any leaves rates unbiased."
+        raise broken_rule("", f"'{value}'", expected, mend)
+    return known[value].model_dump()
 
 
 _Shipped = BeforeValidator(_shipped, json_schema_input_type=Surrogate | str)

@@ -111,7 +111,7 @@ def estimate_blocks(
     level of the intervals, by default the campaign's.
     """
     confidence, own = confidence or campaign.stop.confidence, headline_of(campaign)
-    done = one_pass(blocks, estimators or ESTIMATORS, confidence=confidence, headline=own)
+    done = one_pass(blocks, estimators or ESTIMATORS, own, confidence)
     best = done.headline_estimate
     level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
     distance_km = None if distance_m is None else distance_m / 1000.0

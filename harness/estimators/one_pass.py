@@ -109,21 +109,17 @@ class PassResult:
 
 
 def one_pass(
-    blocks: Iterable[Block],
-    estimators: Collection[Asked] = ESTIMATORS,
-    *,
-    confidence: float = 0.9,
-    headline: Asked | None = None,
+    blocks: Iterable[Block], names: Collection[Asked] = ESTIMATORS, best: Asked | None = None, confidence: float = 0.9
 ) -> PassResult:
-    """Feed every block to every estimator that can use it; the ``headline`` is by default the method's own.
+    """Feed every block to every estimator that can use it; the ``best``, the headline, is by default the method's own.
 
     Blocks are contiguous and in index order, from episode 0; a gap, or no episode at all, is a `ValueError`.
     """
     blocks = iter(blocks)
     if (first := next(blocks, None)) is None:
         raise ValueError("an estimate needs at least one episode")
-    best = headline or first.drawn.sampling.headline
-    asked, own = {str(each): each for each in (*estimators, best)}, str(best)
+    best = best or first.drawn.sampling.headline
+    asked, own = {str(each): each for each in (*names, best)}, str(best)
     refusals = {name: refusal(first, asked[name]) for name in (own, *asked)}
     states = {name: accumulator(asked[name]) for name, why in refusals.items() if why is None}
     empty = SeenShells if own == "shells" else partial(accumulator, best)

@@ -27,8 +27,6 @@ from harness.estimators.estimate import Estimate, note
 from harness.estimators.weighted import Nade
 from harness.vocabulary import ESTIMATORS, METHODS, SAMPLING, EstimatorName
 
-_A_CLASS = "an estimator: a class with methods, add and result (see docs/estimators.md)"
-
 
 @dataclass(frozen=True)
 class OwnEstimator:
@@ -82,24 +80,28 @@ def asked_for(estimators: Iterable[Any], where: str) -> list[Asked]:
 
     Raises `HarnessError`: there is no such estimator, or it says not whose tests it can use.
     """
-    return [_asked(each, where) for each in estimators]
+    return [each if isinstance(each, str) and each in ESTIMATORS else _own(each, where) for each in estimators]
 
 
-def _asked(of: Any, where: str) -> Asked:
-    if isinstance(of, OwnEstimator) or (isinstance(of, str) and of in ESTIMATORS):
+def _own(of: Any, where: str) -> OwnEstimator:
+    if isinstance(of, OwnEstimator):
         return of
-    name, found = getattr(of, "__name__", type(of).__name__), of
+    what, name, found = (
+        "a class with methods, add and result (see docs/estimators.md)",
+        getattr(of, "__name__", type(of).__name__),
+        of,
+    )
     if isinstance(of, str):
         installed = {each.name: each.value for each in entry_points(group="harness.estimators")}
         if of not in installed and ":" not in of:
             known = [*ESTIMATORS, *installed]
             mend = did_you_mean(of, known) or "Write my.py:MyEstimator for one of your own."
             raise HarnessError(where, f"'{of}'", f"one of {', '.join(map(repr, known))}, or my.py:MyEstimator", mend)
-        name, found = of.rpartition("/")[2], own_code(installed.get(of, of), where, _A_CLASS)
+        name, found = of.rpartition("/")[2], own_code(installed.get(of, of), where, what)
     if missing := [each for each in ("methods", "add", "result") if not hasattr(found, each)]:
-        raise HarnessError(where, f"{name} without {' and '.join(missing)}", _A_CLASS, "Add what is missing.")
-    if isinstance(found.methods, str) or not {*found.methods} <= (known := {*METHODS} - {"shells"}):
-        expected = f"those of {listed(sorted(known))} whose tests it can use; shells have no weights"
+        raise HarnessError(where, f"{name} without {' and '.join(missing)}", what, "Add what is missing.")
+    if isinstance(found.methods, str) or not {*found.methods} <= {*METHODS} - {"shells"}:
+        expected = f"those of {listed(METHODS)} whose tests it can use, but shells, which have no weights"
         mend = 'Write methods = ("forced",), say. Weights have mean 1 only where a method can draw every test.'
         raise HarnessError(where, f"{name} with methods {found.methods!r}", expected, mend)
     return OwnEstimator(name, found if isinstance(found, type) else partial(deepcopy, found), tuple(found.methods))
@@ -110,10 +112,9 @@ def headline_of(campaign: Campaign) -> Asked:
 
     Raises `HarnessError`: there is no such estimator, or it cannot use such tests.
     """
-    method, name = campaign.testing.method, campaign.testing.estimator
-    found = _asked(name or campaign.sampling.headline, "testing.estimator")
+    where, method, headline = "testing.estimator", campaign.testing.method, campaign.sampling.headline
+    (found,) = asked_for([campaign.testing.estimator or headline], where)
     if method not in found.methods if isinstance(found, OwnEstimator) else found not in SAMPLING[method].estimators:
-        mend = f"Choose such a method, or delete the key for {campaign.sampling.headline}."
-        found_words = f"{found}, with testing.method {method}"
-        raise CampaignError("testing.estimator", found_words, "an estimator for such tests", mend)
+        mend = f"Choose such a method, or delete the key for {headline}."
+        raise CampaignError(where, f"{found}, with testing.method {method}", "an estimator for such tests", mend)
     return found

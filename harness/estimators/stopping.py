@@ -305,13 +305,8 @@ class PairRule(Rule):
         watched, level = pairs.inside(pairs.design.n_within(self._statement)), Level.two_sided(self._confidence)
         self.decision = replace(self.decision, verdict=self._verdict(watched))
         pool = watched.rhw_from_pool(level)
-        given_up = self._looked(
-            watched.rhw(level),
-            pairs.n_crashes,
-            of="rhw_of_difference",
-            after_first_tests=True,
-            pool=(pool, pool),
-        )
+        found, of = (watched.rhw(level), pairs.n_crashes), "rhw_of_difference"
+        given_up = self._looked(*found, of=of, after_first_tests=True, pool=(pool, pool))
         if not self.ends_at_rhw:
             ended = self.look.ended
             if self.decision.verdict != "open":
