@@ -23,7 +23,7 @@ SHARD_ENDS = range(200, 200_200, 200)
 
 def stopped(rng: np.random.Generator, ratio: float) -> tuple[int, float, bool]:
     """Tests used, crash rate found, and whether the interval holds the truth."""
-    rule, state = StopRule(STOP, "nde", SHARD_ENDS, ratio), Nde()
+    rule, state = StopRule(STOP, SHARD_ENDS, ratio), Nde()
     for n in rule.looks:
         state.n_crashes += int(rng.binomial(n - state.n, RATE))
         state.n = n
@@ -39,7 +39,7 @@ def main(replications: int) -> None:
     for ratio in (1.02, 1.1, 1.25):
         results = [stopped(np.random.default_rng([7, k]), ratio) for k in range(replications)]
         tests, rates, covered = map(np.array, zip(*results, strict=True))
-        n_looks = len(StopRule(STOP, "nde", SHARD_ENDS, ratio).looks)
+        n_looks = len(StopRule(STOP, SHARD_ENDS, ratio).looks)
         print(f"| {ratio} | {n_looks} | {tests.mean():,.0f} | {rates.mean() / RATE:.3f} | {covered.mean():.3f} |")
 
 

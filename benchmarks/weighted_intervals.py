@@ -88,7 +88,7 @@ def stopping(population: Population, replications: int, *, known: bool) -> str:
     """Row of the second table."""
     tests, rates, covered = [], [], 0
     for k in range(replications):
-        rule, state, n = StopRule(STOP, "forced", SHARD_ENDS), Nade(), 0
+        rule, state, n = StopRule(STOP, SHARD_ENDS), Nade(), 0
         rng = np.random.default_rng([SEED, k])
         for look in rule.looks:
             found = population.campaign(rng, look - n, state)

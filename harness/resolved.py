@@ -11,11 +11,13 @@ from functools import cached_property
 from harness.campaign.campaign import Campaign, Command, Use, refusal
 from harness.controllers.find import require_controller
 from harness.errors import CampaignError
+from harness.estimators.one_pass import accumulator
+from harness.estimators.own import headline_of
 from harness.families import family_named
 from harness.families.protocol import Environment, Family, Parameters
 from harness.loop.loop import Scenario
-from harness.vehicles.drivers import av_records, driver_records
-from harness.vehicles.library import Library, load_library
+from harness.vehicles.drivers import av_records
+from harness.vehicles.library import Library, library_records, load_library
 from harness.vocabulary import RecordArray
 from harness.worlds.sumo_driven import av_type
 from harness.worlds.system_libraries import require_libraries
@@ -77,6 +79,7 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
 
         require_private(campaign.av.traci)
     resolved = resolve(campaign, command, controller_sha256=controller_sha256)
+    accumulator(headline_of(campaign))  # one of the user's own can be made
     if campaign.sampling.strata:
         library, accept = resolved.library, campaign.accept  # the file is read, and refused if it is wrong
         if accept is not None and accept.times_reference is not None:
@@ -108,7 +111,7 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
         parameters,
         environment,
         av_records(campaign.av, see_onset=shows),
-        driver_records([each.parameters for each in campaign.surrogates.values()]),
+        library_records([*campaign.surrogates.values()], see_onset=False),
         campaign.content_hash(parameters.content_hash()),
         controller_sha256,
     )

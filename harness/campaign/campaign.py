@@ -12,12 +12,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from typing import Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from harness.campaign.drivers import Surrogate, default_surrogates
-from harness.campaign.problems import NAME_PATTERN, broken_rule
+from harness.campaign.problems import NAME_PATTERN, broken_rule, did_you_mean
 from harness.campaign.sections import (
     Accept,
     CrashSettings,
@@ -37,6 +37,25 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.vocabulary import SAMPLING, Sampling
 
 
+def _shipped(value: Any) -> Any:
+    """What the name of a driver of the shipped libraries stands for; any other value as it is."""
+    if not isinstance(value, str):
+        return value
+    from harness.vehicles.library import shipped_drivers  # noqa: PLC0415 - libraries read campaigns' sections
+
+    if value not in (known := shipped_drivers()):
+        expected = (
+            "model, parameters and reaction of a driver, or the name of a shipped one: it is driven from millions "
+        )
+        expected += f"of states in compiled code, so no class of Python's ({listed(known)})"
+        mend = did_you_mean(value, list(known)) or "Write one that is like yours: any leaves rates unbiased."
+        raise broken_rule("", f"'{value}'", expected, mend)
+    return known[value].model_dump()
+
+
+_Shipped = BeforeValidator(_shipped, json_schema_input_type=Surrogate | str)
+
+
 class Campaign(Section):
     """A test campaign, as one YAML file describes it."""
 
@@ -48,8 +67,8 @@ class Campaign(Section):
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
     crash: CrashSettings = CrashSettings()
-    surrogates: dict[SurrogateName, Surrogate] = Field(default_factory=default_surrogates)
-    """stand-ins for the unknown AV, by name"""
+    surrogates: dict[SurrogateName, Annotated[Surrogate, _Shipped]] = Field(default_factory=default_surrogates)
+    """stand-ins for the unknown AV, by name: each a driver, or the name of a shipped one, such as r157-cc"""
     testing: Testing = Testing()
     pool: PoolSettings = PoolSettings()
     world: World = World()
@@ -110,8 +129,8 @@ class Campaign(Section):
     def content_hash(self, environment_parameters: str) -> str:
         """Hash of everything that changes an episode's bits, that of the environment's parameters included.
 
-        Cells, workers, stop rule, trace policy and names are left out, so that a campaign can be continued to a
-        smaller RHW or with other resources.
+        Cells, workers, estimator, stop rule, trace policy and names are left out, so that a campaign can be continued
+        to a smaller RHW or with other resources.
         """
         others = {} if self.scenario == "cut_in" else {"scenario": self.scenario}
         unused = set() if self.av.acts_before_event else {"shadow_paths", "pilot_tests"}
@@ -121,8 +140,8 @@ class Campaign(Section):
             "environment": self.environment.model_dump(exclude={"parameters"}),
             "environment_parameters": environment_parameters,
             "av": self.av.identity(),
-            "surrogates": [(name, model.model_dump()) for name, model in self.surrogates.items()],
-            "testing": self.testing.model_dump(),
+            "surrogates": [(name, model.identity()) for name, model in self.surrogates.items()],
+            "testing": self.testing.model_dump(exclude={"estimator"}),
             "pool": self.pool.model_dump(exclude=unused) if self.sampling.strata else None,
             "engine": self.world.engine,
             "moments": self.records.moments,

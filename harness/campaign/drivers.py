@@ -187,14 +187,32 @@ class Driver(Section):
     """of the model, as under av"""
 
 
-class Surrogate(Driver):
-    """A stand-in for the unknown AV."""
+class Reflexes(Section):
+    """How a driver lags behind its model: surrogates may be late and smooth, but not random."""
 
-    model: Literal["idm", "fvdm"] = Field(description="driver model")
-    parameters: Annotated[IDMParameters | FVDMParameters, Parameters] = Field(
-        default_factory=dict, validate_default=True
-    )
-    """of the model, as under av"""
+    delay_s: StepTime = Field(0.0, ge=0.0, le=10.0)
+    """time after the cut-in in which it keeps its speed [assumed]"""
+    max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = None
+    """fastest change of acceleration; none: unlimited [assumed]"""
+    perceives_lateral_m: float = Field(PERCEIVES_LATERAL_M, ge=0.0, le=10.0)
+    """how far BV has come over when it is seen, where cut-ins take time [JRC-FSM: 0.375 of wandering]"""
+
+
+class Surrogate(Driver):
+    """A stand-in for the unknown AV, with its reflexes; the shipped libraries have some."""
+
+    reaction: Reflexes = Reflexes()
+
+    @property
+    def delay_after_event_s(self) -> float | None:
+        """How long after a dangerous cut-in a reference driver begins to brake (s); None for any other driver."""
+        if not isinstance(self.parameters, Reference):
+            return None
+        return self.parameters.delay_after_event_s + self.reaction.delay_s
+
+    def identity(self) -> dict[str, Any]:
+        """What decides what it does; reflexes where it has some."""
+        return self.model_dump(exclude={"reaction"} if self.reaction == Reflexes() else None)
 
 
 def default_surrogates() -> dict[str, Surrogate]:
@@ -205,17 +223,6 @@ def default_surrogates() -> dict[str, Surrogate]:
         "SM-II": Surrogate(model="fvdm", parameters=brakes_1),
         "SM-III": Surrogate(model="fvdm", parameters=brakes_6),
     }
-
-
-class Reflexes(Section):
-    """How a driver lags behind its model: surrogates may be late and smooth, but not random."""
-
-    delay_s: StepTime = Field(0.0, ge=0.0, le=10.0)
-    """time after the cut-in in which it keeps its speed [assumed]"""
-    max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = None
-    """fastest change of acceleration; none: unlimited [assumed]"""
-    perceives_lateral_m: float = Field(PERCEIVES_LATERAL_M, ge=0.0, le=10.0)
-    """how far BV has come over when it is seen, where cut-ins take time [JRC-FSM: 0.375 of wandering]"""
 
 
 class Reaction(Reflexes):

@@ -122,6 +122,8 @@ class Testing(Section):
         description="shells: cut-ins of a pool; forced: a cut-in in every test; nde: no control; step_mixture: NADE as "
         "published; episode_mixture: one importance function per test",
     )
+    estimator: str | None = None
+    """what answers and stops instead of the method's own: a name, or my.py:MyEstimator"""
     challenge: Literal["immediate", "recursive"] = "recursive"
     """immediate: crash if BV cuts in now (published); recursive: backward induction"""
     epsilon: float = Field(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -14,10 +14,6 @@ from harness.commands.printing import answer_lines, print_either, print_estimate
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share
 from harness.vocabulary import COMPARISON, ESTIMATORS
-
-if TYPE_CHECKING:
-    from harness.vocabulary import EstimatorName
-
 
 FCD = ".xml"
 """Suffix of SUMO's floating car data."""
@@ -36,9 +32,9 @@ LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_tt
     "--estimator",
     "-e",
     "estimators",
-    type=click.Choice(ESTIMATORS),
+    metavar="NAME",
     multiple=True,
-    help="Only this one; may be given several times.",
+    help=f"Only this one: {', '.join(ESTIMATORS)}, or your own, my.py:MyEstimator. May be given several times.",
 )
 @click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
@@ -53,7 +49,7 @@ def estimate(
     ctx: click.Context,
     folder: Path,
     *,
-    estimators: Sequence[EstimatorName],
+    estimators: Sequence[str],
     confidence: float | None,
     write: bool,
     environment: str | None,
@@ -83,7 +79,11 @@ def estimate(
 
             content = estimate_in_other_traffic(folder, environment, confidence=confidence, own=write, progress=bar)
     else:
-        content = harness.estimate(folder, estimators=estimators or None, confidence=confidence)
+        from harness.estimators.own import asked_for  # noqa: PLC0415 - keeps --help fast
+
+        asked = asked_for(estimators, "--estimator")
+        estimators = list(map(str, asked))
+        content = harness.estimate(folder, estimators=asked or None, confidence=confidence)
     if write:
         from harness.records.folder import write_sealed  # noqa: PLC0415 - keeps --help fast
 

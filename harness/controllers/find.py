@@ -33,17 +33,20 @@ from harness.processes import Child, WorkerDeath, first_to_answer, tell
 _Answer = TypeVar("_Answer")
 
 
+_A_CONTROLLER = "a controller (see docs/controllers.md)"
+
+
 class AvEndedProcessError(HarnessError):
     """The AV's controller ended the process that it ran in."""
 
     exit_code = EXIT_TOO_MANY_FAILED
 
 
-def controller_class(name: str) -> Callable[..., Any]:
+def own_code(name: str, where: str = "av.controller", what: str = _A_CONTROLLER) -> Callable[..., Any]:
     """The class, or function, that a name stands for: ``my_av.py:Class`` or ``package.module:Class``.
 
     The folder that the harness was started in is importable, as it is for a script, and so is that of a file. Where
-    there is no such module or class, a `CampaignError` says so.
+    there is no such module or class, a `CampaignError` says so, of the key ``where`` and ``what`` it has to be.
     """
     module_name, _, class_name = name.rpartition(":")
     is_file = module_name.endswith(".py")
@@ -55,13 +58,13 @@ def controller_class(name: str) -> Callable[..., Any]:
         cause = f"{name}, whose module cannot be imported ({cause_of(error)})"
         meant = did_you_mean(module_name, [file.stem for file in Path.cwd().glob("*.py")])
         mend = "Mend the module." if is_file else "Name its file, my_av.py:Class, or install it beside the harness."
-        raise CampaignError("av.controller", cause, "a Python module that can be imported", meant or mend) from error
+        raise CampaignError(where, cause, "a Python module that can be imported", meant or mend) from error
     found = getattr(module, class_name, None)
     if not callable(found):
         own = [name for name, each in vars(module).items() if getattr(each, "__module__", "") == module.__name__]
-        what = f"no class or function {class_name} in {getattr(module, '__file__', module_name)}"
+        lacks = f"no class or function {class_name} in {getattr(module, '__file__', module_name)}"
         mend = did_you_mean(class_name, own) or f"It has: {', '.join(own) or 'none'}."
-        raise CampaignError("av.controller", what, "a controller (see docs/controllers.md)", mend)
+        raise CampaignError(where, lacks, what, mend)
     return found  # type: ignore[no-any-return]
 
 
@@ -105,14 +108,14 @@ def build_host(
     except (Exception, SystemExit) as error:  # who looks for an attribute runs the user's code, too
         found = f"{av.controller}, of which looking at its attributes fails ({cause_of(error)})"
         mend = "Mend what is raised: a __getattr__ raises AttributeError for what is not there."
-        raise CampaignError("av.controller", found, "a controller (see docs/controllers.md)", mend) from error
+        raise CampaignError("av.controller", found, _A_CONTROLLER, mend) from error
     return BatchHost(*told, first) if is_batch else VehicleHost(*told, make, n_cells, first)
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
     """Makes controllers, each with parameters of its own: what one does to a list among them is nobody else's."""
     name = str(av.controller)
-    found = controller_class(name)
+    found = own_code(name)
     parameters = av.parameters if isinstance(av.parameters, dict) else {}
     make, handed = _as_class(found, name)
     if "loaded" in handed:
@@ -247,6 +250,6 @@ def _source_of_made(av: AutomatedVehicle) -> str | None:
     build_host(av, n_cells=1, seed=0)  # what it holds ends with the process
     if av.controller is None:
         return None
-    module = sys.modules.get(getattr(controller_class(av.controller), "__module__", ""))
+    module = sys.modules.get(getattr(own_code(av.controller), "__module__", ""))
     file = Path(getattr(module, "__file__", None) or "")
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None

@@ -15,13 +15,14 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Note, Number, Point, Unavailable, finite_json
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import one_pass
+from harness.estimators.own import Asked, headline_of
 from harness.estimators.severity import Severity
 from harness.estimators.stopping import RoundRule, Rule
 from harness.estimators.traffic import TrafficError
 from harness.numbers import two_digits_up
 from harness.records.folder import StoppedBy
 from harness.strata import Assumed, weight_of_a_test
-from harness.vocabulary import ESTIMATORS, EstimatorName
+from harness.vocabulary import ESTIMATORS
 
 ROOM = 1.25
 """Tests go in steps, and not to all shells alike: beyond those that would just do [measured: 1.15 at most]."""
@@ -99,17 +100,18 @@ def estimate_blocks(
     campaign: Campaign,
     manifest: Mapping[str, Any],
     *,
-    estimators: Collection[EstimatorName] | None = None,
+    estimators: Collection[Asked] | None = None,
     confidence: float | None = None,
 ) -> dict[str, Any]:
     """Estimates of blocks that cover a campaign's episodes, as JSON content.
 
     Blocks are contiguous and in index order; ``manifest`` is the run's, of which nothing but ``campaign_hash`` need be
     known. Nothing is said per km where it has no ``distance_per_test_m``, the mean distance that the AV drives in a
-    naturalistic test. ``estimators`` are reported beside the method's own, all by default; ``confidence`` is the level
-    of the intervals, by default the campaign's.
+    naturalistic test. ``estimators`` are reported beside the campaign's own, all by default; ``confidence`` is the
+    level of the intervals, by default the campaign's.
     """
-    done = one_pass(blocks, estimators or ESTIMATORS, confidence=confidence or campaign.stop.confidence)
+    confidence, own = confidence or campaign.stop.confidence, headline_of(campaign)
+    done = one_pass(blocks, estimators or ESTIMATORS, own, confidence)
     best = done.headline_estimate
     level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
     distance_km = None if distance_m is None else distance_m / 1000.0
@@ -119,7 +121,7 @@ def estimate_blocks(
         distance_per_test_km=distance_km,
         crash_rate_per_1e6_km=None if distance_km is None else _per_1e6_km(best, distance_km),
         estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in done.estimates.items()},
-        diagnostics=done.diagnostics.result(campaign.importance_names), convergence=tuple(done.convergence),
+        diagnostics=done.diagnostics.result(), convergence=tuple(done.convergence),
         severity=done.severity,
         assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
         stopped_by=manifest.get("stopped_by"), unmet=tuple(Note(**each) for each in manifest.get("unmet", ())),

@@ -59,7 +59,8 @@ class Drawn:
     ``alpha`` (M,) are mixture weights of the importance functions; ``weight_cap`` is the bound on Y = 1{crash}·weight
     that the design guarantees for every episode, seen or not, None if there is none; ``epsilon`` is the least share of
     its exposure with which the step mixture draws a maneuver; ``shells`` is what is known of the strata, where tests
-    are drawn from some. Crashes count with an impact above ``counts_above_mps``, all of them at 0.
+    are drawn from some. Crashes count with an impact above ``counts_above_mps``, all of them at 0. ``names`` (M,) are
+    those of the importance functions.
     """
 
     method: Method
@@ -68,6 +69,7 @@ class Drawn:
     shells: ShellDesign | None = None
     counts_above_mps: float = 0.0
     epsilon: float = 0.0
+    names: tuple[str, ...] = ()
 
     @property
     def sampling(self) -> Sampling:
@@ -233,7 +235,8 @@ def block_from_tables(
             step = pc.fill_null(episodes.column("event_step"), -1).to_numpy()
             columns["step"] = np.where(columns["cut_in"], step, -1 - index).astype(np.int64)
     cap, above_mps = None if sampling.controlled else 1.0, campaign.crash.counts_above_mps
-    drawn = Drawn(campaign.testing.method, alpha, cap, shells, above_mps, campaign.testing.epsilon)
+    method, names = campaign.testing.method, campaign.importance_names
+    drawn = Drawn(method, alpha, cap, shells, above_mps, campaign.testing.epsilon, names)
     block = Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
     return block.harder_than(above_mps) if above_mps > 0.0 else block
 

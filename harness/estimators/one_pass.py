@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from harness.estimators.block import Block
+from harness.estimators.block import Block, Drawn
 from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Note, Point, Unavailable, note
+from harness.estimators.own import Asked, OwnEstimator, OwnState
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.severity import Impacts, Severity
 from harness.estimators.shells import SeenShells
 from harness.estimators.weighted import Moments, Nade, Nde
-from harness.vocabulary import CONTACT, ESTIMATORS, EstimatorName, Sampling
+from harness.vocabulary import CONTACT, ESTIMATORS, SAMPLING, EstimatorName
 
 ACCUMULATORS: dict[EstimatorName, Callable[[], Accumulator]] = {
     "nde": Nde,
@@ -37,7 +38,7 @@ BEFORE_OVERLAP = ("took_over_early", "asked_to_speed_up")
 class Diagnostics:
     """Running moments of weights and ratios; add blocks, ask for the result."""
 
-    _sampling: Sampling  # of the first block
+    _drawn: Drawn  # of the last block
 
     def __init__(self) -> None:
         self.n, self.counts = 0, Counter[str]()
@@ -47,7 +48,7 @@ class Diagnostics:
     def add(self, block: Block) -> None:
         """Add one block."""
         weights, contact = block.weights(), block.outcome == CONTACT
-        self._sampling = block.drawn.sampling
+        self._drawn = block.drawn
         self.n += len(block)
         counted = {"n_events": block.cut_in, "n_bv_lv_contacts": contact, "n_failed": block.failed}
         counted |= {f"n_{name}": block.columns[name] for name in BEFORE_OVERLAP if name in block.columns}
@@ -55,12 +56,13 @@ class Diagnostics:
         self._weight += Moments.of(weights)
         self._cut_in += Moments.of(weights[block.cut_in])
         self._contact += Moments.of(weights[contact])
-        for j, ratios in enumerate(block.mixture_ratios().T if self._sampling.mixes else ()):
+        for j, ratios in enumerate(block.mixture_ratios().T if block.drawn.sampling.mixes else ()):
             self._ratios[j] += Moments.of(ratios)
 
-    def result(self, importance_names: tuple[str, ...] = ()) -> dict[str, Any]:
-        """Means with standard errors; the M importance functions, in order, are numbered where names are left out."""
-        ratios = {importance_names[j] if importance_names else f"q_{j}": sums for j, sums in self._ratios.items()}
+    def result(self) -> dict[str, Any]:
+        """Means with standard errors; importance functions without names are numbered."""
+        names = self._drawn.names
+        ratios = {names[j] if names else f"q_{j}": sums for j, sums in self._ratios.items()}
         return {
             "mean_weight": self._mean(self._weight),
             "mean_weight_event": self._mean(self._cut_in),
@@ -70,32 +72,36 @@ class Diagnostics:
         }
 
     def _mean(self, sums: Moments) -> dict[str, float]:
-        known = not self._sampling.strata
+        known = not self._drawn.sampling.strata
         return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)} if known else UNKNOWN_MEAN
 
 
-def refusal(block: Block, estimator: EstimatorName) -> Note | None:
+def refusal(block: Block, estimator: Asked) -> Note | None:
     """Why records like this block do not allow an estimator; None if they do."""
-    if estimator not in block.drawn.sampling.estimators:
-        return note(f"needs_{estimator}", method=block.drawn.method)
+    method = block.drawn.method
+    if isinstance(estimator, OwnEstimator):
+        allowed, of = method in estimator.methods, ", ".join(estimator.methods)
+        return None if allowed else note("needs_own", methods=of, method=method)
+    if estimator not in SAMPLING[method].estimators:
+        return note(f"needs_{estimator}", method=method)
     return note("needs_moments") if estimator == "scv" and "first_ratios" not in block.columns else None
 
 
-def accumulator(name: EstimatorName) -> FailureBounds:
+def accumulator(asked: Asked) -> FailureBounds:
     """Empty state of an estimator, for those who feed it themselves (the runner does, for stopping)."""
-    return FailureBounds(ACCUMULATORS[name]())
+    return FailureBounds(OwnState(asked) if isinstance(asked, OwnEstimator) else ACCUMULATORS[asked]())
 
 
 @dataclass(frozen=True)
 class PassResult:
     """What one pass over a campaign's blocks gives.
 
-    ``estimates`` begin with the ``headline``, the method's own, asked for or not; ``convergence`` is that on growing
+    ``estimates`` begin with the ``headline``, the campaign's own, asked for or not; ``convergence`` is that on growing
     prefixes, for plots: block boundaries at least 1 % apart; ``severity`` is how hard its crashes are.
     """
 
-    estimates: dict[EstimatorName, Estimate | Unavailable]
-    headline: EstimatorName
+    estimates: dict[str, Estimate | Unavailable]
+    headline: str
     headline_estimate: Estimate
     diagnostics: Diagnostics
     convergence: list[Point]
@@ -103,19 +109,20 @@ class PassResult:
 
 
 def one_pass(
-    blocks: Iterable[Block], names: Collection[EstimatorName] = ESTIMATORS, *, confidence: float = 0.9
+    blocks: Iterable[Block], names: Collection[Asked] = ESTIMATORS, best: Asked | None = None, confidence: float = 0.9
 ) -> PassResult:
-    """Feed every block to every estimator that can use it.
+    """Feed every block to every estimator that can use it; the ``best``, the headline, is by default the method's own.
 
     Blocks are contiguous and in index order, from episode 0; a gap, or no episode at all, is a `ValueError`.
     """
     blocks = iter(blocks)
     if (first := next(blocks, None)) is None:
         raise ValueError("an estimate needs at least one episode")
-    own = first.drawn.sampling.headline
-    refusals = {name: refusal(first, name) for name in (own, *names)}
-    states = {name: accumulator(name) for name, why in refusals.items() if why is None}
-    empty = SeenShells if own == "shells" else partial(accumulator, own)
+    best = best or first.drawn.sampling.headline
+    asked, own = {str(each): each for each in (*names, best)}, str(best)
+    refusals = {name: refusal(first, asked[name]) for name in (own, *asked)}
+    states = {name: accumulator(asked[name]) for name, why in refusals.items() if why is None}
+    empty = SeenShells if own == "shells" else partial(accumulator, best)
     impacts = Impacts(empty, first.drawn.counts_above_mps) if "impact_mps" in first.columns else None
     diagnostics, convergence, n = Diagnostics(), list[Point](), 0
     for block in chain((first,), blocks):

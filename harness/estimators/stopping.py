@@ -30,7 +30,6 @@ from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts, PairDecision, PairVerdict
 from harness.estimators.shells import SeenShells
 from harness.strata import ASSUMPTION_FREE
-from harness.vocabulary import SAMPLING, EstimatorName, Method
 
 LOOK_RATIO = 1.1
 """Of neighbouring looks: since the half-width shrinks with 1/√n, they differ by 5 % in precision, which is the noise of
@@ -189,16 +188,13 @@ def look_grid(n_episodes: int, shard_ends: Sequence[int], ratio: float = LOOK_RA
 class StopRule(Rule):
     """Fed with the estimate of weighted tests at each look in turn.
 
-    ``estimator``, the method's own, is whose estimate `observe` wants, ``looks`` at which numbers of episodes.
+    `observe` wants the estimate of the campaign's own estimator, ``looks`` are the numbers of episodes at which.
     """
 
     _needed = 2
 
-    def __init__(
-        self, campaign_stop: Stop, method: Method, shard_ends: Sequence[int], ratio: float = LOOK_RATIO
-    ) -> None:
+    def __init__(self, campaign_stop: Stop, shard_ends: Sequence[int], ratio: float = LOOK_RATIO) -> None:
         super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or DEFAULT_MIN_CRASHES)
-        self.estimator: EstimatorName = SAMPLING[method].headline
         self.looks = look_grid(campaign_stop.episodes, shard_ends, ratio)
         self._n_looks = 0
 
@@ -309,13 +305,8 @@ class PairRule(Rule):
         watched, level = pairs.inside(pairs.design.n_within(self._statement)), Level.two_sided(self._confidence)
         self.decision = replace(self.decision, verdict=self._verdict(watched))
         pool = watched.rhw_from_pool(level)
-        given_up = self._looked(
-            watched.rhw(level),
-            pairs.n_crashes,
-            of="rhw_of_difference",
-            after_first_tests=True,
-            pool=(pool, pool),
-        )
+        found, of = (watched.rhw(level), pairs.n_crashes), "rhw_of_difference"
+        given_up = self._looked(*found, of=of, after_first_tests=True, pool=(pool, pool))
         if not self.ends_at_rhw:
             ended = self.look.ended
             if self.decision.verdict != "open":

@@ -33,9 +33,8 @@ def code_of(av: AutomatedVehicle) -> str | None:
     return av.controller or (None if av.fmu is None else av.fmu.file)
 
 
-def require_trust(folder: Path, manifest: Mapping[str, Any], av: AutomatedVehicle, mend: str) -> None:
-    """Refuse (`RunFolderError`) to run the code that a folder names which this user has not made on this machine."""
-    code = code_of(av)
+def require_trust(folder: Path, manifest: Mapping[str, Any], code: str | None, mend: str) -> None:
+    """Refuse (`RunFolderError`) to run ``code`` that a folder names which this user has not made on this machine."""
     signed = signature((folder / CAMPAIGN).read_bytes())
     if code is not None and (signed is None or not hmac.compare_digest(signed, str(manifest.get("signature")))):
         found = f"a run that was not made on this machine by this user; it names {code}, which would be run"

@@ -74,7 +74,9 @@ NOTES = {
     "±{alone:share} of the rate, as far as these can tell",
     "used_up": "all cut-ins that the pool has kept of {shells} were tested",
     "refuted": "{n:,} crashes beyond {boundary}: statement library does not hold for this vehicle",
+    "own": "an estimator of your own: nobody has measured how often its interval covers",
     # why an estimator has no value
+    "needs_own": "is for tests drawn by {methods}, as it says itself" + _DRAWN_BY,
     "needs_nde": "a share of crashes needs naturalistic tests (method nde)" + _DRAWN_BY,
     "needs_nade": "shares of crashes within shells must be added by the shells' probabilities (estimator shells)"
     + _DRAWN_BY,

@@ -49,7 +49,7 @@ def write_page_of(run: RunFolder) -> Path:
         folder / "report.html", "report.html.j2",
         run=run, answer=answer, summary=summary, gallery=gallery, scenes=scenes, lateral=lateral_facts(run),
         sizes=table_sizes(run.manifest["parts"]), figures={plot.name: plot for plot in plots},
-        tabled=traffic is not None and traffic.accepted.size > 0,
+        tabled=len(getattr(traffic, "accepted", ())) > 0,  # a table that families have or not
         outcomes=list(zip(OUTCOMES, summary.count, summary.weight, strict=True)),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         warnings=[*answer.warnings, *uncovered(run, summary)], diagnostics=diagnostics(run),

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.drivers import Surrogate
 from harness.families import family_named
 from harness.families.protocol import Driven, Environment
 from harness.numbers import tenths
@@ -23,14 +24,14 @@ from harness.records.schemas import chosen_from
 from harness.report.summary import floats
 from harness.report.templates import write_page
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
-from harness.vehicles.library import LibraryDriver, library_records
+from harness.vehicles.library import library_records
 from harness.vocabulary import FloatArray, IntArray
 
 OTHERS = {
-    "r157-cc": ("a careful and competent driver", LibraryDriver(model="r157-cc")),
+    "r157-cc": ("a careful and competent driver", Surrogate(model="r157-cc")),
     "brakes-8": (
         "braking at once, at up to 8 m/s²",
-        LibraryDriver.model_validate({"model": "idm", "parameters": {"min_acceleration_mps2": -8.0}}),
+        Surrogate.model_validate({"model": "idm", "parameters": {"min_acceleration_mps2": -8.0}}),
     ),
 }
 """Who is driven in the AV's place, and in words: the reference driver first."""

@@ -87,7 +87,7 @@ def vehicle_words(av: AutomatedVehicle) -> tuple[str, list[tuple[str, str]]]:
         else:
             changed = dict(section)
         given |= {key: changed} if key and changed else changed
-    name = av.model or Path(av.controller or "").name
+    name = av.model or Path(av.controller or av.source).name
     if av.sumo is not None:
         given |= av.sumo
         name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"

@@ -31,7 +31,7 @@ from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, sole_use, write_sealed
-from harness.records.origin import require_trust
+from harness.records.origin import code_of, require_trust
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import Earlier, require_own_folder
 from harness.runner.run import begun, finish, show, workers_of
@@ -94,7 +94,7 @@ def compare_campaigns(
     a, b = campaign_of(a), campaign_of(b)
     if stored is not None:
         mend = f"Read that code; then name {Path(stored) / CAMPAIGN} for A, which drives it anew."
-        require_trust(Path(stored), read_manifest(Path(stored)), a.av, mend)
+        require_trust(Path(stored), read_manifest(Path(stored)), code_of(a.av), mend)
     if margin is not None and rhw is not None:
         expected = "one end of the comparison"
         raise CampaignError("--margin", f"stop.rhw={rhw:g} beside it", expected, "Leave out --margin or stop.rhw.")

@@ -20,18 +20,19 @@ from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables, joined
 from harness.estimators.one_pass import SPACING
+from harness.estimators.own import asked_for
 from harness.families.protocol import Environment
 from harness.files import write_atomically
 from harness.processes import SharedFile, made_ahead
 from harness.records.folder import CAMPAIGN, Part, no_episodes, read_kept, read_manifest
-from harness.records.origin import require_trust
+from harness.records.origin import code_of, require_trust
 from harness.records.reader import N_READERS, read_campaign, require_campaign, traffic_of
 from harness.records.schemas import moments_schema, shard_tables
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
-from harness.vocabulary import ESTIMATORS, EstimatorName
+from harness.vocabulary import ESTIMATORS
 from harness.worlds import build_world
 from harness.worlds.system_libraries import require_libraries
 
@@ -44,21 +45,23 @@ _FINISH = "Run `harness run` with --resume, which makes missing tests."
 def estimate_run(
     folder: str | Path,
     *,
-    estimators: Annotated[Sequence[EstimatorName], Field(min_length=1)] | None = None,
+    estimators: Annotated[Sequence[str | Any], Field(min_length=1)] | None = None,
     confidence: Confidence | None = None,
 ) -> dict[str, Any]:
     """Estimate a stored run from its records; returns the content of ``estimates.json``.
 
-    ``estimators`` are reported beside the method's own, all by default; ``confidence`` is the level of the intervals,
-    by default the campaign's.
+    ``estimators`` are reported beside the campaign's own, all by default: names, or estimators of your own
+    (`harness.estimators.own`). ``confidence`` is the level of the intervals, by default the campaign's.
 
-    Raises `HarnessError`: if the folder is not a run, its records are damaged or incomplete.
+    Raises `HarnessError`: if the folder is not a run, its records are damaged or incomplete; or an estimator is wrong.
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
     campaign = read_campaign(folder, manifest)
-    blocks = stored_blocks(folder, moments="scv" in (estimators or ESTIMATORS))
-    return estimate_blocks(even(blocks), campaign, manifest, estimators=estimators, confidence=confidence)
+    require_trust(folder, manifest, campaign.testing.estimator, "Read that code, and run campaign.yaml yourself.")
+    asked = asked_for(estimators or ESTIMATORS, "harness.estimate(estimators=…)")
+    blocks = stored_blocks(folder, moments=not {*asked} < {*ESTIMATORS} - {"scv"})
+    return estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence)
 
 
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
@@ -166,7 +169,7 @@ def replay_episode(
     if not stored:
         _require_reproducible(manifest, campaign)
         if not trust:
-            require_trust(folder, manifest, campaign.av, _TRUST)
+            require_trust(folder, manifest, code_of(campaign.av), _TRUST)
         return _simulated(folder, manifest, campaign, tables, episode, gui, fcd)
     if gui or fcd is not None:
         found, expected = "stored motion, which SUMO does not simulate", "a simulation, for sumo-gui and its data"

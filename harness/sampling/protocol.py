@@ -21,6 +21,7 @@ from harness.controllers.find import build_host
 from harness.controllers.hosts import BeforeTest
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator
+from harness.estimators.own import headline_of
 from harness.estimators.stopping import Rule, StopRule
 from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import judge
@@ -74,8 +75,8 @@ class KnownRounds(Rounds):
     def __init__(self, campaign: Campaign) -> None:
         self._total, self._confidence = campaign.stop.episodes, campaign.stop.confidence
         self._ends = campaign.run.shard_ends(self._total)
-        self.rule = self._rule = StopRule(campaign.stop, campaign.testing.method, self._ends)
-        self._sums, self._n_episodes = accumulator(self._rule.estimator), 0
+        self.rule = self._rule = StopRule(campaign.stop, self._ends)
+        self._sums, self._n_episodes = accumulator(headline_of(campaign)), 0
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
         edges = enumerate(pairwise(chain((0,), self._ends)))

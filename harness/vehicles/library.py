@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Literal, Self
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from harness.campaign.drivers import Driver, Reference, Reflexes
+from harness.campaign.drivers import Surrogate
 from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.problems import broken_rule, did_you_mean
 from harness.campaign.sections import Section, SurrogateName, listed
@@ -23,20 +24,7 @@ MOST_SURROGATES = 60
 """Outcomes of a cut-in are bits of one integer."""
 
 
-class LibraryDriver(Driver):
-    """A driver with its reflexes."""
-
-    reaction: Reflexes = Reflexes()
-
-    @property
-    def delay_after_event_s(self) -> float | None:
-        """How long after a dangerous cut-in a reference driver begins to brake (s); None for any other driver."""
-        if not isinstance(self.parameters, Reference):
-            return None
-        return self.parameters.delay_after_event_s + self.reaction.delay_s
-
-
-def library_records(models: Sequence[LibraryDriver], see_onset: bool) -> RecordArray:
+def library_records(models: Sequence[Surrogate], see_onset: bool) -> RecordArray:
     """Drivers of a library as kernels read them, shape (D,); ``see_onset`` says that cut-ins take time."""
     parameters, reactions = [model.parameters for model in models], [model.reaction for model in models]
     return driver_records(parameters, reactions, see_onset=see_onset)
@@ -60,8 +48,8 @@ class Library(Section):
     )
     envelope: SurrogateName
     """a driver at constant full throttle: it crashes wherever any vehicle within its acceleration does"""
-    surrogates: dict[SurrogateName, LibraryDriver] = Field(description="drivers by name")
-    references: dict[SurrogateName, LibraryDriver] = Field(default_factory=dict)
+    surrogates: dict[SurrogateName, Surrogate] = Field(description="drivers by name")
+    references: dict[SurrogateName, Surrogate] = Field(default_factory=dict)
     """drivers that the vehicle is compared with; no shell is made of them"""
 
     _counts_above_mps: float = PrivateAttr(0.0)
@@ -127,6 +115,13 @@ class Library(Section):
                 expected = "an envelope that accelerates at least as hard as every surrogate"
                 raise broken_rule(f"{place}.parameters.acceleration_mps2", found, expected, mend)
         return self
+
+
+@cache
+def shipped_drivers() -> dict[str, Surrogate]:
+    """Surrogates and references of all shipped libraries, by name."""
+    libraries = [read_model(file, Library) for file in sorted(SHIPPED_FOLDER.glob("*.yaml"))]
+    return {name: each for one in libraries for name, each in (one.surrogates | one.references).items()}
 
 
 def load_library(name: str | None, *, shows: bool = False) -> Library:

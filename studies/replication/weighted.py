@@ -89,8 +89,8 @@ class WeightedCampaign:
         campaign = self.campaign
         stop = campaign.stop.model_copy(update={"estimator": self.estimators[0]})
         ends = campaign.run.shard_ends(stop.episodes)
-        rule = StopRule(stop, campaign.testing.method, ends)
-        watched, blocks = accumulator(rule.estimator), list[Block]()
+        rule = StopRule(stop, ends)
+        watched, blocks = accumulator(campaign.sampling.headline), list[Block]()
         for n, look in pairwise([0, *rule.looks]):
             blocks.append(self.source(replication * stop.episodes + n, look - n))
             watched.add(blocks[-1])

@@ -54,6 +54,8 @@ MISTAKES = (
 )
 """Which an editor's schema refuses, too."""
 BROKEN_RULES = (
+    ("surrogates:\n  A: my.py:Model", "surrogates.A", 3, "so no class of Python"),
+    ("surrogates:\n  A: r157-c", "surrogates.A", 3, "Did you mean 'r157-cc'?"),
     ("testing: {method: episode_mixture}\nsurrogates: {}", "surrogates", 3, "at least one surrogate"),
     ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.2}", "testing.alpha", 3, "sum to 1.1"),
     ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.5}", "testing.alpha", 3, "SM-I, SM-II, SM-III"),

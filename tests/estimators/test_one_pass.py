@@ -84,8 +84,8 @@ def test_each_estimator_gets_what_it_would_get_alone_and_convergence_is_the_head
     assert done.estimates[SAMPLING[method].headline] == prefixes[-1]
 
 
-def diagnosed(*parts, names=()) -> dict:
-    return fed(Diagnostics(), parts).result(names)
+def diagnosed(*parts) -> dict:
+    return fed(Diagnostics(), parts).result()
 
 
 def test_what_is_counted_and_a_small_mean_weight_are_told():

@@ -58,7 +58,7 @@ def test_long_runs_have_some_200_shards():
 @pytest.mark.parametrize(("weight_cap", "stops"), [(59.0, True), (61.0, False), (math.inf, False)])
 def test_one_more_crash_of_the_largest_weight_must_not_matter(weight_cap, stops):
     """At n = 200 and a rate of 1 an RHW of 0.3 allows for a weight of 60."""
-    rule = StopRule(Stop(episodes=100_000, rhw=0.3, min_crashes=10), "forced", ENDS)
+    rule = StopRule(Stop(episodes=100_000, rhw=0.3, min_crashes=10), ENDS)
     rule.observe(rule.looks[0], replace(passing(200), weight_cap=weight_cap))
     assert rule.observe(rule.looks[1], replace(passing(400), weight_cap=2 * weight_cap)) == stops
 
@@ -82,7 +82,7 @@ WRONG = {"cautions": ("unbounded",)}
     ],
 )
 def test_two_looks_in_turn_must_pass_and_what_was_missing_is_remembered(looks, reached, unmet):
-    rule = StopRule(Stop(episodes=SHARD * len(looks), rhw=0.3, min_crashes=50), "forced", ENDS)
+    rule = StopRule(Stop(episodes=SHARD * len(looks), rhw=0.3, min_crashes=50), ENDS)
     ended = [rule.observe(n, replace(passing(n), **of)) for n, of in zip(rule.looks, looks, strict=True)]
     assert ended == [False] * (len(looks) - 1) + [True]
     assert (rule.look.stopped, tuple(each.key for each in rule.look.unmet)) == (reached, unmet)

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from scipy import special
 
+from harness.campaign.drivers import CarefulCompetentParameters, IDMParameters, Reflexes
+from harness.families.cut_in.nade import challenge
+from harness.vehicles.drivers import driver_records
 from harness.vehicles.kinematics import CONTACT_M
 from tests.chains.seed import SEED
 from tests.episode.twin_runs import Mean, prepared, run
@@ -172,3 +175,34 @@ def test_predicted_crash_rates(j, av, low, high):
     prediction, rate = Mean.of(predicted), run("forced", av=av, n=20_000).rate
     margin = 4.0 * np.hypot(prediction.std_error, high * rate.std_error)
     assert low * rate.value - margin < prediction.value < high * rate.value + margin
+
+
+def late_gap(state, delay_steps, seconds=12):
+    """Smallest gap (m) of SM-I that keeps its speed for some steps behind a BV that keeps its own."""
+    v, r2, rate = state
+    follower, smallest = v - rate, np.inf
+    for step in range(10 * seconds):
+        a = 0.0 if step < delay_steps else float(surrogate_acceleration("SM-I", follower, v, r2))
+        after = max(follower + 0.1 * a, 0.0)
+        r2 += 0.05 * (2.0 * v - follower - after)
+        follower, smallest = after, min(smallest, r2)
+    return smallest
+
+
+def test_a_surrogate_that_lags_is_late_after_the_cut_in_alone():
+    driver = driver_records([IDMParameters()] * 2, [Reflexes(delay_s=0.7), Reflexes()]).view(np.recarray)
+    for state in [(25.0, 30.0, -6.0), (30.0, 12.0, -3.0), (20.0, 45.0, -10.0)]:
+        gaps = np.empty(13)
+        challenge.smallest_gaps(*state, 20, 10, 10, driver[0], gaps)
+        assert gaps[-1] == pytest.approx(late_gap(state, 7), abs=1e-9)
+        late, reacted = (challenge.hold_period(*state, 0.0, driver[0], 10, first) for first in (0, challenge.LONG))
+        assert reacted == challenge.hold_period(*state, 0.0, driver[1], 10, 0)
+        assert late[1] < reacted[1]
+
+
+def test_the_careful_and_competent_driver_brakes_sooner_once_it_has_reacted():
+    cc = driver_records([CarefulCompetentParameters()]).view(np.recarray)[0]
+    state = (20.0, 15.0, -9.0)  # a time to collision below two seconds
+    late, reacted = (challenge.hold_period(*state, 0.0, cc, 10, first) for first in (0, challenge.LONG))
+    assert state[1] - 9.0 < late[1] < reacted[1]
+    assert reacted[2] - state[2] == pytest.approx(7.59294, abs=0.01)

@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 from harness.campaign.yaml_text import yaml_text
-from harness.families.cut_in.nade.in_loop import DrawnInLoop
-from harness.families.cut_in.nade.source import InLoop
+from harness.families.cut_in.nade.in_loop import DrawnInLoop, InLoop
 from harness.loop.loop import Shard
 from harness.progress import Progress
 from harness.resolved import resolve

@@ -110,7 +110,7 @@ class CutIn:
         return EXPOSURE
 
     def sources(self) -> Mapping[Method, type[Any]]:
-        from harness.families.cut_in.nade.source import InLoop  # noqa: PLC0415 - imports what draws on families
+        from harness.families.cut_in.nade.in_loop import InLoop  # noqa: PLC0415 - imports what draws on families
 
         return dict.fromkeys(("nde", "step_mixture", "episode_mixture"), InLoop)
 

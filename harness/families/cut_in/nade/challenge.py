@@ -6,6 +6,8 @@ freely and redraws its acceleration every hold period; the surrogate reacts in e
 
     U_0 = 0,   U_{i+1}(s) = Σ_a p(a | v_BV) [1 if the pair collides while a is held, else U_i(s'(s, a))].
 
+A surrogate that lags behind what it sees is late in the first period after the cut-in; from the second on it counts as
+one who has known of the danger for long, which the state cannot tell. What is wrong with that costs tests alone.
 Levels of U are stored about one second apart (time remaining in the episode); the challenge of a maneuver,
 C(s, a) = 1 or U(s'), is stored for the longest remaining time. Where U of the time that remains is 0, no surrogate can
 crash any more, and nothing is controlled.
@@ -48,26 +50,45 @@ from harness.families.cut_in.nade.grid import (
 from harness.processes import usable_cpus
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
+from harness.vehicles.references import Memory, react
 from harness.vocabulary import N_ACCELERATIONS, Float32Array, FloatArray, Record, RecordArray
 
 LEVELS = 12
 """Seconds of remaining time that are told apart; later crashes are counted in the last level."""
 COLLIDED = -1.0
+LONG = 1000
+"""Steps after which any driver has reacted."""
+
+
+@compiled_inline
+def lags(driver: Record) -> bool:
+    """Whether what a driver does follows from more than what it sees in that step."""
+    return bool(driver.kind < 0 or driver.delay_steps > 0 or driver.max_jerk_mps3 < math.inf)
+
+
+@compiled_inline
+def acts(driver: Record, memory: Memory, step: int, speed: float, lead_speed: float, r2: float) -> Memory:
+    """What a surrogate does in a step after the cut-in, as what it remembers."""
+    acting = step - driver.delay_steps
+    return memory if acting < 0 else react(driver, memory, acting, speed, lead_speed, r2)
 
 
 @compiled_inline
 def hold_period(
-    speed: float, r2: float, r2dot: float, bv_acceleration: float, driver: RecordArray, steps: int
+    speed: float, r2: float, r2dot: float, bv_acceleration: float, driver: Record, steps: int, first: int
 ) -> tuple[float, float, float]:
     """(v_BV, R2, R2dot) after ``steps`` steps of a held acceleration, with the surrogate following.
 
-    v_BV is `COLLIDED` if the surrogate hit BV.
+    v_BV is `COLLIDED` if the surrogate hit BV. The ``first`` step is the 0th after the cut-in, or comes `LONG` after.
     """
     follower = speed - r2dot
-    for _ in range(steps):
-        a = driver_acceleration(driver, follower, speed, r2)
+    memory = Memory(0.0, math.inf, driver.used_up_steps)
+    if first == LONG and driver.kind < 0:  # brakes as hard as it can, as long as there is a danger
+        memory = Memory(driver.min_acceleration_mps2, 0.0, driver.used_up_steps)
+    for step in range(first, first + steps):
+        memory = acts(driver, memory, step, follower, speed, r2)
         speed_after = next_speed(speed, bv_acceleration)
-        follower_after = next_speed(follower, a)
+        follower_after = next_speed(follower, memory.acceleration)
         r2 += 0.5 * (speed + speed_after - follower - follower_after) * STEP_S
         speed, follower = speed_after, follower_after
         if r2 < CONTACT_M:
@@ -76,12 +97,12 @@ def hold_period(
 
 
 @compiled_threads
-def transitions(driver: RecordArray, steps: int, points: GridPoints, out: Float32Array) -> None:
+def transitions(driver: RecordArray, steps: int, first: int, points: GridPoints, out: Float32Array) -> None:
     """State one hold period later for every grid state and acceleration; ``out`` (v, R2, R2dot, 31, 3)."""
     for i, j, k in np.ndindex(out.shape[:3]):
         v, r2, r2dot = state_at(points, i, j, k)
         for m in range(N_ACCELERATIONS):
-            after = hold_period(v, r2, r2dot, acceleration(m), driver[0], steps)
+            after = hold_period(v, r2, r2dot, acceleration(m), driver[0], steps, first)
             out[i, j, k, m, 0], out[i, j, k, m, 1], out[i, j, k, m, 2] = after
 
 
@@ -130,10 +151,13 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
     """
     points, shape = points_of(AFTER), shape_of(AFTER)
     hold = int(environment.numbers["hold_steps"])
+    lagging = lags(driver.view(np.recarray)[0])
     pmf = np.empty((points.speed.size, N_ACCELERATIONS))
     free_driving_table(points.speed, unboxed(environment), pmf)
     after = np.empty((*shape, N_ACCELERATIONS, 3), np.float32)
-    transitions(driver, hold, points, after)
+    transitions(driver, hold, LONG, points, after)
+    if lagging:
+        transitions(driver, hold, 0, points, late := np.empty_like(after))
     value = np.zeros((LEVELS + 1, *shape), np.float32)
     current, following = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for level in range(1, LEVELS + 1):
@@ -141,6 +165,8 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
             backward_step(after, pmf, current, following)
             current, following = following, current
         value[level] = current
+        if lagging:
+            backward_step(late, pmf, following, value[level])  # from one period later on it has reacted
     maneuvers = np.empty((*shape, N_ACCELERATIONS), np.float32)
     maneuver_challenge(after, current, maneuvers)
     return value, maneuvers
@@ -171,11 +197,15 @@ def smallest_gaps(
     smallest = _NO_CONTACT_M
     out[0] = smallest
     gap_of_shape, shape = math.inf, 1.0
+    lagging, memory = lags(driver), Memory(0.0, math.inf, driver.used_up_steps)
     for step in range((out.size - 1) * steps_per_level):
         # tanh takes most of FVDM's time. While the gap shrinks, the last value computed is an upper bound of
         # `fvdm_shape`: where the command is below the limit even for that, rounding included, it brakes fully.
         a = driver.min_acceleration_mps2
-        if not (
+        if lagging:
+            memory = acts(driver, memory, step, follower, speed, r2)
+            a = memory.acceleration
+        elif not (
             driver.kind == FVDM_KIND
             and r2 <= gap_of_shape
             and fvdm_acceleration(driver, follower, speed, shape) < a - _ROUNDING_MPS2

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from harness import cache
-from harness.campaign.drivers import FVDMParameters, IDMParameters
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.nade.challenge import LEVELS, build_after_cut_in, build_before_cut_in, build_immediate
 from harness.families.cut_in.nade.grid import AFTER, BEFORE
@@ -25,8 +24,6 @@ from harness.vocabulary import Float32Array, RecordArray
 
 _FORMAT = 4
 """Raise it when the meaning of a table changes."""
-MODEL_FIELDS = ("kind", *dict.fromkeys((*IDMParameters.model_fields, *FVDMParameters.model_fields)))
-"""What decides the acceleration of a surrogate."""
 
 
 class Tables(NamedTuple):
@@ -47,8 +44,8 @@ class Tables(NamedTuple):
 def tables_hash(environment: Environment, drivers: RecordArray, challenge: str) -> str:
     """Hash of what the surrogates' tables depend on; the level of lane changing is not among it."""
     numbers = {name: value for name, value in environment.content().items() if name != "level"}
-    surrogates = [[driver[name].item() for name in MODEL_FIELDS] for driver in drivers]
-    content = json.dumps([_FORMAT, challenge, numbers, AFTER, BEFORE, MODEL_FIELDS, surrogates, LEVELS], sort_keys=True)
+    surrogates = drivers.dtype.names, drivers.tolist()
+    content = json.dumps([_FORMAT, challenge, numbers, AFTER, BEFORE, surrogates, LEVELS], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:24]
 
 
