@@ -17,7 +17,7 @@ MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}
 class InLoop(Source):
     """``tables`` are challenges, where surrogates' importance functions are mixed."""
 
-    columns = (*EPISODE_COLUMNS, "log_q")
+    columns = (*EPISODE_COLUMNS, "log_q", "martingale")
     kernel = staticmethod(decide)
 
     def __init__(self, resolved: Resolved, progress: Progress) -> None:
