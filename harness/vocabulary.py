@@ -55,7 +55,7 @@ def states_from(columns: Iterable[FloatArray]) -> RecordArray:
 
 
 Method = Literal["nde", "forced", "step_mixture", "episode_mixture", "shells"]
-EstimatorName = Literal["nde", "nade", "mixture_cv", "scv", "shells"]
+EstimatorName = Literal["nde", "nade", "mixture_cv", "dr", "scv", "shells"]
 
 METHODS: tuple[Method, ...] = get_args(Method)
 ESTIMATORS: tuple[EstimatorName, ...] = get_args(EstimatorName)
@@ -66,7 +66,7 @@ class Sampling:
     """One method of drawing tests.
 
     ``estimators`` are those that its records allow, the first being the method's own, which answers the campaign's
-    question; `scv` needs control steps on record besides.
+    question; `scv` needs control steps on record besides, `dr` 1,000 tests.
     """
 
     estimators: tuple[EstimatorName, ...]
@@ -93,8 +93,8 @@ class Sampling:
 SAMPLING: dict[Method, Sampling] = {
     "nde": Sampling(("nde", "nade"), controlled=False),
     "forced": Sampling(("nade",), forces=True, baseline_runs=True),
-    "step_mixture": Sampling(("nade", "scv"), mixes_steps=True, bounded=False),
-    "episode_mixture": Sampling(("mixture_cv", "nade"), mixes_episodes=True, forces=True, holds_speed=True),
+    "step_mixture": Sampling(("nade", "dr", "scv"), mixes_steps=True, bounded=False),
+    "episode_mixture": Sampling(("mixture_cv", "nade", "dr"), mixes_episodes=True, forces=True, holds_speed=True),
     "shells": Sampling(("shells",), baseline_runs=True, strata=True),
 }
 

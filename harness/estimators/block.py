@@ -94,6 +94,7 @@ class Block:
     ``took_over_early`` (the AV did something before BV was on its lane) and ``asked_to_speed_up`` (or that in vain);
     ``impact_mps`` (n,), closing speed at contact, NaN without a crash; ``n_control_steps`` (n,). ``log_q`` (n, M) is,
     per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode;
+    ``martingale`` (n, J) the D_j of `harness.estimators.doubly_robust`;
     ``first_ratios`` (n, 9, J) q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one;
     ``log_p_event`` (n,) log P(cut-in | path), where the path is drawn ahead: it bounds Y of that episode alone. Of
     shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C), its path's probability of a cut-in of each cell, and
@@ -223,6 +224,7 @@ def block_from_tables(
     }
     if sampling.mixes:
         columns["log_q"] = _nested(episodes, "log_q", len(alpha))
+        columns["martingale"] = _nested(episodes, "martingale", len(campaign.surrogates))
     if moments is not None and sampling.mixes_steps:
         columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     if np.all(_known(episodes, "log_p_event") | failed):
@@ -270,7 +272,7 @@ def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
     column = table.column(name).combine_chunks()
     values = np.asarray(column.flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
     if len(values) != table.num_rows * width:
-        expected = f"{width} in each row, one per importance function of the campaign"
+        expected = f"{width} in each row, by importance function or surrogate of the campaign"
         mend = "The records belong to another campaign or are damaged. " + MEND_PART
         raise RunFolderError(f"column {name}", f"{len(values)} numbers in {table.num_rows} rows", expected, mend)
     return values.reshape(table.num_rows, width)

@@ -66,9 +66,7 @@ class MixtureCv(Nade):
         ones = np.ones((len(block), 1))
         columns = [ones, block.mixture_ratios() - 1.0, block.weighted_crashes()[:, None]]
         rows = np.asfortranarray(np.concatenate(columns, axis=1))
-        for start in range(0, len(rows), _ROWS_AT_ONCE):
-            part = rows[start : start + _ROWS_AT_ONCE]
-            self._cubes = self._cubes + (part[:, :, None] * part[:, None, :]).reshape(len(part), -1).T @ part
+        self._cubes = with_cubes(self._cubes, rows)
         self._factor = fold_rows(self._factor, rows)
 
     def result(self, confidence: float) -> Estimate:
@@ -78,7 +76,8 @@ class MixtureCv(Nade):
         coefficients, rank, variance = _regression(self._factor, n)
         residual = std_error = math.sqrt(variance)
         of_residuals = np.array([*-coefficients, 1.0])
-        third_moment = float(np.outer(of_residuals, of_residuals).ravel() @ self._cubes @ of_residuals) / n**3
+        squares = np.outer(of_residuals, of_residuals).ravel()
+        third_moment = float(squares @ self._cubes.reshape(len(squares), -1) @ of_residuals) / n**3
         plain, warnings = y.std_error(n), []
         if self.n_crashes and y.n_effective < FEW_FOR_RESIDUALS and residual < plain:
             std_error, third_moment = plain, y.third_moment(n)
@@ -87,6 +86,15 @@ class MixtureCv(Nade):
         details |= {"plain_mean": y.mean(n), "plain_std_error": plain}
         rate = float(coefficients[0])
         return self.estimate(rate, std_error, third_moment, confidence, warnings=warnings, details=details)
+
+
+def with_cubes(cubes: FloatArray, rows: FloatArray) -> FloatArray:
+    """Σ x_i x_j x_k (k, k, k) with more ``rows`` (m, k); of no rows so far it is 0, of any shape."""
+    for start in range(0, len(rows), _ROWS_AT_ONCE):
+        part = rows[start : start + _ROWS_AT_ONCE]
+        products = (part[:, :, None] * part[:, None, :]).reshape(len(part), -1).T @ part
+        cubes = cubes + products.reshape([part.shape[1]] * 3)
+    return cubes
 
 
 def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:

@@ -81,7 +81,7 @@ def episodes_schema(
             _field("log_weight", _F8, "1", "log p(x_c) - log q_sampled(x_c), 0 without control; of shells log p_s"),
             _or_null("log_p_event", _F8, "1", "log P(cut-in | path), where the method draws the path ahead"),
             _field("log_q", _per(n_importance), "1", "per importance function: sum of log(q_j/p)"),
-            _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_(t-1) V_j (q_j,t/q_alpha,t - 1)"),
+            _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_t C_j,t - W_(t-1) V_j,t"),
             _or_null("pool_row", _I8, "1", "row of the pool's cut-in (method shells), else null"),
             *(of_shells if n_cells else ()),
             *(of_baseline_runs if acts else ()),

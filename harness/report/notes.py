@@ -16,6 +16,7 @@ RATES: Mapping[EstimatorName | str, str] = {
     "nde": "share of crashes",
     "nade": "mean of weighted crashes",
     "mixture_cv": "mean of weighted crashes with the episode mixture's known-mean control variates",
+    "dr": "mean of weighted crashes less the luck that a surrogate knows of (doubly robust)",
     "scv": "sparse control variates as published (Algorithm 1)",
     "shells": "crashes within shells of known probability",
 }
@@ -82,6 +83,8 @@ NOTES = {
     + _DRAWN_BY,
     "needs_mixture_cv": "needs the episode mixture: it alone has control variates of known means without heavy tails"
     + _DRAWN_BY,
+    "needs_dr": "needs a mixture of surrogates' importance functions (step_mixture, episode_mixture)" + _DRAWN_BY,
+    "needs_tests": "needs {least:,} tests, as with fewer ({n:,}) its intervals miss too often",
     "needs_scv": "is defined for the step mixture ([paper] section III-C)" + _DRAWN_BY,
     "needs_shells": "tests must be drawn from shells (testing.method shells)" + _DRAWN_BY,
     "needs_moments": "needs the control steps of every episode: set records.moments to first_9 or all",

@@ -110,21 +110,26 @@ class Chain:
         for response in self.surrogate_responses:
             before, after = (each[1:] for each in self.values(response))
             stay = before @ self.approach.T * (self.challenge == "recursive")
-            q, v = importance_function(p, np.stack([stay, after @ self.entry.T], axis=-1), self.epsilon)
-            afterwards = importance_function(self.exposure, np.einsum("dae,te->tda", response, after), self.epsilon)
-            found.append((q[..., 1], v, *afterwards))
-        cut, before, maneuver, after = (np.stack(each) for each in zip(*found, strict=True))
-        return Proposals(cut, maneuver, np.any(before > 0.0, axis=0), np.any(after > 0.0, axis=0))
+            challenges = np.stack([stay, after @ self.entry.T], axis=-1), np.einsum("dae,te->tda", response, after)
+            q, v = importance_function(p, challenges[0], self.epsilon)
+            found.append((q[..., 1], v, *importance_function(self.exposure, challenges[1], self.epsilon), *challenges))
+        cut, before, maneuver, after, *challenge = (np.stack(each) for each in zip(*found, strict=True))
+        return Proposals(cut, maneuver, np.any(before > 0.0, axis=0), np.any(after > 0.0, axis=0), *challenge)
 
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """q_j(cut_in | t, state) of shape (J, T, G), q_j(a | t, state) of shape (J, T, D, A), and where they act."""
+    """q_j(cut_in | t, state) of shape (J, T, G), q_j(a | t, state) of shape (J, T, D, A), and where they act.
+
+    ``challenge_before`` (J, T, G, 2), of staying and cutting in, and ``challenge_after`` (J, T, D, A) are C_j.
+    """
 
     cut: FloatArray
     maneuver: FloatArray
     critical_before: BoolArray
     critical_after: BoolArray
+    challenge_before: FloatArray
+    challenge_after: FloatArray
 
 
 def importance_function(p: FloatArray, challenge: FloatArray, epsilon: float) -> tuple[FloatArray, FloatArray]:
@@ -139,12 +144,14 @@ def importance_function(p: FloatArray, challenge: FloatArray, epsilon: float) ->
 class Episodes:
     """Every episode that p can draw from a small chain.
 
-    Probability under p (k,), q_j/p of each control step (k, T, J), 1 beyond the last one, how many there are (k,), that
-    of forced cut-ins over p (k,), and whether it crashes (k,).
+    Probability under p (k,), q_j/p of each control step (k, T, J), 1 beyond the last one, C_j and V_j, 0 beyond it, how
+    many there are (k,), that of forced cut-ins over p (k,), and whether it crashes (k,).
     """
 
     p: FloatArray
     ratios: FloatArray
+    challenge: FloatArray
+    value: FloatArray
     n_control_steps: IntArray
     forced: FloatArray
     crash: BoolArray
@@ -156,16 +163,18 @@ class Episodes:
 
 
 _Row = tuple[float, list[FloatArray], bool]
-"""Probability, q_j/p of each control step, whether it crashes."""
+"""Probability, q_j/p with C_j and V_j of each control step (3, J), whether it crashes."""
 
 
 def enumerate_episodes(chain: Chain) -> Episodes:
     """All episodes of the chain."""
     p, controlled, crash, forced = zip(*_episodes(chain), strict=True)
     n_control_steps = np.array([len(steps) for steps in controlled])
-    ratios = np.ones((len(p), n_control_steps.max(), chain.n_surrogates))
-    ratios[np.arange(ratios.shape[1]) < n_control_steps[:, None]] = [step for steps in controlled for step in steps]
-    return Episodes(np.array(p), ratios, n_control_steps, np.array(forced), np.array(crash))
+    found = np.zeros((len(p), n_control_steps.max(), 3, chain.n_surrogates))
+    found[:, :, 0] = 1.0
+    found[np.arange(found.shape[1]) < n_control_steps[:, None]] = [step for steps in controlled for step in steps]
+    ratios, challenge, value = (found[:, :, k] for k in range(3))
+    return Episodes(np.array(p), ratios, challenge, value, n_control_steps, np.array(forced), np.array(crash))
 
 
 def _episodes(chain: Chain) -> Iterator[tuple[float, list[FloatArray], bool, float]]:
@@ -177,14 +186,16 @@ def _episodes(chain: Chain) -> Iterator[tuple[float, list[FloatArray], bool, flo
         p_cut, before = 1.0 - float(np.prod(1.0 - chain.hazard[[*path]])), list[FloatArray]()
         for t, g in enumerate(path):
             hazard, q = float(chain.hazard[g]), chain.proposals.cut[:, t, g]
-            critical = bool(chain.proposals.critical_before[t, g])
+            critical, challenge = bool(chain.proposals.critical_before[t, g]), chain.proposals.challenge_before[:, t, g]
+            value = challenge @ [1.0 - hazard, hazard]
             if hazard > 0.0:
-                here = [*before, q / hazard] if critical else before
+                here = [*before, np.stack([q / hazard, challenge[:, 1], value])] if critical else before
                 for d in np.flatnonzero(chain.entry[g]).tolist():
                     for row in _after(chain, t + 1, p * hazard * float(chain.entry[g, d]), here, d):
                         yield *row, 1.0 / p_cut
             p *= 1.0 - hazard
-            before = [*before, (1.0 - q) / (1.0 - hazard)] if critical else before
+            stayed = np.stack([(1.0 - q) / (1.0 - hazard), challenge[:, 0], value])
+            before = [*before, stayed] if critical else before
         yield p, before, False, 0.0
 
 
@@ -192,9 +203,11 @@ def _after(chain: Chain, t: int, p: float, before: list[FloatArray], d: int) -> 
     if t == chain.horizon or d >= chain.crashed - 1:
         yield p, before, d == chain.crashed
         return
-    critical = bool(chain.proposals.critical_after[t, d])
+    critical, challenge = bool(chain.proposals.critical_after[t, d]), chain.proposals.challenge_after[:, t, d]
+    value = challenge @ chain.exposure[d]
     for a, exposure in enumerate(chain.exposure[d]):
-        here = [*before, chain.proposals.maneuver[:, t, d, a] / exposure] if critical else before
+        ratio = chain.proposals.maneuver[:, t, d, a] / exposure
+        here = [*before, np.stack([ratio, challenge[:, a], value])] if critical else before
         for following in np.flatnonzero(chain.response[d, a]).tolist():
             weight = p * float(exposure) * float(chain.response[d, a, following])
             yield from _after(chain, t + 1, weight, here, following)

@@ -64,7 +64,8 @@ class Sampler:
         self.component = rng.choice(len(self.alpha), size=n, p=self.alpha) if len(self.alpha) else np.empty(0, np.int64)
         self.log_p_cut = np.log(np.maximum(self.p_cut_later[:, 0], np.finfo(float).tiny))
         self.log_ratio = np.zeros((n, chain.n_surrogates))
-        self.log_step = np.zeros(n)
+        self.log_step, self.log_forced = np.zeros((2, n))
+        self.martingale = np.zeros((n, chain.n_surrogates))
         self.ratios = np.ones((n, MAX_CONTROL_STEPS, chain.n_surrogates))
         self.n_control = np.zeros(n, dtype=np.int64)
         self.after = np.full(n, -1)
@@ -81,6 +82,7 @@ class Sampler:
             forced = np.where(self.cut_in, -self.log_p_cut, -np.inf)
             log_q = np.column_stack([forced, log_q])[:, : len(self.alpha)]
         columns = {"cut_in": self.cut_in, "log_q": log_q, "n_control_steps": self.n_control}
+        columns["martingale"] = self.martingale
         if self.method == "step_mixture":
             columns["first_ratios"] = self.ratios
         if self.method in ("forced", "episode_mixture"):
@@ -99,20 +101,43 @@ class Sampler:
         later = self.p_cut_later[rows, t]
         forced_cut = np.divide(p[:, 1], later, out=np.zeros(len(rows)), where=later > 0.0)
         forced = np.stack([1.0 - forced_cut, forced_cut], axis=1)
-        cut = self._maneuver(rows, p, q, forced, chain.proposals.critical_before[t, state]) == 1
+        critical, challenge = chain.proposals.critical_before[t, state], self.challenge(t)[0][:, state]
+        cut = self._maneuver(rows, p, q, forced, critical, challenge) == 1
         self.after[rows[cut]] = _choose(chain.entry[state[cut]], self.rng)
 
     def _step_after(self, t: int, rows: IntArray) -> None:
         chain, state = self.chain, self.after[rows]
         p = chain.exposure[state]
         q = np.moveaxis(chain.proposals.maneuver[:, t, state], 0, 1)
-        maneuver = self._maneuver(rows, p, q, p, chain.proposals.critical_after[t, state])
+        critical, challenge = chain.proposals.critical_after[t, state], self.challenge(t)[1][:, state]
+        maneuver = self._maneuver(rows, p, q, p, critical, challenge)
         self.after[rows] = _choose(chain.response[state, maneuver], self.rng)
 
+    def challenge(self, t: int) -> tuple[FloatArray, FloatArray]:
+        """C_j before and after the cut-in, shapes (J, G, 2) and (J, D, A)."""
+        return self.chain.proposals.challenge_before[:, t], self.chain.proposals.challenge_after[:, t]
+
+    def predicted(self, p: FloatArray, challenge: FloatArray) -> FloatArray:
+        """V_j = Σ_a p(a) C_j(a) of each row, shape (m, J); p (m, A), challenge (J, m, A)."""
+        return np.asarray(np.einsum("ma,jma->mj", p, challenge))
+
+    def weight(self, rows: IntArray) -> FloatArray:
+        """W so far, shape (m,)."""
+        if self.method == "step_mixture":
+            return np.exp(self.log_step[rows])
+        log_q = np.column_stack([self.log_forced[rows], self.log_ratio[rows]])
+        return np.asarray(np.exp(-logsumexp(log_q + np.log(self.alpha), axis=1)))
+
     def _maneuver(
-        self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, critical: BoolArray
+        self,
+        rows: IntArray,
+        p: FloatArray,
+        q: FloatArray,
+        forced: FloatArray,
+        critical: BoolArray,
+        challenge: FloatArray,
     ) -> IntArray:
-        """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A)."""
+        """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A), challenge (J, m, A)."""
         sampled = p
         if self.method == "step_mixture":
             sampled = np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
@@ -123,7 +148,10 @@ class Sampler:
         self.cut_in[rows] |= (self.after[rows] < 0) & (chosen == 1)
         if self.method in ("nde", "forced"):
             return chosen
-        at = np.flatnonzero(critical)
+        at, every = np.flatnonzero(critical), np.arange(len(rows))
+        before = self.weight(rows)[:, None]
+        with np.errstate(divide="ignore"):
+            self.log_forced[rows] += np.log(forced[every, chosen] / p[every, chosen])
         picked_p, picked_q = p[at, chosen[at]], q[at, :, chosen[at]]
         episode = rows[at]
         self.log_ratio[episode] += np.log(picked_q / picked_p[:, None])
@@ -134,6 +162,8 @@ class Sampler:
             kept = step < MAX_CONTROL_STEPS
             self.ratios[episode[kept], step[kept]] = (picked_q / mixed[:, None])[kept]
         self.n_control[episode] += 1
+        terms = self.weight(rows)[:, None] * challenge[:, every, chosen].T - before * self.predicted(p, challenge)
+        self.martingale[episode] += terms[at]
         return chosen
 
 

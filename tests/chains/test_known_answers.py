@@ -26,8 +26,8 @@ SIZES = [5_000] * 12
 METHODS = {
     "nde": {"nde", "nade"},
     "forced": {"nade"},
-    "step_mixture": {"nade", "scv"},
-    "episode_mixture": {"nade", "mixture_cv"},
+    "step_mixture": {"nade", "dr", "scv"},
+    "episode_mixture": {"nade", "mixture_cv", "dr"},
 }
 """Which estimators its records allow, by method."""
 

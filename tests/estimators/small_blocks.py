@@ -43,7 +43,8 @@ def block(
     outcome = np.select(
         [np.array([False] * n if failed is None else failed, bool), crashed], [FAILED, CRASH], TIMEOUT
     ).astype(np.int8)
-    columns = {"cut_in": crashed, "log_q": np.zeros((n, 2)), "n_control_steps": np.ones(n, dtype=np.int64), **more}
+    columns = {"cut_in": crashed, "log_q": np.zeros((n, 2)), "n_control_steps": np.ones(n, dtype=np.int64)}
+    columns |= {"martingale": np.zeros((n, 2)), **more}
     drawn = Drawn(method, np.full(2, 0.5) if alpha is None else alpha, weight_cap, epsilon=epsilon)
     return Block(
         first_episode, outcome, np.array([0.0] * n if log_weight is None else log_weight, np.float64), columns, drawn

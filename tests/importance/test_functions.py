@@ -5,12 +5,15 @@
 With ε = 0 maneuvers that cannot lead to a crash are never drawn: the second sum is then the exposure of the others.
 """
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
+from harness.campaign.campaign import Campaign
 from harness.families.cut_in.nade.functions import as_challenge, harmless_cells
 from harness.families.cut_in.nade.grid import interpolate_maneuvers
 from harness.families.cut_in.nade.tables import Tables
@@ -151,6 +154,7 @@ def test_harmless_cells_are_those_without_a_challenge_wherever_they_are_read(rec
 # -- likelihood ratios: the predictive mixture telescopes to the mixture over whole episodes; fixed weights do not --
 
 
+EPSILON = Campaign(name="default").testing.epsilon
 ratio = st.one_of(st.just(0.0), st.floats(1e-6, 1e6))
 weights = st.lists(st.floats(0.05, 1.0), min_size=4, max_size=4).map(lambda w: np.array(w) / sum(w))
 
@@ -179,11 +183,39 @@ def test_the_episode_mixture_telescopes(alpha, ratios):
 @pytest.mark.parametrize("of_episodes", [False, True])
 @given(weights, sequences(st.floats(0.1, 10.0)), st.integers(0, 2**32 - 1))
 def test_martingale_terms(of_episodes, alpha, ratios, seed):
-    """Σ_t W_{t-1} V_j (q_j/q_α - 1), W being one over the ratio sampled so far; V = 0 adds nothing."""
+    """Σ_t W_t C_j - W_{t-1} V_j, W being one over the ratio sampled so far; V = 0 adds nothing."""
     v = np.random.default_rng(seed).random((len(ratios), 3))
     v[::3] = 0.0
     _, martingale, sampled = accumulated(of_episodes, alpha, ratios, v)
-    weight_before = np.concatenate([[1.0], 1.0 / np.cumprod(sampled)[:-1]])
-    terms = weight_before[:, None] * v * (ratios[:, 1:] / sampled[:, None] - 1.0)
-    scale = np.abs(terms).sum(axis=0) + 1e-300
+    weight = np.concatenate([[1.0], 1.0 / np.cumprod(sampled)])[:, None]
+    challenge = v * (ratios[:, 1:] - EPSILON) / (1.0 - EPSILON)
+    terms = weight[1:] * challenge - weight[:-1] * v
+    scale = (weight[1:] * np.abs(challenge) + weight[:-1] * v).sum(axis=0) + 1e-300
     assert (np.abs(martingale - terms.sum(axis=0)) <= 1e-9 * scale).all()
+
+
+@pytest.mark.parametrize("of_episodes", [False, True])
+@given(weights, st.integers(0, 2**32 - 1))
+def test_the_mean_of_martingale_sums_over_all_episodes_is_zero(of_episodes, alpha, seed):
+    """Three steps of three maneuvers, any challenge, and a forced function that some maneuvers are impossible under."""
+    rng, steps, maneuvers = np.random.default_rng(seed), 3, range(3)
+    means, wrong = np.zeros(3), np.zeros(3)
+    laws = {}
+    for path in itertools.chain.from_iterable(itertools.product(maneuvers, repeat=t) for t in range(steps)):
+        p, challenge = rng.dirichlet(np.ones(3)), rng.random((3, 3)) * rng.integers(0, 2, (3, 3))
+        forced = rng.dirichlet(np.ones(3)) * np.array([0.0, 1.0, 1.0])
+        v = challenge @ p
+        aimed = np.divide(challenge, v[:, None], out=np.ones((3, 3)), where=v[:, None] > 0.0)
+        ratios = np.vstack([forced / forced.sum() / p, EPSILON + (1.0 - EPSILON) * aimed])
+        laws[path] = p, ratios, challenge, v
+    for path in itertools.product(maneuvers, repeat=steps):
+        along = [(laws[path[:t]], path[t]) for t in range(steps)]
+        ratios = np.array([law[1][:, a] for law, a in along])
+        v, seen = np.array([law[3] for law, _ in along]), np.array([law[2][:, a] for law, a in along])
+        _, martingale, sampled = accumulated(of_episodes, alpha, ratios, v)
+        probability = np.prod([law[0][a] for law, a in along]) * np.prod(sampled)
+        means += probability * martingale
+        wrong += probability * accumulated(of_episodes, alpha, ratios, seen)[1]
+    assert np.all(np.abs(means) < 1e-12)
+    challenged = np.array([law[2].std(axis=1) for law in laws.values()]).max() > 0.0
+    assert np.abs(wrong).max() > 1e-9 or not challenged  # told what comes, instead of what was to be expected

@@ -82,7 +82,7 @@ class DrawnInLoop(Traffic):
 class InLoop(Source):
     """``tables`` are challenges, where surrogates' importance functions are mixed."""
 
-    columns = (*EPISODE_COLUMNS, "log_q")
+    columns = (*EPISODE_COLUMNS, "log_q", "martingale")
     kernel = staticmethod(decide)
 
     def __init__(self, resolved: Resolved, progress: Progress) -> None:

@@ -10,6 +10,10 @@ shared history*, is the mixture Σ_j w_j q_j with
 Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Each control step
 adds its ratios (`record_lane`, `record_acceleration`), and where the episode is over (`decide.finish`) `log_weight` is
 what its record says.
+
+**What surrogates predicted** is summed up beside it: W_t C_j(s_t, a_t) − W_{t−1} V_j(s_t) over control steps, W being
+the weight so far. Given the shared history its mean is 0 in every step, whatever the surrogate is, since q_sampled can
+draw whatever has a challenge: a martingale whose known mean is a control variate (`harness.estimators.doubly_robust`).
 """
 
 from __future__ import annotations
@@ -60,7 +64,7 @@ def accumulate(
 
     ``ratio`` (M,) is q_j/p of the maneuver; ``v`` (J,) is V_j(s), 0 where the moment is not critical; ``log_sampled``
     is the step mixture's Σ log q_α/p of the steps before. ``log_ratio`` (M,) is updated, ``martingale`` (J,) increased
-    by W_{t−1} V_j (q_{j,t}/q_{α,t} − 1).
+    by W_t C_{j,t} − W_{t−1} V_j, with C_j/V_j = (q_j/p − ε)/(1 − ε): natural driving alone (ε = 1) says nothing of it.
     """
     posterior, alpha = importance.mixes_episodes, importance.alpha
     before = log_mixture(alpha, log_ratio) if posterior else log_sampled
@@ -71,8 +75,9 @@ def accumulate(
         log_ratio[j] += math.log(ratio[j])
     weight_before = math.exp(-before)
     for j in range(v.size):
-        if v[j] > 0.0:
-            martingale[j] += weight_before * v[j] * (ratio[importance.n_forced + j] / sampled - 1.0)
+        if v[j] > 0.0 and importance.epsilon < 1.0:
+            challenge = (ratio[importance.n_forced + j] - importance.epsilon) / (1.0 - importance.epsilon)
+            martingale[j] += weight_before * v[j] * (challenge / sampled - 1.0)
     return sampled
 
 
