@@ -143,7 +143,9 @@ def one_pass(
         if not convergence or n >= convergence[-1].n * SPACING:
             convergence.append(_point(states[own].result(confidence)))
     results = {name: state.result(confidence) for name, state in states.items()}
-    few: dict[str, Note] = {name: note("needs_tests", n=n, least=least) for name, least in LEAST_TESTS.items() if n < least}
+    few: dict[str, Note] = {
+        name: note("needs_tests", n=n, least=least) for name, least in LEAST_TESTS.items() if n < least
+    }
     refusals = {name: few.get(name) if why is None else why for name, why in refusals.items()}
     if convergence[-1].n != n:
         convergence.append(_point(results[own]))

@@ -75,10 +75,11 @@ class WeightedCampaign:
         for some in (replications[k : k + at_once] for k in range(0, len(replications), at_once)):
             block = self.source(some.start * each, len(some) * each)
             for k, replication in enumerate(some):
-                rows += self._results(replication, [block.take(slice(k * each, (k + 1) * each))])
+                rows += self.results(replication, [block.take(slice(k * each, (k + 1) * each))])
         return rows
 
-    def _results(self, replication: int, blocks: Sequence[Block], *, reached: bool = False) -> list[Row]:
+    def results(self, replication: int, blocks: Sequence[Block], *, reached: bool = False) -> list[Row]:
+        """Rows of one replication, by all estimators."""
         states = {name: accumulator(name) for name in self.estimators}
         for state, block in product(states.values(), blocks):
             state.add(block)
@@ -96,4 +97,4 @@ class WeightedCampaign:
             watched.add(blocks[-1])
             if rule.observe(look, watched.result(stop.confidence)):
                 break
-        return self._results(replication, blocks, reached=rule.look.stopped)
+        return self.results(replication, blocks, reached=rule.look.stopped)
