@@ -168,9 +168,7 @@ LIMITS = {
     "lead_at_most_1.5_s": "at most 1.5 s from the onset to the overlap",
     "ttc_at_onset_below_2_s": "time to collision at the onset below 2 s",
     "ttc_below_1.5_s": "time to collision at the overlap below 1.5 s",
-    "ttc_below_0.5_s": "time to collision at the overlap below 0.5 s",
     "gap_below_5_m": "gap R2 at the overlap below 5 m",
-    "gap_below_2_m": "gap R2 at the overlap below 2 m",
     "crash_within_1_s": "crash within one second of the overlap",
     "av_above_144_kmph": "AV faster than 144 km/h",
 }
@@ -189,7 +187,7 @@ def limits_table() -> str:
     return _listed(rows) + (
         f"\nOf all cut-ins {short:.1%} take at most 1.5 s; in {fast:.1%} of the tests the AV is faster than 144 km/h. "
         f"Default vehicle, {found['crash_rate']:.3g} per test, {found['n_crashes']:,} sampled crashes. "
-        f"`{found['command']}`; its docstring says how.\n"
+        f"`{found['command']}`\n"
     )
 
 
@@ -215,10 +213,11 @@ def validated_range(name: str) -> str:
     of = [one for one in _result(name)["judgements"] if _is_headline(one)]
 
     def span(key: str, form: str) -> str:
-        return " to ".join(f"{end(one[key] for one in of):{form}}" for end in (min, max))
+        ends = (f"{end(one[key] for one in of):{form}}" for end in (min, max))
+        return " to ".join(dict.fromkeys(ends))
 
     return (
-        f"Of {len(of)} vehicles with true rates of {span('truth', '.3g')}: coverage {span('coverage', '.3f')}, bias "
+        f"{len(of)} vehicles with true rates of {span('truth', '.3g')}: coverage {span('coverage', '.3f')}, bias "
         f"{span('bias', '+.1%')}, {span('tests_median', ',.0f')} tests (medians).\n"
     )
 
