@@ -260,8 +260,7 @@ CONTENDERS: dict[str, tuple[Callable[[], Contender], int]] = {
     "twin recursive": (lambda: TwinAlone(campaign("recursive", **{"records.moments": "none"})), 40_000),
     "twin recorded": (
         lambda: Recorded(
-            campaign(NADE, **{"world.engine": "twin", "world.cells": TWIN_CELLS}),
-            lambda c: TwinWorld(c.world.cells),
+            campaign(NADE, **{"world.engine": "twin", "world.cells": TWIN_CELLS}), lambda c: TwinWorld(c.world.cells)
         ),
         40_000,
     ),

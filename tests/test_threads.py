@@ -43,11 +43,7 @@ def test_the_next_item_is_made_while_the_present_one_is_in_use():
         ("0::/\n", {"cpu.max": "200000 100000"}, 2),
         ("0::/a/b\n", {"a/cpu.max": "150000 100000", "a/b/cpu.max": "max 100000"}, 2),
         ("0::/named/as/outside\n", {"cpu.max": "50000 100000"}, 1),
-        (
-            "3:cpu,cpuacct:/x\n1:memory:/y\n",
-            {"cpu/x/cpu.cfs_quota_us": "3000", "cpu/x/cpu.cfs_period_us": "1000"},
-            3,
-        ),
+        ("3:cpu,cpuacct:/x\n1:memory:/y\n", {"cpu/x/cpu.cfs_quota_us": "3000", "cpu/x/cpu.cfs_period_us": "1000"}, 3),
         ("3:cpu:/outside\n0::/\n", {"cpu/cpu.cfs_quota_us": "4000", "cpu/cpu.cfs_period_us": "1000"}, 4),
         ("3:cpu:/\n", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "1000"}, 8),
         ("0::/\n", {"cpu.max": "2000000 100000"}, 8),

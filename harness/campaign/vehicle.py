@@ -11,14 +11,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from harness.campaign.drivers import (
-    PARAMETERS,
-    BuiltInParameters,
-    ModelName,
-    Parameters,
-    Reaction,
-    schema_by_model,
-)
+from harness.campaign.drivers import PARAMETERS, BuiltInParameters, ModelName, Parameters, Reaction, schema_by_model
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Positive, Section, StepTime, Whole, listed
 

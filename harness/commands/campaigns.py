@@ -354,12 +354,7 @@ def setup(*, dry_run: bool) -> None:
     Exit code 2 says that they could not be installed; the message names the packages.
     """
     from harness.runner.setup import compile_kernels  # noqa: PLC0415 - keeps --help fast
-    from harness.worlds.system_libraries import (  # noqa: PLC0415 - keeps --help fast
-        install,
-        install_commands,
-        missing_libraries,
-        require_libsumo,
-    )
+    from harness.worlds.system_libraries import install, install_commands, missing_libraries, require_libsumo  # noqa: PLC0415 - keeps --help fast
 
     missing = missing_libraries()
     commands = install_commands(missing) if missing else []

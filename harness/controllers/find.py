@@ -16,15 +16,7 @@ from typing import Any, TypeVar, get_type_hints
 
 from harness.campaign.problems import did_you_mean
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.hosts import (
-    BatchHost,
-    BeforeTest,
-    ControllerHost,
-    Guard,
-    VehicleHost,
-    cause_of,
-    death_cause,
-)
+from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Guard, VehicleHost, cause_of, death_cause
 from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.files import real_path

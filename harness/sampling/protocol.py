@@ -140,13 +140,7 @@ class Source:
         """What the others do in consecutive episodes."""
         raise NotImplementedError
 
-    def loop(
-        self,
-        world: World,
-        *,
-        traces: str | None = None,
-        before_test: BeforeTest = lambda _: None,
-    ) -> EpisodeLoop:
+    def loop(self, world: World, *, traces: str | None = None, before_test: BeforeTest = lambda _: None) -> EpisodeLoop:
         """Episode loop in a world, recording what the campaign asks for, or other ``traces``."""
         campaign = self.campaign
         av = build_host(campaign.av, n_cells=world.n_cells, seed=campaign.seed, before_test=before_test)

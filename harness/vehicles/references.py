@@ -19,12 +19,7 @@ from typing import NamedTuple
 
 from harness.compiled import compiled_inline
 from harness.random_stream import AV_DRAWS, uniform
-from harness.vehicles.drivers import (
-    CAREFUL_COMPETENT_KIND,
-    SMALLEST_GAP_M,
-    driver_acceleration,
-    idm_acceleration,
-)
+from harness.vehicles.drivers import CAREFUL_COMPETENT_KIND, SMALLEST_GAP_M, driver_acceleration, idm_acceleration
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import Record
 

@@ -52,10 +52,7 @@ def test_estimates_are_right(chain, method):
         assert estimate.upper_bound > estimate.crash_rate
     if method == "episode_mixture":  # its weights are bounded; no such test exists for the step mixture
         said = done.diagnostics.result()
-        known = [
-            (said["mean_weight_event"], chain.cut_in_rate),
-            *((mean, 1.0) for mean in said["mean_ratio"].values()),
-        ]
+        known = [(said["mean_weight_event"], chain.cut_in_rate), *((mean, 1.0) for mean in said["mean_ratio"].values())]
         for mean, truth in known:
             assert abs(mean["mean"] - truth) < 4.0 * mean["std_error"]
 

@@ -19,13 +19,7 @@ import pytest
 
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
-from harness.records.folder import (
-    read_as,
-    write_json,
-    write_part,
-    write_sealed,
-    write_together,
-)
+from harness.records.folder import read_as, write_json, write_part, write_sealed, write_together
 from harness.records.reader import read, table_sizes
 from harness.records.schemas import ShardTables
 from harness.report.summary import read_run_folder, summarise

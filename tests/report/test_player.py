@@ -116,10 +116,7 @@ NOBODY, BRAKES, BOTH = (30, 30), (30, -1), (-1, -1)
 @pytest.mark.parametrize(
     ("who", "leads"),
     [
-        (
-            {1: BOTH, 3: BRAKES, 4: BOTH},
-            [AVOIDED.format(1), AVOIDED.format(2), "hardest avoidable no. 2"],
-        ),
+        ({1: BOTH, 3: BRAKES, 4: BOTH}, [AVOIDED.format(1), AVOIDED.format(2), "hardest avoidable no. 2"]),
         ({5: BRAKES}, ["hardest avoidable no. 1, typical no. 1, weight no. 1"]),
         ({}, ["hardest no. 1", "hardest no. 2", "hardest no. 3"]),
     ],

@@ -122,11 +122,7 @@ def written(file: str, text: str | None):
         (lambda run: run.rename(run.parent / "gone"), READERS, "run"),
         (lambda run: None, [("replay", 400)], "from 0 to 239"),
         (lambda run: truncate(part_files(run)[1]), READERS, f"episodes/{SECOND}"),
-        (
-            lambda run: truncate(part_files(unnoted(run))[1]),
-            READERS,
-            f"{SECOND} found: a file that cannot",
-        ),
+        (lambda run: truncate(part_files(unnoted(run))[1]), READERS, f"{SECOND} found: a file that cannot"),
         (lambda run: part_files(run)[1].unlink(), READERS, f"episodes/{SECOND} found: no such file"),
         (lambda run: part_files(run, "traces")[1].unlink(), READERS[1:], f"traces/{SECOND} found"),
         (lambda run: (run / "estimates.json").unlink(), READERS[1:2], "harness estimate"),

@@ -112,11 +112,7 @@ def who_crashes_after(
 
 
 def write_maneuvers(
-    seed: int,
-    paths: Paths,
-    cut: IntArray,
-    environment: Environment,
-    draws_per_cut_in: int = FREE_DRAWS_PER_CUT_IN,
+    seed: int, paths: Paths, cut: IntArray, environment: Environment, draws_per_cut_in: int = FREE_DRAWS_PER_CUT_IN
 ) -> Maneuvers:
     """What LV and BV do on paths (n,) with cut-ins in steps ``cut`` (n,), -1: none.
 

@@ -20,19 +20,7 @@ from harness.vehicles.drivers import MOST_FOLLOWERS, Followers
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
 from harness.vehicles.references import Memory, react, still_cruises
 from harness.vehicles.sideways import onset_of, perceived_in
-from harness.vocabulary import (
-    AV,
-    BV,
-    CONTACT,
-    LV,
-    PASSED,
-    RUNNING,
-    FloatArray,
-    Int8Array,
-    Record,
-    RecordArray,
-    State,
-)
+from harness.vocabulary import AV, BV, CONTACT, LV, PASSED, RUNNING, FloatArray, Int8Array, Record, RecordArray, State
 
 AV_START_M = 100.0
 NO_CRASH, WAS_AHEAD, FOLLOWS = -1, -2, -3

@@ -14,12 +14,7 @@ from harness.families.cut_in.lateral import draw_lead
 from harness.families.cut_in.laws import acceleration, draw_acceleration
 from harness.families.cut_in.nade.cells import Nade
 from harness.families.cut_in.nade.challenge import remaining_level
-from harness.families.cut_in.nade.functions import (
-    challenges_nobody,
-    look_ahead,
-    propose_acceleration,
-    propose_cut_in,
-)
+from harness.families.cut_in.nade.functions import challenges_nobody, look_ahead, propose_acceleration, propose_cut_in
 from harness.families.cut_in.nade.likelihood_ratio import log_weight, record_acceleration, record_lane
 from harness.families.cut_in.path import state_of, walk, weigh_cut_ins
 from harness.loop.cells import KernelState
