@@ -13,6 +13,7 @@ import pyarrow as pa
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import FailureBounds
 from harness.estimators.likelihood import Level
+from harness.estimators.one_pass import refusal
 from harness.estimators.scv import CHUNK_ROWS as CHUNK
 from harness.estimators.scv import Scv, StratumFit, fill_product_columns
 from harness.estimators.weighted import Nade
@@ -56,7 +57,7 @@ class Claims:
     def add(self, block: Block) -> None:
         """Add tests."""
         self._method = block.drawn.method
-        self._with_scv = self._with_scv and block.refusal("scv") is None
+        self._with_scv = self._with_scv and refusal(block, "scv") is None
         self._n += len(block)
         self._weight += float(block.weights().sum())
         self.nade.add(block)
