@@ -6,12 +6,13 @@ The same as the command line, in a few lines of Python::
 
     campaign = harness.load_campaign("scenarios/smoke.yaml", ["stop.rhw=0.1"])
     result = harness.run(campaign, "runs/smoke", workers=2)
-    print(result.estimates["crash_rate_per_1e6_km"])
+    print(result)  # the short answer; result.estimates is all of it
     tests = harness.read("runs/smoke").episodes()
     harness.replay("runs/smoke", 17).outcome
 """
 
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ _PLACES = {
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return version("harness")
     if name not in _PLACES:
         raise AttributeError(f"module 'harness' has no attribute {name!r}")
     module, attribute = _PLACES[name]

@@ -8,7 +8,7 @@ import math
 import subprocess
 import sys
 from importlib.machinery import PathFinder
-from importlib.metadata import distributions
+from importlib.metadata import distributions, version
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ SMALL = ["world.engine=twin", "testing.method=forced", "av={model: fvdm}", *BUDG
 def test_all_that_is_promised_is_there():
     assert dir(harness) == harness.__all__
     assert all(inspect.getdoc(getattr(harness, name)) for name in harness.__all__)
+    assert harness.__version__ == version("harness")
     with pytest.raises(AttributeError, match="nothing"):
         _ = harness.nothing
 
@@ -57,6 +58,8 @@ def test_load_run_estimate_and_replay_in_a_few_lines(tmp_path):
     folder = tmp_path / "run"
     result = harness.run(harness.load_campaign(str(MIXTURE_FILE), SMALL), str(folder), workers=1)
     assert (result.exit_code, result.stopped_by, result.folder) == (0, "rhw", folder)
+    assert repr(result).startswith(f"fvdm · {result.estimates['n_episodes']:,} tests in SUMO")
+    assert len(repr(result).splitlines()) <= 10
     assert result.estimates == estimates(folder) == harness.estimate(str(folder))
     assert harness.estimate(folder, estimators=["nade"], confidence=0.5)["confidence"] == 0.5
     files = {"campaign.yaml", "manifest.json", "estimates.json", "report.html", "plots", "episodes", "traces"}

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,9 +48,11 @@ EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTE
 ESTIMATES = "estimates.json"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RunResult:
     """What a finished campaign left in its folder, ``estimates.json`` and the page ``report.html`` among it.
+
+    Shown, it is the short answer.
 
     ``stopped_by`` is explained at `harness.records.folder.StoppedBy`. The exit code is 0, or 4 when the budget or the
     pool was spent before the asked precision or decision, or 5 where the crash rate is above the limit that was to be
@@ -62,8 +64,15 @@ class RunResult:
     estimates: dict[str, Any]
     stopped_by: StoppedBy
     exit_code: int
-    shown: RunFolder = field(repr=False)
+    shown: RunFolder
     """What its page is made of."""
+
+    def __repr__(self) -> str:
+        from harness.report.lines import lines  # noqa: PLC0415 - draws
+        from harness.report.words import short_answer  # noqa: PLC0415
+
+        answer = short_answer(self.shown.campaign, self.shown.manifest, self.shown.estimates)
+        return "\n".join(lines(answer, self.shown.manifest["wall_time_s"], self.report))
 
 
 @checked("harness.run")
