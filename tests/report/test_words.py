@@ -17,7 +17,7 @@ from harness.report.summary import read_run_folder
 from harness.report.words import answer_of, short_answer, vehicle_words
 from harness.runner.stored import stored_blocks
 from tests.golden.campaigns import BASE, RUNS
-from tests.stored_runs import answer_in, golden
+from tests.stored_runs import answer_in, estimates, golden
 
 SAID = {
     "nde-twin": ["lane-change level 3,000,000: never compare", "impact "],
@@ -286,3 +286,24 @@ def test_what_would_decide(verdict, needed, said):
 def test_the_verdict_of_a_comparison(verdict, sign, margin):
     told = [pair_words({"margin": of, "verdict": verdict}) for of in (0.0, 0.1)]
     assert told == [sign, margin]
+
+
+@pytest.mark.parametrize(("name", "untested"), [("shells-inside", True), ("shells-twin", False)])
+def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, untested, stored_run):
+    content = estimates(stored_run(name))
+    rows = {row["key"]: row for row in answer_in(stored_run(name))["rows"]}
+    rate = rows["rate"]
+    shells = content["estimates"]["shells"]["details"]["shells"]
+    assert any(not each["n_episodes"] for each in shells) == untested
+    assert (rate["what"] == "crash rate so far") == untested
+    assert rate["remark"].endswith(" per million km")
+    assert not rows["ratio"]["value"].startswith("≥")
+    assert (rows["unavoidable"]["what"] == "unavoidable so far") == untested
+
+
+def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time(stored_run):
+    for name, shows, warned in (
+        ("forced-krauss", True, True), ("forced-krauss", False, False), ("forced-twin", True, False)
+    ):  # fmt: skip
+        answer = said(read_run_folder(stored_run(name)), manifest={"events_show": shows})
+        assert any("cannot see BV come over" in each for each in answer.warnings) == warned

@@ -322,3 +322,8 @@ def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_at_one_that_acts_befo
     assert with_lead.behaviour.n_crashes <= without.behaviour.n_crashes
     early = check_av(campaign(LEAD, "testing.method=forced", f"av={ACTING.format('Speeds')}"), 4)
     assert (early.exit_code, rows(early)[0]["found"]) == (0, "controller, twin, step_mixture, cut-ins of one step")
+
+
+def test_a_controller_that_acts_early_is_checked_without_forcing():
+    found = check("Steady", "av.before_event=controller", "testing.method=nde")
+    assert (found.method, found.exit_code) == ("step_mixture", 0)

@@ -179,3 +179,14 @@ def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
     again = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert again["shells"] == done.content["shells"]
     assert main(["compare", str(MIXTURE_FILE), str(MIXTURE_FILE), "--out", str(tmp_path / "x"), "--margin", "0.1"]) == 2
+
+
+def test_a_run_that_nobody_limited_is_to_be_run_again(done, campaign, tmp_path):
+    """Which the folder of the comparison does not hinder: the run is not copied."""
+    early = "av={controller: 'tests.controllers.early:Speeds'}"
+    sides, stored = [campaign(*SHELLS, early), campaign(*SHELLS)], done.folder / "a"
+    with pytest.raises(CampaignError, match="so that it is run again"):
+        compare_campaigns(*sides, tmp_path / "out", stored=stored)
+    with pytest.raises(CampaignError, match=r"--against av\.limits\.max_acceleration_mps2=2, which limits B"):
+        compare_campaigns(*reversed(sides), tmp_path / "out", stored=stored)
+    assert not (tmp_path / "out").exists()

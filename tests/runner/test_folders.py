@@ -9,7 +9,7 @@ import pytest
 
 from harness.cli import main
 from harness.errors import RunFolderError
-from harness.records.folder import read_manifest, sole_use
+from harness.records.folder import read_manifest, require_place, sole_use
 from harness.resolved import resolve
 from harness.runner.kept import require_own_folder
 from tests.golden.campaigns import BASE, RUNS
@@ -172,3 +172,13 @@ def test_values_that_no_run_has_written_are_refused(stored):
             read_manifest(stored)
         assert len(str(raised.value)) < 1500
         (stored / "manifest.json").write_text(content)
+
+
+def test_a_place_is_tried_without_leaving_anything(tmp_path):
+    require_place(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "there").mkdir()
+    for place in (tmp_path / "a" / "b", tmp_path / "there"):
+        with pytest.raises(ZeroDivisionError), sole_use(place):
+            _ = 1 / 0
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]

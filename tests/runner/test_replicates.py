@@ -18,6 +18,7 @@ from harness.estimators.traffic import ONE_LAW, uncertain
 from harness.pool import moved
 from harness.pool.moved import assumed
 from harness.progress import Progress
+from harness.report.traffic_words import too_few
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
@@ -219,3 +220,10 @@ def test_both_errors_add_as_squares_of_distances_on_a_logarithmic_scale():
     assert (only.times[0], only.both[0]) == (0.0, 0.0)
     wider = uncertain(2e-7, ends, factors, exact + 0.1, 0, 0.9).times
     assert wider == pytest.approx((found.times[0] / 1.1, found.times[1] * 1.1))
+
+
+@pytest.mark.parametrize(("n", "said"), [(19, "needs 20 at least"), (20, "20 replicates: "), (100, "")])
+def test_few_replicates_are_warned_of(n, said):
+    words = "".join(too_few(n, 0.9))
+    assert said in words
+    assert bool(words) == bool(said)

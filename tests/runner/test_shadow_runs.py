@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,6 +14,7 @@ from harness.errors import RunFolderError, TooManyFailedError
 from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
+from harness.report.page import write_report
 from harness.sampling.baseline import run_baseline
 from harness.sampling.shells import Shells
 from tests.in_process import run_here as run_golden
@@ -21,6 +23,7 @@ from tests.runner.conftest import SHELLS
 from tests.stored_runs import (
     answer_in,
     copy_of,
+    edit,
     estimates,
     golden,
     manifest,
@@ -206,3 +209,15 @@ def test_a_vehicle_that_ends_its_process_in_a_shadow_run_fails_there(campaign, r
     assert "exit code 9" in rows[61]["failure"]
     assert manifest(folder)["shadow_runs"] == {"n_runs": 120, "n_failed": 1}
     assert stored_table(folder, "episodes").column("outcome").to_pylist()[61] != "failed"
+
+
+def test_a_page_is_written_where_so_few_paths_crashed_that_the_pool_s_error_is_not_known(stored_run, tmp_path):
+    folder = copy_of(stored_run(ACTS), tmp_path / "run")
+    content = estimates(folder)["estimates"]
+    details = content["shells"]["details"]
+    for part in (details, details["within"]):
+        part.update(rhw_from_pool=None, rhw_from_pool_at_least=None)
+    edit(folder, "estimates.json", estimates=content)
+    page = write_report(folder).read_text()
+    assert "pool’s own error is not known" in page
+    assert "nan" not in set(re.findall(r"[a-z]+", (folder / "plots" / "shells.svg").read_text().lower()))

@@ -19,7 +19,7 @@ from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import tally as counted
 from tests.in_process import run_here as run_golden
 from tests.runner.conftest import SHELLS
-from tests.stored_runs import answer_in, copy_of, edit, golden, part_files
+from tests.stored_runs import answer_in, copy_of, edit, golden, manifest, part_files, stored_table
 
 
 def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
@@ -164,3 +164,15 @@ def test_a_round_is_divided_into_shards_without_gap():
         for draw in spec.draws:
             taken[draw.stratum] += range(draw.first, draw.first + draw.n)
     assert taken == {0: list(range(12, 82)), 2: list(range(100, 400))}
+
+
+def test_what_is_traced_may_change_when_a_run_goes_on(campaign, run_here, tmp_path):
+    traced, untraced = ("records.traces=all",), ("records.traces=none", "records.trace_share=0")
+    out = tmp_path / "run"
+    run_here(campaign(*SHELLS, "world.engine=twin", SPENT, *traced), out)
+    for _ in range(2):  # the second time all tests are taken over
+        run_here(campaign(*SHELLS, "world.engine=twin", MORE, *untraced), out, resume=True)
+    traced_tests = set(stored_table(out, "traces")["episode"].to_pylist())
+    assert 0 in traced_tests
+    assert len(traced_tests) < manifest(out)["n_episodes"]
+    assert replay(out, 0).bit_equal
