@@ -156,7 +156,8 @@ def test_the_bound_of_theorem_2_by_hand():
     p, steps, crash = np.array([[0.375, 0, 0], [0.125, 0, 1], [0.25, 1, 1], [0.125, 1, 0], [0.125, 2, 1]]).T
     ratios = np.ones((5, 2, 2))
     ratios[2, 0], ratios[3, 0] = (1.5, 0.5), (0.5, 1.5)
-    episodes = Episodes(p, ratios, steps.astype(int), np.ones(5), crash.astype(bool))
+    unused = np.zeros_like(ratios)  # what surrogates predict
+    episodes = Episodes(p, ratios, unused, unused, steps.astype(int), np.ones(5), crash.astype(bool))
     uncontrolled = 0.125 * 0.875
     first = 2 * min(0.375 * (1 / 1.5 - 0.25) ** 2 + 0.0625 / 16, 0.125 * 1.75**2 + 0.1875 / 16) + 3 * (0.25 * 2) ** 2
     second = 4 * 0.125 * 0.875**2 + 3 * (0.125 * 4) ** 2
