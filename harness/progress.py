@@ -109,7 +109,8 @@ class ShownProgress(Progress):
         """What a log is told now, with the time of day: nothing until a stage begins."""
         for task in self._bars.tasks:
             of = f" of {count(task.total)}" if task.total is not None else ""
-            done = f" {count(task.completed)}{of}" if task.completed else ""
+            so_far = task.completed if task.total is None else min(task.completed, task.total)  # rounds may go beyond
+            done = f" {count(so_far)}{of}" if so_far else ""
             yield f"{time.strftime('%H:%M:%S')} {task.description}:{done} · {_words(task)}".rstrip(" ·:")
 
 
@@ -128,7 +129,7 @@ def _words(task: Task) -> str:
         return " · ".join(figures)
     s_each = task.elapsed / done
     rate = f"{count(1.0 / s_each)}/s" if s_each < 1.0 else f"{duration(s_each)} each"
-    left = [] if task.total is None else [f"{duration((task.total - task.completed) * s_each)} left"]
+    left = [] if task.total is None else [f"{duration(max(task.total - task.completed, 0.0) * s_each)} left"]
     return " · ".join([rate, *figures, *left])
 
 
