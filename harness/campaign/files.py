@@ -1,7 +1,4 @@
-"""Files of campaigns: read, overridden (``--set``, ``--av``), checked with every problem named; and written.
-
-How YAML is read stands in `harness.campaign.yaml_text`, what is wrong with a value in `harness.campaign.problems`.
-"""
+"""Files of campaigns: read, overridden (``--set``, ``--av``), checked with every problem named; and written."""
 
 from __future__ import annotations
 
