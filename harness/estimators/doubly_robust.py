@@ -4,7 +4,7 @@ Before control step t surrogate j predicts a crash with probability V_j, after i
 
     D_j = Σ_t (W_t C_j,t - W_{t-1} V_j,t)
 
-has mean 0, whatever surrogate and vehicle are (`harness.families.cut_in.nade.likelihood_ratio`), so that Y - D_j has
+has mean 0, whatever surrogate and vehicle are (the method that draws sums it up: `martingale`), so that Y - D_j has
 the mean of Y; where j crashes as the vehicle does, hardly more is left in it than the first V_j. It is an approximating
 martingale used as a control variate (S. G. Henderson and P. W. Glynn, Mathematics of Operations Research 27, 2002,
 253), with surrogates as the approximation. For sequences of decisions the same idea is known as the doubly robust
