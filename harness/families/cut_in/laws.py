@@ -28,6 +28,7 @@ from scipy import special
 
 from harness.compiled import compiled_inline
 from harness.families.cut_in.lateral import LateralMotion
+from harness.families.flow import Flow
 from harness.random_stream import INITIAL, uniforms
 from harness.vocabulary import (
     ACCELERATIONS_MPS2,
@@ -42,7 +43,6 @@ from harness.vocabulary import (
 
 FREE_DRIVING, CAR_FOLLOWING = 0, 1
 """Which table of noise a law has."""
-_SPEED_POINTS = 8001
 _T_LIMIT = 64.0
 _T_PER_UNIT = 32.0
 _BELOW_ONE = 1.0 - 2.0**-53
@@ -316,16 +316,8 @@ def cut_in_hazard(opportunity_1s: float, accepted: float, environment: Environme
     return float(-n.scenario__step_s * math.log1p(-p_1s))
 
 
-class InitialStates:
-    """Sampler of initial states; ``speed_cdf`` is P(v_BV ≤ v) on a grid over the fit range."""
-
-    def __init__(self, numbers: Record) -> None:
-        self._n = n = numbers
-        self._speeds = np.linspace(n["fit_range__v_min_mps"], n["fit_range__v_max_mps"], _SPEED_POINTS)
-        shape, location, scale = (float(n[f"initial_state__v_{k}"]) for k in ("shape", "location_mps", "scale_mps"))
-        z = (self._speeds - location) / scale
-        cdf = special.ndtr(z) - 2.0 * special.owens_t(z, shape)  # of the skew normal distribution
-        self.speed_cdf: FloatArray = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
+class InitialStates(Flow):
+    """Sampler of initial states."""
 
     def draw(self, seed: int, first_episode: int, n_episodes: int) -> RecordArray:
         """States of consecutive episodes, shape (n_episodes,)."""
@@ -334,8 +326,8 @@ class InitialStates:
     def from_uniforms(self, u: FloatArray) -> RecordArray:
         """States (n,) from uniforms (n, 5), one for each of their numbers."""
         n, of = self._n, states_from(u.T)
-        v = np.interp(of["v_bv_mps"], self.speed_cdf, self._speeds)
-        r1 = self._gap(of["r1_m"], v)
+        v = self.speeds(of["v_bv_mps"])
+        r1 = self.gaps(of["r1_m"], v)
         r1dot = self._rate(of["r1dot_mps"], v, r1)
         r2 = n["initial_state__r2_min_m"] + of["r2_m"] * (n["initial_state__r2_max_m"] - n["initial_state__r2_min_m"])
         span = n["initial_state__r2dot_max_mps"] - n["initial_state__r2dot_min_mps"]
@@ -345,29 +337,14 @@ class InitialStates:
     def given_speed(self, speed: float, gap_u: FloatArray, rate_u: FloatArray) -> RecordArray:
         """States (n,) at a fixed v_BV (m/s) from uniforms for R1 and R1dot, each (n,); the AV is nowhere."""
         v = np.full(gap_u.size, speed)
-        r1 = self._gap(gap_u, v)
+        r1 = self.gaps(gap_u, v)
         nowhere = np.full_like(v, np.nan)
         return states_from([v, r1, self._rate(rate_u, v, r1), nowhere, nowhere])
-
-    def _u(self, v: FloatArray) -> FloatArray:
-        return np.asarray((v - self._n["fit_range__v_centre_mps"]) / self._n["fit_range__v_scale_mps"])
-
-    def _gap(self, probability: FloatArray, v: FloatArray) -> FloatArray:
-        """R1 = shift + LogNormal, truncated to the fit range."""
-        n = self._n
-        u = self._u(v)
-        shift = n["initial_state__r1_shift_m"] + n["initial_state__r1_shift_u_m"] * u
-        mean = n["initial_state__r1_log_mean"] + n["initial_state__r1_log_mean_u"] * u
-        sd = np.exp(n["initial_state__r1_log_sd"] + n["initial_state__r1_log_sd_u"] * u)
-        with np.errstate(divide="ignore"):
-            below = special.ndtr((np.log(np.maximum(n["fit_range__r1_min_m"] - shift, 0.0)) - mean) / sd)
-            upto = special.ndtr((np.log(n["fit_range__r1_max_m"] - shift) - mean) / sd)
-        return np.asarray(shift + np.exp(mean + sd * special.ndtri(below + probability * (upto - below))))
 
     def _rate(self, probability: FloatArray, v: FloatArray, r1: FloatArray) -> FloatArray:
         """R1dot = location + scale t, given that R1 is not closed within the smallest time to collision."""
         n = self._n
-        u = self._u(v)
+        u = self.u_of(v)
         w = (r1 - n["fit_range__r1_centre_m"]) / n["fit_range__r1_scale_m"]
 
         def c(name: str) -> float:

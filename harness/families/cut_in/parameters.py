@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Collection, Mapping
 from functools import cache
@@ -14,11 +13,10 @@ from pydantic import model_validator
 
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule, describe_found
-from harness.campaign.sections import Section
 from harness.campaign.yaml_text import read_yaml
 from harness.families.cut_in import sections
-from harness.families.cut_in.sections import REPLACED, STEP, Number
-from harness.families.replicates import content_hash
+from harness.families.cut_in.sections import REPLACED, STEP
+from harness.families.numbers import FitRange, ParameterFile
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import Record
 
@@ -48,13 +46,13 @@ def _completed(given: dict[str, Any]) -> dict[str, Any]:
     return {key: of for key, of in whole.items() if key != "like"}
 
 
-class EnvironmentParameters(Section):
+class EnvironmentParameters(ParameterFile):
     """All numbers of the environment."""
 
     format: Literal["ndd-overtaking"]
     version: Literal[1]
     scenario: sections.Scenario
-    fit_range: sections.FitRange
+    fit_range: FitRange
     initial_state: sections.InitialState
     free_driving: sections.FreeDriving
     car_following: sections.CarFollowing
@@ -128,35 +126,9 @@ class EnvironmentParameters(Section):
         """A replicate with what zero events leave open upwards; see `AcceptanceSteps`."""
         return dict(row) if self._counted is None else self._counted.as_if_unseen(row)
 
-    def numbers(self) -> dict[str, Number]:
-        """Flat ``section__name``, of those in a list ``section__name__0`` and so on → number, with its provenance."""
-        found: dict[str, Any] = {}
-        for section, of in self:
-            for name, entry in of if isinstance(of, Section) else ():
-                found[f"{section}__{name}"] = entry
-                found |= {
-                    f"{section}__{name}__{i}": each for i, each in enumerate(entry if isinstance(entry, list) else ())
-                }
-        return {name: entry for name, entry in found.items() if isinstance(entry, Number)}
-
     def values(self) -> dict[str, float]:
         """The same without provenance; what is fixed is among them."""
-        given = {name: number.value for name, number in self.numbers().items()}
-        return {**{f"scenario__{name}": value for name, value in FIXED.items()}, **given}
-
-    def with_values(self, values: Mapping[str, float]) -> Self:
-        """Other values by their flat names, as of a row of replicates; a `ValueError` where one is not allowed."""
-        content = self.model_dump()
-        for name, value in values.items():
-            place: Any = content
-            for key in name.split("__"):
-                place = place[int(key) if isinstance(place, list) else key]
-            place |= {"value": value, "range": None}
-        return type(self).model_validate(content)
-
-    def content_hash(self) -> str:
-        """Hash of the numbers alone: a corrected note does not change a campaign."""
-        return content_hash(json.dumps(self.values(), sort_keys=True).encode())
+        return {**{f"scenario__{name}": value for name, value in FIXED.items()}, **super().values()}
 
 
 def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: float, hold_s: float) -> Record:

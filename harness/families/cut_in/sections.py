@@ -5,20 +5,36 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 from scipy.special import gammainc, gammaincinv
 
-from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
 from harness.families.cut_in.lateral import LateralMotion, constant_lead, log_normal_speed
 from harness.families.cut_in.laws import Wish
+from harness.families.numbers import (
+    Acceleration,
+    Braking,
+    Coefficient,
+    DegreesOfFreedom,
+    Gain,
+    Gap,
+    LogScale,
+    Number,
+    Rate,
+    Scale,
+    Share,
+    Speed,
+    Time,
+    in_whole_steps,
+    ordered,
+    within,
+)
 from harness.numbers import plain
-from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import ACCELERATIONS_MPS2, FloatArray
+from harness.vocabulary import FloatArray
 
 LONGEST_LEAD_S = 10.0
 SMALLEST_SHARE = 1e-12
@@ -30,99 +46,11 @@ _SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
 _AXES = (("v_mps", "v_log"), ("r1_m", "r1_log"), ("r1dot_mps", "r1dot_log"))
 
 
-class Number(Section):
-    """A value and where it comes from (the tags are explained in the shipped file).
-
-    ``se`` is the standard error of a fitted one, ``range`` says where an assumed one may lie; neither changes a test.
-    """
-
-    value: float
-    source: Literal[
-        "paper", "itsc", "ndd", "cutin", "openacc", "published", "assumed", "fitted", "derived", "measured", "user"
-    ]
-    note: str = ""
-    se: Annotated[float, Field(ge=0.0)] | None = None
-    range: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
-
-    @model_validator(mode="after")
-    def _range_holds_the_value(self) -> Self:
-        if self.range is not None and not self.range[0] <= self.value <= self.range[1]:
-            mend = "Name the lower end first, and one that the value is not outside of."
-            raise broken_rule("range", f"{self.range}, with the value {self.value:g}", "two ends around it", mend)
-        return self
-
-
-def _within(low: float, high: float) -> AfterValidator:
-    """Refuse a value, or an end of its range, outside of [low, high]."""
-
-    def checked(number: Number) -> Number:
-        for key, values in (("value", [number.value]), ("range", number.range or [])):
-            if outside := [each for each in values if not low <= each <= high]:
-                expected = f"{'a number' if key == 'value' else 'numbers'} from {low:g} to {high:g}"
-                raise broken_rule(key, f"{outside[0]:g}", expected, "Correct the value.")
-        return number
-
-    return AfterValidator(checked)
-
-
-# Wide limits: what a law makes of its numbers is judged by `harness.families.cut_in.loading`.
-Coefficient = Annotated[Number, _within(-1000.0, 1000.0)]
-LogScale = Annotated[Number, _within(-50.0, 50.0)]
-Scale = Annotated[Number, _within(0.001, 1000.0)]
-Gain = Annotated[Number, _within(0.0, 100.0)]
-Gap = Annotated[Number, _within(0.0, 300.0)]  # 4 km of road hold two of them and 25 s at 100 m/s
-Speed = Annotated[Number, _within(0.0, MAX_CONFIGURED_SPEED_MPS)]
-Rate = Annotated[Number, _within(-MAX_CONFIGURED_SPEED_MPS, MAX_CONFIGURED_SPEED_MPS)]
-Acceleration = Annotated[Number, _within(*map(float, ACCELERATIONS_MPS2[[0, -1]]))]
-Braking = Annotated[Number, _within(0.0, 20.0)]
-Time = Annotated[Number, _within(0.0, 100.0)]
-Share = Annotated[Number, _within(0.0, 1.0)]
-DegreesOfFreedom = Annotated[Number, _within(2.0, 1000.0)]  # below 2 more than 1e-4 lies outside of the t table
-
-
-def _ordered(*ranges: tuple[str, str], equal: bool) -> Any:
-    """Validator of a section: the ends of each range are in order, and may be ``equal``."""
-
-    def checked(self: BaseModel) -> BaseModel:
-        for low, high in ranges:
-            least, most = getattr(self, low).value, getattr(self, high).value
-            if least > most or (least == most and not equal):
-                expected = f"a number {'of at most' if equal else 'below'} {high}"
-                mend = "Change places, or correct one of them."
-                raise broken_rule(low, f"{least:g}, with {high} {most:g}", expected, mend)
-        return self
-
-    return model_validator(mode="after")(checked)
-
-
-def _whole_steps(number: Number) -> Number:
-    steps = number.value / STEP_S
-    if abs(steps - round(steps)) >= 1e-9:
-        expected, mend = f"a multiple of the {STEP_S:g} s step", f"The nearest one is {round(steps) * STEP_S:g}."
-        raise broken_rule("value", f"{number.value:g}", expected, mend)
-    return number
-
-
 class Scenario(Section):
     """Horizon of a test."""
 
-    duration_s: Annotated[Number, _within(1.0, 25.0), AfterValidator(_whole_steps)]
+    duration_s: Annotated[Number, within(1.0, 25.0), AfterValidator(in_whole_steps)]
     """At most 25 s: BV's free driving has 256 random numbers for each cut-in, and the road is 4 km long."""
-
-
-class FitRange(Section):
-    """Where the fits hold; states outside are clamped to it."""
-
-    v_min_mps: Speed
-    v_max_mps: Speed
-    v_centre_mps: Speed
-    v_scale_mps: Scale
-    r1_min_m: Gap
-    r1_max_m: Gap
-    r1_centre_m: Gap
-    r1_scale_m: Scale
-
-    _ranges = _ordered(("v_min_mps", "v_max_mps"), ("r1_min_m", "r1_max_m"), equal=False)
 
 
 class InitialState(Section):
@@ -147,13 +75,13 @@ class InitialState(Section):
     r1dot_log_scale_u: LogScale
     r1dot_log_scale_w: LogScale
     r1dot_log_scale_ww: LogScale
-    r1dot_min_ttc_s: Annotated[Number, _within(0.1, 100.0)]
-    r2_min_m: Annotated[Number, _within(0.1, 300.0)]
+    r1dot_min_ttc_s: Annotated[Number, within(0.1, 100.0)]
+    r2_min_m: Annotated[Number, within(0.1, 300.0)]
     r2_max_m: Gap
     r2dot_min_mps: Rate
     r2dot_max_mps: Rate
 
-    _ranges = _ordered(("r2_min_m", "r2_max_m"), ("r2dot_min_mps", "r2dot_max_mps"), equal=True)
+    _ranges = ordered(("r2_min_m", "r2_max_m"), ("r2dot_min_mps", "r2dot_max_mps"), equal=True)
 
 
 class FreeDriving(Section):
@@ -194,8 +122,8 @@ class Guard(Section):
     """What keeps BV off LV; part of p."""
 
     lead_braking_mps2: Braking
-    own_braking_mps2: Annotated[Number, _within(0.1, 20.0)]
-    horizon_s: Annotated[Number, _within(0.0, 10.0)]
+    own_braking_mps2: Annotated[Number, within(0.1, 20.0)]
+    horizon_s: Annotated[Number, within(0.0, 10.0)]
     margin_m: Gap
 
 
@@ -213,7 +141,7 @@ class CutIn(Section):
     ignore_share: Share | None = None
     accept_ttc_s: Time | None = None
     accept_scale_s: Scale | None = None
-    max_probability_1s: Annotated[Number, _within(1e-6, 0.5)]
+    max_probability_1s: Annotated[Number, within(1e-6, 0.5)]
 
 
 _ACCEPTANCE = ("ignore_share", "accept_ttc_s", "accept_scale_s")
@@ -275,8 +203,8 @@ class AcceptanceSteps(Section):
     ``events`` were seen in each step, and ``exposure`` of them would have been expected if each wish were carried out.
     """
 
-    ttc_s: Annotated[list[Annotated[Number, _within(0.01, 100.0)]], _LENGTH, AfterValidator(_rising)]
-    share: list[Annotated[Number, _within(SMALLEST_SHARE, 1.0)]]
+    ttc_s: Annotated[list[Annotated[Number, within(0.01, 100.0)]], _LENGTH, AfterValidator(_rising)]
+    share: list[Annotated[Number, within(SMALLEST_SHARE, 1.0)]]
     events: list[Annotated[int, Field(ge=0)]] | None = None
     exposure: list[Annotated[float, Field(ge=0.0)]] | None = None
 
@@ -320,11 +248,11 @@ def _values(numbers: list[Number]) -> list[float]:
 class Lateral(Section):
     """How long cut-ins show themselves before BV overlaps: a constant lead, or a log-normal lateral speed."""
 
-    distance_m: Annotated[Number, _within(0.1, 5.0)]
-    lead_s: Annotated[Number, _within(0.0, LONGEST_LEAD_S), AfterValidator(_whole_steps)] | None = None
-    speed_median_mps: Annotated[Number, _within(0.05, 20.0)] | None = None
-    speed_log_sd: Annotated[Number, _within(0.01, 3.0)] | None = None
-    longest_lead_s: Annotated[Number, _within(0.1, LONGEST_LEAD_S), AfterValidator(_whole_steps)] | None = None
+    distance_m: Annotated[Number, within(0.1, 5.0)]
+    lead_s: Annotated[Number, within(0.0, LONGEST_LEAD_S), AfterValidator(in_whole_steps)] | None = None
+    speed_median_mps: Annotated[Number, within(0.05, 20.0)] | None = None
+    speed_log_sd: Annotated[Number, within(0.01, 3.0)] | None = None
+    longest_lead_s: Annotated[Number, within(0.1, LONGEST_LEAD_S), AfterValidator(in_whole_steps)] | None = None
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:

@@ -1,0 +1,138 @@
+"""Numbers of a family's file, each with its provenance and within its limits, and a file that is made of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, Field, model_validator
+
+from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
+from harness.campaign.problems import broken_rule
+from harness.campaign.sections import Section
+from harness.families.replicates import content_hash
+from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import ACCELERATIONS_MPS2
+
+
+class Number(Section):
+    """A value and where it comes from (the tags are explained in the shipped file).
+
+    ``se`` is the standard error of a fitted one, ``range`` says where an assumed one may lie; neither changes a test.
+    """
+
+    value: float
+    source: Literal[
+        "paper", "itsc", "ndd", "cutin", "openacc", "published", "assumed", "fitted", "derived", "measured", "user"
+    ]
+    note: str = ""
+    se: Annotated[float, Field(ge=0.0)] | None = None
+    range: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _range_holds_the_value(self) -> Self:
+        if self.range is not None and not self.range[0] <= self.value <= self.range[1]:
+            mend = "Name the lower end first, and one that the value is not outside of."
+            raise broken_rule("range", f"{self.range}, with the value {self.value:g}", "two ends around it", mend)
+        return self
+
+
+def within(low: float, high: float) -> AfterValidator:
+    """Refuse a value, or an end of its range, outside of [low, high]."""
+
+    def checked(number: Number) -> Number:
+        for key, values in (("value", [number.value]), ("range", number.range or [])):
+            if outside := [each for each in values if not low <= each <= high]:
+                expected = f"{'a number' if key == 'value' else 'numbers'} from {low:g} to {high:g}"
+                raise broken_rule(key, f"{outside[0]:g}", expected, "Correct the value.")
+        return number
+
+    return AfterValidator(checked)
+
+
+# Wide limits: what a law makes of its numbers is judged where it is loaded.
+Coefficient = Annotated[Number, within(-1000.0, 1000.0)]
+LogScale = Annotated[Number, within(-50.0, 50.0)]
+Scale = Annotated[Number, within(0.001, 1000.0)]
+Gain = Annotated[Number, within(0.0, 100.0)]
+Gap = Annotated[Number, within(0.0, 300.0)]  # 4 km of road hold two of them and 25 s at 100 m/s
+Speed = Annotated[Number, within(0.0, MAX_CONFIGURED_SPEED_MPS)]
+Rate = Annotated[Number, within(-MAX_CONFIGURED_SPEED_MPS, MAX_CONFIGURED_SPEED_MPS)]
+Acceleration = Annotated[Number, within(*map(float, ACCELERATIONS_MPS2[[0, -1]]))]
+Braking = Annotated[Number, within(0.0, 20.0)]
+Time = Annotated[Number, within(0.0, 100.0)]
+Share = Annotated[Number, within(0.0, 1.0)]
+DegreesOfFreedom = Annotated[Number, within(2.0, 1000.0)]  # below 2 more than 1e-4 lies outside of the t table
+
+
+def ordered(*ranges: tuple[str, str], equal: bool) -> Any:
+    """Validator of a section: the ends of each range are in order, and may be ``equal``."""
+
+    def checked(self: BaseModel) -> BaseModel:
+        for low, high in ranges:
+            least, most = getattr(self, low).value, getattr(self, high).value
+            if least > most or (least == most and not equal):
+                expected = f"a number {'of at most' if equal else 'below'} {high}"
+                mend = "Change places, or correct one of them."
+                raise broken_rule(low, f"{least:g}, with {high} {most:g}", expected, mend)
+        return self
+
+    return model_validator(mode="after")(checked)
+
+
+def in_whole_steps(number: Number) -> Number:
+    """Refuse a time that is not a multiple of the step."""
+    steps = number.value / STEP_S
+    if abs(steps - round(steps)) >= 1e-9:
+        expected, mend = f"a multiple of the {STEP_S:g} s step", f"The nearest one is {round(steps) * STEP_S:g}."
+        raise broken_rule("value", f"{number.value:g}", expected, mend)
+    return number
+
+
+class FitRange(Section):
+    """Where the fits hold; states outside are clamped to it."""
+
+    v_min_mps: Speed
+    v_max_mps: Speed
+    v_centre_mps: Speed
+    v_scale_mps: Scale
+    r1_min_m: Gap
+    r1_max_m: Gap
+    r1_centre_m: Gap
+    r1_scale_m: Scale
+
+    _ranges = ordered(("v_min_mps", "v_max_mps"), ("r1_min_m", "r1_max_m"), equal=False)
+
+
+class ParameterFile(Section):
+    """Sections of numbers, which are known by flat names ``section__name``."""
+
+    def numbers(self) -> dict[str, Number]:
+        """Flat ``section__name``, of those in a list ``section__name__0`` and so on → number, with its provenance."""
+        found: dict[str, Any] = {}
+        for section, of in self:
+            for name, entry in of if isinstance(of, Section) else ():
+                found[f"{section}__{name}"] = entry
+                found |= {
+                    f"{section}__{name}__{i}": each for i, each in enumerate(entry if isinstance(entry, list) else ())
+                }
+        return {name: entry for name, entry in found.items() if isinstance(entry, Number)}
+
+    def values(self) -> dict[str, float]:
+        """The same without provenance."""
+        return {name: number.value for name, number in self.numbers().items()}
+
+    def with_values(self, values: Mapping[str, float]) -> Self:
+        """Other values by their flat names, as of a row of replicates; a `ValueError` where one is not allowed."""
+        content = self.model_dump()
+        for name, value in values.items():
+            place: Any = content
+            for key in name.split("__"):
+                place = place[int(key) if isinstance(place, list) else key]
+            place |= {"value": value, "range": None}
+        return type(self).model_validate(content)
+
+    def content_hash(self) -> str:
+        """Hash of the numbers alone: a corrected note does not change a campaign."""
+        return content_hash(json.dumps(self.values(), sort_keys=True).encode())
