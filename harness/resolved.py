@@ -60,7 +60,9 @@ class Resolved:
 
         Raises `CampaignError`: the library's file is missing or wrong.
         """
-        return load_library(self.campaign.pool.library).counting_above(self.campaign.crash.counts_above_mps)
+        library = load_library(self.campaign.pool.library)
+        library.require_drivers(follows=self.family.follows)
+        return library.counting_above(self.campaign.crash.counts_above_mps)
 
 
 def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
@@ -103,9 +105,11 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     parameters = family.parameters(campaign.environment)
     environment = family.traffic(campaign.environment, parameters)
     shows = family.shows(environment)
-    if (words := refusal(campaign, Use(command, shows))) is not None:
+    if (words := refusal(campaign, Use(command, shows, family.follows))) is not None:
         raise CampaignError(*words)
     campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[shows])
+    named = campaign.environment.named(family.default_parameters)
+    campaign = campaign.replaced(("environment", "parameters"), named)
     return Resolved(
         campaign,
         parameters,

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from harness.campaign.drivers import Surrogate, default_surrogates
+from harness.campaign.drivers import NATURAL, Surrogate, default_surrogates
 from harness.campaign.problems import NAME_PATTERN, broken_rule, did_you_mean
 from harness.campaign.sections import (
     Accept,
@@ -156,10 +156,14 @@ Command = Literal["run", "compare", "av-check"]
 
 
 class Use(NamedTuple):
-    """What a campaign is for (no command while it is read), and whether its cut-ins are known to take time."""
+    """What a campaign is for (no command while it is read), and what is known of its scenario by then.
+
+    That is whether its cut-ins take time, and whether the AV ``follows`` a vehicle from the start.
+    """
 
     command: Command | None = None
     shows: bool = False
+    follows: bool = False
 
 
 class Combination(NamedTuple):
@@ -170,6 +174,13 @@ class Combination(NamedTuple):
     found: str
     expected: str
     mend: str
+
+
+_FOLLOWS = "in {scenario}, where the AV follows a vehicle from the start"
+
+
+def _natural(campaign: Campaign) -> bool:
+    return getattr(campaign.av.parameters, "time_headway_s", None) == NATURAL
 
 
 _TAKES_TIME = "where cut-ins take time (`lateral` of the environment)"
@@ -239,6 +250,42 @@ REFUSED = (
         "shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at those that an "
         "attentive vehicle avoids",
         "Choose shells, or add --set environment.parameters=ndd-overtaking-1.",
+    ),
+    # -- scenarios in which the AV follows --
+    Combination(
+        "testing.method",
+        lambda c, use: use.follows and c.sampling.mixes,
+        "{testing.method}, " + _FOLLOWS,
+        "shells, forced or nde: importance functions are those of cut-ins",
+        "Choose shells, or scenario: cut_in.",
+    ),
+    Combination(
+        "av.before_event",
+        lambda c, use: use.follows and c.av.acts_before_event,
+        "controller, " + _FOLLOWS,
+        "hold_speed, which means nothing there: the vehicle drives in any case",
+        "Delete the key.",
+    ),
+    Combination(
+        "av.model",
+        lambda c, use: use.follows and c.av.model == "r157-fsm",
+        "r157-fsm, " + _FOLLOWS,
+        "another driver: how the fuzzy safety model meets lead braking has not been tried",
+        "Choose r157-cc, idm or fvdm, or bring a controller of your own.",
+    ),
+    Combination(
+        "av.parameters.time_headway_s",
+        lambda c, use: use.command is not None and not use.follows and _natural(c),
+        "natural, in {scenario}",
+        "seconds: the vehicle does not follow before the event",
+        "Write a number, or scenario: lead_brakes.",
+    ),
+    Combination(
+        "environment",
+        lambda c, use: use.follows and c.environment != EnvironmentSettings(parameters=c.environment.parameters),
+        "numbers of cut-ins, " + _FOLLOWS,
+        "parameters alone",
+        "Delete lane_change_level, acceleration_hold_s and cut_in_lead_s.",
     ),
     # -- comparisons --
     Combination(

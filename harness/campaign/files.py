@@ -20,7 +20,7 @@ from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import ModelName, default_surrogates
 from harness.campaign.problems import MOST_SHOWN, NAME_PATTERN, describe_found, did_you_mean, in_words
-from harness.campaign.sections import Section
+from harness.campaign.sections import DEFAULT, Section
 from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_text, read_yaml, yaml_text
 from harness.errors import CampaignError
@@ -86,7 +86,8 @@ def load_campaign(
         from harness.families import family_named  # noqa: PLC0415 - families read campaigns' sections
 
         shipped = family_named(campaign.scenario, place(("scenario",))).shipped
-        shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))
+        if campaign.environment.parameters != DEFAULT:
+            shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))
     env = campaign.run.ray.runtime_env
     paths = {key: _absolute(env[key], folder) for key in ("working_dir", "py_modules") if key in env}
     return campaign.replaced(("run", "ray", "runtime_env"), {**env, **paths})

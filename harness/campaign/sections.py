@@ -81,16 +81,24 @@ def listed(names: Iterable[str]) -> str:
     return ", ".join(names) or "none"
 
 
+DEFAULT = "default"
+
+
 class EnvironmentSettings(Section):
     """The naturalistic driving environment."""
 
-    parameters: str = Field("ndd-overtaking-2", description="name of a shipped parameter file, or a path to your own")
+    parameters: str = DEFAULT
+    """name of a shipped parameter file, or a path to your own; default: the scenario's"""
     lane_change_level: Positive = Field(1.0, le=1e8)
     """multiplies the cut-in hazard; highD: about 270 (python -m studies traffic)"""
     acceleration_hold_s: StepTime = Field(1.0, ge=0.1, le=2.0)
     """how long a drawn acceleration is held: 1.0 or 0.1"""
     cut_in_lead_s: LeadTime | None = None
     """time from onset to overlap of every cut-in; none: as the parameters say"""
+
+    def named(self, default: str) -> str:
+        """Of the parameter file, where the ``default`` is the scenario's."""
+        return default if self.parameters == DEFAULT else self.parameters
 
 
 class CrashSettings(Section):
@@ -157,8 +165,9 @@ class PoolSettings(Section):
 
     library: str | None = None
     """name of a shipped surrogate library, or a path to your own; none: the traffic's"""
-    relative_error: float = Field(0.005, ge=LEAST_POOL_ERROR, le=0.2)
-    """relative standard error of the surrogates' crash rates; four times that beyond the boundary"""
+    relative_error: float | None = Field(None, ge=LEAST_POOL_ERROR, le=0.2)
+    """relative standard error of the surrogates' crash rates, four times that beyond the boundary; none: the
+    scenario's, 0.005 or 0.01"""
     events_per_shell: Whole = Field(25_000, ge=100, le=MOST_CUT_INS)
     """cut-ins kept of each shell: its most tests"""
     shadow_paths: Whole = Field(500, ge=50, le=100_000)
