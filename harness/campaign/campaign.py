@@ -23,6 +23,7 @@ from harness.campaign.sections import (
     CrashSettings,
     EnvironmentSettings,
     PoolSettings,
+    Positive,
     Records,
     Run,
     Section,
@@ -64,6 +65,9 @@ class Campaign(Section):
     seed: Whole = Field(1, ge=0, lt=2**63)
     """random numbers of the tests follow from it; those of the pool from pool.seed"""
     scenario: str = Field("cut_in", description="kind of events that are tested: cut_in, or one that a package brings")
+    scenarios: Annotated[list[str], Field(min_length=1)] | None = None
+    """several kinds of events in one answer per hour, in place of scenario"""
+    exposure: dict[str, Positive] = Field(default_factory=dict, description="events per hour of driving, by scenario")
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
     crash: CrashSettings = CrashSettings()
@@ -87,6 +91,12 @@ class Campaign(Section):
         if (words := refusal(self)) is not None:
             raise broken_rule(*words)
         return self
+
+    def of_family(self, name: str) -> Campaign:
+        """The campaign of one of its scenarios; ``environment`` is that of cut-ins where others are beside them."""
+        given = {"environment": EnvironmentSettings()} if name != "cut_in" else {}
+        stop = self.stop.model_copy(update={"each_family": False})
+        return self.model_copy(update={"scenario": name, "scenarios": None, "exposure": {}, "stop": stop, **given})
 
     @property
     def sampling(self) -> Sampling:
@@ -193,6 +203,42 @@ REFUSED = (
         "a limit, with testing.method {testing.method}",
         "testing.method shells: how often decisions are wrong is known for its intervals alone",
         "Choose shells, or delete the section and compare the interval with the limit yourself.",
+    ),
+    # -- several scenarios --
+    Combination(
+        "scenarios",
+        lambda c, _: c.scenarios is not None and len(set(c.scenarios)) < len(c.scenarios),
+        "a scenario that is named twice",
+        "each once",
+        "Delete one of both.",
+    ),
+    Combination(
+        "testing.method",
+        lambda c, _: c.scenarios is not None and not c.sampling.strata,
+        "{testing.method}, with several scenarios",
+        "shells: rates of several kinds of events are one sum over strata",
+        "Choose shells, or write one scenario.",
+    ),
+    Combination(
+        "accept",
+        lambda c, _: c.scenarios is not None and c.accept is not None and c.accept.times_reference is None,
+        "a limit of crashes per test, with several scenarios",
+        "times_reference: their tests are not of one kind",
+        "Write accept: {times_reference: {driver: r157-cc}}, or one scenario.",
+    ),
+    Combination(
+        "pool.library",
+        lambda c, _: c.scenarios is not None and c.pool.library is not None,
+        "one library, with several scenarios",
+        "null: each scenario has its own",
+        "Delete the key, or write one scenario.",
+    ),
+    Combination(
+        "exposure",
+        lambda c, _: bool(set(c.exposure) - set(c.scenarios or ())),
+        "of a scenario that is not among scenarios",
+        "events per hour of those that are tested",
+        "Name it among scenarios, or delete it: one scenario alone has no rate per hour.",
     ),
     # -- vehicles that act before the cut-in --
     Combination(

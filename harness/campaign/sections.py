@@ -209,6 +209,9 @@ class Stop(Section):
         description="with rhw and shells: stop, too, once the rate is known to be below so many times that of the "
         "library's first reference driver; not where --set says rhw alone",
     )
+    each_family: bool = Field(
+        False, description="with several scenarios: rhw is asked of each one's rate, not of the sum"
+    )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = None
     """crashes needed before rhw may stop the campaign; none: 100, with shells 1"""

@@ -258,6 +258,9 @@ class Family(Protocol):
     def mean_distance_m(self, traffic: Environment) -> float:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens."""
 
+    def mean_speed_mps(self, traffic: Environment) -> float:
+        """Mean speed (m/s) of the AV on the road that its exposure is of."""
+
     def sources(self) -> Mapping[Method, type[Any]]:
         """Methods of its own, which draw the event in the loop: a class each (`harness.sampling.protocol.Source`)."""
 

@@ -43,6 +43,7 @@ from harness.strata import STORED_DESIGN
 
 if TYPE_CHECKING:
     from harness.report.summary import RunFolder
+    from harness.runner.families import Hours
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
 ESTIMATES = "estimates.json"
@@ -83,7 +84,7 @@ def run_campaign(
     workers: AtLeastOne | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-) -> RunResult:
+) -> RunResult | Hours:
     """Run a campaign, or the one that a path or a vehicle's name stands for, into a folder.
 
     That is new or empty or, with ``resume``, holds a run of this campaign that was interrupted, or is to go on to a
@@ -91,7 +92,13 @@ def run_campaign(
 
     Raises `HarnessError`: the campaign, the folder or the AV is at fault; nothing that was finished is lost.
     """
-    resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign_of(campaign))
+    if not isinstance(campaign, Resolved):
+        campaign = campaign_of(campaign)
+        if campaign.scenarios is not None:
+            from harness.runner.families import run_families  # noqa: PLC0415 - runs of this file, for several
+
+            return run_families(campaign, Path(out), workers=workers, resume=resume, progress=progress)
+    resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign)
     out, progress = Path(out), progress or Progress()
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)

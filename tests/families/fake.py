@@ -87,6 +87,9 @@ class Fake:
     def mean_distance_m(self, traffic):
         return 180.0
 
+    def mean_speed_mps(self, traffic):
+        return 30.0
+
     def sources(self):
         return {}
 

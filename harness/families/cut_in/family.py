@@ -108,6 +108,10 @@ class CutIn:
         scratch = empty_trajectory(traffic)
         return float(mean_test_distance(DISTANCE_SEED, states, unboxed(traffic), unboxed(scratch)))
 
+    def mean_speed_mps(self, traffic: Environment) -> float:
+        states = InitialStates(traffic.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
+        return float((states["v_bv_mps"] - states["r2dot_mps"]).mean())
+
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:  # noqa: ARG002 - counted, whatever the laws
         return EXPOSURE
 

@@ -109,7 +109,14 @@ class FollowingFamily:
         return False
 
     def mean_distance_m(self, traffic: Following) -> float:
-        return float(_speeds(traffic).mean() * traffic.numbers["max_steps"] * STEP_S)
+        return self.mean_speed_mps(traffic) * int(traffic.numbers["max_steps"]) * STEP_S
+
+    def mean_speed_mps(self, traffic: Following) -> float:
+        """Of the vehicle ahead, as it approaches."""
+        paths = Paths(np.arange(N_SPEEDS), np.zeros(N_SPEEDS, START_DTYPE))
+        paths.start["speed_mps"] = _speeds(traffic)
+        speed = self._moved(traffic, self.choose(traffic, 0, paths, np.full(N_SPEEDS, -1)).facts)[1]
+        return float(speed[:, : int(traffic.numbers["onset"]), 0].mean())
 
     def share_in_scope(self, traffic: Following) -> float:
         """Share of events that are in scope."""
