@@ -212,7 +212,8 @@ def replay_episode(
     if not stored:
         _require_reproducible(manifest, campaign)
         if not trust:
-            require_trust(folder, manifest, code_of(campaign.av), _TRUST)
+            for code in (code_of(campaign.av), campaign.testing.own_challenge):
+                require_trust(folder, manifest, code, _TRUST)
         return _simulated(folder, manifest, campaign, tables, episode, gui, fcd)
     if gui or fcd is not None:
         found, expected = "stored motion, which SUMO does not simulate", "a simulation, for sumo-gui and its data"
