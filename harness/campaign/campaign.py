@@ -136,8 +136,10 @@ class Campaign(Section):
         share = self.testing.defensive_share if alpha else 1.0
         return (share, *((1.0 - share) * weight for weight in alpha))
 
-    def content_hash(self, environment_parameters: str) -> str:
+    def content_hash(self, environment_parameters: str, challenge: str | None = None) -> str:
         """Hash of everything that changes an episode's bits, that of the environment's parameters included.
+
+        Of a challenge of the user's own, ``challenge`` says what is to be known.
 
         Cells, workers, estimator, stop rule, trace policy and names are left out, so that a campaign can be continued
         to a smaller RHW or with other resources.
@@ -151,7 +153,10 @@ class Campaign(Section):
             "environment_parameters": environment_parameters,
             "av": self.av.identity(),
             "surrogates": [(name, model.identity()) for name, model in self.surrogates.items()],
-            "testing": self.testing.model_dump(exclude={"estimator"}),
+            "testing": {
+                **self.testing.model_dump(exclude={"estimator"}),
+                "challenge": challenge or self.testing.challenge,
+            },
             "pool": self.pool.model_dump(exclude=unused) if self.sampling.strata else None,
             "engine": self.world.engine,
             "moments": self.records.moments,

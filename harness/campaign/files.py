@@ -31,6 +31,7 @@ SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"
 _FILES = {
     ("av", "controller"): "a Python file with the controller",
     ("testing", "estimator"): "a Python file with the estimator",
+    ("testing", "challenge"): "a Python file with the challenge",
     ("av", "fmu", "file"): "an FMI 2.0 co-simulation FMU",
     ("pool", "library"): "a surrogate library, or the name of a shipped one",
     ("environment", "parameters"): "a parameter file, or the name of a shipped one",
@@ -69,7 +70,7 @@ def load_campaign(
             raise CampaignError(each.option, found, expected, "Add --set accept=null.")
     for where, expected in _FILES.items():
         name, end = campaign.at(where), ""
-        if where[-1] in ("controller", "estimator") and name is not None and ".py:" in name:
+        if where[-1] in ("controller", "estimator", "challenge") and name is not None and ".py:" in name:
             name, _, end = name.rpartition(":")
         elif name is None or (where[-1] != "file" and not names_a_file(name)):
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, Self
 
@@ -18,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, in_words
+from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, did_you_mean, in_words
 from harness.vocabulary import Method
 
 
@@ -122,6 +123,9 @@ class ShellSettings(Section):
     """fewest tests of a round; raise it for many workers"""
 
 
+CHALLENGE = r"^(immediate|recursive|.+\.py:\w+)$"
+
+
 class Testing(Section):
     """How maneuvers are drawn at critical moments."""
 
@@ -132,8 +136,12 @@ class Testing(Section):
     )
     estimator: str | None = None
     """what answers and stops instead of the method's own: a name, or my.py:MyEstimator"""
-    challenge: Literal["immediate", "recursive"] = "recursive"
-    """immediate: crash if BV cuts in now (published); recursive: backward induction"""
+    challenge: str = Field(
+        "recursive",
+        json_schema_extra={"pattern": CHALLENGE},
+        description="immediate: crash if BV cuts in now (published); recursive: backward induction; my.py:function: "
+        "your own",
+    )
     epsilon: float = Field(
         0.1,
         ge=1e-6,
@@ -146,6 +154,19 @@ class Testing(Section):
     defensive_share: float = Field(0.1, gt=0.0, lt=1.0, description="share of forced cut-ins in the episode mixture")
     criticality_threshold: float = Field(0.0, ge=0.0, lt=1.0, description="a moment is critical above it")
     shells: ShellSettings = ShellSettings()
+
+    @property
+    def own_challenge(self) -> str | None:
+        """The challenge, if it is a function of the user's own."""
+        return self.challenge if ":" in self.challenge else None
+
+    @field_validator("challenge")
+    @classmethod
+    def _challenge_is_known(cls, challenge: str) -> str:
+        if not re.search(CHALLENGE, challenge):
+            mend = did_you_mean(challenge, ("immediate", "recursive")) or "Write my.py:function for one of your own."
+            raise broken_rule("", f"'{challenge}'", "'immediate', 'recursive' or my.py:function", mend)
+        return challenge
 
     @field_validator("alpha")
     @classmethod

@@ -309,9 +309,7 @@ def compare(
         found = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )
-    from harness.report.lines import pair_lines  # noqa: PLC0415 - keeps --help fast
-
-    told = pair_lines(found.content, a.crash.counts_above_mps, found.report, found.s_per_pair)
+    told = repr(found).splitlines()
     if junit is not None:
         from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
 

@@ -89,9 +89,9 @@ def estimate(
             _compared_elsewhere(folder, environment, confidence, as_json=as_json)
             return
         with progress_bar() as bar:
-            from harness.runner.other_traffic import estimate_in_other_traffic  # noqa: PLC0415 - keeps --help fast
-
-            content = estimate_in_other_traffic(folder, environment, confidence=confidence, own=write, progress=bar)
+            content = harness.estimate_in_other_traffic(
+                folder, environment, confidence=confidence, own=write, progress=bar
+            )
     else:
         from harness.estimators.own import asked_for  # noqa: PLC0415 - keeps --help fast
 
@@ -196,9 +196,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     simulated in SUMO: each move takes a second, once. DIR keeps it as sensitivity.json, and its page shows it.
     """
     with progress_bar() as bar:
-        from harness.runner.sensitivity import sensitivity as found_by  # noqa: PLC0415 - keeps --help fast
-
-        content = found_by(folder, ranges=ranges, progress=bar)
+        content = harness.sensitivity(folder, ranges=ranges, progress=bar)
         page = harness.write_report(folder)
     if as_json:
         print_json(content)
@@ -228,13 +226,7 @@ def _bar(bar: dict[str, Any]) -> dict[str, str]:
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 def report(folder: Path) -> None:
     """Write report.html of the run or of the comparison in DIR anew, and print where the page is."""
-    write = harness.write_report
-    if (folder / COMPARISON).is_file():
-        from harness.report.compare_page import write_comparison as write  # noqa: PLC0415 - keeps --help fast
-    elif (folder / FAMILIES).is_file():
-        from harness.report.hours_page import write_hours as write  # noqa: PLC0415 - keeps --help fast
-
-    say(write(folder))
+    say(harness.write_report(folder))
 
 
 def _motion_files(_ctx: click.Context, _parameter: click.Parameter, files: tuple[Path, ...]) -> tuple[Path, ...]:
@@ -301,8 +293,8 @@ def replay(
     content |= {name: result.row[name] for name in LATERAL if name in result.row}
     compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
     words = "as the run has traced it" if stored else compared[result.bit_equal]
-    facts = [f"  {name:<13} {fact}" for name, fact in result.scene["facts"]]
-    print_either(content, [f"episode {episode}: {result.outcome}; {words}", *facts, *written], as_json=as_json)
+    head, *facts = repr(result).splitlines()
+    print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
     if result.bit_equal is False:
         found = "a replay that differs from the stored trace"
         raise WorldDisagreementError(f"episode {episode} of {folder}", found, "the same bits", str(result.suspects))
