@@ -12,7 +12,7 @@ import pyarrow as pa
 from scipy.special import ndtr, ndtri
 
 from harness.campaign.sections import Section
-from harness.families.following.approach import Following
+from harness.families.following.approach import NEVER, Following
 from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
 from harness.families.numbers import Number, Share, ordered, within
@@ -105,10 +105,8 @@ class CutOut(FollowingFamily):
 
     def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
         clear_m, visible_m = (float(traffic.numbers[name]) for name in ("clear_m", "visible_from_m"))
-        seen = [
-            0 if np.isnan(w) else seen_after(clear_m, w, 10**9) - seen_after(visible_m, w, 10**9)
-            for w in events["lateral_mps"]
-        ]
+        clear = [0 if np.isnan(w) else seen_after(clear_m, w, NEVER) for w in events["lateral_mps"]]
+        seen = [c - seen_after(visible_m, w, c) if c else 0 for c, w in zip(clear, events["lateral_mps"], strict=True)]
         return {
             "revealed_speed_mps": events["ratio"] * speed_mps,
             "closing_mps": (1.0 - events["ratio"]) * speed_mps,
