@@ -11,21 +11,27 @@ from harness.campaign.yaml_text import read_text
 TRACI_MODULES = "traci", "libsumo", "libtraci"
 
 
-def _parsed(file: Path) -> ast.Module | None:
-    """A Python file, or None: it is not there, or wrong."""
+def _parsed(name: str) -> ast.Module | None:
+    """A Python file; None where it is not there, and one without content where it is not Python."""
+    file = Path(name)
+    if file.suffix != ".py" or not file.is_file():
+        return None
     with suppress(SyntaxError):
-        return ast.parse(read_text(file)) if file.suffix == ".py" and file.is_file() else None
-    return None
+        return ast.parse(read_text(file))
+    return ast.Module([], [])
 
 
 def is_script(name: str) -> bool:
-    """Whether it is a TraCI script that runs as it is: a file that imports traci, or its function without arguments."""
+    """Whether it is a TraCI script that runs as it is: a file that imports traci, or its function without arguments.
+
+    A file that is not Python counts as one, so that running it says where it is wrong.
+    """
     file, colon, function = name.partition(".py:")
-    if (tree := _parsed(Path(f"{file}.py" if colon else name))) is None:
+    if (tree := _parsed(f"{file}.py" if colon else name)) is None:
         return False
     imported = [each.module or "" for each in ast.walk(tree) if isinstance(each, ast.ImportFrom)]
     imported += [alias.name for each in ast.walk(tree) if isinstance(each, ast.Import) for alias in each.names]
-    if not any(each.partition(".")[0] in TRACI_MODULES for each in imported):
+    if tree.body and not any(each.partition(".")[0] in TRACI_MODULES for each in imported):
         return False
     for each in tree.body:
         if isinstance(each, ast.FunctionDef) and each.name == function:
@@ -37,7 +43,7 @@ def is_script(name: str) -> bool:
 
 def in_python_file(text: str) -> str:
     """What of a Python file may be meant; empty if it is none."""
-    if (tree := _parsed(Path(text))) is None:
+    if (tree := _parsed(text)) is None:
         return ""
     found = {each.name: each for each in tree.body if isinstance(each, ast.ClassDef | ast.FunctionDef)}
     drive = [name for name, each in found.items() if isinstance(each, ast.FunctionDef) or "step" in ast.dump(each)]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 
 import numpy as np
 import sumo_data
 
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.hosts import Guard
+from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
 from harness.controllers.traci_script import Script, ScriptController
 from harness.controllers.traci_vehicle import VEH_ID, Seen, VehicleDomain
@@ -19,6 +20,7 @@ from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 OTHERS = "LV", "BV"
+SPEED_MPS = 25.0
 
 
 def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptController]:
@@ -34,19 +36,16 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         found, place = f"{name}, which is no Python", f"{error.msg} in line {error.lineno}"
         raise CampaignError("av.controller", found, "a TraCI script", f"Mend it: {place}.") from error
     os.environ.setdefault("SUMO_HOME", sumo_data.__path__[0])  # as libsumo does: scripts look for it
-    ego, found, mend = style.ego, "", "Name its vehicle: --set av.traci_style.ego=NAME."
-    if ego in OTHERS:
-        ego, found = None, f"a script whose vehicle is called {ego}, as one of the others in every test"
-    elif ego is None:
-        with guard:
-            commanded, wrong = guard.call(_commanded_by, script, makes=True)
-        if wrong is not None:
-            found, mend = f"{name}, which fails when it is tried before a cut-in: {wrong}", "Mend the script."
-        elif len(commanded) != 1:
-            found = f"{name}, which commands {' and '.join(commanded) or 'no vehicle'} when it is tried before a cut-in"
-        else:
-            (ego,) = commanded
+    ego = style.ego
     if ego is None:
+        with guard:
+            answer, late = guard.call(_found, script, makes=True)
+        ego, wrong = answer or (None, f"fails when it is tried before a cut-in: {late}")
+    else:
+        wrong = f"calls its vehicle {ego}, as one of the others is called" if ego in OTHERS else ""
+    if wrong or ego is None:
+        found = f"{name}, which {wrong}"
+        mend = "Mend the script, or name its vehicle: --set av.traci_style.ego=NAME."
         raise CampaignError("av.controller", found, "a script that commands one vehicle", mend)
 
     def vehicle(set_speed_mps: float) -> VehicleDomain:
@@ -62,11 +61,11 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
 class _AnyName(str):
     """The AV's name as long as nobody knows it: whatever a script holds it against, which is ``asked``."""
 
-    asked: set[str]
+    asked: dict[str, None]
 
     def __eq__(self, other: object) -> bool:
-        if type(other) is str and other not in (*OTHERS, VEH_ID):
-            self.asked.add(other)
+        if type(other) is str and other not in OTHERS:
+            self.asked[other] = None
             return True
         return str.__eq__(self, other)
 
@@ -79,48 +78,73 @@ class _AnyName(str):
 class _Anybody(dict[str, Seen]):
     """Vehicles by name, where every unknown one is the AV."""
 
+    def __init__(self, there: dict[str, Seen], ego: _AnyName) -> None:
+        super().__init__(there)
+        self._ego = ego
+
     def __missing__(self, name: str) -> Seen:
-        return self[VEH_ID]
+        self._ego.asked[name] = None
+        return self[self._ego]
 
 
 class _Tried(VehicleDomain):
     """Notes which vehicles a script commands."""
 
-    def __init__(self, set_speed_mps: float) -> None:
-        self.any_name = _AnyName(VEH_ID)
-        self.any_name.asked = set()
-        super().__init__(set_speed_mps, self.any_name)
-        self._seen = _Anybody(self._seen)
+    def __init__(self, ego: str) -> None:
+        super().__init__(SPEED_MPS, ego)
         self.commanded = dict[str, None]()
+        if isinstance(ego, _AnyName):
+            self._seen = _Anybody(self._seen, ego)
 
     def _require_own(self, vehID: str, name: str, why: str = "") -> None:  # noqa: ARG002
+        self._of(vehID)
         if name[:3] != "get":
             self.commanded[vehID] = None
 
-    def names(self) -> list[str]:
-        """Those commanded; one without a name of its own is the one that was asked for, or AV."""
-        named = [name for name in self.commanded if name is not self.any_name]
-        if len(named) < len(self.commanded):
-            named += [name for name in sorted(self.any_name.asked) or [VEH_ID] if name not in named]
-        return named
+
+def _found(script: Script) -> tuple[str | None, str]:
+    """Name of the one vehicle that a script commands, or what is wrong with it.
+
+    Names are first taken as they come, each for the AV; those that came are then tried, one after the other.
+    """
+    anybody = _AnyName(VEH_ID)
+    anybody.asked = {}
+    commanded, wrong = _commanded(script, anybody)
+    named = [name for name in commanded if name is not anybody]
+    for name in dict.fromkeys((named + list(anybody.asked)) or [VEH_ID] * bool(commanded)):
+        if len(named) < 2:
+            named, failed = _commanded(script, name)
+            wrong = failed or wrong
+        if len(named) > 1:
+            return None, f"commands {' and '.join(named)}"
+        if named == [name] and not failed:
+            return name, ""
+    return None, f"fails when it is tried before a cut-in: {wrong}" if wrong else "commands no vehicle before a cut-in"
 
 
-def _commanded_by(script: Script) -> list[str]:
-    """Names of the vehicles that a script commands, when a car cuts in 12 m before it that is 10 m/s slower."""
-    tried = _Tried(25.0)
-    controller = ScriptController(script, lambda _: tried)
-    controller.start(EpisodeStart(0, STEP_S, np.random.default_rng(0), 25.0))
+def _commanded(script: Script, ego: str) -> tuple[list[str], str]:
+    """Names of the vehicles that a script commands when a car cuts in before it; and what it raises."""
+    tried = _Tried(ego)
+    try:
+        with closing(ScriptController(script, lambda _: tried)) as controller:
+            _drive(controller)
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a user's code raises
+        return list(tried.commanded), cause_of(error)
+    return list(tried.commanded), ""
+
+
+def _drive(controller: ScriptController) -> None:
+    """Ten seconds, in which a car that is 10 m/s slower cuts in 12 m ahead."""
+    controller.start(EpisodeStart(0, STEP_S, np.random.default_rng(0), SPEED_MPS))
     position = acceleration = 0.0
-    speed, bv_position, cut_in = 25.0, 60.0, False
+    speed, bv_position, cut_in = SPEED_MPS, 60.0, False
     for step in range(100):
         gap = bv_position - VEHICLE_LENGTH_M - position
         cut_in = cut_in or gap < 12.0 or step > 60
-        ahead = (gap, 15.0) if cut_in else (math.inf, math.nan)
+        ahead = (gap, 15.0) if cut_in and gap > -10.0 else (math.inf, math.nan)
         bv, lv = Neighbour(bv_position, 15.0, 0 if cut_in else 1), Neighbour(bv_position + 50.0, 15.0, 1)
         own = STEP_S * step, position, speed, acceleration
-        answer = controller.step(Observation(*own, *ahead, bv, lv, bv_overlaps=cut_in, set_speed_mps=25.0))
+        answer = controller.step(Observation(*own, *ahead, bv, lv, bv_overlaps=cut_in, set_speed_mps=SPEED_MPS))
         acceleration = min(max(answer, -10.0), 3.0)
         speed = max(0.0, speed + STEP_S * acceleration)
         position, bv_position = position + STEP_S * speed, bv_position + STEP_S * 15.0
-    controller.close()
-    return tried.names()

@@ -63,7 +63,9 @@ class Domain:
             raise AttributeError(name)
         why = _REFUSED.get(name, _WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None)
         if why is None:
-            there = ", ".join(entry for entry in dir(self) if not entry.startswith("_") and entry != "see")
+            public = [entry for entry in dir(self) if entry[0] != "_" and entry != "see"]
+            domains = [entry for entry in public if isinstance(getattr(self, entry), Domain)]
+            there = ", ".join(domains or public)
             raise AttributeError(f"{self._path} has no {name} here; it has {there}")
 
         def refused(*_arguments: Any, **_named: Any) -> NoReturn:
