@@ -48,6 +48,8 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         mend = "Mend the script, or name its vehicle: --set av.traci_style.ego=NAME."
         raise CampaignError("av.controller", found, "a script that commands one vehicle", mend)
 
+    guard.hint = "; bound commands as its vehicle type does: av.traci_style.decel_mps2, accel_mps2"
+
     def vehicle(set_speed_mps: float) -> VehicleDomain:
         made = VehicleDomain(set_speed_mps, ego)
         for bound, value in (made.setAccel, style.accel_mps2), (made.setDecel, style.decel_mps2):

@@ -212,6 +212,11 @@ class _Beside(SourceFileLoader):
 
     imports: _Imports
 
+    def get_code(self, fullname: str) -> CodeType | None:
+        if fullname not in self.imports.codes:
+            self.imports.codes[fullname] = super().get_code(fullname)
+        return self.imports.codes[fullname]
+
     def exec_module(self, module: ModuleType) -> None:
         vars(module)["__builtins__"] = self.imports.builtins
         super().exec_module(module)
@@ -220,8 +225,10 @@ class _Beside(SourceFileLoader):
 class _Imports:
     """What one run imports: the facade, random numbers of its own, and copies of its own of modules beside it."""
 
-    def __init__(self, folder: str, traci: ScriptTraci, seed: Callable[[], int]) -> None:
-        self._folder, self._traci, self._seed = folder, traci, seed
+    def __init__(
+        self, folder: str, codes: dict[str, CodeType | None], traci: ScriptTraci, seed: Callable[[], int]
+    ) -> None:
+        self._folder, self.codes, self._traci, self._seed = folder, codes, traci, seed
         self._random: Any = None
         self._own: dict[str, ModuleType] = {}
         self._names = set[str]()
@@ -276,6 +283,8 @@ class Script:
         self._parameters = parameters
         options = [f"--{key}" if value is True else f"--{key}={value}" for key, value in parameters.items()]
         self.argv = [str(self._file), *([] if colon else options)]
+        self._codes: dict[str, CodeType | None] = {}
+        """Of the modules beside it, by name."""
         self._code: CodeType = compile(self._file.read_bytes(), self._file, "exec")
 
     def run(self, traci: ScriptTraci, seed: Callable[[], int]) -> None:
@@ -283,7 +292,7 @@ class Script:
         module = ModuleType(f"{self._file.stem}_script" if self._function else "__main__")
         if self._function:  # dataclasses look their module up
             sys.modules[module.__name__] = module
-        imports = _Imports(str(self._file.parent), traci, seed)
+        imports = _Imports(str(self._file.parent), self._codes, traci, seed)
         vars(module).update(__file__=str(self._file), __builtins__=imports.builtins)
         exec(self._code, vars(module))  # noqa: S102 - the user's own
         if self._function:
