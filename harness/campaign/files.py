@@ -216,7 +216,9 @@ class Places:
 # -- vehicles by name --
 
 FEW_NAMES = 6
-_OTHER_FORMS = "my_av.py:MyClass, package.module:MyClass, my_av.fmu, sumo:MODEL, PANEL.yaml:NAME, or "
+_OTHER_FORMS = (
+    "my_av.py:MyClass, package.module:MyClass, a TraCI script my_script.py, my_av.fmu, sumo:MODEL, PANEL.yaml:NAME, or "
+)
 QUICK = {"rhw": 0.3, "below_reference": 0.3}
 """When a vehicle without a campaign has been tested enough."""
 
