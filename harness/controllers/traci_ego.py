@@ -14,8 +14,8 @@ import sumo_data
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_script import Script, ScriptController
-from harness.controllers.traci_vehicle import VEH_ID, Seen, VehicleDomain
+from harness.controllers.traci_script import Script, ScriptController, ScriptVehicles
+from harness.controllers.traci_vehicle import VEH_ID, Seen
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
@@ -50,8 +50,8 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
 
     guard.hint = "; bound commands as its vehicle type does: av.traci_style.decel_mps2, accel_mps2"
 
-    def vehicle(set_speed_mps: float) -> VehicleDomain:
-        made = VehicleDomain(set_speed_mps, ego)
+    def vehicle(set_speed_mps: float) -> ScriptVehicles:
+        made = ScriptVehicles(set_speed_mps, ego)
         for bound, value in (made.setAccel, style.accel_mps2), (made.setDecel, style.decel_mps2):
             if value is not None:
                 bound(ego, value)
@@ -89,7 +89,7 @@ class _Anybody(dict[str, Seen]):
         return self[self._ego]
 
 
-class _Tried(VehicleDomain):
+class _Tried(ScriptVehicles):
     """Notes which vehicles a script commands."""
 
     def __init__(self, ego: str) -> None:

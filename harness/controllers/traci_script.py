@@ -78,6 +78,21 @@ class _Simulation(SimulationDomain):
     getLoadedIDList = getDepartedIDList
 
 
+class ScriptVehicles(VehicleDomain):
+    """``traci.vehicle`` of a script."""
+
+    def add(self, vehID: str, *_arguments: Any, **_named: Any) -> None:
+        """Accepted of its own vehicle, which is there."""
+        self._require_own(vehID, "add")
+
+
+class _Routes(Domain):
+    """``traci.route``: of the one that its vehicle is added on."""
+
+    _path = "traci.route"
+    add = staticmethod(lambda *_arguments: None)
+
+
 class _Gui(Domain):
     """``traci.gui``: nobody looks."""
 
@@ -93,9 +108,10 @@ class ScriptTraci(Traci):
     StepListener: ClassVar[type] = StepListener
     simulation: _Simulation
 
-    def __init__(self, vehicle: VehicleDomain) -> None:
+    def __init__(self, vehicle: ScriptVehicles) -> None:
         super().__init__()
-        self.vehicle, self.simulation, self.gui = vehicle, _Simulation(vehicle.getIDList()), _Gui()
+        self.vehicle, self.simulation = vehicle, _Simulation(vehicle.getIDList())
+        self.gui, self.route = _Gui(), _Routes()
         self._listeners: dict[int, Any] = {}
         self._n_listeners = self._n_after = 0
         self.importing = False
@@ -304,7 +320,7 @@ class ScriptController:
 
     _traci: ScriptTraci
 
-    def __init__(self, script: Script, vehicle: Callable[[float], VehicleDomain]) -> None:
+    def __init__(self, script: Script, vehicle: Callable[[float], ScriptVehicles]) -> None:
         self._script, self._vehicle = script, vehicle
         self._run: greenlet | None = None
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from contextlib import closing
 from pathlib import Path
 
@@ -68,6 +69,22 @@ def test_a_script_leaves_the_bits_of_the_hook(name, of_the_hook):
 def test_so_it_does_in_sumo(name, of_the_hook):
     with closing(SumoWorld(7)) as world:
         assert motion(script(name), world=world) == of_the_hook
+
+
+def test_one_that_acts_from_the_start_does_so_as_a_script():
+    early = ", before_event: controller}", "testing={method: step_mixture}", "environment.lane_change_level=350"
+    hook, *more = (HOOK[:-1] + early[0], *early[1:])
+    as_script = motion(script("plain.py")[:-1] + early[0], *more, n=60)
+    assert as_script == motion(hook, *more, n=60)
+    assert as_script != motion(script("plain.py"), *more, n=60)
+
+
+def test_a_campaign_is_the_same_wherever_its_script_lies(tmp_path):
+    shutil.copy(SCRIPTS / "plain.py", tmp_path)
+    hashes = {load_campaign(str(folder / "plain.py")).content_hash("") for folder in (SCRIPTS, tmp_path)}
+    named = load_campaign(str(SCRIPTS / "plain.py"), ["av.traci_style.ego=ego"])
+    assert hashes != {named.content_hash("")}
+    assert len(hashes) == 1
 
 
 def test_parameters_are_options_of_a_script_and_arguments_of_a_function():

@@ -1,11 +1,13 @@
 """Names of the module in the script's own, a server that is joined, steps by their time."""
 
-from traci import StepListener, close, init, setOrder, simulation, simulationStep, vehicle
+from traci import *
 from traci.exceptions import FatalTraCIError, TraCIException
 
 assert issubclass(StepListener, object)
 init(8813, label="a")
 setOrder(1)
+route.add("straight", ["in", "out"])
+vehicle.add("ego", "straight", typeID="av", departSpeed="25")
 try:
     for step in range(1, 5000):
         simulationStep(0.1 * step)
