@@ -31,6 +31,7 @@ FORMS = {
     "batch": ("{controller: 'examples.idm_batch:IDM'}", 1.2),
     "per vehicle": ("{controller: 'examples.idm:IDM'}", 4.0),
     "TraCI-style": ("{controller: 'examples.idm_traci_style:IDM'}", 6.0),
+    "TraCI script": (f"{{controller: '{ROOT}/examples/idm_traci_script.py'}}", 6.0),
     "step listener": ("{controller: 'examples.idm_traci_style:Listener'}", 6.0),
 }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import difflib
 import json
 import os
@@ -20,9 +19,10 @@ from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import ModelName, default_surrogates
 from harness.campaign.problems import MOST_SHOWN, NAME_PATTERN, describe_found, did_you_mean, in_words
+from harness.campaign.python_files import in_python_file, is_script
 from harness.campaign.sections import DEFAULT, Section
 from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle, with_another_driver
-from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_text, read_yaml, yaml_text
+from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml, yaml_text
 from harness.errors import CampaignError
 from harness.files import real_path
 
@@ -110,7 +110,7 @@ def _absolute(value: Any, folder: Path) -> Any:
 
 def names_a_file(name: str) -> bool:
     """Tell a path to a file of one's own from the name of a shipped one."""
-    return name.endswith((".yaml", ".yml")) or "/" in name
+    return name.endswith((".yaml", ".yml", ".py")) or "/" in name
 
 
 def shipped_or_own(name: str, folder: Path, where: str) -> Path:
@@ -218,7 +218,9 @@ class Places:
 # -- vehicles by name --
 
 FEW_NAMES = 6
-_OTHER_FORMS = "my_av.py:MyClass, package.module:MyClass, my_av.fmu, sumo:MODEL, PANEL.yaml:NAME, or "
+_OTHER_FORMS = (
+    "my_av.py:MyClass, package.module:MyClass, a TraCI script my_script.py, my_av.fmu, sumo:MODEL, PANEL.yaml:NAME, or "
+)
 QUICK = {"rhw": 0.3, "below_reference": 0.3}
 """When a vehicle without a campaign has been tested enough."""
 
@@ -233,7 +235,8 @@ def names_a_campaign(path: str | Path) -> bool:
 
 def _default_campaign(vehicle: str) -> dict[str, Any]:
     place, _, name = vehicle.rpartition(":")
-    words = Path(vehicle).stem if vehicle.endswith(".fmu") else f"{Path(place).name.removesuffix('.py')}-{name}"
+    whole = vehicle.endswith((".fmu", ".py"))
+    words = Path(vehicle).stem if whole else f"{Path(place).name.removesuffix('.py')}-{name}"
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", words).strip("-._")
     av, for_the_player = named_vehicle(vehicle), {"traces": "crash"}
     return {"name": name, "av": av, "stop": dict(QUICK), "records": for_the_player}
@@ -242,13 +245,16 @@ def _default_campaign(vehicle: str) -> dict[str, Any]:
 def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     """The ``av`` section that a word stands for; a `CampaignError` if it stands for none.
 
-    That is a Python class or function, ``my_av.py:MyClass`` or ``package.module:MyClass``; the path of an FMU; one of
+    That is a Python class or function, ``my_av.py:MyClass`` or ``package.module:MyClass``; a TraCI script,
+    ``my_script.py`` or, a function of it that takes nothing, ``my_script.py:main``; the path of an FMU; one of
     SUMO's car-following models, ``sumo:ACC``; a vehicle of a panel, ``PANEL.yaml:NAME``; or, without a colon, one of
     the shipped panel, or a built-in model.
     """
     place, colon, name = text.rpartition(":")
     if text.endswith(".fmu"):
         return {"fmu": {"file": str(real_path(text))}}
+    if not colon and is_script(text):
+        return {"controller": str(real_path(text))}
     if place == "sumo":
         return {"sumo": {"carFollowModel": name}}
     if colon and not place.endswith((".yaml", ".yml")):
@@ -264,19 +270,8 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     few = difflib.get_close_matches(name, known, FEW_NAMES, cutoff=0.3) or known[:FEW_NAMES]
     more = f" … ({len(known)} names)" if len(few) < len(known) else ""
     expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(few)}{more}"
-    mend = _in_python_file(text) or did_you_mean(name, [*files, *known]) or "Name one of them."
+    mend = in_python_file(text) or did_you_mean(name, [*files, *known]) or "Name one of them."
     raise CampaignError(f"{option}{text}", found, expected, mend)
-
-
-def _in_python_file(text: str) -> str:
-    """What of a Python file may be meant; empty if it is none."""
-    if not text.endswith(".py") or not Path(text).is_file():
-        return ""
-    tree = ast.parse(read_text(Path(text)))
-    found = {each.name: each for each in tree.body if isinstance(each, ast.ClassDef | ast.FunctionDef)}
-    drive = [name for name, each in found.items() if isinstance(each, ast.FunctionDef) or "step" in ast.dump(each)]
-    shown = ([name for name in drive if name[0] != "_"] or list(found))[:FEW_NAMES]
-    return f"Name its class or function: {' or '.join(f'{text}:{name}' for name in shown)}." if shown else ""
 
 
 class Panel(Section):

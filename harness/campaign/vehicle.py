@@ -22,7 +22,7 @@ READS_NO_PARAMETERS = {
     "fmu": "Write them under av.fmu.start_values.",
 }
 """Sources of an AV beside which parameters would be lost, and where to write them."""
-CONTROLLER_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*|.+\.py):[A-Za-z_][A-Za-z0-9_]*$"
+CONTROLLER_PATTERN = r"^(.+\.py|([A-Za-z_][A-Za-z0-9_.]*|.+\.py):[A-Za-z_][A-Za-z0-9_]*)$"
 
 
 def with_another_driver(data: dict[str, Any], source: str, value: Any) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def with_another_driver(data: dict[str, Any], source: str, value: Any) -> dict[s
     last = next((name for name in AV_SOURCES if av.get(name) is not None), "model")
     av = {key: each for key, each in av.items() if key == source or key not in AV_SOURCES}
     if source != last:
-        lost = {"parameters", "reaction"} | ({"before_event"} if source == "model" else set())
+        lost = {"parameters", "reaction", "traci_style"} | ({"before_event"} if source == "model" else set())
         lost |= {"takes_over"} if source in ("sumo", "traci") else set()
         av = {key: each for key, each in av.items() if key not in lost}
     elif source == "model" and isinstance(parameters := av.get("parameters"), dict) and value in PARAMETERS:
@@ -82,6 +82,17 @@ class TraciProcess(Section):
         return shlex.split(self.command.format(port=port, cells=cells))
 
 
+class TraciStyle(Section):
+    """Of a TraCI script that runs as it is."""
+
+    ego: str | None = Field(None, min_length=1)
+    """name of the vehicle that it commands; none: found by trying it"""
+    accel_mps2: Positive | None = None
+    """bounds what its commands lead to, as accel of its vehicle type does"""
+    decel_mps2: Positive | None = None
+    """the same of braking"""
+
+
 class FmuController(Section):
     """An FMI 2.0 co-simulation FMU as controller."""
 
@@ -115,7 +126,8 @@ class AutomatedVehicle(Section):
     controller: str | None = Field(
         None, pattern=CONTROLLER_PATTERN, examples=["my_av.py:MyClass", "my_package.my_module:MyClass"]
     )
-    """your own: 'file.py:Class' or 'package.module:Class', or a function step(seen)"""
+    """your own: 'file.py:Class' or 'package.module:Class', a function step(seen), or a TraCI script 'file.py'"""
+    traci_style: TraciStyle = TraciStyle()
     sumo: dict[str, str | float] | None = None
     """SUMO drives it: carFollowModel and other vType attributes"""
     traci: TraciProcess | None = Field(None, description="your program, in any language, as a TraCI client")
@@ -162,8 +174,10 @@ class AutomatedVehicle(Section):
             del content["takes_over"]
         if not self.warm_up_steps:  # nobody is shown it
             del content["warm_up_s"]
+        if self.traci_style == TraciStyle():
+            del content["traci_style"]
         if self.controller is not None:  # as a module that is found from where it lies
-            content["controller"] = re.sub(r"^(?:.*/)?([^/]+)\.py:", r"\1:", self.controller)
+            content["controller"] = re.sub(r"^(?:.*/)?([^/]+)\.py(:|$)", r"\1\2", self.controller)
         if self.fmu is not None and (file := Path(self.fmu.file)).is_file():
             content["fmu"]["file"] = hashlib.sha256(file.read_bytes()).hexdigest()
         if self.traci is not None:
@@ -194,6 +208,8 @@ class AutomatedVehicle(Section):
         if self.source in READS_NO_PARAMETERS and self.parameters:
             found = f"{listed(dict(self.parameters))}, which nothing reads"
             raise broken_rule("parameters", found, f"no parameters {beside}", READS_NO_PARAMETERS[self.source])
+        if self.controller is None and self.traci_style != TraciStyle():
+            raise broken_rule("traci_style", f"traci_style {beside}", "it only beside a controller", "Leave it out.")
         if self.takes_over == "onset" and (self.source in ("sumo", "traci") or self.acts_before_event):
             beside = f"beside before_event: {self.before_event}" if self.acts_before_event else beside
             mend = "Leave it out. SUMO hands over at the overlap; who acts before the cut-in drives from the start."

@@ -67,6 +67,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     short_help="Run a campaign until it is precise enough.",
     epilog=examples(
         "harness run my_av.py:MyClass                        # or module:Class, my_av.fmu, sumo:ACC, r157-cc",
+        "harness run my_script.py                            # a TraCI script as it is",
         "harness run my_av.py:MyClass --set av.parameters.hardest_mps2=8",
         "harness run my_av.py:MyClass --scenario all         # cut-in, lead braking, cut-out: crashes per hour",
         "harness run scenarios/smoke.yaml --out runs/smoke",
@@ -119,8 +120,9 @@ def run(
 ) -> None:
     """Run CAMPAIGN until it is precise enough, and print the crash rate; that of VEHICLE is known to 30 %.
 
-    VEHICLE is a Python class or function (my_av.py:MyClass, package.module:MyClass), an FMU (my_av.fmu), a model of
-    SUMO's (sumo:ACC), of a panel (PANEL.yaml:NAME) or built in (r157-cc). A function is asked step(seen) each 0.1 s.
+    VEHICLE is a Python class or function (my_av.py:MyClass, package.module:MyClass), a TraCI script (my_script.py), an
+    FMU (my_av.fmu), a model of SUMO's (sumo:ACC), of a panel (PANEL.yaml:NAME) or built in (r157-cc). A function is
+    asked step(seen) each 0.1 s.
 
     The same campaign gives the same records, bit for bit, whatever the number of workers, and also when it was
     interrupted and resumed. The run folder holds the resolved campaign, all records (Parquet), estimates.json and

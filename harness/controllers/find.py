@@ -15,6 +15,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar, get_type_hints
 
 from harness.campaign.problems import did_you_mean
+from harness.campaign.python_files import in_python_file, is_script
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Guard, VehicleHost, cause_of, death_cause
 from harness.controllers.traci_style import StepListenerController
@@ -102,7 +103,7 @@ def build_host(
 
         return VehicleHost(*told, fmu_maker(av.fmu), n_cells)
     try:
-        make = _maker(av)
+        make = _script(av, guard) or _maker(av)
         guard.restore_modes()
         first = _made(make, str(av.controller), guard)
         is_batch = _is_batch(first)
@@ -113,6 +114,17 @@ def build_host(
         mend = "Mend what is raised: a __getattr__ raises AttributeError for what is not there."
         raise CampaignError("av.controller", found, _A_CONTROLLER, mend) from error
     return BatchHost(*told, first) if is_batch else VehicleHost(*told, make, n_cells, first)
+
+
+def _script(av: AutomatedVehicle, guard: Guard) -> Callable[[], Any] | None:
+    if (name := str(av.controller)).endswith(".py") and not is_script(name):
+        found, mend = f"{name}, which does not import traci", in_python_file(name) or "Name its class: my_av.py:Class."
+        raise CampaignError("av.controller", found, "a TraCI script, or a class or function of a file", mend)
+    if not is_script(name):
+        return None
+    from harness.controllers.traci_ego import script_maker  # noqa: PLC0415 - few campaigns have one
+
+    return script_maker(av, guard)
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
@@ -253,6 +265,9 @@ def _source_of_made(av: AutomatedVehicle) -> str | None:
     build_host(av, n_cells=1, seed=0)  # what it holds ends with the process
     if av.controller is None:
         return None
-    module = sys.modules.get(getattr(own_code(av.controller), "__module__", ""))
-    file = Path(getattr(module, "__file__", None) or "")
+    if is_script(av.controller):
+        file = Path(av.controller.removesuffix(":" + av.controller.rpartition(":")[2]))
+    else:
+        module = sys.modules.get(getattr(own_code(av.controller), "__module__", ""))
+        file = Path(getattr(module, "__file__", None) or "")
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None

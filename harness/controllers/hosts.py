@@ -123,6 +123,8 @@ class Guard:
     def __init__(self, limits: Limits) -> None:
         self._low, self._high = limits.min_acceleration_mps2, limits.max_acceleration_mps2
         self._limits = [time_limit(limits, makes=makes) for makes in (False, True)]
+        self.hint = ""
+        """What may help where an answer is outside of the limits."""
         self._makes = False
         """Of the call under way."""
         self._pid = os.getpid()
@@ -200,7 +202,12 @@ class Guard:
         Guard._current = None
 
     def acceleration(self, answer: Any) -> tuple[float, str | None]:
-        """An answer as a number, and what is wrong with it: a subclass may compare as it likes."""
+        """An answer as a number, and what is wrong with it: a subclass may compare as it likes.
+
+        An array of one element, as policies give it, is that.
+        """
+        if not isinstance(answer, float) and hasattr(answer, "__array__") and (found := np.asarray(answer)).size == 1:
+            answer = found.item()
         if not isinstance(answer, int | float | np.floating | np.integer) or isinstance(answer, bool):
             what = "None (is a return missing?)" if answer is None else type(answer).__name__
             return math.nan, f"returned {what}, expected an acceleration in m/s2 as a number"
@@ -208,7 +215,7 @@ class Guard:
         if not math.isfinite(value):
             return value, f"returned {value}, expected a finite acceleration in m/s2"
         if not self._low <= value <= self._high:
-            return value, f"asked for {value:g} m/s2, outside of av.limits ({self._low:g} to {self._high:g})"
+            return value, f"asked for {value:g} m/s2, outside of av.limits ({self._low:g} to {self._high:g}){self.hint}"
         return value, None
 
     def outside(self, values: FloatArray) -> IntArray:
@@ -319,8 +326,13 @@ def _step(controller: VehicleController, seen: list[Any]) -> Any:
 
 
 def _numbers(n: int, answer: Any) -> tuple[FloatArray | None, str | None]:
-    """An answer as (n,) float64, and what is wrong with it: a cast would make numbers of texts and of complex ones."""
+    """An answer as (n,) float64, and what is wrong with it: a cast would make numbers of texts and of complex ones.
+
+    That of a policy may be (n, 1).
+    """
     found = np.array(answer)
+    if found.shape == (n, 1):
+        found = found[:, 0]
     if found.shape != (n,):
         return None, f"returned an array of shape {found.shape}, expected ({n},)"
     if found.dtype.kind not in "iufO":

@@ -47,7 +47,7 @@ MISTAKES = (
     ("surrogates:\n  a.b: {model: idm}", "surrogates.a.b", 3, "another name"),
     ("av:\n  model: idm\n  controller: a:B", "av", 2, "An AV has one driver"),
     ("av:\n  controller:", "av.controller", 3, "Write a value after 'controller:'"),
-    ("av:\n  controller: my module.py", "av.controller", 3, "text such as my_av.py:MyClass"),
+    ("av:\n  controller: my module", "av.controller", 3, "text such as my_av.py:MyClass"),
     ("av:\n  sumo:\n    carFollowModel: ACC\n    minGap: true", "av.sumo.minGap", 5, "text or a number"),
     ("av:\n  traci: {command: ''}", "av.traci.command", 3, "starts the program"),
     ("av:\n  fmu: {output: a}", "av.fmu.file", 3, "Add 'file: …'"),

@@ -30,7 +30,7 @@ stop: {episodes: 60}
 run: {shard_size: 60}
 """
 RECIPES = [text for kind, text in BLOCKS if kind == "yaml"]
-BRAKES = [text for text in RECIPES if "Brakes" in text]
+BRAKES = [text for text in RECIPES if "Brakes" in text or "my_script" in text]
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def per_vehicle(folder):
 @pytest.mark.parametrize("recipe", RECIPES[1:], ids=lambda recipe: " ".join(recipe.split())[:50])
 def test_recipes_of_the_same_controller_are_the_same_vehicle_and_all_others_run(recipe, folder, per_vehicle):
     rows = run(folder, recipe)
-    assert (len(RECIPES), len(BRAKES)) == (8, 6)
+    assert (len(RECIPES), len(BRAKES)) == (9, 7)
     assert {row["outcome"] for row in per_vehicle} >= {"crash", "timeout"}
     if "fmu:" in recipe:
         assert [row["outcome"] for row in rows] == [row["outcome"] for row in per_vehicle]

@@ -13,12 +13,14 @@ from harness.controllers.hosts import BatchHost, Guard
 from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
 from harness.vocabulary import CRASH, PASSED
+from tests.stored_runs import ROOT
 from tests.worlds.running import LATERAL, drive, fmu_av, forced, motion
 
 FORMS = {
     "per vehicle": "av={controller: 'examples.idm:IDM'}",
     "batch": "av={controller: 'examples.idm_batch:IDM'}",
     "TraCI-style": "av={controller: 'examples.idm_traci_style:IDM'}",
+    "TraCI script": f"av={{controller: '{ROOT}/examples/idm_traci_script.py'}}",
     "step listener": "av={controller: 'examples.idm_traci_style:Listener'}",
 }
 

@@ -6,7 +6,7 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
-from harness.controllers import traci_facade
+from harness.controllers import traci_facade, traci_vehicle
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
 from harness.controllers.traci_facade import Traci
 from harness.controllers.traci_style import StepListenerController, TraciStyleController
@@ -96,7 +96,7 @@ def test_questions_about_neighbours_and_subscriptions_are_answered_as_sumo_does(
     assert vehicle.getSubscriptionResults("LV") == {}
     with pytest.raises(traci.TraCIException, match="Variable 0x60 of vehicles is not known here"):
         vehicle.subscribe("AV", [constants.VAR_CO2EMISSION])
-    for number in traci_facade._VARIABLES:
+    for number in traci_vehicle._VARIABLES:
         vehicle.subscribe("AV", [number])
         assert list(vehicle.getSubscriptionResults("AV")) == [number]
     assert traci.simulation.getCollidingVehiclesIDList() == traci.simulation.getCollisions() == ()
@@ -202,7 +202,7 @@ class Twice:
         self.traci.vehicle.setSpeed("AV", self.speed)
         return len(self.log) < 2
 
-    def cleanUp(self):  # noqa: N802 - TraCI's own name
+    def cleanUp(self):
         self.log.append("clean")
 
 

@@ -47,7 +47,7 @@ class Faulty:
     def __getattr__(self, name):
         return getattr(self._connection, name)
 
-    def simulationStep(self):  # noqa: N802 - TraCI's name
+    def simulationStep(self):
         self._step += 1
         if self._step == FAULT_STEP and self._fault in FAULTS:
             FAULTS[self._fault](self._connection)

@@ -1,0 +1,51 @@
+"""What a Python file of the user's holds, told without running it: a TraCI script, or classes and functions."""
+
+from __future__ import annotations
+
+import ast
+from contextlib import suppress
+from pathlib import Path
+
+from harness.campaign.yaml_text import read_text
+
+TRACI_MODULES = "traci", "libsumo", "libtraci"
+
+
+def _parsed(name: str) -> ast.Module | None:
+    """A Python file; None where it is not there, and one without content where it is not Python."""
+    file = Path(name)
+    if file.suffix != ".py" or not file.is_file():
+        return None
+    with suppress(SyntaxError):
+        return ast.parse(read_text(file))
+    return ast.Module([], [])
+
+
+def is_script(name: str) -> bool:
+    """Whether it is a TraCI script that runs as it is: a file that imports traci, or its function without arguments.
+
+    A file that is not Python counts as one, so that running it says where it is wrong.
+    """
+    file, colon, function = name.partition(".py:")
+    if (tree := _parsed(f"{file}.py" if colon else name)) is None:
+        return False
+    imported = [each.module or "" for each in ast.walk(tree) if isinstance(each, ast.ImportFrom)]
+    imported += [alias.name for each in ast.walk(tree) if isinstance(each, ast.Import) for alias in each.names]
+    if tree.body and not any(each.partition(".")[0] in TRACI_MODULES for each in imported):
+        return False
+    for each in tree.body:
+        if isinstance(each, ast.FunctionDef) and each.name == function:
+            given, makes = each.args, each.returns
+            required = len(given.posonlyargs) + len(given.args) - len(given.defaults) + given.kw_defaults.count(None)
+            return required == 0 and (makes is None or ast.unparse(makes) == "None")
+    return not colon
+
+
+def in_python_file(text: str) -> str:
+    """What of a Python file may be meant; empty if it is none."""
+    if (tree := _parsed(text)) is None:
+        return ""
+    found = {each.name: each for each in tree.body if isinstance(each, ast.ClassDef | ast.FunctionDef)}
+    drive = [name for name, each in found.items() if isinstance(each, ast.FunctionDef) or "step" in ast.dump(each)]
+    shown = ([name for name in drive if name[0] != "_"] or list(found))[:6]
+    return f"Name its class or function: {' or '.join(f'{text}:{name}' for name in shown)}." if shown else ""

@@ -1,0 +1,152 @@
+"""Which vehicle a TraCI script commands: it is tried before a car that cuts in, and the one vehicle is the AV."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
+
+import numpy as np
+import sumo_data
+
+from harness.campaign.vehicle import AutomatedVehicle
+from harness.controllers.hosts import Guard, cause_of
+from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
+from harness.controllers.traci_script import Script, ScriptController, ScriptVehicles
+from harness.controllers.traci_vehicle import VEH_ID, Seen
+from harness.errors import CampaignError
+from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
+
+OTHERS = "LV", "BV"
+SPEED_MPS = 25.0
+
+
+def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptController]:
+    """Makes controllers that run the script ``av.controller``.
+
+    Raises `CampaignError`: it cannot be compiled; or, where ``av.traci_style.ego`` is not given, it fails when it is
+    tried before a car that cuts in, or does not command one vehicle there.
+    """
+    name, style = str(av.controller), av.traci_style
+    try:
+        script = Script(name, dict(av.parameters))
+    except SyntaxError as error:
+        found, place = f"{name}, which is no Python", f"{error.msg} in line {error.lineno}"
+        raise CampaignError("av.controller", found, "a TraCI script", f"Mend it: {place}.") from error
+    os.environ.setdefault("SUMO_HOME", sumo_data.__path__[0])  # as libsumo does: scripts look for it
+    ego = style.ego
+    if ego is None:
+        with guard:
+            answer, late = guard.call(_found, script, makes=True)
+        ego, wrong = answer or (None, f"fails when it is tried before a cut-in: {late}")
+    else:
+        wrong = f"calls its vehicle {ego}, as one of the others is called" if ego in OTHERS else ""
+    if wrong or ego is None:
+        found = f"{name}, which {wrong}"
+        mend = "Mend the script, or name its vehicle: --set av.traci_style.ego=NAME."
+        raise CampaignError("av.controller", found, "a script that commands one vehicle", mend)
+
+    guard.hint = "; bound commands as its vehicle type does: av.traci_style.decel_mps2, accel_mps2"
+
+    def vehicle(set_speed_mps: float) -> ScriptVehicles:
+        made = ScriptVehicles(set_speed_mps, ego)
+        for bound, value in (made.setAccel, style.accel_mps2), (made.setDecel, style.decel_mps2):
+            if value is not None:
+                bound(ego, value)
+        return made
+
+    return partial(ScriptController, script, vehicle)
+
+
+class _AnyName(str):
+    """The AV's name as long as nobody knows it: whatever a script holds it against, which is ``asked``."""
+
+    asked: dict[str, None]
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is str and other not in OTHERS:
+            self.asked[other] = None
+            return True
+        return str.__eq__(self, other)
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    __hash__ = str.__hash__
+
+
+class _Anybody(dict[str, Seen]):
+    """Vehicles by name, where every unknown one is the AV."""
+
+    def __init__(self, there: dict[str, Seen], ego: _AnyName) -> None:
+        super().__init__(there)
+        self._ego = ego
+
+    def __missing__(self, name: str) -> Seen:
+        self._ego.asked[name] = None
+        return self[self._ego]
+
+
+class _Tried(ScriptVehicles):
+    """Notes which vehicles a script commands."""
+
+    def __init__(self, ego: str) -> None:
+        super().__init__(SPEED_MPS, ego)
+        self.commanded = dict[str, None]()
+        if isinstance(ego, _AnyName):
+            self._seen = _Anybody(self._seen, ego)
+
+    def _require_own(self, vehID: str, name: str, why: str = "") -> None:  # noqa: ARG002
+        self._of(vehID)
+        if name[:3] != "get":
+            self.commanded[vehID] = None
+
+
+def _found(script: Script) -> tuple[str | None, str]:
+    """Name of the one vehicle that a script commands, or what is wrong with it.
+
+    Names are first taken as they come, each for the AV; those that came are then tried, one after the other.
+    """
+    anybody = _AnyName(VEH_ID)
+    anybody.asked = {}
+    commanded, wrong = _commanded(script, anybody)
+    named = [name for name in commanded if name is not anybody]
+    for name in dict.fromkeys((named + list(anybody.asked)) or [VEH_ID] * bool(commanded)):
+        if len(named) < 2:
+            named, failed = _commanded(script, name)
+            wrong = failed or wrong
+        if len(named) > 1:
+            return None, f"commands {' and '.join(named)}"
+        if named == [name] and not failed:
+            return name, ""
+    return None, f"fails when it is tried before a cut-in: {wrong}" if wrong else "commands no vehicle before a cut-in"
+
+
+def _commanded(script: Script, ego: str) -> tuple[list[str], str]:
+    """Names of the vehicles that a script commands when a car cuts in before it; and what it raises."""
+    tried = _Tried(ego)
+    try:
+        with closing(ScriptController(script, lambda _: tried)) as controller:
+            _drive(controller)
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a user's code raises
+        return list(tried.commanded), cause_of(error)
+    return list(tried.commanded), ""
+
+
+def _drive(controller: ScriptController) -> None:
+    """Ten seconds, in which a car that is 10 m/s slower cuts in 12 m ahead."""
+    controller.start(EpisodeStart(0, STEP_S, np.random.default_rng(0), SPEED_MPS))
+    position = acceleration = 0.0
+    speed, bv_position, cut_in = SPEED_MPS, 60.0, False
+    for step in range(100):
+        gap = bv_position - VEHICLE_LENGTH_M - position
+        cut_in = cut_in or gap < 12.0 or step > 60
+        ahead = (gap, 15.0) if cut_in and gap > -10.0 else (math.inf, math.nan)
+        bv, lv = Neighbour(bv_position, 15.0, 0 if cut_in else 1), Neighbour(bv_position + 50.0, 15.0, 1)
+        own = STEP_S * step, position, speed, acceleration
+        answer = controller.step(Observation(*own, *ahead, bv, lv, bv_overlaps=cut_in, set_speed_mps=SPEED_MPS))
+        acceleration = min(max(answer, -10.0), 3.0)
+        speed = max(0.0, speed + STEP_S * acceleration)
+        position, bv_position = position + STEP_S * speed, bv_position + STEP_S * 15.0

@@ -1,0 +1,363 @@
+"""A TraCI script as it is: each test is one run of it, in a greenlet, with the facade in the place of ``traci``.
+
+Where the script calls ``simulationStep`` it hands over to the harness, and goes on a step later. That takes a greenlet
+half a microsecond, a thread 29; and it is the main thread, in which a script that never steps can be interrupted.
+"""
+
+from __future__ import annotations
+
+import builtins
+import random
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any, ClassVar, NoReturn
+
+from greenlet import GreenletExit, getcurrent, greenlet
+
+from harness.campaign.python_files import TRACI_MODULES
+from harness.controllers.protocol import EpisodeStart, Observation
+from harness.controllers.traci_facade import SimulationDomain, Traci
+from harness.controllers.traci_vehicle import Domain, FatalTraCIError, RefusedError, VehicleDomain
+from harness.files import real_path
+from harness.vehicles.kinematics import STEP_S
+
+_ROUNDING = 1e-9
+_PATIENCE = 100
+"""Steps that a script may ask for when its simulation has ended; a loop that no error ends is left where it is."""
+_LEFT = list[greenlet]()
+_VERSION = 22, "SUMO 1.28.0"
+
+
+class ScriptError(Exception):
+    """A script that ends before its test does, or never."""
+
+
+class StepListener:
+    """As ``traci.StepListener``."""
+
+    def step(self, t: float = 0.0) -> bool:  # noqa: ARG002 - TraCI's signature
+        """Whether it stays."""
+        return True
+
+    def cleanUp(self) -> None:
+        """It is removed."""
+
+    def setID(self, ID: int) -> None:
+        """Take the number that removes it."""
+        self._ID = ID
+
+    def getID(self) -> int:
+        """That number."""
+        return self._ID
+
+
+class _Simulation(SimulationDomain):
+    over = False
+    n_steps = 0
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self._names = names
+
+    def getDepartedIDList(self) -> tuple[str, ...]:
+        """All, in the first step."""
+        return self._names if self.n_steps == 1 else ()
+
+    def getArrivedIDList(self) -> tuple[str, ...]:  # type: ignore[override]
+        """All, when the test has ended."""
+        return self._names if self.over else ()
+
+    def getMinExpectedNumber(self) -> int:
+        """None is left at the end."""
+        return 0 if self.over else len(self._names)
+
+    getLoadedIDList = getDepartedIDList
+
+
+class ScriptVehicles(VehicleDomain):
+    """``traci.vehicle`` of a script."""
+
+    def add(self, vehID: str, *_arguments: Any, **_named: Any) -> None:
+        """Accepted of its own vehicle, which is there."""
+        self._require_own(vehID, "add")
+
+
+class _Routes(Domain):
+    """``traci.route``: of the one that its vehicle is added on."""
+
+    _path = "traci.route"
+    add = staticmethod(lambda *_arguments: None)
+
+
+class _Gui(Domain):
+    """``traci.gui``: nobody looks."""
+
+    _path = "traci.gui"
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_arguments, **_named: None
+
+
+class ScriptTraci(Traci):
+    """What stands for ``traci`` and ``libsumo`` in one run of a script; its time begins with the run."""
+
+    StepListener: ClassVar[type] = StepListener
+    simulation: _Simulation
+
+    def __init__(self, vehicle: ScriptVehicles) -> None:
+        super().__init__()
+        self.vehicle, self.simulation = vehicle, _Simulation(vehicle.getIDList())
+        self.gui, self.route = _Gui(), _Routes()
+        self._listeners: dict[int, Any] = {}
+        self._n_listeners = self._n_after = 0
+        self.importing = False
+
+    @property
+    def __all__(self) -> list[str]:
+        return [name for name in dir(self) if name[0] != "_" and name not in ("see", "end")]
+
+    def see(self, now: Observation) -> None:
+        """Take in what is there before a step."""
+        self.vehicle.see(now)
+
+    def end(self) -> None:
+        """Nobody is left."""
+        self.simulation.over = True
+        self.vehicle.leave()
+
+    def start(self, *_arguments: Any, **_named: Any) -> tuple[int, str]:
+        """Begin the run: the harness has begun the test."""
+        if self.simulation.over:
+            raise GreenletExit  # the next of a script that runs several: a test is one
+        if self.simulation.n_steps:
+            raise RefusedError("traci.start is refused after a step: each test is one run of the script.")
+        return _VERSION
+
+    init = load = start
+    getVersion = staticmethod(lambda: _VERSION)
+    getLabel = staticmethod(lambda: "default")
+    hasGUI = isLibsumo = isLibtraci = staticmethod(lambda: False)
+    switch = setOrder = setTraceFile = staticmethod(lambda *_: None)
+
+    def connect(self, *_arguments: Any, **_named: Any) -> ScriptTraci:
+        """Begin the run; the connection is the module."""
+        self.start()
+        return self
+
+    def getConnection(self, label: str = "default") -> ScriptTraci:  # noqa: ARG002 - there is one
+        """The connection is the module."""
+        return self
+
+    def isLoaded(self) -> bool:
+        """Whether the test goes on."""
+        return not self.simulation.over
+
+    def close(self, wait: bool = True) -> None:  # noqa: ARG002 - TraCI's signature
+        """End the run, when the test has ended; or because an error ends it."""
+        if not self.simulation.over and sys.exc_info()[1] is None:
+            raise RefusedError(f"traci.close is refused {self._early()}")
+
+    def _early(self) -> str:
+        time_s = self.simulation.time_s
+        return f"after {time_s:g} s, before the test has ended: let the loop go on while getMinExpectedNumber() > 0."
+
+    def require_unfinished(self, *, dead: bool) -> None:
+        """Refuse a script that has returned (`ScriptError`)."""
+        if dead:
+            why = self._early() if self.simulation.n_steps else "without a step: it never calls simulationStep"
+            raise ScriptError(f"the script returns {why}")
+
+    def simulationStep(self, step: float = 0.0) -> list[Any]:
+        """Hand over for a step, or until a time (s)."""
+        if self.simulation.over:
+            self._has_ended()
+        if not step:
+            self._advance()
+        while step - self.simulation.time_s > _ROUNDING and not self.simulation.over:
+            self._advance()
+        for number, listener in [*self._listeners.items()]:
+            if not listener.step(step):
+                self.removeStepListener(number)
+        return []
+
+    step = simulationStep
+
+    def _advance(self) -> None:
+        simulation = self.simulation
+        if self.importing:
+            raise RefusedError(
+                "traci.simulationStep is refused while a module is imported: put the loop in a function."
+            )
+        if simulation.n_steps:  # what comes after the first is seen already
+            _hand_over()
+        simulation.n_steps += 1
+        simulation.time_s = round(STEP_S * simulation.n_steps, 6)
+
+    def _has_ended(self) -> NoReturn:
+        self._n_after += 1
+        while self._n_after > _PATIENCE:
+            _hand_over()
+        raise FatalTraCIError("Connection closed by SUMO.")
+
+    def addStepListener(self, listener: Any) -> int:
+        """Call it after each step, until it answers something false."""
+        self._n_listeners += 1
+        self._listeners[self._n_listeners] = listener
+        getattr(listener, "setID", lambda _: None)(self._n_listeners)
+        return self._n_listeners
+
+    def removeStepListener(self, listenerID: int) -> bool:
+        """Whether it was there."""
+        listener = self._listeners.pop(listenerID, None)
+        getattr(listener, "cleanUp", lambda: None)()
+        return listener is not None
+
+
+def _hand_over() -> None:
+    harness = getcurrent().parent
+    assert harness is not None
+    harness.switch()
+
+
+class _Beside(SourceFileLoader):
+    """Loads a module that lies beside the script, for one run."""
+
+    imports: _Imports
+
+    def get_code(self, fullname: str) -> CodeType | None:
+        if fullname not in self.imports.codes:
+            self.imports.codes[fullname] = super().get_code(fullname)
+        return self.imports.codes[fullname]
+
+    def exec_module(self, module: ModuleType) -> None:
+        vars(module)["__builtins__"] = self.imports.builtins
+        super().exec_module(module)
+
+
+class _Imports:
+    """What one run imports: the facade, random numbers of its own, and copies of its own of modules beside it."""
+
+    def __init__(
+        self, folder: str, codes: dict[str, CodeType | None], traci: ScriptTraci, seed: Callable[[], int]
+    ) -> None:
+        self._folder, self.codes, self._traci, self._seed = folder, codes, traci, seed
+        self._random: Any = None
+        self._own: dict[str, ModuleType] = {}
+        self._names = set[str]()
+        self.builtins = {**vars(builtins), "__import__": self._import}
+
+    def _import(self, name: str, namespace: Any = None, local: Any = None, fromlist: Any = (), level: int = 0) -> Any:
+        top, *rest = name.split(".")
+        if level == 0 and top in TRACI_MODULES:
+            found: Any = self._traci
+            for each in rest if fromlist else ():
+                found = getattr(found, each)
+            return found
+        if level == 0 and name == "random":
+            if self._random is None:
+                self._random = random.Random(self._seed())  # noqa: S311 - for simulation
+                vars(self._random).update(Random=random.Random, SystemRandom=random.SystemRandom)
+            return self._random
+        if self._traci.importing:
+            return builtins.__import__(name, namespace, local, fromlist, level)
+        self._traci.importing = True
+        sys.modules.update(self._own)
+        sys.meta_path.insert(0, self)
+        try:
+            return builtins.__import__(name, namespace, local, fromlist, level)
+        finally:
+            self._traci.importing = False
+            sys.meta_path.remove(self)
+            self._own |= {each: sys.modules.pop(each) for each in self._names if each in sys.modules}
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:  # noqa: ARG002
+        """As a finder of ``sys.meta_path``."""
+        if (top := name.partition(".")[0]) in sys.modules and top not in self._names:
+            return None
+        spec = PathFinder.find_spec(name, [self._folder] if path is None else path)
+        if spec is None or type(spec.loader) is not SourceFileLoader:
+            return None
+        self._names.add(name)
+        spec.loader = loader = _Beside(name, spec.loader.path)
+        loader.imports = self
+        return spec
+
+
+class Script:
+    """A script: its file, ``file.py``, or a function of it, ``file.py:main``; compiled once.
+
+    Parameters become keyword arguments of the function; without one, options of the command line.
+    """
+
+    def __init__(self, name: str, parameters: dict[str, Any]) -> None:
+        file, colon, self._function = name.partition(".py:")
+        self._file = real_path(Path(f"{file}.py" if colon else name))
+        self._parameters = parameters
+        options = [f"--{key}" if value is True else f"--{key}={value}" for key, value in parameters.items()]
+        self.argv = [str(self._file), *([] if colon else options)]
+        self._codes: dict[str, CodeType | None] = {}
+        """Of the modules beside it, by name."""
+        self._code: CodeType = compile(self._file.read_bytes(), self._file, "exec")
+
+    def run(self, traci: ScriptTraci, seed: Callable[[], int]) -> None:
+        """Once, from the beginning, with globals of its own."""
+        module = ModuleType(f"{self._file.stem}_script" if self._function else "__main__")
+        if self._function:  # dataclasses look their module up
+            sys.modules[module.__name__] = module
+        imports = _Imports(str(self._file.parent), self._codes, traci, seed)
+        vars(module).update(__file__=str(self._file), __builtins__=imports.builtins)
+        exec(self._code, vars(module))  # noqa: S102 - the user's own
+        if self._function:
+            vars(module)[self._function](**self._parameters)
+
+
+class ScriptController:
+    """Runs a script once a test; see `harness.controllers.VehicleController`."""
+
+    _traci: ScriptTraci
+
+    def __init__(self, script: Script, vehicle: Callable[[float], ScriptVehicles]) -> None:
+        self._script, self._vehicle = script, vehicle
+        self._run: greenlet | None = None
+
+    def start(self, episode: EpisodeStart) -> None:
+        """See `harness.controllers.VehicleController`."""
+        with suppress(ScriptError):  # the last test's
+            self.close()
+        self._traci = ScriptTraci(self._vehicle(episode.set_speed_mps))
+        seed = partial(episode.random.integers, 2**63)
+        self._run = greenlet(partial(self._script.run, self._traci, lambda: int(seed())))
+
+    def step(self, observation: Observation) -> float:
+        """See `harness.controllers.VehicleController`."""
+        self._traci.see(observation)
+        self._turn()
+        return self._traci.vehicle.next_acceleration()
+
+    def _turn(self) -> None:
+        assert self._run is not None
+        RefusedError.last = None
+        argv, sys.argv = sys.argv, self._script.argv
+        try:
+            self._run.switch()
+        finally:
+            sys.argv = argv
+        if RefusedError.last is not None:
+            raise RefusedError.last
+        self._traci.require_unfinished(dead=self._run.dead)
+
+    def close(self) -> None:
+        """Let the last run meet the end of its simulation; what it raises then is nobody's concern."""
+        run, self._run = self._run, None
+        if not run or run.dead:  # a greenlet is true while it runs
+            return
+        self._traci.end()
+        with suppress(Exception, SystemExit):
+            run.switch()
+        if not run.dead:
+            _LEFT.append(run)
+            raise ScriptError("the script goes on when its simulation has ended: no FatalTraCIError ends its loop")

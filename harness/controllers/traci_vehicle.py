@@ -1,0 +1,390 @@
+"""What stands for ``traci.vehicle`` (see `harness.controllers.traci_facade`): questions and commands.
+
+What a script may not do here is refused with the reason.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, ClassVar, NoReturn
+
+from harness.controllers.protocol import Observation
+from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
+
+VEH_ID = "AV"
+ROAD = "cell0"
+LANE_CENTRES_M = (-1.6, 1.6)
+MAX_SPEED_MPS = 100.0
+_ROUNDING = 1e-9
+_SAFE_SPEED, _ACCEL, _DECEL = 1, 2, 4
+"""Bits of a speed mode."""
+_CHANGES_LANE = 0b1100_1111_1111
+"""Bits of a lane change mode that let SUMO change lanes, but for how much room it leaves."""
+_DEFAULT_VARIABLES, _VEHICLES = (0x50, 0x56), 0xA4
+
+_WOULD_MOVE = "it would move vehicles past the harness and invalidate the likelihood ratios"
+_STEPS = "the harness itself starts, steps and ends the simulation"
+_REFUSED = {
+    **dict.fromkeys(("start", "init", "connect", "switch", "setOrder", "close", "load", "loadState"), _STEPS),
+    **dict.fromkeys(("saveState", "simulationStep", "step", "executeMove"), _STEPS),
+    "addStepListener": "name the listener in the campaign, as av.controller",
+    "changeLane": "the AV stays on its lane; " + _WOULD_MOVE,
+}
+_REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")
+
+
+class TraCIException(Exception):  # noqa: N818 - TraCI's own name
+    """A command or question that TraCI, or the harness, does not answer."""
+
+
+class FatalTraCIError(Exception):
+    """The simulation has ended."""
+
+
+class RefusedError(TraCIException):
+    """What the harness cannot do: the ``last`` of a turn fails its test also where a script catches it."""
+
+    last: ClassVar[RefusedError | None] = None
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        RefusedError.last = self
+
+
+class Domain:
+    """Part of the facade: what it lacks is refused with the reason, or unknown with a list of what there is."""
+
+    _path: ClassVar[str]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        why = _REFUSED.get(name, _WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None)
+        if why is None:
+            public = [entry for entry in dir(self) if entry[0] != "_" and entry != "see"]
+            domains = [entry for entry in public if isinstance(getattr(self, entry), Domain)]
+            there = ", ".join(domains or public)
+            raise AttributeError(f"{self._path} has no {name} here; it has {there}")
+
+        def refused(*_arguments: Any, **_named: Any) -> NoReturn:
+            raise RefusedError(f"{self._path}.{name} is refused: {why}.")
+
+        return refused
+
+
+class Seen:
+    """What a script may ask of one vehicle: m, m/s, m/s²; lane 0 right, 1 left; sideways positive to the left."""
+
+    __slots__ = "acceleration", "lane", "max_speed", "position", "sideways", "sideways_speed", "speed"
+    position: float
+    speed: float
+    acceleration: float
+
+    def __init__(self, lane: int, max_speed: float) -> None:
+        self.lane, self.max_speed = lane, max_speed
+        self.sideways = self.sideways_speed = 0.0
+
+    def __getattr__(self, name: str) -> NoReturn:
+        raise TraCIException(f"The {name} of a vehicle is not known before the first step.")
+
+
+_QUESTIONS: dict[str, tuple[int, Callable[[Seen], Any]]] = {
+    "getLateralSpeed": (0x32, lambda of: of.sideways_speed),
+    "getSpeed": (0x40, lambda of: of.speed),
+    "getMaxSpeed": (0x41, lambda of: of.max_speed),  # of the AV that at which it cruises
+    "getPosition": (0x42, lambda of: (of.position, LANE_CENTRES_M[of.lane] + of.sideways)),
+    "getAngle": (0x43, lambda _: 90.0),  # degrees: along x
+    "getLength": (0x44, lambda _: VEHICLE_LENGTH_M),
+    "getMinGap": (0x4C, lambda _: 0.0),  # gaps are bumper to bumper
+    "getTypeID": (0x4F, lambda _: "exact"),
+    "getRoadID": (0x50, lambda _: ROAD),
+    "getLaneID": (0x51, lambda of: f"{ROAD}_{of.lane}"),
+    "getLaneIndex": (0x52, lambda of: of.lane),
+    "getLanePosition": (0x56, lambda of: of.position),
+    "getAcceleration": (0x72, lambda of: of.acceleration),
+    "getLateralLanePosition": (0xB8, lambda of: of.sideways),
+}
+"""Questions about a vehicle: their numbers in ``traci.constants``, and what answers them. Front bumpers count."""
+_VARIABLES = {number: name for name, (number, _) in _QUESTIONS.items()}
+_VARIABLES |= {0x68: "getLeader", 0x78: "getFollower"}
+"""What can be subscribed to, by number."""
+_OF_THE_AV = {"getSpeedMode": "_speed_mode", "getAccel": "_accel", "getDecel": "_decel"}
+"""What has been set of it, and where that is kept: bounds of its commands (m/s²) are infinite without."""
+_NEIGHBOURS = ("getLeftFollowers", "getRightFollowers", "getLeftLeaders", "getRightLeaders")
+"""Modes of `VehicleDomain.getNeighbors`, from 0; with ``blockingOnly`` each is four more."""
+_ACCEPTED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "setLaneChangeMode": (lambda mode: not mode & _CHANGES_LANE, "the AV stays on its lane, as in mode 0, 256 or 512"),
+    "setMinGap": (lambda gap: gap == 0.0, "gaps are bumper to bumper, minGap is 0"),
+    "setLength": (lambda length: length == VEHICLE_LENGTH_M, "vehicles are 5 m long"),
+    "setActionStepLength": (lambda step: step == STEP_S, "the AV acts in every 0.1 s"),
+    "setSpeedFactor": (lambda factor: factor == 1.0, "the speed factor is 1"),
+    "setColor": (lambda _: True, "nobody sees a colour"),
+}
+"""Setters of the AV that change nothing: each is refused unless it asks for what holds anyway."""
+
+
+class VehicleDomain(Domain):
+    """``traci.vehicle`` of one cell: what is here, and what the tables above have."""
+
+    _path = "traci.vehicle"
+
+    def __init__(self, set_speed_mps: float = math.nan, ego: str = VEH_ID) -> None:
+        self.legacy_leader = True
+        self._ego = ego
+        self._plan: Iterator[float] = iter(())
+        """Accelerations (m/s²) of the coming steps; empty without a command."""
+        self._command: Callable[[], Iterator[float]] | None = None
+        """What begins the plan anew: nothing for a command that is over after a step."""
+        self._told = math.nan
+        """Speed (m/s) that the AV will have if it does what it is told."""
+        self._accel = self._decel = math.inf
+        self._speed_mode = _ACCEL | _DECEL
+        self._subscribed: dict[str, tuple[int, ...]] = {}
+        self._around: dict[str, tuple[float, tuple[int, ...]]] = {}
+        """Range (m) and variables of what has been subscribed to around a vehicle."""
+        self._lv, self._bv, self._own = Seen(1, MAX_SPEED_MPS), Seen(1, MAX_SPEED_MPS), Seen(0, set_speed_mps)
+        self._seen = {"LV": self._lv, "BV": self._bv, ego: self._own}
+        self._begun = False
+
+    def see(self, now: Observation) -> None:
+        """Take in what is there before a step."""
+        for other, there in ((self._lv, now.lv), (self._bv, now.bv)):
+            other.acceleration = (there.speed_mps - other.speed) / STEP_S if self._begun else 0.0
+            other.position, other.speed, other.lane = there
+        # SUMO counts to the left; once BV overlaps it counts as a vehicle of the right lane, in its middle.
+        self._bv.sideways = 0.0 if now.bv_overlaps else -now.bv_lateral_m
+        self._bv.sideways_speed = -now.bv_lateral_speed_mps
+        own = self._own
+        own.position, own.speed, own.acceleration = now.position_m, now.speed_mps, now.acceleration_mps2
+        self._begun = True
+        # In the warm-up, and as long as it is held, the AV does not do what it is told. A command of longer than a step
+        # waits for it: else it would ask, at the hand-over, for speeds that it should have reached by then.
+        if self._command is not None and abs(now.speed_mps - self._told) > _ROUNDING:
+            self._plan = self._command()
+
+    def leave(self) -> None:
+        """All vehicles are gone: the test has ended."""
+        self._seen, self._subscribed, self._around = {}, {}, {}
+
+    def next_acceleration(self) -> float:
+        """What the AV is told for the coming step (m/s²); without a command it keeps its speed."""
+        if (acceleration := next(self._plan, None)) is None:
+            self._command, acceleration = None, 0.0
+        elif self._speed_mode & _DECEL:
+            acceleration = max(acceleration, -self._decel)
+        if self._speed_mode & _ACCEL:
+            acceleration = min(acceleration, self._accel)
+        self._told = max(0.0, self._own.speed + acceleration * STEP_S)
+        return acceleration
+
+    def _of(self, vehID: str) -> Seen:
+        try:
+            return self._seen[vehID]
+        except KeyError:
+            raise TraCIException(
+                f"Vehicle '{vehID}' is not known: there are {', '.join(self._seen) or 'none'}."
+            ) from None
+
+    # -- questions --
+
+    def getIDList(self) -> tuple[str, ...]:
+        """The cell's vehicles."""
+        return tuple(self._seen)
+
+    def getIDCount(self) -> int:
+        """Their number."""
+        return len(self._seen)
+
+    def subscribe(self, objectID: str, varIDs: Sequence[int] | None = None, *_when: float) -> None:
+        """Ask for variables (numbers of ``traci.constants``), for the whole test; by default road and position."""
+        self._of(objectID)
+        self._subscribed[objectID] = _variables(varIDs)
+
+    def unsubscribe(self, objectID: str) -> None:
+        """Ask for nothing more."""
+        self._subscribed.pop(objectID, None)
+
+    def getSubscriptionResults(self, objectID: str) -> dict[int, Any]:
+        """Values of what has been subscribed to, by number; none without."""
+        return self._values(objectID, self._subscribed.get(objectID, ()))
+
+    def _values(self, objectID: str, variables: Sequence[int]) -> dict[int, Any]:
+        return {number: getattr(self, _VARIABLES[number])(objectID) for number in variables}
+
+    def getAllSubscriptionResults(self) -> dict[str, dict[int, Any]]:
+        """The same of all vehicles that have been subscribed to."""
+        return {name: self.getSubscriptionResults(name) for name in self._subscribed}
+
+    def subscribeContext(
+        self, objectID: str, domain: int, dist: float, varIDs: Sequence[int] | None = None, *_when: float
+    ) -> None:
+        """Ask for variables of the vehicles (``domain`` 0xa4) within a distance (m) of one, itself included."""
+        self._of(objectID)
+        if domain != _VEHICLES:
+            raise RefusedError(f"vehicle.subscribeContext of domain {domain:#x} is refused: there are vehicles alone.")
+        self._around[objectID] = dist, _variables(varIDs)
+
+    def getContextSubscriptionResults(self, objectID: str) -> dict[str, dict[int, Any]]:
+        """Values of what has been subscribed to around a vehicle, by its and their names; none without."""
+        dist, variables = self._around.get(objectID, (-1.0, ()))
+        here = self.getPosition(objectID)
+        return {
+            name: self._values(name, variables)
+            for name in self._seen
+            if math.dist(here, self.getPosition(name)) <= dist
+        }
+
+    def getLeader(self, vehID: str, dist: float = 100.0) -> tuple[str, float] | None:  # noqa: ARG002 - TraCI's signature
+        """Vehicle ahead on the lane and the gap to it (m, less the minGap of zero), however far away.
+
+        Without one None, or ``("", -1.0)`` after ``traci.setLegacyGetLeader(False)``.
+        """
+        ahead = self._nearest(vehID, 1.0)
+        return ahead if ahead is not None or self.legacy_leader else ("", -1.0)
+
+    def getFollower(self, vehID: str, dist: float = 0.0) -> tuple[str, float]:  # noqa: ARG002 - TraCI's signature
+        """Vehicle behind on the lane and the gap from it (m); ``("", -1.0)`` without one."""
+        return self._nearest(vehID, -1.0) or ("", -1.0)
+
+    def getNeighbors(self, vehID: str, mode: int) -> tuple[tuple[str, float], ...]:
+        """Nearest vehicle on a lane beside, and the gap (m): 1 the right one, not the left; 2 ahead, not behind.
+
+        With 4 only one that is in the way of a lane change: one beside.
+        """
+        lane = self._of(vehID).lane + (-1 if mode & 1 else 1)
+        found = self._nearest(vehID, 1.0 if mode & 2 else -1.0, lane)
+        return () if found is None or (mode & 4 and found[1] > 0.0) else (found,)
+
+    def _nearest(self, vehID: str, direction: float, lane: int | None = None) -> tuple[str, float] | None:
+        own = self._of(vehID)
+        here, lane = own.position, own.lane if lane is None else lane
+        found: tuple[str, float] | None = None
+        for name, other in self._seen.items():
+            there = other.position
+            if name == vehID or other.lane != lane or direction * (there - here) < 0.0:
+                continue
+            # Operation by operation as the observed gap: bit-equal to what other controllers see.
+            gap = (there - VEHICLE_LENGTH_M - here) if direction > 0.0 else (here - VEHICLE_LENGTH_M - there)
+            if found is None or gap < found[1]:
+                found = name, gap
+        return found
+
+    # -- commands --
+
+    def setSpeed(self, vehID: str, speed: float) -> None:
+        """Drive at this speed (m/s) from the next step on until told otherwise; -1 releases."""
+        self._require_own(vehID, "setSpeed")
+        self._begin(None if speed < 0.0 else partial(self._hold, _finite(speed)), math.inf)
+
+    def setAcceleration(self, vehID: str, acceleration: float, duration: float) -> None:
+        """Accelerate (m/s²) for a duration (s)."""
+        self._require_own(vehID, "setAcceleration")
+        if duration < 0.0:
+            raise TraCIException("Duration must not be negative.")
+        self._begin(partial(self._accelerate, _finite(acceleration), duration), duration)
+
+    def slowDown(self, vehID: str, speed: float, duration: float) -> None:
+        """Change speed linearly to a value (m/s) in a duration (s)."""
+        self._require_own(vehID, "slowDown")
+        if not speed >= 0.0:
+            raise TraCIException("Speed must not be negative.")
+        if duration < 0.0:
+            raise TraCIException("Invalid time interval.")
+        self._begin(partial(self._approach, _finite(speed), duration), duration)
+
+    def _begin(self, command: Callable[[], Iterator[float]] | None, duration: float) -> None:
+        self._plan = iter(()) if command is None else command()
+        self._command = command if duration > STEP_S + _ROUNDING else None
+
+    def _hold(self, speed: float) -> Iterator[float]:
+        """Until further notice."""
+        while True:
+            yield (speed - self._own.speed) / STEP_S
+
+    def _accelerate(self, acceleration: float, duration: float) -> Iterator[float]:
+        """For whole steps, and a share of a last one."""
+        left = duration / STEP_S
+        while left >= _ROUNDING:
+            yield acceleration if left > 1.0 - _ROUNDING else acceleration * left
+            left -= 1.0
+
+    def _approach(self, target: float, duration: float) -> Iterator[float]:
+        start, steps, done = self._own.speed, max(duration / STEP_S, 1.0), 0
+        while done <= steps - _ROUNDING:
+            done += 1
+            share = min(1.0, done / steps)
+            yield (start + (target - start) * share - self._own.speed) / STEP_S
+
+    def setAccel(self, vehID: str, accel: float) -> None:
+        """Bound the acceleration (m/s²) that later commands lead to."""
+        self._require_own(vehID, "setAccel")
+        self._accel = accel
+
+    def setDecel(self, vehID: str, decel: float) -> None:
+        """Bound the braking (m/s², positive) that later commands lead to."""
+        self._require_own(vehID, "setDecel")
+        self._decel = decel
+
+    def setSpeedMode(self, vehID: str, speedMode: int) -> None:
+        """Whether `setAccel` (bit 2) and `setDecel` (bit 4) bound commands."""
+        self._require_own(vehID, "setSpeedMode")
+        if speedMode & _SAFE_SPEED:
+            why = "SUMO's safe speeds (bit 1) do not bound the AV here: what it is told it does, as under speed mode 32"
+            raise RefusedError(f"vehicle.setSpeedMode('{vehID}', {speedMode}) is refused: {why}.")
+        self._speed_mode = speedMode
+
+    def _require_own(self, vehID: str, name: str, why: str = _WOULD_MOVE) -> None:
+        if vehID != self._ego:
+            self._of(vehID)
+            raise RefusedError(f"vehicle.{name}('{vehID}') is refused: {why}. Commands are for '{self._ego}' only.")
+
+
+def _variables(asked: Sequence[int] | None) -> tuple[int, ...]:
+    wanted = tuple(_DEFAULT_VARIABLES if asked is None else asked)
+    if unknown := [hex(number) for number in wanted if number not in _VARIABLES]:
+        known = ", ".join(map(hex, _VARIABLES))
+        raise RefusedError(f"Variable {unknown[0]} of vehicles is not known here: it has {known}.")
+    return wanted
+
+
+def _question(answer: Callable[[Seen], Any]) -> Callable[[VehicleDomain, str], Any]:
+    return lambda self, vehID: answer(self._of(vehID))
+
+
+def _of_the_av(name: str, kept: str) -> Callable[[VehicleDomain, str], Any]:
+    def ask(self: VehicleDomain, vehID: str) -> Any:
+        self._require_own(vehID, name, "is not known of traffic")
+        return getattr(self, kept)
+
+    return ask
+
+
+def _neighbours(mode: int) -> Callable[..., tuple[tuple[str, float], ...]]:
+    return lambda self, vehID, blockingOnly=False: self.getNeighbors(vehID, mode | 4 * blockingOnly)
+
+
+def _accepted(name: str, holds: Callable[[Any], bool], what_holds: str) -> Callable[..., None]:
+    def accept(self: VehicleDomain, vehID: str, value: Any, *_more: Any) -> None:
+        self._require_own(vehID, name)
+        if not holds(value):
+            raise RefusedError(f"vehicle.{name}('{vehID}', {value}) is refused: {what_holds}.")
+
+    return accept
+
+
+_FROM_TABLES: dict[str, Callable[..., Any]] = {
+    **{name: _question(answer) for name, (_, answer) in _QUESTIONS.items()},
+    **{name: _of_the_av(name, kept) for name, kept in _OF_THE_AV.items()},
+    **{name: _neighbours(mode) for mode, name in enumerate(_NEIGHBOURS)},
+    **{name: _accepted(name, *row) for name, row in _ACCEPTED.items()},
+}
+for _name, _method in (*_FROM_TABLES.items(), ("getAllowedSpeed", _FROM_TABLES["getMaxSpeed"])):
+    setattr(VehicleDomain, _name, _method)
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise TraCIException(f"{value} is no command for a vehicle.")
+    return value

@@ -1,0 +1,242 @@
+"""A TraCI script runs as it is: each test is one run of it, and its bits are those of the same vehicle as a hook."""
+
+import json
+import re
+import shutil
+from contextlib import closing
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from harness.campaign.files import load_campaign
+from harness.cli import main
+from harness.controllers.traci_style import TraciStyleController
+from harness.errors import CampaignError
+from harness.worlds.sumo import SumoWorld
+from tests.worlds.running import drive, motion
+
+SCRIPTS = Path(__file__).parent / "scripts"
+NAMES = {
+    "plain.py", "main_guard.py", "options.py", "with_class.py", "with_main.py:main", "listener.py", "subscriptions.py",
+    "around.py", "connection.py", "from_imports.py", "remembers.py", "several/several.py",
+}  # fmt: skip
+
+
+class BrakesWith(TraciStyleController):
+    def __init__(self, hardest):
+        self.hardest = hardest
+
+    def on_step(self, traci, veh_id, time):
+        leader = traci.vehicle.getLeader(veh_id)
+        if leader is not None:
+            closing = traci.vehicle.getSpeed(veh_id) - traci.vehicle.getSpeed(leader[0])
+            traci.vehicle.setAcceleration(veh_id, -self.hardest if 4.0 * closing > leader[1] else 0.0, 0.1)
+
+
+class Brakes(BrakesWith):
+    """What each of the scripts is."""
+
+    def __init__(self):
+        super().__init__(4.0)
+
+
+FORCED = "testing={method: forced}", "stop.rhw=null", "stop.below_reference=null", "records={moments: none}"
+HOOK = "av={controller: 'tests.controllers.test_traci_script:Brakes'}"
+
+
+def script(name, more=""):
+    return f"av={{controller: '{SCRIPTS / name}'{more}}}"
+
+
+@pytest.fixture(scope="module")
+def of_the_hook():
+    return motion(HOOK)
+
+
+def test_there_is_no_script_that_no_test_runs():
+    there = {str(file.relative_to(SCRIPTS)) for file in SCRIPTS.rglob("*.py") if file.parent.name != "parts"}
+    assert there == {name.removesuffix(":main") for name in NAMES}
+    assert len(NAMES) >= 12
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_a_script_leaves_the_bits_of_the_hook(name, of_the_hook):
+    assert motion(script(name)) == of_the_hook
+
+
+@pytest.mark.parametrize("name", ["main_guard.py", "with_main.py:main", "several/several.py"])
+def test_so_it_does_in_sumo(name, of_the_hook):
+    with closing(SumoWorld(7)) as world:
+        assert motion(script(name), world=world) == of_the_hook
+
+
+def test_one_that_acts_from_the_start_does_so_as_a_script():
+    early = ", before_event: controller}", "testing={method: step_mixture}", "environment.lane_change_level=350"
+    hook, *more = (HOOK[:-1] + early[0], *early[1:])
+    as_script = motion(script("plain.py")[:-1] + early[0], *more, n=60)
+    assert as_script == motion(hook, *more, n=60)
+    assert as_script != motion(script("plain.py"), *more, n=60)
+
+
+def test_a_campaign_is_the_same_wherever_its_script_lies(tmp_path):
+    shutil.copy(SCRIPTS / "plain.py", tmp_path)
+    hashes = {load_campaign(str(folder / "plain.py")).content_hash("") for folder in (SCRIPTS, tmp_path)}
+    named = load_campaign(str(SCRIPTS / "plain.py"), ["av.traci_style.ego=ego"])
+    assert hashes != {named.content_hash("")}
+    assert len(hashes) == 1
+
+
+def test_parameters_are_options_of_a_script_and_arguments_of_a_function():
+    hook = f"{HOOK[:-1]}, parameters: {{hardest: 2.0}}}}".replace("Brakes", "BrakesWith")
+    of_the_hook = motion(hook)
+    for name in ("options.py", "with_main.py:main"):
+        assert motion(script(name, ", parameters: {hardest: 2.0, ego: other}")) == of_the_hook
+
+
+# -- what goes wrong --
+
+LOOP = """
+traci.start(["sumo"])
+while traci.simulation.getMinExpectedNumber() > 0:
+    traci.simulationStep()
+    leader = traci.vehicle.getLeader("ego")
+    {body}
+traci.close()
+"""
+
+
+def text(body, loop=LOOP):
+    return "import sys, time, traci\n" + loop.replace("{body}", body)
+
+
+NEVER_STEPS = "import traci\ntraci.start(['sumo'])\ntraci.vehicle.setSpeedMode('ego', 0)\n"
+ENDLESS = "import traci\ntraci.vehicle.setSpeedMode('ego', 0)\nwhile True:\n    try:\n        traci.simulationStep()\n"
+AT_THE_DOOR = {
+    "commands no vehicle": text("traci.vehicle.getSpeed('ego')"),
+    "commands one and two": text("traci.vehicle.setSpeed('one', 20.0); traci.vehicle.setSpeed('two', 20.0)"),
+    "commands ego and LV": text("traci.vehicle.setSpeed('ego', 20.0); traci.vehicle.setSpeed('LV', 20.0)"),
+    "never calls simulationStep": NEVER_STEPS,
+    r"ZeroDivisionError: division by zero \(my.py:7\)": text("traci.vehicle.setSpeed('ego', 1 / 0)"),
+    r"SystemExit: no more \(my.py:7\)": text("sys.exit('no more')"),
+    r"SystemExit: none \(my.py:7\)": text("traci.close(); sys.exit('none')").replace("traci.close()", "pass"),
+    "goes on when its simulation has ended": f"{ENDLESS}    except Exception:\n        pass\n",
+    r"no answer within 0.2 s .*construction_time_s\) \(my.py:8\)": text(
+        "traci.vehicle.setSpeed('ego', 9.0)\n    while True: pass"
+    ),
+    r"traci.vehicle.setMaxSpeed is refused.*\(my.py:7\)": text(
+        "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.setMaxSpeed('ego', 9.0)"
+    ),
+    r"traci.close is refused after 0.1 s, before the test has ended.*\(my.py:7\)": text(
+        "traci.vehicle.setSpeed('ego', 9.0); traci.close()"
+    ),
+    r"traci has no trafficlight here; it has .*\(my.py:7\)": text(
+        "traci.vehicle.setSpeed('ego', 9.0); traci.trafficlight.getIDList()"
+    ),
+    r"which is no Python.*invalid syntax in line 2": "import traci\ndef x(:\n",
+    "does not import traci.*Name its class or function: .*my.py:Mine": "class Mine:\n    def step(self, seen): ...\n",
+}
+
+
+@pytest.mark.parametrize("reason", AT_THE_DOOR)
+def test_what_a_script_does_wrong_in_any_test_is_said_before_the_first(reason, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("my.py").write_text(AT_THE_DOOR[reason], "utf-8")
+    with pytest.raises(CampaignError, match=reason):
+        drive("av={controller: my.py}", "av.limits.construction_time_s=0.2")
+
+
+HELD = "av.traci_style.ego=ego"
+IN_A_TEST = {
+    r"step: ZeroDivisionError: division by zero \(my.py:7\)": text("if leader: print(1 / 0)"),
+    r"step: SystemExit: 3 \(my.py:7\)": text("if leader: sys.exit(3)"),
+    r"step: ScriptError: the script returns after .*before the test has ended": text("if leader: break").replace(
+        "traci.close()", ""
+    ),
+    r"step: RefusedError: traci.close is refused after .*\(my.py:8\)": text("if leader: break"),
+    r"step: StepTimeoutError: no answer within 0.2 s .*\(my.py:[78]\)": text("while leader:\n        pass"),
+    r"step: RefusedError: traci.vehicle.changeLane is refused: the AV stays.*\(my.py:8\)": text(
+        "if leader:\n        try: traci.vehicle.changeLane('ego', 1, 5.0)\n        except traci.TraCIException: pass"
+    ),
+    r"step: asked for -\d+\.?\d* m/s2, outside of av.limits .*bound commands as its vehicle type does": text(
+        "if leader: traci.vehicle.setSpeed('ego', 0.0)"
+    ),
+}
+
+
+@pytest.mark.parametrize("cause", IN_A_TEST)
+def test_what_it_does_wrong_in_a_test_fails_it_with_the_line_and_no_other(cause, tmp_path):
+    (tmp_path / "my.py").write_text(IN_A_TEST[cause], "utf-8")
+    shard = drive(f"av={{controller: '{tmp_path}/my.py'}}", HELD, "av.limits.step_time_s=0.2", n=6)
+    assert len(shard.failures) == 6
+    for failure in shard.failures.values():
+        assert re.match(cause, failure), failure
+
+
+def test_bounds_are_those_of_its_vehicle_type(tmp_path):
+    (tmp_path / "my.py").write_text(text("if leader: traci.vehicle.setSpeed('ego', 0.0)"), "utf-8")
+    shard = drive(f"av={{controller: '{tmp_path}/my.py'}}", "av.traci_style.decel_mps2=4.5", n=20)
+    assert shard.failures == {}
+    assert min(shard.traces[row][:-1, 2, 2].min() for row in range(20)) == -4.5
+
+
+def test_its_end_is_that_of_sumo(tmp_path, monkeypatch):
+    """No vehicle is left, then an error; what stands behind the loop runs once a test."""
+    monkeypatch.chdir(tmp_path)
+    left = """
+ends = []
+try:
+    while True:
+        traci.simulationStep()
+        ends.append((traci.simulation.getMinExpectedNumber(), traci.vehicle.getIDCount()))
+        if ends[-1][1]: traci.vehicle.setSpeedMode("ego", 0)
+except traci.exceptions.FatalTraCIError as error:
+    with open("ends.txt", "a") as file: file.write(f"{ends[0]} {ends[-2]} {ends[-1]} {error}\\n")
+    assert traci.simulation.getArrivedIDList() == ("LV", "BV", "ego")
+    traci.close()
+"""
+    (tmp_path / "my.py").write_text(text("", left), "utf-8")
+    assert motion(f"av={{controller: '{tmp_path}/my.py'}}", HELD, n=9, cells=4)
+    lines = (tmp_path / "ends.txt").read_text("utf-8").splitlines()
+    assert lines == ["(3, 3) (3, 3) (0, 0) Connection closed by SUMO."] * 9
+
+
+def test_without_a_name_of_a_class_a_module_of_vehicles_is_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("class Mine:\n    def step(self, seen): ...\n", "utf-8")
+    with pytest.raises(CampaignError, match=r"Name its class or function: mine\.py:Mine"):
+        load_campaign("mine.py")
+    Path("wrong.py").write_text("def step(:\n", "utf-8")
+    with pytest.raises(CampaignError, match="which is no Python"):
+        drive("av={controller: wrong.py}")
+    Path("script.py").write_text("def run():\n    import libsumo.constants as tc, os\n", "utf-8")
+    campaign = load_campaign("script.py")
+    assert (campaign.name, campaign.av.controller) == ("script", str(tmp_path / "script.py"))
+    with pytest.raises(CampaignError, match=r"av\.traci_style.*it only beside a controller"):
+        load_campaign("idm", ["av.traci_style.ego=ego"])
+
+
+# -- through the command line --
+
+
+@pytest.mark.parametrize(("name", "engine"), [("main_guard.py", "sumo"), ("remembers.py", "twin")])
+def test_from_the_command_line_with_workers_of_its_own_resumed_and_repeated(name, engine, tmp_path):
+    short = [f"--set={each}" for each in (*FORCED, f"world.engine={engine}", "run.shard_size=40")]
+    run = ["run", str(SCRIPTS / name), "--out", str(tmp_path / "run"), "--quiet", *short]
+    assert main([*run, "--workers", "2", "--set=stop.episodes=80"]) in (0, 4)
+    assert main([*run, "--workers", "1", "--set=stop.episodes=120", "--resume"]) in (0, 4)
+    hook = ["run", "tests.controllers.test_traci_script:Brakes", "--out", str(tmp_path / "hook"), "--quiet", *short]
+    assert main([*hook, "--set=stop.episodes=120"]) in (0, 4)
+    of_both = [pq.read_table(tmp_path / each / "episodes").sort_by("episode") for each in ("run", "hook")]
+    assert of_both[0].equals(of_both[1])
+    assert of_both[0].num_rows == 120
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text("utf-8"))
+    assert manifest["repeated"]["n_episodes"] > 1
+    assert manifest["repeated"]["differing"] == []
+
+
+def test_av_check_finds_nothing(capsys):
+    assert main(["av-check", str(SCRIPTS / "remembers.py"), "--episodes", "20", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["deterministic"]
+    assert found["failures"] == {}
