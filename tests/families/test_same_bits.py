@@ -1,4 +1,4 @@
-"""Tests that a pool prescribes: the same bits in twin, SUMO and `drive`, and crashes where the pool says so."""
+"""Tests of a pool: the same bits in the twin, in SUMO and by `drive`, and crashes where the pool says so."""
 
 from __future__ import annotations
 
