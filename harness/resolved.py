@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from harness.campaign.campaign import Campaign, Command, Use, refusal
-from harness.controllers.find import require_controller
+from harness.controllers.find import require_controller, source_of_own
 from harness.errors import CampaignError
 from harness.estimators.one_pass import accumulator
 from harness.estimators.own import headline_of
@@ -29,6 +29,7 @@ class Resolved:
 
     ``parameters`` are the numbers of its ``environment``, as its family has them. ``av`` (1,) is the record of a
     built-in AV, (0,) of any other; ``surrogates`` (J,) are the drivers that challenges are computed for.
+    ``challenge`` says how they are, one of the user's own by the hash of its file.
     ``content_hash`` is of all that changes an episode's bits, the environment's numbers included;
     ``controller_sha256`` of the source of the AV's controller, None where there is none, or nobody has looked.
     """
@@ -38,6 +39,7 @@ class Resolved:
     environment: Environment
     av: RecordArray
     surrogates: RecordArray
+    challenge: str
     content_hash: str
     controller_sha256: str | None = None
 
@@ -60,7 +62,9 @@ class Resolved:
 
         Raises `CampaignError`: the library's file is missing or wrong.
         """
-        return load_library(self.campaign.pool.library).counting_above(self.campaign.crash.counts_above_mps)
+        library = load_library(self.campaign.pool.library)
+        library.require_drivers(follows=self.family.follows)
+        return library.counting_above(self.campaign.crash.counts_above_mps)
 
 
 def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
@@ -96,22 +100,28 @@ def require_world(campaign: Campaign) -> None:
 def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: str | None = None) -> Resolved:
     """Read what a campaign names, and refuse what does not go together (`harness.campaign.campaign.REFUSED`).
 
-    Raises `CampaignError`: the environment's parameter file is missing or wrong, or something of the campaign does not
-    go with the command.
+    Raises `CampaignError`: a file that it names is missing or wrong, or something of the campaign does not go with the
+    command.
     """
     family = family_named(campaign.scenario)
     parameters = family.parameters(campaign.environment)
     environment = family.traffic(campaign.environment, parameters)
     shows = family.shows(environment)
-    if (words := refusal(campaign, Use(command, shows))) is not None:
+    if (words := refusal(campaign, Use(command, shows, family.follows))) is not None:
         raise CampaignError(*words)
+    challenge = campaign.testing.challenge
+    if campaign.testing.own_challenge is not None:
+        challenge = source_of_own(challenge, "testing.challenge")
     campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[shows])
+    named = campaign.environment.named(family.default_parameters)
+    campaign = campaign.replaced(("environment", "parameters"), named)
     return Resolved(
         campaign,
         parameters,
         environment,
         av_records(campaign.av, see_onset=shows),
         library_records([*campaign.surrogates.values()], see_onset=False),
-        campaign.content_hash(parameters.content_hash()),
+        challenge,
+        campaign.content_hash(parameters.content_hash(), challenge),
         controller_sha256,
     )

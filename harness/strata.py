@@ -77,9 +77,10 @@ class ShellDesign:
     rates in the pool, ``reference_square`` the mean squares of a path's probability that they crash.
 
     ``boundary`` is the most aggressive surrogate inside the library's boundary, up to which ``n_inside`` strata are
-    shells; ``assumes`` ends the sentence that begins with "If this vehicle". ``p_event`` is the probability of a
-    cut-in, ``p_unreachable`` the part of it on which no vehicle within the envelope's acceleration can crash, and which
-    is not tested. ``available`` are cut-ins that the pool has kept of each stratum; empty if that is no limit.
+    shells; ``assumes`` ends the sentence that begins with "If this vehicle". ``p_event`` is the probability of an
+    event, with its standard error ``p_event_se``, ``p_unreachable`` the part of it on which no vehicle within the
+    envelope's acceleration can crash, and which is not tested. ``available`` are events that the pool has kept of each
+    stratum; empty if that is no limit.
 
     With ``shadow_runs`` the paths are the few that the vehicle has walked itself, chosen from so many ``candidates``
     (else 0); ``learned`` says how that surrogate was learned, empty if there is none.
@@ -95,6 +96,7 @@ class ShellDesign:
     n_inside: int
     p_event: float
     p_unreachable: float
+    p_event_se: float = 0.0
     cell_references: tuple[int, ...] = ()
     references: tuple[Reference, ...] = ()
     reference_rate: Numbers = field(default_factory=lambda: np.zeros(0))

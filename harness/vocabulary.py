@@ -98,8 +98,8 @@ SAMPLING: dict[Method, Sampling] = {
     "shells": Sampling(("shells",), baseline_runs=True, strata=True),
 }
 
-COMPARISON = "compare.json"
-"""By this file a folder is that of a comparison, and not of a run."""
+COMPARISON, FAMILIES = "compare.json", "families.json"
+"""By these files a folder is that of a comparison, or of several scenarios, and not of a run."""
 
 OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")
 CRASH, PASSED, TIMEOUT, CONTACT, FAILED = range(len(OUTCOMES))

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import base64
+import doctest
+import html
 import inspect
 import json
 import math
+import re
 import subprocess
 import sys
 from importlib.machinery import PathFinder
 from importlib.metadata import distributions, version
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 import harness
-from harness.cli import main
+from harness.cli import cli, main
 from harness.resolved import resolve
 from tests.in_process import one_process
 from tests.stored_runs import MIXTURE_FILE, ROOT, estimates, sets, unlike_columns
@@ -137,6 +142,47 @@ def test_a_path_is_taken_where_a_campaign_is_and_a_number_of_numpy_s_where_a_num
     harness.run(stored_run(RUN) / "campaign.yaml", tmp_path / "run", workers=np.int64(1))
     assert unlike_columns(stored_run(RUN), tmp_path / "run") == []
     assert harness.replay(tmp_path / "run", np.int16(3)).bit_equal
+
+
+EXAMPLES = ("run", "estimate", "read", "replay", "compare")
+
+
+def test_examples_in_docstrings_give_what_they_say(tmp_path, monkeypatch):
+    """In one folder, in this order: the run of the first is that of the others."""
+    monkeypatch.chdir(tmp_path)
+    runner = doctest.DocTestRunner(verbose=False)
+    for name in EXAMPLES:
+        (example,) = doctest.DocTestFinder(recurse=False).find(getattr(harness, name), name, globs={})
+        assert example.examples, name
+        runner.run(example)
+    assert runner.summarize(verbose=False).failed == 0
+
+
+def test_every_command_has_its_line_in_the_docs_of_python():
+    table = (ROOT / "docs/api.md").read_text(encoding="utf-8").split("| --- |")[1].split("\n\n")[0]
+    assert {*re.findall(r"`([a-z][a-z-]*)`", table)} == {*cli.commands}
+    assert {*re.findall(r"`harness\.(\w+)`", table)} == {*harness.__all__} - {"HarnessError", "read"}
+
+
+def test_every_function_says_what_each_parameter_is():
+    for name in harness.__all__:
+        if inspect.isfunction(function := getattr(harness, name)):
+            told = inspect.getdoc(function).split("Parameters\n----------\n")[1].split("\n\n")[0]
+            heads = re.findall(r"^(\w[\w, ]*)(?: :|$)", told, re.MULTILINE)
+            assert {one for head in heads for one in head.split(", ")} == {*inspect.signature(function).parameters}
+
+
+@pytest.mark.parametrize("name", ["run", "compare"])
+def test_in_a_notebook_it_is_the_short_answer_and_the_map(name, stored_run, tmp_path):
+    campaign = stored_run(RUN) / "campaign.yaml"
+    given = {"run": (campaign,), "compare": (campaign, harness.load_campaign(campaign, av="r157-cc"))}[name]
+    result = getattr(harness, name)(*given, tmp_path / "out")
+    text, image = result._repr_html_().split("</pre>")
+    assert html.unescape(text) == f"<pre>{result!r}"
+    assert len(repr(result).splitlines()) <= 10
+    svg = base64.b64decode(re.search('base64,(.*?)"', image)[1])
+    assert ElementTree.fromstring(svg).findall(".//{*}path")
+    assert b"--ink" in svg
 
 
 # -- the recommended method against a committed reference --

@@ -82,6 +82,17 @@ def test_a_new_surrogate_is_a_driver_by_name_or_by_numbers(tmp_path):
     assert 1.0e-7 < estimates["estimates"]["mixture_cv"]["crash_rate"] < 1.8e-7
 
 
+def test_a_new_criticality_is_a_function_in_a_file(tmp_path):
+    """It steers well, and the rate stays that of the traffic: 1.352e-7 by 12 million tests (tests/reference)."""
+    assert "bit for bit as stored" in ran(laid_out("A new criticality", tmp_path), tmp_path)
+    estimates = json.loads((tmp_path / "runs/mine/estimates.json").read_text())
+    ratio = estimates["diagnostics"]["mean_ratio"]["mine"]
+    assert abs(ratio["mean"] - 1.0) < 4.0 * ratio["std_error"] < 0.04
+    nade = estimates["estimates"]["nade"]
+    assert nade["n_crashes"] > 1000
+    assert nade["crash_rate"] == pytest.approx(1.352e-7, rel=0.1)
+
+
 def test_a_new_controller_kind_is_three_files(tmp_path):
     recipe = laid_out("A new controller kind", tmp_path)
     own = tmp_path / "own"

@@ -16,13 +16,14 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from harness.campaign.drivers import Surrogate, default_surrogates
+from harness.campaign.drivers import NATURAL, Surrogate, default_surrogates
 from harness.campaign.problems import NAME_PATTERN, broken_rule, did_you_mean
 from harness.campaign.sections import (
     Accept,
     CrashSettings,
     EnvironmentSettings,
     PoolSettings,
+    Positive,
     Records,
     Run,
     Section,
@@ -64,6 +65,9 @@ class Campaign(Section):
     seed: Whole = Field(1, ge=0, lt=2**63)
     """random numbers of the tests follow from it; those of the pool from pool.seed"""
     scenario: str = Field("cut_in", description="kind of events that are tested: cut_in, or one that a package brings")
+    scenarios: Annotated[list[str], Field(min_length=1)] | None = None
+    """several kinds of events in one answer per hour, in place of scenario"""
+    exposure: dict[str, Positive] = Field(default_factory=dict, description="events per hour of driving, by scenario")
     environment: EnvironmentSettings = EnvironmentSettings()
     av: AutomatedVehicle = AutomatedVehicle()
     crash: CrashSettings = CrashSettings()
@@ -87,6 +91,12 @@ class Campaign(Section):
         if (words := refusal(self)) is not None:
             raise broken_rule(*words)
         return self
+
+    def of_family(self, name: str) -> Campaign:
+        """The campaign of one of its scenarios; ``environment`` is that of cut-ins where others are beside them."""
+        given = {"environment": EnvironmentSettings()} if name != "cut_in" else {}
+        stop = self.stop.model_copy(update={"each_family": False})
+        return self.model_copy(update={"scenario": name, "scenarios": None, "exposure": {}, "stop": stop, **given})
 
     @property
     def sampling(self) -> Sampling:
@@ -126,8 +136,10 @@ class Campaign(Section):
         share = self.testing.defensive_share if alpha else 1.0
         return (share, *((1.0 - share) * weight for weight in alpha))
 
-    def content_hash(self, environment_parameters: str) -> str:
+    def content_hash(self, environment_parameters: str, challenge: str | None = None) -> str:
         """Hash of everything that changes an episode's bits, that of the environment's parameters included.
+
+        Of a challenge of the user's own, ``challenge`` says what is to be known.
 
         Cells, workers, estimator, stop rule, trace policy and names are left out, so that a campaign can be continued
         to a smaller RHW or with other resources.
@@ -141,7 +153,10 @@ class Campaign(Section):
             "environment_parameters": environment_parameters,
             "av": self.av.identity(),
             "surrogates": [(name, model.identity()) for name, model in self.surrogates.items()],
-            "testing": self.testing.model_dump(exclude={"estimator"}),
+            "testing": {
+                **self.testing.model_dump(exclude={"estimator"}),
+                "challenge": challenge or self.testing.challenge,
+            },
             "pool": self.pool.model_dump(exclude=unused) if self.sampling.strata else None,
             "engine": self.world.engine,
             "moments": self.records.moments,
@@ -156,10 +171,14 @@ Command = Literal["run", "compare", "av-check"]
 
 
 class Use(NamedTuple):
-    """What a campaign is for (no command while it is read), and whether its cut-ins are known to take time."""
+    """What a campaign is for (no command while it is read), and what is known of its scenario by then.
+
+    That is whether its cut-ins take time, and whether the AV ``follows`` a vehicle from the start.
+    """
 
     command: Command | None = None
     shows: bool = False
+    follows: bool = False
 
 
 class Combination(NamedTuple):
@@ -172,6 +191,13 @@ class Combination(NamedTuple):
     mend: str
 
 
+_FOLLOWS = "in {scenario}, where the AV follows a vehicle from the start"
+
+
+def _natural(campaign: Campaign) -> bool:
+    return getattr(campaign.av.parameters, "time_headway_s", None) == NATURAL
+
+
 _TAKES_TIME = "where cut-ins take time (`lateral` of the environment)"
 
 REFUSED = (
@@ -182,6 +208,42 @@ REFUSED = (
         "a limit, with testing.method {testing.method}",
         "testing.method shells: how often decisions are wrong is known for its intervals alone",
         "Choose shells, or delete the section and compare the interval with the limit yourself.",
+    ),
+    # -- several scenarios --
+    Combination(
+        "scenarios",
+        lambda c, _: c.scenarios is not None and len(set(c.scenarios)) < len(c.scenarios),
+        "a scenario that is named twice",
+        "each once",
+        "Delete one of both.",
+    ),
+    Combination(
+        "testing.method",
+        lambda c, _: c.scenarios is not None and not c.sampling.strata,
+        "{testing.method}, with several scenarios",
+        "shells: rates of several kinds of events are one sum over strata",
+        "Choose shells, or write one scenario.",
+    ),
+    Combination(
+        "accept",
+        lambda c, _: c.scenarios is not None and c.accept is not None and c.accept.times_reference is None,
+        "a limit of crashes per test, with several scenarios",
+        "times_reference: their tests are not of one kind",
+        "Write accept: {times_reference: {driver: r157-cc}}, or one scenario.",
+    ),
+    Combination(
+        "pool.library",
+        lambda c, _: c.scenarios is not None and c.pool.library is not None,
+        "one library, with several scenarios",
+        "null: each scenario has its own",
+        "Delete the key, or write one scenario.",
+    ),
+    Combination(
+        "exposure",
+        lambda c, _: bool(set(c.exposure) - set(c.scenarios or ())),
+        "of a scenario that is not among scenarios",
+        "events per hour of those that are tested",
+        "Name it among scenarios, or delete it: one scenario alone has no rate per hour.",
     ),
     # -- vehicles that act before the cut-in --
     Combination(
@@ -239,6 +301,42 @@ REFUSED = (
         "shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at those that an "
         "attentive vehicle avoids",
         "Choose shells, or add --set environment.parameters=ndd-overtaking-1.",
+    ),
+    # -- scenarios in which the AV follows --
+    Combination(
+        "testing.method",
+        lambda c, use: use.follows and c.sampling.mixes,
+        "{testing.method}, " + _FOLLOWS,
+        "shells, forced or nde: importance functions are those of cut-ins",
+        "Choose shells, or scenario: cut_in.",
+    ),
+    Combination(
+        "av.before_event",
+        lambda c, use: use.follows and c.av.acts_before_event,
+        "controller, " + _FOLLOWS,
+        "hold_speed, which means nothing there: the vehicle drives in any case",
+        "Delete the key.",
+    ),
+    Combination(
+        "av.model",
+        lambda c, use: use.follows and c.av.model == "r157-fsm",
+        "r157-fsm, " + _FOLLOWS,
+        "another driver: how the fuzzy safety model meets lead braking has not been tried",
+        "Choose r157-cc, idm or fvdm, or bring a controller of your own.",
+    ),
+    Combination(
+        "av.parameters.time_headway_s",
+        lambda c, use: use.command is not None and not use.follows and _natural(c),
+        "natural, in {scenario}",
+        "seconds: the vehicle does not follow before the event",
+        "Write a number, or scenario: lead_brakes.",
+    ),
+    Combination(
+        "environment",
+        lambda c, use: use.follows and c.environment != EnvironmentSettings(parameters=c.environment.parameters),
+        "numbers of cut-ins, " + _FOLLOWS,
+        "parameters alone",
+        "Delete lane_change_level, acceleration_hold_s and cut_in_lead_s.",
     ),
     # -- comparisons --
     Combination(

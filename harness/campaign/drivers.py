@@ -13,6 +13,8 @@ from harness.campaign.sections import Positive, Probability, Section, StepTime
 MAX_CONFIGURED_SPEED_MPS = 60.0
 PERCEIVES_LATERAL_M = 0.375
 RISK_EVALUATION_S = 0.4
+NATURAL = "natural"
+"""Headway that people keep."""
 
 
 Strength = Annotated[float, Field(gt=0.0, le=20.0)]
@@ -86,6 +88,10 @@ class Reference(Following):
     """lateral distance when the risk has been evaluated [JRC-FSM: CC_calc_dist_to_react]"""
     risk_evaluation_s: StepTime = Field(RISK_EVALUATION_S, ge=0.0, le=5.0)
     """from seeing a cut-in that takes time to the evaluated risk [JRC-FSM: 0.4 s]"""
+    time_headway_s: Delay | Literal["natural"] = 1.0  # type: ignore[assignment]
+    """T; natural: as people keep it, where the vehicle follows from the start [cutin]"""
+    perceives_braking_mps2: float = Field(3.0, ge=0.0, le=20.0)
+    """how hard the vehicle ahead brakes when that is a danger [assumed; 5 by the regulation, UN R157]"""
     min_acceleration_mps2: Braking = -7.59294
     """hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"""
     braking_jerk_mps3: Positive = Field(12.65, le=1000.0)
@@ -190,8 +196,8 @@ class Driver(Section):
 class Reflexes(Section):
     """How a driver lags behind its model: surrogates may be late and smooth, but not random."""
 
-    delay_s: StepTime = Field(0.0, ge=0.0, le=10.0)
-    """time after the cut-in in which it keeps its speed [assumed]"""
+    delay_s: StepTime = Field(0.0, ge=0.0, le=20.0)
+    """time after it has perceived an event in which it does what it did [assumed]"""
     max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = None
     """fastest change of acceleration; none: unlimited [assumed]"""
     perceives_lateral_m: float = Field(PERCEIVES_LATERAL_M, ge=0.0, le=10.0)

@@ -20,7 +20,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import ModelName, default_surrogates
 from harness.campaign.problems import MOST_SHOWN, NAME_PATTERN, describe_found, did_you_mean, in_words
 from harness.campaign.python_files import in_python_file, is_script
-from harness.campaign.sections import Section
+from harness.campaign.sections import DEFAULT, Section
 from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml, yaml_text
 from harness.errors import CampaignError
@@ -31,6 +31,7 @@ SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"
 _FILES = {
     ("av", "controller"): "a Python file with the controller",
     ("testing", "estimator"): "a Python file with the estimator",
+    ("testing", "challenge"): "a Python file with the challenge",
     ("av", "fmu", "file"): "an FMI 2.0 co-simulation FMU",
     ("pool", "library"): "a surrogate library, or the name of a shipped one",
     ("environment", "parameters"): "a parameter file, or the name of a shipped one",
@@ -69,7 +70,7 @@ def load_campaign(
             raise CampaignError(each.option, found, expected, "Add --set accept=null.")
     for where, expected in _FILES.items():
         name, end = campaign.at(where), ""
-        if where[-1] in ("controller", "estimator") and name is not None and ".py:" in name:
+        if where[-1] in ("controller", "estimator", "challenge") and name is not None and ".py:" in name:
             name, _, end = name.rpartition(":")
         elif name is None or (where[-1] != "file" and not names_a_file(name)):
             continue
@@ -86,7 +87,8 @@ def load_campaign(
         from harness.families import family_named  # noqa: PLC0415 - families read campaigns' sections
 
         shipped = family_named(campaign.scenario, place(("scenario",))).shipped
-        shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))
+        if campaign.environment.parameters != DEFAULT:
+            shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))
     env = campaign.run.ray.runtime_env
     paths = {key: _absolute(env[key], folder) for key in ("working_dir", "py_modules") if key in env}
     return campaign.replaced(("run", "ray", "runtime_env"), {**env, **paths})

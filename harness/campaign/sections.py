@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, Self
 
@@ -18,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, in_words
+from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, did_you_mean, in_words
 from harness.vocabulary import Method
 
 
@@ -81,16 +82,24 @@ def listed(names: Iterable[str]) -> str:
     return ", ".join(names) or "none"
 
 
+DEFAULT = "default"
+
+
 class EnvironmentSettings(Section):
     """The naturalistic driving environment."""
 
-    parameters: str = Field("ndd-overtaking-2", description="name of a shipped parameter file, or a path to your own")
+    parameters: str = DEFAULT
+    """name of a shipped parameter file, or a path to your own; default: the scenario's"""
     lane_change_level: Positive = Field(1.0, le=1e8)
     """multiplies the cut-in hazard; highD: about 270 (python -m studies traffic)"""
     acceleration_hold_s: StepTime = Field(1.0, ge=0.1, le=2.0)
     """how long a drawn acceleration is held: 1.0 or 0.1"""
     cut_in_lead_s: LeadTime | None = None
     """time from onset to overlap of every cut-in; none: as the parameters say"""
+
+    def named(self, default: str) -> str:
+        """Of the parameter file, where the ``default`` is the scenario's."""
+        return default if self.parameters == DEFAULT else self.parameters
 
 
 class CrashSettings(Section):
@@ -114,6 +123,9 @@ class ShellSettings(Section):
     """fewest tests of a round; raise it for many workers"""
 
 
+CHALLENGE = r"^(immediate|recursive|.+\.py:\w+)$"
+
+
 class Testing(Section):
     """How maneuvers are drawn at critical moments."""
 
@@ -124,8 +136,12 @@ class Testing(Section):
     )
     estimator: str | None = None
     """what answers and stops instead of the method's own: a name, or my.py:MyEstimator"""
-    challenge: Literal["immediate", "recursive"] = "recursive"
-    """immediate: crash if BV cuts in now (published); recursive: backward induction"""
+    challenge: str = Field(
+        "recursive",
+        json_schema_extra={"pattern": CHALLENGE},
+        description="immediate: crash if BV cuts in now (published); recursive: backward induction; my.py:function: "
+        "your own",
+    )
     epsilon: float = Field(
         0.1,
         ge=1e-6,
@@ -138,6 +154,19 @@ class Testing(Section):
     defensive_share: float = Field(0.1, gt=0.0, lt=1.0, description="share of forced cut-ins in the episode mixture")
     criticality_threshold: float = Field(0.0, ge=0.0, lt=1.0, description="a moment is critical above it")
     shells: ShellSettings = ShellSettings()
+
+    @property
+    def own_challenge(self) -> str | None:
+        """The challenge, if it is a function of the user's own."""
+        return self.challenge if ":" in self.challenge else None
+
+    @field_validator("challenge")
+    @classmethod
+    def _challenge_is_known(cls, challenge: str) -> str:
+        if not re.search(CHALLENGE, challenge):
+            mend = did_you_mean(challenge, ("immediate", "recursive")) or "Write my.py:function for one of your own."
+            raise broken_rule("", f"'{challenge}'", "'immediate', 'recursive' or my.py:function", mend)
+        return challenge
 
     @field_validator("alpha")
     @classmethod
@@ -157,8 +186,9 @@ class PoolSettings(Section):
 
     library: str | None = None
     """name of a shipped surrogate library, or a path to your own; none: the traffic's"""
-    relative_error: float = Field(0.005, ge=LEAST_POOL_ERROR, le=0.2)
-    """relative standard error of the surrogates' crash rates; four times that beyond the boundary"""
+    relative_error: float | None = Field(None, ge=LEAST_POOL_ERROR, le=0.2)
+    """relative standard error of the surrogates' crash rates, four times that beyond the boundary; none: the
+    scenario's, 0.005 or 0.01"""
     events_per_shell: Whole = Field(25_000, ge=100, le=MOST_CUT_INS)
     """cut-ins kept of each shell: its most tests"""
     shadow_paths: Whole = Field(500, ge=50, le=100_000)
@@ -199,6 +229,9 @@ class Stop(Section):
         le=1e6,
         description="with rhw and shells: stop, too, once the rate is known to be below so many times that of the "
         "library's first reference driver; not where --set says rhw alone",
+    )
+    each_family: bool = Field(
+        False, description="with several scenarios: rhw is asked of each one's rate, not of the sum"
     )
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = None

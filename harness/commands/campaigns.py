@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -21,13 +22,18 @@ from harness.commands.options import (
     executor_option,
     json_option,
     junit_option,
+    of_scenario,
     progress_bar,
+    scenario_option,
     set_option,
     workers_option,
 )
 from harness.commands.printing import answer_lines, print_either, print_json, print_table, say
 from harness.numbers import leaves, words
 from harness.processes import start_server
+
+if TYPE_CHECKING:
+    from harness.runner.families import Hours
 
 
 @click.command(
@@ -63,6 +69,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
         "harness run my_av.py:MyClass                        # or module:Class, my_av.fmu, sumo:ACC, r157-cc",
         "harness run my_script.py                            # a TraCI script as it is",
         "harness run my_av.py:MyClass --set av.parameters.hardest_mps2=8",
+        "harness run my_av.py:MyClass --scenario all         # cut-in, lead braking, cut-out: crashes per hour",
         "harness run scenarios/smoke.yaml --out runs/smoke",
         "harness run scenarios/smoke.yaml --out runs/smoke --resume --set stop.rhw=0.03",
         "harness run scenarios/smoke.yaml --out runs/mine --set av.controller=my_av.py:MyClass",
@@ -73,6 +80,7 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, help="Run folder; made if it is not there. Default: a new one in runs/.")
+@scenario_option
 @workers_option
 @executor_option
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
@@ -99,6 +107,7 @@ def run(
     campaign_file: Path,
     folder: Path | None,
     *,
+    scenario: str | None,
     workers: int | None,
     executor: str | None,
     resume: bool,
@@ -125,12 +134,18 @@ def run(
     limit = [] if accept is None else accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
     seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
-    campaign = harness.load_campaign(campaign_file, [*seeds, *overrides, *limit, *where], av=av)
+    scenarios = [] if scenario is None else of_scenario(scenario)
+    campaign = harness.load_campaign(campaign_file, [*scenarios, *seeds, *overrides, *limit, *where], av=av)
     chosen, folder = folder is None, folder or _run_folder(campaign.name, resume=resume)
     if campaign.run.executor == "local":
         start_server()
     with named_if_written(folder, chosen=chosen), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
+    from harness.runner.run import RunResult  # noqa: PLC0415 - keeps --help fast
+
+    if not isinstance(result, RunResult):
+        _told_of_several(result, junit, as_json=as_json)
+        ctx.exit(result.exit_code)
     of = result.shown.campaign, result.shown.manifest, result.estimates
     if junit is not None:
         from harness.report.junit import statement_case, write_junit  # noqa: PLC0415 - keeps --help fast
@@ -140,6 +155,19 @@ def run(
         write_junit(junit, campaign.name, case, [result.report])
     print_either(result.estimates, answer_lines(*of, result.report), as_json=as_json)
     ctx.exit(result.exit_code)
+
+
+def _told_of_several(found: Hours, junit: Path | None, *, as_json: bool) -> None:
+    """Print the answer of several scenarios."""
+    from harness.report.hour_words import hour_lines  # noqa: PLC0415 - keeps --help fast
+
+    told = hour_lines(found.content, found.report)
+    if junit is not None:
+        from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
+
+        case = Case("crashes per hour", "\n".join(told), outcome_of(found.exit_code))
+        write_junit(junit, found.content["name"], case, [found.report])
+    print_either(found.content, told, as_json=as_json)
 
 
 def accepting(limit: str) -> list[str]:
@@ -283,9 +311,7 @@ def compare(
         found = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )
-    from harness.report.lines import pair_lines  # noqa: PLC0415 - keeps --help fast
-
-    told = pair_lines(found.content, a.crash.counts_above_mps, found.report, found.s_per_pair)
+    told = repr(found).splitlines()
     if junit is not None:
         from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
 

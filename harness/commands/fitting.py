@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+import harness
 from harness.commands.options import FILE, examples, json_option, progress_bar, written_file
 from harness.commands.printing import print_json, say
 
@@ -53,14 +54,13 @@ def fit(
     environments that other trajectories of the same kind would have given: from these `harness estimate --environment`
     computes how uncertain the rate is.
     """
-    from harness.fitting.files import fit_files  # noqa: PLC0415 - keeps --help fast
     from harness.fitting.page import CONFIDENCE  # noqa: PLC0415 - keeps --help fast
     from harness.report.traffic_words import too_few  # noqa: PLC0415 - keeps --help fast
 
     with progress_bar() as bar:
         given: dict[str, Any] = {"mapping": mapping, "mirror": mirror, "leave_out": leave_out, "force": force}
-        found = fit_files(files, out, n_replicates=replicates, seed=seed, progress=bar, **given)
-    written = [str(found.environment), str(found.page), str(found.replicates)]
+        found = harness.fit(files, out, n_replicates=replicates, seed=seed, progress=bar, **given)
+    written = repr(found).splitlines()
     if as_json:
         print_json({"files": written, **found.facts})
         return

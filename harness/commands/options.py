@@ -60,6 +60,12 @@ workers_option = click.option(
     help="Processes that simulate. Default: one per CPU that this process may use (affinity and quota counted); with "
     "Ray, as many as the cluster has room for.",
 )
+scenario_option = click.option(
+    "--scenario",
+    metavar="NAME",
+    help="What happens in the tests: cut_in, lead_brakes or cut_out; several with commas, or all, are one answer per "
+    "hour of driving.",
+)
 executor_option = click.option(
     "--executor",
     type=click.Choice(["local", "ray"]),
@@ -70,6 +76,18 @@ quiet_option = click.option(
     help="No progress: no bar on a terminal, no line every 30 s elsewhere.",
 )  # fmt: skip
 """Common to all commands: `progress_bar` asks for it."""
+
+
+ALL_SCENARIOS = ("cut_in", "lead_brakes", "cut_out")
+"""Those of UN Regulation No. 157."""
+
+
+def of_scenario(text: str) -> list[str]:
+    """What ``--scenario`` sets."""
+    names = ALL_SCENARIOS if text == "all" else tuple(name.strip() for name in text.split(","))
+    if len(names) == 1:
+        return [f"scenario={names[0]}", "scenarios=null"]
+    return [f"scenarios=[{', '.join(names)}]"]
 
 
 def progress_bar() -> Progress:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,8 @@ import harness
 from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar
 from harness.commands.printing import answer_lines, print_either, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
-from harness.numbers import number, plain, share
-from harness.vocabulary import COMPARISON, ESTIMATORS
+from harness.numbers import number, plain, share, words
+from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 
 FCD = ".xml"
 """Suffix of SUMO's floating car data."""
@@ -43,6 +44,13 @@ LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_tt
     metavar="NAME|FILE",
     help="Answer for other traffic from the same tests (testing.method shells): a shipped environment, or a file.",
 )
+@click.option(
+    "--exposure",
+    "exposures",
+    metavar="SCENARIO=N",
+    multiple=True,
+    help="Events per hour of driving, where DIR holds several scenarios. May be given several times.",
+)
 @json_option
 @click.pass_context
 def estimate(
@@ -53,6 +61,7 @@ def estimate(
     confidence: float | None,
     write: bool,
     environment: str | None,
+    exposures: Sequence[str],
     as_json: bool,
 ) -> None:
     """Estimate the crash rate again from the records in DIR, with any estimator.
@@ -66,6 +75,11 @@ def estimate(
     seconds, and so are most other vehicles tested in the same pool. The answer tells what they leave open, and with
     --write, in the run's own traffic, so do estimates.json and the page. DIR may be that of a comparison, too.
     """
+    if exposures or (folder / FAMILIES).is_file():
+        if estimators or environment is not None:
+            raise click.UsageError("-e and --environment are for the folder of one scenario, such as DIR/cut_in.")
+        _estimate_hours(folder, exposures, confidence, write=write, as_json=as_json)
+        return
     if environment is not None:
         if estimators:
             raise click.UsageError("--environment does not go with -e: tests of shells alone can be moved.")
@@ -75,9 +89,9 @@ def estimate(
             _compared_elsewhere(folder, environment, confidence, as_json=as_json)
             return
         with progress_bar() as bar:
-            from harness.runner.other_traffic import estimate_in_other_traffic  # noqa: PLC0415 - keeps --help fast
-
-            content = estimate_in_other_traffic(folder, environment, confidence=confidence, own=write, progress=bar)
+            content = harness.estimate_in_other_traffic(
+                folder, environment, confidence=confidence, own=write, progress=bar
+            )
     else:
         from harness.estimators.own import asked_for  # noqa: PLC0415 - keeps --help fast
 
@@ -102,6 +116,32 @@ def estimate(
         say(*answer_lines(read_campaign(folder, manifest), manifest, content, shown))
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
+
+
+def _estimate_hours(
+    folder: Path, exposures: Sequence[str], confidence: float | None, *, write: bool, as_json: bool
+) -> None:
+    """What stored tests of several scenarios say, with other exposures."""
+    from harness.campaign.files import parse_override  # noqa: PLC0415 - keeps --help fast
+    from harness.report.hour_words import hour_lines  # noqa: PLC0415
+    from harness.runner.families import estimate_families, require_families  # noqa: PLC0415
+
+    require_families(folder)
+    given = {}
+    for each in exposures:
+        value = (read := parse_override(each)).value
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
+            found = f"{words(value)}, of {read.path[0]}"
+            raise HarnessError("--exposure", found, "events per hour, above 0", "Write --exposure lead_brakes=0.3.")
+        given[".".join(read.path)] = float(value)
+    content, page = estimate_families(folder, given, confidence), None
+    if write:
+        from harness.records.folder import write_sealed  # noqa: PLC0415 - keeps --help fast
+        from harness.report.hours_page import write_hours_of  # noqa: PLC0415
+
+        write_sealed(folder / FAMILIES, content)
+        page = write_hours_of(folder, content)
+    print_either(content, hour_lines(content, page), as_json=as_json)
 
 
 def _compared_elsewhere(folder: Path, environment: str, confidence: float | None, *, as_json: bool) -> None:
@@ -156,9 +196,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     simulated in SUMO: each move takes a second, once. DIR keeps it as sensitivity.json, and its page shows it.
     """
     with progress_bar() as bar:
-        from harness.runner.sensitivity import sensitivity as found_by  # noqa: PLC0415 - keeps --help fast
-
-        content = found_by(folder, ranges=ranges, progress=bar)
+        content = harness.sensitivity(folder, ranges=ranges, progress=bar)
         page = harness.write_report(folder)
     if as_json:
         print_json(content)
@@ -188,11 +226,7 @@ def _bar(bar: dict[str, Any]) -> dict[str, str]:
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 def report(folder: Path) -> None:
     """Write report.html of the run or of the comparison in DIR anew, and print where the page is."""
-    write = harness.write_report
-    if (folder / COMPARISON).is_file():
-        from harness.report.compare_page import write_comparison as write  # noqa: PLC0415 - keeps --help fast
-
-    say(write(folder))
+    say(harness.write_report(folder))
 
 
 def _motion_files(_ctx: click.Context, _parameter: click.Parameter, files: tuple[Path, ...]) -> tuple[Path, ...]:
@@ -259,8 +293,8 @@ def replay(
     content |= {name: result.row[name] for name in LATERAL if name in result.row}
     compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
     words = "as the run has traced it" if stored else compared[result.bit_equal]
-    facts = [f"  {name:<13} {fact}" for name, fact in result.scene["facts"]]
-    print_either(content, [f"episode {episode}: {result.outcome}; {words}", *facts, *written], as_json=as_json)
+    head, *facts = repr(result).splitlines()
+    print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
     if result.bit_equal is False:
         found = "a replay that differs from the stored trace"
         raise WorldDisagreementError(f"episode {episode} of {folder}", found, "the same bits", str(result.suspects))

@@ -61,6 +61,17 @@ def own_code(name: str, where: str = "av.controller", what: str = _A_CONTROLLER)
     return found  # type: ignore[no-any-return]
 
 
+def source_of_own(name: str, where: str) -> str:
+    """What ``my.py:function`` is, wherever it lies: its name and the hash of its file, which is not run.
+
+    Raises `CampaignError`, of the key ``where``: there is no such file.
+    """
+    file, _, function = name.rpartition(":")
+    if not Path(file).is_file():
+        raise CampaignError(where, f"no file {file}", "a Python file", "Correct the path, or put the file there again.")
+    return f"{function} {hashlib.sha256(Path(file).read_bytes()).hexdigest()}"
+
+
 def _of_file(file: Path) -> ModuleType:
     """The module that a file makes; its name is not that of another file, or of an installed module, of this name."""
     name = f"{file.stem}_{hashlib.sha256(bytes(real_path(file))).hexdigest()[:8]}"

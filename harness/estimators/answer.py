@@ -19,6 +19,7 @@ from harness.estimators.own import Asked, headline_of
 from harness.estimators.severity import Severity
 from harness.estimators.stopping import RoundRule, Rule
 from harness.estimators.traffic import TrafficError
+from harness.families import family_named
 from harness.numbers import two_digits_up
 from harness.records.folder import StoppedBy
 from harness.strata import Assumed, weight_of_a_test
@@ -171,7 +172,7 @@ def pool_remedy(rule: Rule, campaign: Campaign, stopped_by: StoppedBy) -> dict[s
     finer = max(2.0 * (from_pool / target) ** 2, 1.0)
     times = rule.seen.events_for(rule.more_tests(target, finer) * ROOM)
     own = target / math.sqrt(2.0) / Level.two_sided(campaign.stop.confidence).z  # a pool has some paths in any case
-    error = min(pool.relative_error / math.sqrt(finer), own)
+    error = min((pool.relative_error or family_named(campaign.scenario).pool_error) / math.sqrt(finer), own)
     kept = two_digits_up(min(pool.events_per_shell * times, 1e9))
     if error < LEAST_POOL_ERROR or kept > MOST_CUT_INS:
         return {}

@@ -103,10 +103,8 @@ def rate_ratio_limits(
     Of that ``moments`` has the rate and the mean square of a path's probability of a crash; ``with_reference`` (S,) is,
     over the crashed tests of each stratum, the sum of their paths' probability that the reference crashes.
     """
-    rate, square = moments
-    own, of_paths = float(p @ tally.share), pool_variance(p, tally, n_paths)
-    product = float(weight_of_a_test(p, tally.tests) @ with_reference)
-    covariance, of_reference = (product - own * rate) / n_paths, (square - rate * rate) / n_paths
+    rate, _ = moments
+    of_paths, covariance, of_reference = path_errors(p, tally, with_reference, moments, n_paths)
 
     def variance(x: float) -> float:
         return max(of_paths - 2.0 * x * covariance + x * x * of_reference, 0.0)
@@ -114,6 +112,18 @@ def rate_ratio_limits(
     # A constant as a sum over strata: the same for either outcome.
     below = np.full((p.size, 2), rate / p.size)
     return ratio_limits(np.outer(p, CRASH), below, tally.outcomes, level, variance)
+
+
+def path_errors(
+    p: FloatArray, tally: Tally, with_reference: FloatArray, moments: tuple[float, float], n_paths: float
+) -> tuple[float, float, float]:
+    """What few paths leave open: variance of Σ p_s c_s, its covariance with a reference's rate, that rate's variance.
+
+    Arguments see `rate_ratio_limits`.
+    """
+    rate, square = moments
+    own, product = float(p @ tally.share), float(weight_of_a_test(p, tally.tests) @ with_reference)
+    return pool_variance(p, tally, n_paths), (product - own * rate) / n_paths, (square - rate * rate) / n_paths
 
 
 def preventable_share(

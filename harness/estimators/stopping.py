@@ -28,6 +28,7 @@ from harness.campaign.sections import Accept, Stop
 from harness.estimators.estimate import Estimate, Note, note
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts, PairDecision, PairVerdict
+from harness.estimators.per_hour import PerHour
 from harness.estimators.shells import SeenShells
 from harness.strata import ASSUMPTION_FREE
 
@@ -278,6 +279,50 @@ class RoundRule(Rule):
             ended: Ended | None = None if found.verdict == "undecided" else "accept"
             self.look = Look(rhw, ended, (note("accept", asked=key, limit=limit),), decision=found)
         return found.verdict != "undecided" and n >= self._held
+
+
+class HourRule(Rule):
+    """Looks at the rate per hour of several families after each round, or at each of theirs (``stop.each_family``).
+
+    Or at its ratio to the competent driver's: whether that is below ``stop.below_reference``, or on which side of
+    ``accept.times_reference`` it lies.
+    """
+
+    level_at = staticmethod(decision_level)
+
+    def __init__(self, campaign: Campaign) -> None:
+        super().__init__(campaign.stop.rhw, campaign.min_crashes)
+        self._confidence, self._accept = campaign.stop.confidence, campaign.accept
+        self._each, self._below = campaign.stop.each_family, campaign.stop.below_reference
+
+    def observe(self, hour: PerHour) -> bool:
+        """Whether to stop at the end of a round."""
+        level, n_crashes = Level.two_sided(self._confidence), hour.totals[1]
+        limits = hour.limits(level)
+        if self._accept is not None and self._accept.times_reference is not None:
+            beside = self._accept.times_reference
+            found = self._beside(hour, beside.at_most, beside.driver)
+            ended: Ended | None = None if found.verdict == "undecided" else "accept"
+            asked = note("accept", asked="times_reference", limit=beside.at_most)
+            self.look = Look(limits.rhw, ended, (asked,), decision=found)
+            return self.look.stopped
+        rhw = max(of.limits(level).rhw for of in hour.families) if self._each else limits.rhw
+        also = note("first_tests") if self.of_first_tests else None
+        pool = limits.from_pool_relative() if n_crashes >= self._min_crashes else (0.0, 0.0)
+        enough = self._looked(rhw, n_crashes, also=also, pool=pool)
+        if not self.look.stopped and (limit := self._below) is not None and not self._each:
+            likely = (
+                limits.high <= 2.0 * limit * hour.reference_rate
+            )  # the ratio's own limits take a hundred times as long
+            if likely and self._beside(hour, limit, "").verdict == "accepted":
+                self.look = replace(self.look, ended="below_reference", unmet=(note("below_reference", limit=limit),))
+        return self.look.stopped or enough
+
+    def _beside(self, hour: PerHour, limit: float, driver: str) -> Decision:
+        n, mass = hour.totals[0], math.fsum(float(of.p.sum()) for of in hour.families)
+        level = self.level_at(limit * hour.reference_rate * n / mass, self._confidence)
+        _, low, high = hour.ratio(level)
+        return Decision(limit, ASSUMPTION_FREE, (1.0 + self._confidence) / 2.0, low, high, n, driver=driver)
 
 
 class PairRule(Rule):

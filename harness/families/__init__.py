@@ -21,9 +21,11 @@ GROUP = "harness.families"
 def families() -> dict[str, Family]:
     """All that are installed, by name."""
     from harness.families.cut_in.family import CUT_IN  # noqa: PLC0415 - families are read when one is asked for
+    from harness.families.cut_out.family import CUT_OUT  # noqa: PLC0415
+    from harness.families.lead_brakes.family import LEAD_BRAKES  # noqa: PLC0415
 
-    found: dict[str, Family] = {each.name: each.load() for each in entry_points(group=GROUP)}
-    return {**found, CUT_IN.name: CUT_IN}
+    own: tuple[Family, ...] = CUT_IN, LEAD_BRAKES, CUT_OUT
+    return {each.name: each.load() for each in entry_points(group=GROUP)} | {each.name: each for each in own}
 
 
 def family_named(name: str, where: str = "scenario") -> Family:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
-from harness.campaign.problems import broken_rule
+from harness.campaign.problems import broken_rule, describe_found
 from harness.campaign.sections import Section
+from harness.campaign.yaml_text import read_yaml
 from harness.families.replicates import content_hash
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2
@@ -136,3 +139,23 @@ class ParameterFile(Section):
     def content_hash(self) -> str:
         """Hash of the numbers alone: a corrected note does not change a campaign."""
         return content_hash(json.dumps(self.values(), sort_keys=True).encode())
+
+
+@cache
+def _shipped(file: Path) -> dict[str, Any]:
+    return completed(read_yaml(file)[0], file.parent)
+
+
+def completed(given: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """What a file says, with numbers and sections that it leaves out as in the shipped one that it is ``like``."""
+    if "like" not in given:
+        return given
+    shipped = sorted(file.stem for file in folder.glob("*.yaml"))
+    if given["like"] not in shipped:
+        found, expected = describe_found(given["like"]), f"one of {', '.join(shipped)}"
+        raise broken_rule("like", found, expected, "Name one, or write all numbers.")
+    whole = dict(_shipped(folder / f"{given['like']}.yaml"))
+    for key, of in given.items():
+        both = isinstance(of, dict) and isinstance(whole.get(key), dict)
+        whole[key] = {**whole[key], **of} if both else of
+    return {key: of for key, of in whole.items() if key != "like"}

@@ -197,8 +197,16 @@ class Family(Protocol):
         How many uniforms the beginning of a path is made from: what a pool is aimed over.
     shipped : Path
         Folder of the parameter files that a name alone stands for.
+    default_parameters : str
+        The one of them where nothing is said.
     ladders : mapping of bool to str
         Libraries of surrogates where nothing is said, by whether events show themselves before they happen.
+    follows : bool
+        Whether the AV drives from the start, behind a vehicle that does not look at it: events do not depend on it.
+    stride : int
+        Events of a path between two that a pool asks.
+    pool_error : float
+        Relative standard error of its surrogates' crash rates where nothing is said.
     """
 
     name: str
@@ -209,7 +217,11 @@ class Family(Protocol):
     n_uniforms: int
 
     shipped: Path
+    default_parameters: str
     ladders: Mapping[bool, str]
+    follows: bool
+    stride: int
+    pool_error: float
 
     def parameters(self, settings: EnvironmentSettings) -> Parameters:
         """The numbers that a campaign's environment names.
@@ -240,11 +252,14 @@ class Family(Protocol):
     def shows(self, traffic: Environment) -> bool:
         """Whether events can be seen before they happen."""
 
-    def exposure(self, traffic: Environment) -> Exposure:
+    def exposure(self, traffic: Environment, parameters: Any) -> Exposure:
         """How often there are events, as `Events.probability` counts them."""
 
     def mean_distance_m(self, traffic: Environment) -> float:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens."""
+
+    def mean_speed_mps(self, traffic: Environment) -> float:
+        """Mean speed (m/s) of the AV on the road that its exposure is of."""
 
     def sources(self) -> Mapping[Method, type[Any]]:
         """Methods of its own, which draw the event in the loop: a class each (`harness.sampling.protocol.Source`)."""

@@ -12,6 +12,7 @@ from typing import Any
 import pyarrow as pa
 import yaml
 
+from harness.arguments import checked
 from harness.campaign.files import read_model
 from harness.campaign.yaml_text import yaml_text
 from harness.errors import HarnessError, printable
@@ -34,7 +35,7 @@ BASE = "ndd-overtaking-2"
 SEED = 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FittedFiles:
     """The files that a fit has written, and the fit itself."""
 
@@ -43,6 +44,9 @@ class FittedFiles:
     page: Path
     fit: Fit
     tally: Tally
+
+    def __repr__(self) -> str:
+        return "\n".join(map(str, (self.environment, self.page, self.replicates)))
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -63,6 +67,7 @@ class FittedFiles:
         }
 
 
+@checked("harness.fit")
 def fit_files(
     files: Sequence[str | Path],
     out: str | Path,
@@ -77,9 +82,24 @@ def fit_files(
 ) -> FittedFiles:
     """Fit traffic to trajectories and write it: ``out`` (YAML), and beside it its replicates and a page.
 
-    ``mapping`` is ``highd``, ``ngsim`` or a YAML file; ``mirror``, if given, takes the place of what it says, and
-    recordings to ``leave_out`` are added to its own. Files that no fit has written stay, unless ``force``. The same
-    files and seed give the same bytes.
+    Parameters
+    ----------
+    files : sequence of str or Path
+        Trajectories, in CSV or Parquet.
+    out : str or Path
+        Environment file to write.
+    mapping : str, optional
+        How to read columns of other names: ``highd``, ``ngsim`` or a YAML file.
+    mirror : bool, optional
+        Whether to fit lane changes to the left, in place of what the mapping says.
+    leave_out : sequence of str
+        Recordings not to fit, beside the mapping's own.
+    n_replicates, seed : int
+        Environments to draw, and by which seed; the same files and seed give the same bytes.
+    force : bool
+        Whether to write over files that no fit has written.
+    progress : Progress, optional
+        Who is told how far it is.
 
     Raises `HarnessError`: a file, its mapping or what was read cannot be used, or ``out`` cannot be written.
     """
@@ -118,8 +138,6 @@ def _require_ours(written: Mapping[Path, bytes], inputs: Sequence[Path], *, forc
     """Refuse to write over an input, or over what has not the mark of a file that a fit has written."""
     for path, mark in written.items():
         where = f"--out {next(iter(written))}"
-        if printable(path.name) != path.name:
-            raise HarnessError(where, "a name with bytes that are no text", "a name in UTF-8", "Choose another name.")
         if os.path.realpath(path) in map(os.path.realpath, inputs):
             raise HarnessError(where, f"{path}, which is also an input", "another file", "Choose another name.")
         if path.is_dir() or (not force and not _may_replace(path, mark)):

@@ -63,10 +63,12 @@ class Script(NamedTuple):
     ``lanes`` (n, steps, O) on which lanes they then are; no steps if they are driven in the loop. The event is in step
     ``at`` (n,), -1 for none, and shows itself ``lead`` (n,) steps earlier. ``n_steps`` (n,) are the most of each test,
     ``acts_from`` (n,) the first in which the AV may act, at most the one after the onset, and ``visible_from`` (n, O)
-    those from which on it sees the others. ``stratum`` (n,) is what a test was drawn from, ``log_weight`` (n,) its log
-    weight, ``log_p_event`` (n,) the log probability of an event on its path, NaN where nobody has asked.
-    ``announced_index`` (n,) are the indices that AVs are told, -1 for the test's own, and ``motion_hash`` (n,) of what
-    they must have done when the step of the onset is over, as in their baseline runs; 0 where nobody has one.
+    those from which on it sees the others. ``headway_s`` (n,) is what people keep on the path, ``sideways_mps`` (n,)
+    the speed at which a vehicle moves sideways, and ``set_speed_mps`` (n,) at which the AV would cruise: NaN, 0 and NaN
+    (its own) where nothing is said. ``stratum`` (n,) is what a test was drawn from, ``log_weight`` (n,) its log weight,
+    ``log_p_event`` (n,) the log probability of an event on its path, NaN where nobody has asked. ``announced_index``
+    (n,) are the indices that AVs are told, -1 for the test's own, and ``motion_hash`` (n,) of what they must have done
+    when the step of the onset is over, as in their baseline runs; 0 where nobody has one.
     """
 
     x: FloatArray
@@ -79,6 +81,9 @@ class Script(NamedTuple):
     n_steps: IntArray
     acts_from: IntArray
     visible_from: IntArray
+    headway_s: FloatArray
+    sideways_mps: FloatArray
+    set_speed_mps: FloatArray
     stratum: IntArray
     log_weight: FloatArray
     log_p_event: FloatArray
@@ -102,6 +107,9 @@ def natural_script(
     n_steps: int | IntArray | None = None,
     acts_from: int | IntArray | None = None,
     visible_from: IntArray | None = None,
+    headway_s: float | FloatArray = math.nan,
+    sideways_mps: float | FloatArray = 0.0,
+    set_speed_mps: float | FloatArray = math.nan,
 ) -> Script:
     """A script whose tests weigh 1; see `Script`.
 
@@ -114,10 +122,15 @@ def natural_script(
     if visible_from is None:
         visible_from = np.zeros((n, x.shape[1] - 1), np.int64)
     most, acts_from = (np.array(np.broadcast_to(each, n), np.int64) for each in (most, acts_from))
+    headway, sideways, cruise = (
+        np.array(np.broadcast_to(each, n), np.float64) for each in (headway_s, sideways_mps, set_speed_mps)
+    )
     stratum, weighs, unknown = np.full(n, -1), np.zeros(n), np.full(n, math.nan)
     index, motion = np.full(n, -1), np.zeros(n, np.uint64)
     moves = x, v, lane, speed, lanes, at, lead
-    return Script(*moves, most, acts_from, visible_from, stratum, weighs, unknown, index, motion)
+    return Script(
+        *moves, most, acts_from, visible_from, headway, sideways, cruise, stratum, weighs, unknown, index, motion
+    )
 
 
 class Cells(NamedTuple):

@@ -9,7 +9,8 @@ import numpy as np
 
 from harness.compiled import compiled, compiled_inline
 from harness.controllers.protocol import BatchObservation
-from harness.loop.cells import KernelState
+from harness.loop.cells import NEVER, KernelState
+from harness.vehicles.following import Ahead, follow_on, headway_of, seen_after
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
 from harness.vehicles.references import Memory, react, reaction_steps, still_cruises
 from harness.vehicles.sideways import lateral_position, perceived_in
@@ -23,7 +24,9 @@ def drive(kernel: KernelState) -> None:
     perceives_m, av, other = driver[0].perceives_lateral_m, x.shape[1] - 1, kernel.principal
     for k in range(cells.cell.size):
         cell = cells.cell[k]
-        if cell.row < 0 or cell.onset_step < 0 or cell.step <= cell.onset_step:
+        if cell.row >= 0 and cell.acts_from == 0:
+            follow(k, kernel)
+        if cell.row < 0 or cell.acts_from == 0 or cell.onset_step < 0 or cell.step <= cell.onset_step:
             continue
         first, earlier = perceived_in(perceives_m, cell.planned, cell.lead, kernel.sideways_m)
         step = cell.step - first - reaction_steps(driver[0], kernel.seed, cell.episode)
@@ -31,6 +34,51 @@ def drive(kernel: KernelState) -> None:
             memory = Memory(cells.acceleration[k], cell.danger, driver[0].used_up_steps + earlier)
             memory = react(driver[0], memory, step, v[k, av], v[k, other], gap(x[k, other], x[k, av]))
             cells.acceleration[k], cell.danger = held_if_cruising(k, memory.acceleration, kernel), memory.danger
+
+
+@compiled_inline
+def follow(k: int, kernel: KernelState) -> None:
+    """Acceleration of a built-in AV that follows from the start; see `harness.vehicles.following`."""
+    cells, driver, script = kernel.cells, kernel.driver[0], kernel.script
+    cell, speed = cells.cell[k], kernel.v[k, kernel.x.shape[1] - 1]
+    late, perceived, reacts, nobody = (
+        reaction_steps(driver, kernel.seed, cell.episode),
+        0,
+        NEVER,
+        Ahead(speed, math.inf, 0.0),
+    )
+    lead, revealed = nobody, nobody
+    if cell.onset_step >= 0:
+        clear, perceived = cell.planned + 1 - cell.onset_step, cell.onset_step + 1
+        if script.sideways_mps[cell.row] > 0.0:
+            perceived = cell.onset_step + seen_after(driver.perceives_lateral_m, script.sideways_mps[cell.row], clear)
+        reacts = perceived + late
+    for other in range(kernel.x.shape[1] - 1):
+        hidden = script.visible_from[cell.row, other] > 0
+        if not is_ahead_of(k, other, kernel) or (hidden and (cell.onset_step < 0 or cell.step < perceived)):
+            continue
+        seen = ahead_of(k, other, kernel)
+        if hidden and seen.gap < revealed.gap:
+            revealed = seen
+        elif not hidden and seen.gap < lead.gap:
+            lead = seen
+    waits = 0 <= cell.onset_step < cell.step < reacts
+    memory = Memory(cells.acceleration[k], cell.danger, 0.0)
+    headway_s = headway_of(driver, script.headway_s[cell.row], script.v[cell.row, script.v.shape[1] - 1])
+    memory = follow_on(driver, headway_s, memory, cell.step - reacts, waits, speed, lead, revealed)
+    cells.acceleration[k], cell.danger = memory.acceleration, memory.danger
+
+
+@compiled_inline
+def ahead_of(k: int, other: int, kernel: KernelState) -> Ahead:
+    """Another vehicle, as the AV sees it ahead."""
+    cell, v = kernel.cells.cell[k], kernel.v[k, other]
+    before = v
+    if cell.step == 1:
+        before = kernel.script.v[cell.row, other]
+    elif cell.step > 1:
+        before = kernel.script.speed[cell.row, cell.step - 2, other]
+    return Ahead(v, gap(kernel.x[k, other], kernel.x[k, kernel.x.shape[1] - 1]), (v - before) / STEP_S)
 
 
 @compiled_inline
@@ -88,11 +136,18 @@ def is_visible(k: int, other: int, kernel: KernelState) -> bool:
 
 
 @compiled_inline
+def is_ahead_of(k: int, other: int, kernel: KernelState) -> bool:
+    """Whether another vehicle is on the AV's lane, ahead of it."""
+    x, lane, av = kernel.x, kernel.cells.lane_before, kernel.x.shape[1] - 1
+    return bool(lane[k, other] == lane[k, av] and x[k, other] > x[k, av])
+
+
+@compiled_inline
 def leader_of(k: int, kernel: KernelState) -> int:
     """The nearest vehicle ahead on the AV's lane that it sees; -1 for none."""
-    x, lane, av, leader = kernel.x, kernel.cells.lane_before, kernel.x.shape[1] - 1, -1
-    for other in range(av):
-        ahead = lane[k, other] == lane[k, av] and x[k, other] > x[k, av] and is_visible(k, other, kernel)
+    x, leader = kernel.x, -1
+    for other in range(x.shape[1] - 1):
+        ahead = is_ahead_of(k, other, kernel) and is_visible(k, other, kernel)
         if ahead and (leader < 0 or x[k, other] < x[k, leader]):
             leader = other
     return leader

@@ -96,9 +96,24 @@ def outcome_of(k: int, kernel: KernelState) -> int:
             return PASSED
     elif left <= kernel.passed_m and not (0 <= cell.onset_step < cell.step):
         return PASSED
-    if cell.step >= kernel.script.n_steps[cell.row]:
+    if cell.step >= kernel.script.n_steps[cell.row] or both_stand(k, kernel):
         return TIMEOUT
     return RUNNING
+
+
+@compiled_inline
+def both_stand(k: int, kernel: KernelState) -> bool:
+    """Whether the AV and the vehicle ahead of it stand, after the onset: nothing more happens."""
+    x, v, lane, av = kernel.x, kernel.v, kernel.cells.lane, kernel.x.shape[1] - 1
+    onset = kernel.cells.cell[k].onset_step
+    if v[k, av] != 0.0 or not 0 <= onset < kernel.cells.cell[k].step:
+        return False
+    leader = -1
+    for other in range(av):
+        ahead = lane[k, other] == lane[k, av] and x[k, other] > x[k, av]
+        if ahead and (leader < 0 or x[k, other] < x[k, leader]):
+            leader = other
+    return leader >= 0 and v[k, leader] == 0.0
 
 
 @compiled_inline

@@ -200,7 +200,7 @@ class EpisodeLoop:
     def _warm_up(self, av: ControllerHost, seen: BatchObservation) -> dict[int, str]:
         """Show controllers that are asked for the first time in their episode what was before; returns who failed."""
         cell, failures = self._cells.cell[seen.cell], dict[int, str]()
-        new = cell["step"] == cell["acts_from"]
+        new = (cell["step"] == cell["acts_from"]) & (cell["acts_from"] > 0)  # who follows has had its warm-up
         if new.any():
             for before in self._past.before(BatchObservation._make(column[new] for column in seen)):
                 failures = {**av.act(before, warms_up=True)[1], **failures}

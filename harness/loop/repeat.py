@@ -78,7 +78,8 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     cell.event_step = cell.planned = cell.onset_step = cell.took_over_step = -1
     cell.lead = cell.asked_to_speed_up = 0
     cell.acts_from = 0 if kernel.acts_early else script.acts_from[row]
-    cell.cruises, cell.set_speed = kernel.av_cruises if cell.acts_from > 0 else 0, kernel.v[k, av]
+    cell.cruises, told = kernel.av_cruises if cell.acts_from > 0 else 0, script.set_speed_mps[row]
+    cell.set_speed = kernel.v[k, av] if math.isnan(told) else told
     cell.announced_index = script.announced_index[row] if script.announced_index[row] >= 0 else episode
     cell.component, cell.log_weight = script.stratum[row], script.log_weight[row]
     cell.log_p_event = script.log_p_event[row]

@@ -1,6 +1,6 @@
 """Paths of a pool, enumerated where crashes are, by importance sampling in the uniforms that they begin with.
 
-Events next to each other mostly end alike. So of each path only every `STRIDE`-th is asked, from a random one on, and
+Events next to each other mostly end alike. So of each path only every ``stride``-th is asked, from a random one on, and
 counts for the ones around it: that keeps every sum over events unbiased, and with the same time for more paths the
 crash rates become known about three times sooner.
 
@@ -22,8 +22,6 @@ from harness.random_stream import DIAGNOSTIC, INITIAL, uniforms
 from harness.vehicles.drivers import Followers
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
-STRIDE = 4
-"""Steps between the events of a path that are asked; `benchmarks.pool_stride` says what other numbers would cost."""
 PILOT_PATHS = 2048
 BLOCK_PATHS = 256
 N_BINS = 16
@@ -121,7 +119,8 @@ class Enumerator:
     followers: Followers
     seed: int
     proposal: FloatArray | None = None
-    stride: int = STRIDE
+    stride: int | None = None
+    """None: the family's."""
 
     def __post_init__(self) -> None:
         # Compiled here, by one thread: of two that want a new kernel at once, the second would have to wait for
@@ -151,12 +150,10 @@ class Enumerator:
 
     def _block(self, first: int, n: int = BLOCK_PATHS) -> EnumeratedPaths:
         u, weight = self.uniforms(first, n), np.ones(n)
-        drawn = uniforms(self.seed, first, n, DIAGNOSTIC, 2)
-        offset = (drawn[:, OFFSET_DRAW] * self.stride).astype(np.int64)
+        drawn, stride = uniforms(self.seed, first, n, DIAGNOSTIC, 2), self.stride or self.family.stride
+        offset = (drawn[:, OFFSET_DRAW] * stride).astype(np.int64)
         if self.proposal is not None:
             u, weight = aimed_points(self.proposal, u, drawn[:, AIMED_DRAW])
         paths = Paths(first + np.arange(n), self.family.start(self.environment, u))
-        found = self.family.events(
-            self.environment, self.seed, paths, self.followers, stride=self.stride, offset=offset
-        )
+        found = self.family.events(self.environment, self.seed, paths, self.followers, stride=stride, offset=offset)
         return EnumeratedPaths(*paths, weight, found.probability * weight[:, None], found.crashes)

@@ -145,7 +145,9 @@ def planned_number(aim: Aim, settings: PoolSettings) -> int:
     mean = rates.mean(0)
     seen = mean > 0.0
     relvar = (rates * rates * weight[:, None]).mean(0)[seen] / mean[seen] ** 2 - 1.0
-    wanted = settings.relative_error * np.where(aim.conservative, 1.0, AGGRESSIVE_ERROR)[seen]
+    wanted = (settings.relative_error or aim.enumerator.family.pool_error) * np.where(
+        aim.conservative, 1.0, AGGRESSIVE_ERROR
+    )[seen]
     rounds = np.ceil(np.max(relvar / wanted**2, initial=1.0) / ROUND_PATHS)
     return ROUND_PATHS * min(int(rounds), MOST_PATHS // ROUND_PATHS)
 

@@ -121,6 +121,7 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         assumes=pool.library.assumes or f"crashes only where the surrogate {boundary} or a more careful one crashes",
         n_inside=sum(group[-1] <= boundary_shell(pool) for group in groups),
         p_event=pool.p_event,
+        p_event_se=pool.p_event_se,
         p_unreachable=pool.p_event - float(p.sum()),
         shadow_runs=(acts := pool.events.acts),
         candidates=CANDIDATES if acts else 0,

@@ -217,7 +217,24 @@ def _described(table: pa.Table) -> pd.DataFrame:
 def read(folder: str | Path) -> StoredRun:
     """Tables of a stored run, as pandas frames or Arrow tables, with units and weights.
 
+    Parameters
+    ----------
+    folder : str or Path
+        Run folder.
+
     Raises `RunFolderError`: the folder is no run.
+
+    Examples
+    --------
+    Of the run that `harness.run` shows:
+
+    >>> import harness
+    >>> tests = harness.read("runs/idm").episodes(["outcome", "impact_speed_mps"])
+    >>> tests.attrs["unit"]["impact_speed_mps"]
+    'm/s'
+    >>> crashed = tests["outcome"] == "crash"
+    >>> f"{int(crashed.sum())} crashes, {(tests['weight'] * crashed).mean():.2e} per test"
+    '95 crashes, 1.95e-07 per test'
     """
     read_manifest(Path(folder))
     return StoredRun(Path(folder))

@@ -14,6 +14,7 @@ from harness.errors import HarnessError, RunFolderError
 from harness.numbers import count, tenths
 from harness.records.folder import read_as
 from harness.report.crashes import rows_of
+from harness.report.drawing import Plot
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
 from harness.report.player import Scene, Scenes, beside_other
 from harness.report.plots import WHO, pairs_plot
@@ -48,7 +49,6 @@ def write_comparison(folder: str | Path) -> Path:
 def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder]) -> Path:
     """Write the page of a comparison in hand."""
     pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
-    plot = pairs_plot(pairs.who, pairs.weight, pairs.gap_m, pairs.closing_mps)
     return write_page(
         folder / "report.html", "compare.html.j2",
         compared=stored, asked=asked, given=asked is not stored,
@@ -56,7 +56,7 @@ def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder
         answers=[short_answer(run.campaign, run.manifest, run.estimates) for run in runs],
         to_decide=deciding_words(stored), above=runs[0].campaign.crash.counts_above_mps,
         sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
-        plot=plot, scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
+        plot=pairs.plot, scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
     )  # fmt: skip
 
 
@@ -78,6 +78,11 @@ class Pairs(NamedTuple):
     def counts(self) -> dict[str, int]:
         """Pairs by who crashes."""
         return {name: int(np.count_nonzero(self.who == place)) for place, name in enumerate(WHO)}
+
+    @property
+    def plot(self) -> Plot | None:
+        """Their map; None without any."""
+        return pairs_plot(self.who, self.weight, self.gap_m, self.closing_mps)
 
 
 def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> Pairs:

@@ -31,11 +31,11 @@ def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None 
     if parameters:
         room = WIDTH - len(" · ".join(head)) - 3
         head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
-    table = _columns([row.texts for row in rows])
-    return [" · ".join(head), *table, *_wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+    table = columns([row.texts for row in rows])
+    return [" · ".join(head), *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
 
 
-def _columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Rows of equally many texts, each column as wide as its widest; a row too long for that is pushed together."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
@@ -44,10 +44,10 @@ def _columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
         line = "  ".join(["", *others, remark]).rstrip()
         if len(line) > WIDTH:
             line = f"{left}  {remark:>{max(WIDTH - 2 - len(left), 0)}}"
-        yield from [line] if len(line) <= WIDTH else _wrapped(["  ".join(filter(None, row))])
+        yield from [line] if len(line) <= WIDTH else wrapped(["  ".join(filter(None, row))])
 
 
-def _wrapped(texts: Iterable[str]) -> Iterator[str]:
+def wrapped(texts: Iterable[str]) -> Iterator[str]:
     """Lines of at most `WIDTH` columns, which begin after two spaces and go on after four."""
     fill = textwrap.TextWrapper(WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
     for text in texts:
@@ -83,4 +83,4 @@ def pair_lines(
     pairs = f"{count(content['n_pairs'])} pairs of tests"
     head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per test"
     last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
-    return [head, *_columns(rows), *_wrapped([*remarks[: 3 - len(last)], *last]), f"  report  {report}"]
+    return [head, *columns(rows), *wrapped([*remarks[: 3 - len(last)], *last]), f"  report  {report}"]

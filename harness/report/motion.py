@@ -23,8 +23,14 @@ SUFFIXES = ".html", ".csv", ".xosc"
 def write_motion(result: ReplayResult, file: str | Path) -> Sequence[Path]:
     """Write what `harness.replay` has given into a file, and return the files that were written.
 
-    ``.html`` is a page that plays it; ``.csv`` has a row for each vehicle and step, with units in the columns' names;
-    ``.xosc`` is OpenSCENARIO XML 1.2 (extra ``harness[export]``), with its OpenDRIVE road beside it (``.xodr``).
+    Parameters
+    ----------
+    result : ReplayResult
+        Motion of an episode.
+    file : str or Path
+        ``.html`` is a page that plays it; ``.csv`` has a row for each vehicle and step, with units in the columns'
+        names; ``.xosc`` is OpenSCENARIO XML 1.2 (extra ``harness[export]``), with its OpenDRIVE road beside it
+        (``.xodr``).
 
     Raises `HarnessError`: the name has another suffix, or the extra is missing.
     """

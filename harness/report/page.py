@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import re
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,6 @@ from harness.arguments import checked
 from harness.campaign.files import dump_campaign
 from harness.estimators.traffic import Sensitivity
 from harness.families import family_named
-from harness.families.protocol import Environment
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.records.reader import table_sizes
@@ -20,14 +21,19 @@ from harness.report.plots import convergence_plot, sensitivity_plot, severity_pl
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
 from harness.report.templates import write_page
 from harness.report.words import short_answer
-from harness.vocabulary import OUTCOMES
+from harness.vocabulary import COMPARISON, FAMILIES, OUTCOMES
 
 PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")
 
 
 @checked("harness.write_report")
 def write_report(folder: str | Path) -> Path:
-    """Write ``report.html`` and ``plots/`` (SVG) into a run folder anew, and return the page.
+    """Write ``report.html`` and ``plots/`` (SVG) into a run folder anew, or the page of a comparison, or of scenarios.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Run folder, or the folder of a comparison, or of several scenarios.
 
     The page is self-contained: it can be mailed, archived and opened offline. The same folder gives the same bytes if
     it is reached from the working directory by the same relative path, by which the commands on the page name it;
@@ -36,13 +42,21 @@ def write_report(folder: str | Path) -> Path:
 
     Raises `RunFolderError`: if the folder misses a file, or a file is damaged or belongs to another run.
     """
+    if (Path(folder) / COMPARISON).is_file():
+        from harness.report.compare_page import write_comparison  # noqa: PLC0415 - most folders are runs
+
+        return write_comparison(folder)
+    if (Path(folder) / FAMILIES).is_file():
+        from harness.report.hours_page import write_hours  # noqa: PLC0415
+
+        return write_hours(folder)
     return write_page_of(read_run_folder(Path(folder)))
 
 
 def write_page_of(run: RunFolder) -> Path:
     """Write the page of a run in hand: none of its files is read but traces of crashes."""
     folder, summary, traffic = run.path, summarise(run), run.traffic
-    plots = _plots(run, summary, traffic)
+    plots = _plots(run, summary)
     gallery, scenes = crash_gallery(run, summary, traffic)
     answer = short_answer(run.campaign, run.manifest, run.estimates)
     page = write_page(
@@ -59,10 +73,22 @@ def write_page_of(run: RunFolder) -> Path:
     return page
 
 
-def _plots(run: RunFolder, summary: RunSummary, traffic: Environment | None) -> list[Plot]:
+def where_plot_of(run: RunFolder, summary: RunSummary | None = None) -> Plot | None:
+    """The map of a run; None without an event."""
+    return where_plot(summary or summarise(run), family_named(run.campaign.scenario), run.traffic)
+
+
+def shown_with(text: str, plot: Plot | None) -> str:
+    """HTML of a text with a plot below it, as a notebook shows results: the plot keeps its style to itself."""
+    image = "" if plot is None else base64.b64encode(plot.file(_style())).decode()
+    shown = f'<img width="440" alt="{plot.alt}" src="data:image/svg+xml;base64,{image}">' if plot else ""
+    return f"<pre>{escape(text)}</pre>{shown}"
+
+
+def _plots(run: RunFolder, summary: RunSummary) -> list[Plot]:
     plots = [
         severity_plot(run.estimates),
-        where_plot(summary, family_named(run.campaign.scenario), traffic),
+        where_plot_of(run, summary),
         None if run.shells is None else shells_plot(run.shells),
         sensitivity_plot(found) if (found := _sensitivity(run)) is not None and found.shown else None,
         convergence_plot(run),
@@ -78,11 +104,15 @@ def _sensitivity(run: RunFolder) -> Sensitivity | None:
     return found if found.campaign_hash == run.manifest["campaign_hash"] else None
 
 
-def _write_plots(folder: Path, plots: list[Plot]) -> None:
+def _style() -> str:
+    """What the page's style sheet says of plots."""
     css = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
-    style = "".join(re.findall(r"^:root \{.*?^\}$|^\.panel.*?$", css, flags=re.DOTALL | re.MULTILINE))
+    return "".join(re.findall(r"^:root \{.*?^\}$|^\.panel.*?$", css, flags=re.DOTALL | re.MULTILINE))
+
+
+def _write_plots(folder: Path, plots: list[Plot]) -> None:
     folder.mkdir(exist_ok=True)
-    files = {f"{plot.name}.svg": plot.file(style) for plot in plots}
+    files = {f"{plot.name}.svg": plot.file(_style()) for plot in plots}
     for name, content in files.items():
         write_bytes(folder / name, content)
     for old in folder.iterdir():

@@ -50,20 +50,34 @@ EXIT_OF: Mapping[PairVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUT
 Both = tuple[Resolved, Resolved]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
-    """Two finished campaigns, in run folders ``a`` and ``b``, and the difference.
+    """Two finished campaigns, in run folders ``a`` and ``b``, and the difference; shown, it is the short answer.
 
     ``content`` is that of ``compare.json``, ``report`` the page. The exit code is 4 when budget or pool were spent
-    before what was asked was known, and 5 when B is worse than A by more than the margin. ``s_per_pair`` is what a
-    pair takes.
+    before what was asked was known, and 5 when B is worse than A by more than the margin.
     """
 
     folder: Path
     content: dict[str, Any]
     exit_code: int
     report: Path
-    s_per_pair: float
+    shown: list[RunFolder]
+    """What the page is made of, of A and of B."""
+
+    def __repr__(self) -> str:
+        from harness.report.lines import pair_lines  # noqa: PLC0415 - draws
+
+        last = self.shown[1]
+        s_per_pair = last.manifest["wall_time_s"] / self.content["n_pairs"]
+        return "\n".join(pair_lines(self.content, last.campaign.crash.counts_above_mps, self.report, s_per_pair))
+
+    def _repr_html_(self) -> str:
+        """The short answer, and the map of cut-ins on which one of them crashes, as a notebook shows them."""
+        from harness.report.compare_page import crashing_pairs  # noqa: PLC0415 - draws
+        from harness.report.page import shown_with  # noqa: PLC0415
+
+        return shown_with(repr(self), crashing_pairs(self.shown, self.content["shells"]).plot)
 
 
 @checked("harness.compare")
@@ -81,15 +95,40 @@ def compare_campaigns(
 ) -> Comparison:
     """Drive two vehicles on the same cut-ins until it is known who crashes less often, or to half-width 0.1.
 
-    The campaigns, or those that paths or vehicles' names stand for, are equal but for ``av``, ``name`` and
-    ``description``; ``labels`` name them in the answer, by default as they do themselves. ``out/a`` and ``out/b``
-    become run folders; what an earlier call has finished there is used again. ``stored`` is a run folder of A, whose
-    tests are not driven again: it is copied to ``out/a``. A ``margin`` asks instead whether B's rate is at most
-    1 + margin times A's, ``rhw`` for a half-width of A - B over the larger rate; the campaigns' own ``stop.rhw`` is
-    about one vehicle. ``workers`` and ``progress`` are those of `run_campaign`.
+    Parameters
+    ----------
+    a, b : Campaign, str or Path
+        Campaigns, or the paths or vehicles' names that stand for them, equal but for av, name and description; their
+        own ``stop.rhw`` is about one vehicle, and not asked.
+    out : str or Path
+        Folder of the run folders ``a`` and ``b``; what an earlier call has finished there is used again.
+    workers, progress
+        As in `harness.run`.
+    labels : tuple of two str, optional
+        Names of A and B in the answer, by default the campaigns'.
+    stored : str or Path, optional
+        Run folder of A, whose tests are not driven again: it is copied to ``out/a``.
+    margin : float, optional
+        Ask instead whether B's rate is at most 1 + margin times A's.
+    rhw : float, optional
+        Ask instead for this half-width of A - B over the larger rate.
 
     Raises `CampaignError`: the campaigns differ in something else, or do not draw from the same shells; a margin and a
     half-width are asked for. Raises `RunFolderError`: ``out`` holds other runs.
+
+    Examples
+    --------
+    >>> import harness
+    >>> fast = ["world.engine=twin", "environment.parameters=ndd-overtaking-1", "pool.relative_error=0.1"]
+    >>> idm, late = (harness.load_campaign(av, [*fast, "stop.episodes=2000"]) for av in ("idm", "late-600ms"))
+    >>> harness.compare(idm, late, "runs/late")
+    B crashes more often than A · 1,054 pairs of tests · crashes per test
+      A idm         1.32 × 10⁻⁷   (0.99 to 2.04) × 10⁻⁷    17 crashes
+      B late-600ms  2.38 × 10⁻⁷   (2.03 to 3.11) × 10⁻⁷    57 crashes
+      A / B         0.56          0.41 to 0.86
+      A − B         −1.06 × 10⁻⁷  (−1.79 to −0.33) × 10⁻⁷  A alone 0, B alone 40
+      sampling error in this simulated traffic only (90 %); ended by: decision reached
+      report  runs/late/report.html
     """
     a, b = campaign_of(a), campaign_of(b)
     if stored is not None:
@@ -130,8 +169,7 @@ def compare_campaigns(
     write_sealed(out / COMPARISON, content)
     from harness.report.compare_page import write_page_of  # noqa: PLC0415 - draws
 
-    took_s = shown[1].manifest["wall_time_s"] / found["n_pairs"]
-    return Comparison(out, content, code, write_page_of(out, content, shown), took_s)
+    return Comparison(out, content, code, write_page_of(out, content, shown), shown)
 
 
 def _compared(

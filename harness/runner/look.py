@@ -78,7 +78,7 @@ class Speed:
     constructions: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class AvCheck:
     """What a few dozen episodes say about an AV, run on an engine with cut-ins that a method brought about.
 
@@ -112,6 +112,11 @@ class AvCheck:
         """0 when all is well, 3 when episodes failed or were not reproduced."""
         return EXIT_TOO_MANY_FAILED if self.failures or self.differing else EXIT_DONE
 
+    def __repr__(self) -> str:
+        from harness.report.av_check import verdict  # noqa: PLC0415 - reads this
+
+        return verdict(self)
+
     def to_json(self) -> dict[str, Any]:
         """Plain JSON content; undefined numbers become null."""
         return finite_json({**asdict(self), "deterministic": not self.differing, "exit_code": self.exit_code})
@@ -124,8 +129,12 @@ def check_av(campaign: Campaign | str | Path, n_episodes: Annotated[int, Field(g
     The second run has other cells, begins in the middle, and follows episodes of its own: a controller that remembers
     an earlier episode, shares state between instances or draws from a global stream gives other bits there.
 
-    The campaign's method, engine and records are replaced by what the check needs; its AV and seed are not.
-    ``n_episodes`` is at least 2.
+    Parameters
+    ----------
+    campaign : Campaign, str or Path
+        Whose AV; its method, engine and records are replaced by what the check needs, its AV and seed are not.
+    n_episodes : int
+        At least 2.
 
     Raises `HarnessError`: the campaign is wrong, or the AV cannot be found, made or started.
     """

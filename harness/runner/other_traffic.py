@@ -30,7 +30,7 @@ from harness.runner.stored_shells import ELSEWHERE, OPTION, Elsewhere, Nearby, S
 from harness.vocabulary import EstimatorName, FloatArray
 
 
-@checked("estimate_in_other_traffic")
+@checked("harness.estimate_in_other_traffic")
 def estimate_in_other_traffic(
     folder: str | Path,
     environment: str,
@@ -39,10 +39,20 @@ def estimate_in_other_traffic(
     own: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Content of ``estimates.json`` as the stored tests have it for another environment: a shipped name or a file.
+    """Content of ``estimates.json`` as the stored tests of shells have it for another environment.
 
-    Where it names replicates ``traffic`` is what they leave open (`TrafficError`). With ``own`` it has to be the
-    folder's own traffic.
+    Parameters
+    ----------
+    folder : str or Path
+        Run folder.
+    environment : str
+        A shipped name or a file; where it names replicates, ``traffic`` is what they leave open (`TrafficError`).
+    confidence : float, optional
+        Level of the intervals, by default the campaign's.
+    own : bool
+        Whether it has to be the folder's own traffic.
+    progress : Progress, optional
+        Who is told how far it is.
 
     Raises `HarnessError`: the folder is no run of shells, the environment is wrong, or the tests say nothing of it.
     """

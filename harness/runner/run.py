@@ -43,6 +43,7 @@ from harness.strata import STORED_DESIGN
 
 if TYPE_CHECKING:
     from harness.report.summary import RunFolder
+    from harness.runner.families import Hours
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
 ESTIMATES = "estimates.json"
@@ -74,6 +75,12 @@ class RunResult:
         answer = short_answer(self.shown.campaign, self.shown.manifest, self.shown.estimates)
         return "\n".join(lines(answer, self.shown.manifest["wall_time_s"], self.report))
 
+    def _repr_html_(self) -> str:
+        """The short answer, and the map of the share of cut-ins that crash, as a notebook shows them."""
+        from harness.report.page import shown_with, where_plot_of  # noqa: PLC0415 - draws
+
+        return shown_with(repr(self), where_plot_of(self.shown))
+
 
 @checked("harness.run")
 def run_campaign(
@@ -83,15 +90,44 @@ def run_campaign(
     workers: AtLeastOne | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-) -> RunResult:
-    """Run a campaign, or the one that a path or a vehicle's name stands for, into a folder.
+) -> RunResult | Hours:
+    """Run a campaign into a folder; one of several scenarios into a run folder each.
 
-    That is new or empty or, with ``resume``, holds a run of this campaign that was interrupted, or is to go on to a
-    smaller RHW. The number of ``workers``, by default as many as there are cores, never changes a result.
+    Parameters
+    ----------
+    campaign : Campaign, str or Path
+        What to run, or the path or the vehicle's name that stands for it (`harness.load_campaign`).
+    out : str or Path
+        New or empty folder.
+    workers : int, optional
+        Processes, by default as many as there are cores; their number never changes a result.
+    resume : bool
+        Whether ``out`` holds this campaign, interrupted, or to go on to a smaller RHW.
+    progress : Progress, optional
+        Who is told how far it is.
 
     Raises `HarnessError`: the campaign, the folder or the AV is at fault; nothing that was finished is lost.
+
+    Examples
+    --------
+    >>> import harness
+    >>> fast = ["world.engine=twin", "environment.parameters=ndd-overtaking-1", "testing.method=forced"]
+    >>> idm = harness.load_campaign("idm", [*fast, "stop.rhw=null", "stop.episodes=1000"])
+    >>> result = harness.run(idm, "runs/idm")
+    >>> print(result)  # doctest: +ELLIPSIS
+    idm · 1,000 tests in SUMO’s twin · ...
+      crash rate  1.95 × 10⁻⁷ per test  (0.73 to 7.14) × 10⁻⁷  0.586 per million km
+      ...
+    >>> result.stopped_by, result.exit_code
+    ('episodes', 0)
     """
-    resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign_of(campaign))
+    if not isinstance(campaign, Resolved):
+        campaign = campaign_of(campaign)
+        if campaign.scenarios is not None:
+            from harness.runner.families import run_families  # noqa: PLC0415 - runs of this file, for several
+
+            return run_families(campaign, Path(out), workers=workers, resume=resume, progress=progress)
+    resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign)
     out, progress = Path(out), progress or Progress()
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)

@@ -42,13 +42,20 @@ class Move:
     settings: Sequence[Mapping[str, float]]
 
 
-@checked("sensitivity")
+@checked("harness.sensitivity")
 def sensitivity(
     folder: str | Path, *, ranges: Mapping[str, tuple[float, float]] | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Write ``sensitivity.json`` into the folder of a run of shells, and return its content (`Sensitivity`).
 
-    ``ranges`` of numbers, by ``section.name``, are taken besides those that the environment states.
+    Parameters
+    ----------
+    folder : str or Path
+        Run folder.
+    ranges : mapping, optional
+        Lowest and highest value of numbers, by ``section.name``, besides those that the environment states.
+    progress : Progress, optional
+        Who is told how far it is.
 
     Raises `HarnessError`: the folder is no run of shells, a number is not there, or nothing is said to be uncertain.
     """

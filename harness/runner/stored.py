@@ -50,10 +50,25 @@ def estimate_run(
 ) -> dict[str, Any]:
     """Estimate a stored run from its records; returns the content of ``estimates.json``.
 
-    ``estimators`` are reported beside the campaign's own, all by default: names, or estimators of your own
-    (`harness.estimators.own`). ``confidence`` is the level of the intervals, by default the campaign's.
+    Parameters
+    ----------
+    folder : str or Path
+        Run folder.
+    estimators : sequence, optional
+        Those to report beside the campaign's own, by default all: names, or your own (`harness.estimators.own`).
+    confidence : float, optional
+        Level of the intervals, by default the campaign's.
 
     Raises `HarnessError`: if the folder is not a run, its records are damaged or incomplete; or an estimator is wrong.
+
+    Examples
+    --------
+    Of the run that `harness.run` shows:
+
+    >>> import harness
+    >>> found = harness.estimate("runs/idm", estimators=["nade"], confidence=0.5)["estimates"]["nade"]
+    >>> f"{found['crash_rate']:.2e}, {found['ci_low']:.2e} to {found['ci_high']:.2e}"
+    '1.95e-07, 1.45e-07 to 2.69e-07'
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -124,13 +139,13 @@ _TRUST = "Look at stored motion alone (--stored), which runs no code; or read th
 _UNLIKE_BITS = ("episode", "seed", "failure")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ReplayResult:
     """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
 
     ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where
     nothing is; ``suspects`` is what may be why if it was not. ``scene`` is what a page plays; its ``facts`` are what
-    happens, as pairs of a name and a phrase.
+    happens, as pairs of a name and a phrase, and what is shown of it.
     """
 
     outcome: str
@@ -140,6 +155,10 @@ class ReplayResult:
     compared: tuple[str, ...]
     scene: dict[str, Any]
     suspects: str | None = None
+
+    def __repr__(self) -> str:
+        facts = [f"  {name:<13} {fact}" for name, fact in self.scene["facts"]]
+        return "\n".join([f"episode {self.row['episode']}: {self.outcome}", *facts])
 
 
 @checked("harness.replay")
@@ -154,13 +173,37 @@ def replay_episode(
 ) -> ReplayResult:
     """Replay an episode of a run; a user's own code in a process of its own.
 
-    ``episode`` is its index in the campaign. With ``gui`` it is shown in sumo-gui (extra ``harness[sumo]``); ``fcd`` is
-    a file for SUMO's floating-car data. With ``stored`` it is as the run has traced it: nothing is simulated. Code that
-    a folder names which was not made on this machine by this user is run only if you ``trust`` it.
+    Parameters
+    ----------
+    folder : str or Path
+        Run folder.
+    episode : int
+        Index of the test in the campaign, from 0.
+    gui : bool
+        Whether to show it in sumo-gui (extra ``harness[sumo]``).
+    fcd : str or Path, optional
+        File for SUMO's floating-car data.
+    stored : bool
+        Whether to give it as the run has traced it: nothing is simulated.
+    trust : bool
+        Whether to run code that the folder names though it was not made on this machine by this user.
 
     Raises `RunFolderError`: the folder is no run, has no such episode, or none that is traced, the campaign or the
     environment's parameter file has changed since, or it names code that is not trusted. Raises `CampaignError`: the AV
     is not reproducible. Raises `HarnessError`: SUMO's system libraries are missing.
+
+    Examples
+    --------
+    Of the run that `harness.run` shows:
+
+    >>> import harness
+    >>> harness.replay("runs/idm", 17)
+    episode 17: timeout
+      BV cuts in    3.1 s: 26.2 m ahead and 10.1 m/s slower
+      AV brakes     3.2 s, 0.1 s after the cut-in: at up to 4.0 m/s²
+      AV            avoids it, 12.1 m at the closest
+      r157-cc       a careful and competent driver: avoids it, 9.1 m at the closest
+      brakes-8      braking at once, at up to 8 m/s²: avoids it, 18.7 m at the closest
     """
     folder, fcd = Path(folder), None if fcd is None else Path(fcd)
     manifest = read_manifest(folder)
@@ -169,7 +212,8 @@ def replay_episode(
     if not stored:
         _require_reproducible(manifest, campaign)
         if not trust:
-            require_trust(folder, manifest, code_of(campaign.av), _TRUST)
+            for code in (code_of(campaign.av), campaign.testing.own_challenge):
+                require_trust(folder, manifest, code, _TRUST)
         return _simulated(folder, manifest, campaign, tables, episode, gui, fcd)
     if gui or fcd is not None:
         found, expected = "stored motion, which SUMO does not simulate", "a simulation, for sumo-gui and its data"

@@ -18,7 +18,7 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from harness.campaign.drivers import BuiltInParameters, Reaction, Reference, Reflexes
+from harness.campaign.drivers import NATURAL, BuiltInParameters, Reaction, Reference, Reflexes
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.compiled import compiled_inline
 from harness.vocabulary import Record, RecordArray
@@ -47,7 +47,7 @@ class Followers(NamedTuple):
 
 @cache
 def driver_dtype() -> np.dtype[np.void]:
-    """All parameters of all models, and how a driver lags behind; 0 where one has no such."""
+    """All parameters of all models, and how a driver lags behind; 0 where one has none, NaN for natural headways."""
     derived = "reaction_steps", "used_up_steps", "max_jerk_mps3", "inattention_probability", "perceives_lateral_m"
     numbers = dict.fromkeys(chain(*(model.model_fields for model in get_args(BuiltInParameters)), derived))
     whole = "kind", "delay_steps", "inattention_steps", "cruises"
@@ -68,7 +68,8 @@ def driver_records(
     for record, driver, reaction in zip(records, drivers, reactions or [Reflexes()] * len(drivers), strict=True):
         record["kind"], record["cruises"] = kinds[type(driver)], 1
         for name in records.dtype.names or ():
-            record[name] = getattr(driver, name, record[name])
+            value = getattr(driver, name, record[name])
+            record[name] = math.nan if value == NATURAL else value
         record["reaction_steps"] = 10.0 * record["reaction_time_s"]
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3
         record["perceives_lateral_m"] = reaction.perceives_lateral_m
@@ -92,13 +93,13 @@ def av_records(av: AutomatedVehicle, *, see_onset: bool = False) -> RecordArray:
 
 
 @compiled_inline
-def idm_acceleration(driver: Record, speed: float, lead_speed: float, gap: float) -> float:
-    """Intelligent driver model, before clipping (m/s²).
+def idm_acceleration(driver: Record, headway_s: float, speed: float, lead_speed: float, gap: float) -> float:
+    """Intelligent driver model, before clipping (m/s²), with the time headway T.
 
     a = α [1 − (v/v0)⁴ − (s*/s)²], s* = s0 + max(0, v T + v (v − v_lead)/(2 √(α b))).
     """
     braking = 2.0 * math.sqrt(driver.acceleration_mps2 * driver.comfortable_deceleration_mps2)
-    desired = driver.minimum_gap_m + max(0.0, speed * driver.time_headway_s + (speed * (speed - lead_speed)) / braking)
+    desired = driver.minimum_gap_m + max(0.0, speed * headway_s + (speed * (speed - lead_speed)) / braking)
     ratio = speed / driver.desired_speed_mps
     squared = ratio * ratio
     close = desired / gap
@@ -128,7 +129,7 @@ def driver_acceleration(driver: Record, speed: float, lead_speed: float, gap: fl
         return float(driver.acceleration_mps2)
     seen = max(gap, SMALLEST_GAP_M)
     if driver.kind == IDM_KIND:
-        a = idm_acceleration(driver, speed, lead_speed, seen)
+        a = idm_acceleration(driver, driver.time_headway_s, speed, lead_speed, seen)
     else:
         a = fvdm_acceleration(driver, speed, lead_speed, fvdm_shape(driver, seen))
     return float(min(max(a, driver.min_acceleration_mps2), driver.max_acceleration_mps2))

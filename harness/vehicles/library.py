@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Literal, Self
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from harness.campaign.drivers import Surrogate
+from harness.campaign.drivers import NATURAL, Surrogate
 from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.problems import broken_rule, did_you_mean
 from harness.campaign.sections import Section, SurrogateName, listed
@@ -46,8 +47,9 @@ class Library(Section):
     assumes: str = Field(
         "", description='what that assumes, as the end of a sentence that begins with "If this vehicle"'
     )
-    envelope: SurrogateName
-    """a driver at constant full throttle: it crashes wherever any vehicle within its acceleration does"""
+    envelope: SurrogateName | None
+    """a driver at constant full throttle: it crashes wherever any vehicle within its acceleration does; none: every
+    event may be a crash"""
     surrogates: dict[SurrogateName, Surrogate] = Field(description="drivers by name")
     references: dict[SurrogateName, Surrogate] = Field(default_factory=dict)
     """drivers that the vehicle is compared with; no shell is made of them"""
@@ -63,7 +65,8 @@ class Library(Section):
     def followers(self, see_onset: bool) -> Followers:
         """The surrogates and then the references as kernels read them, in the order of the file, D + R of them."""
         drivers = library_records([*self.surrogates.values(), *self.references.values()], see_onset)
-        return Followers(drivers, list(self.surrogates).index(self.envelope), self._counts_above_mps)
+        place = -1 if self.envelope is None else list(self.surrogates).index(self.envelope)
+        return Followers(drivers, place, self._counts_above_mps)
 
     @property
     def n_drivers(self) -> int:
@@ -72,8 +75,23 @@ class Library(Section):
 
     @property
     def envelope_mps2(self) -> float:
-        """Acceleration of the envelope (m/s²)."""
+        """Acceleration of the envelope (m/s²); negative infinity without one, as then no vehicle is within it."""
+        if self.envelope is None:
+            return -math.inf
         return self.surrogates[self.envelope].parameters.max_acceleration_mps2
+
+    def require_drivers(self, *, follows: bool) -> None:
+        """Refuse (`CampaignError`) a library of drivers who cannot drive, where the AV ``follows`` or does not."""
+        for name, each in (self.surrogates | self.references).items():
+            natural = getattr(each.parameters, "time_headway_s", None) == NATURAL
+            if follows and each.model == "r157-fsm":
+                found, expected = "r157-fsm", "a driver who has been tried where the AV follows from the start"
+            elif natural and not follows:
+                found, expected = "a natural headway", "seconds: nobody follows before the event"
+            else:
+                continue
+            mend = "Choose the scenario's own library (pool.library: null), or delete the driver from yours."
+            raise CampaignError(f"pool.library, {name}", found, expected, mend)
 
     def require_reference(self, asked: str) -> None:
         """Refuse (`CampaignError`) a limit beside a reference driver that is not there."""
@@ -85,11 +103,11 @@ class Library(Section):
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
         for key, name in {"boundary": self.boundary, "envelope": self.envelope}.items():
-            if name not in self.surrogates:
+            if name is not None and name not in self.surrogates:
                 expected = f"one of the surrogates: {', '.join(self.surrogates)}"
                 mend = did_you_mean(name, list(self.surrogates)) or "Add it to surrogates, or name another."
                 raise broken_rule(key, f"'{name}'", expected, mend)
-            if name == self.envelope and key != "envelope":
+            if name is not None and name == self.envelope and key != "envelope":
                 expected = "a driver that reacts: the envelope crashes nearly always, which says nothing"
                 mend = "Name the most careless driver that the vehicle can be expected to outdo."
                 raise broken_rule(key, f"'{name}', which is the envelope", expected, mend)
@@ -100,6 +118,8 @@ class Library(Section):
 
     @model_validator(mode="after")
     def _envelope_encloses(self) -> Self:
+        if self.envelope is None:
+            return self
         envelope, most = self.surrogates[self.envelope], self.envelope_mps2
         place = f"surrogates.{self.envelope}"
         if envelope.model != "constant":

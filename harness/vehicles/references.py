@@ -52,7 +52,7 @@ def changing(part: float, before: float, after: float) -> float:
 @compiled_inline
 def following(driver: Record, speed: float, lead_speed: float, gap: float) -> float:
     """Acceleration (m/s²) of the IDM by which a reference driver follows."""
-    wanted = idm_acceleration(driver, speed, lead_speed, max(gap, SMALLEST_GAP_M))
+    wanted = idm_acceleration(driver, driver.time_headway_s, speed, lead_speed, max(gap, SMALLEST_GAP_M))
     hardest = max(driver.following_min_acceleration_mps2, driver.min_acceleration_mps2)
     return float(min(max(wanted, hardest), driver.max_acceleration_mps2))
 

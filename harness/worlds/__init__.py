@@ -83,12 +83,13 @@ def build_world(
     # A run needs one of them, and not what the others import.
     from harness.families import family_named  # noqa: PLC0415 - families read what worlds are asked
 
-    av, cells, vehicles = campaign.av, n_cells or campaign.world.cells, family_named(campaign.scenario).vehicles
+    av, cells, family = campaign.av, n_cells or campaign.world.cells, family_named(campaign.scenario)
+    vehicles = family.vehicles
     if campaign.world.engine == "twin" and not in_sumo:
         from harness.worlds.twin import TwinWorld  # noqa: PLC0415
 
         return TwinWorld(cells, vehicles)
-    cells, early = min(cells, MOST_SUMO_CELLS), av.acts_before_event
+    cells, early = min(cells, MOST_SUMO_CELLS), av.acts_before_event or family.follows
     if av.traci is not None:
         from harness.worlds.program import TraciWorld  # noqa: PLC0415
 

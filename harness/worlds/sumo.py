@@ -96,12 +96,18 @@ class SumoCells(World):
         """Move the vehicles of the given cells (n,) to ``x[cells]``, at ``v[cells]``, on ``lane[cells]``.
 
         Who changes lanes for it comes last: SUMO does not sort its list of a lane again when a vehicle is moved within
-        it; one from another lane it puts at the right place.
+        it; one from another lane it puts at the right place. So of several that stay on a lane all but one go by the
+        other: when a test ended one may have run through another.
         """
         for k, at, driving in zip(cells.tolist(), x[cells].tolist(), v[cells].tolist(), strict=True):
-            changes = (lane[k] != self.lane[k]).tolist()
+            changes, to_lane = (lane[k] != self.lane[k]).tolist(), lane[k].tolist()
+            stay: dict[int, int] = {}
+            for vehicle, on in enumerate(to_lane):
+                if not changes[vehicle] and stay.setdefault(on, vehicle) != vehicle:
+                    self._move(to, k, vehicle, at[vehicle], driving[vehicle], 1 - on)
+                    changes[vehicle] = True
             for vehicle in sorted(range(len(changes)), key=changes.__getitem__):
-                self._move(to, k, vehicle, at[vehicle], driving[vehicle], int(lane[k, vehicle]))
+                self._move(to, k, vehicle, at[vehicle], driving[vehicle], to_lane[vehicle])
         self.x[cells], self.v[cells], self.lane[cells] = x[cells], v[cells], lane[cells]
 
     def _move(self, to: Any, k: int, vehicle: int, x: float, v: float, lane: int) -> None:

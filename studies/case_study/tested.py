@@ -15,7 +15,7 @@ from harness.estimators.likelihood import Level
 from harness.estimators.limits import clopper_pearson
 from harness.records.folder import read_table
 from harness.resolved import resolve
-from harness.runner.run import run_campaign
+from harness.runner.run import RunResult, run_campaign
 from harness.sampling import prepare
 from harness.vocabulary import FloatArray, Method
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in
@@ -68,6 +68,7 @@ def keep_run(step: Run, context: Context) -> dict[str, Any]:
     """Run the campaign, or go on with it."""
     campaign, run = campaign_of(step), context.folder / "run"
     done = run_campaign(campaign, run, workers=context.workers, resume=True, progress=context.progress)
+    assert isinstance(done, RunResult)  # of one scenario
     method, engine = campaign.testing.method, {"engine": campaign.world.engine}
     if method != "shells":
         return {**engine, **_kept(context, method, read_run(run)[0])}

@@ -7,7 +7,7 @@ ratios of two of them, so that each has a standard error.
 
 A vehicle that acts before the cut-in has a population of paths that it has walked. They are chosen as for a campaign's
 shadow runs, only many more of them. As there every cut-in is asked where pools are drawn, or the error of few paths
-would look larger than it is; of paths for the truth every `STRIDE`-th. Surrogates and references take
+would look larger than it is; of paths for the truth every `stride`-th. Surrogates and references take
 over from the vehicle as in its pool, and the vehicle itself drives each of these cut-ins as a test of the campaign
 would: told the index of its shadow run, and held to the hash of what it did there.
 """
@@ -32,7 +32,7 @@ from harness.families.protocol import Paths
 from harness.loop.judge import motion_hashes
 from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.loop.repeat import Traffic
-from harness.pool.aim import PILOT_PATHS, STRIDE, Enumerator
+from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.kept import onset_steps
 from harness.pool.learned import Learned
 from harness.pool.shells import CANDIDATES, PrescribedEpisodes, acceleration_limit
@@ -307,7 +307,7 @@ def walk_paths(
     paths: BaselinePaths,
     executor: Executor,
     progress: Progress,
-    stride: int = STRIDE,
+    stride: int = family_named("cut_in").stride,
     learned: Sequence[Learned] = (),
 ) -> SuperPopulation:
     """Let the campaign's vehicle walk paths, and ask every ``stride``-th of their cut-ins.

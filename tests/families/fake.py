@@ -53,6 +53,7 @@ class Fake:
         Column("event", pa.int64(), "1", "which of the two, -1 for none"),
     )
     n_uniforms = 1
+    default_parameters, follows, stride, pool_error = "two-events", False, 4, 0.005
     shipped = Path(__file__).parent
     ladders = {False: "ladder-2", True: "ladder-2"}
 
@@ -80,11 +81,14 @@ class Fake:
     def shows(self, traffic):
         return False
 
-    def exposure(self, traffic):
+    def exposure(self, traffic, parameters):
         return Exposure(2.0, 1.0, 4.0, None, "assumed")
 
     def mean_distance_m(self, traffic):
         return 180.0
+
+    def mean_speed_mps(self, traffic):
+        return 30.0
 
     def sources(self):
         return {}

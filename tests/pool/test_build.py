@@ -10,7 +10,7 @@ from harness.campaign.sections import PoolSettings
 from harness.families import family_named
 from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.families.cut_in.parameters import EnvironmentParameters
-from harness.pool.aim import NATURALISTIC_SHARE, STRIDE, Enumerator, aimed_points, fit_proposal
+from harness.pool.aim import NATURALISTIC_SHARE, Enumerator, aimed_points, fit_proposal
 from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_name
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
 from harness.resolved import resolve
@@ -140,6 +140,7 @@ def test_weights_of_a_proposal_make_up_for_its_aim():
 
 
 FAMILY = family_named("cut_in")
+STRIDE = family_named("cut_in").stride
 LIBRARY = load_library("ladder-1")
 NAMES = list(LIBRARY.surrogates)
 ENVELOPE = NAMES.index(LIBRARY.envelope)

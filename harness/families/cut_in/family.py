@@ -17,7 +17,7 @@ from harness.families.cut_in.events import FREE_DRAWS_PER_CUT_IN, enumerate_cut_
 from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.learned import learned_crashes
 from harness.families.cut_in.loading import load_environment, load_parameters, require_sound_laws
-from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
+from harness.families.cut_in.parameters import DEFAULT, SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
@@ -66,6 +66,8 @@ class CutIn:
     n_uniforms = len(STATE_COLUMNS)
 
     shipped = SHIPPED_FOLDER
+    default_parameters = DEFAULT
+    follows, stride, pool_error = False, 4, 0.005  # `benchmarks.pool_stride` says what other strides would cost
     ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-2", True: "ladder-lateral-1"})
 
     parameters = staticmethod(load_parameters)
@@ -106,7 +108,11 @@ class CutIn:
         scratch = empty_trajectory(traffic)
         return float(mean_test_distance(DISTANCE_SEED, states, unboxed(traffic), unboxed(scratch)))
 
-    def exposure(self, traffic: Environment) -> Exposure:  # noqa: ARG002 - counted on roads, whatever the laws
+    def mean_speed_mps(self, traffic: Environment) -> float:
+        states = InitialStates(traffic.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
+        return float((states["v_bv_mps"] - states["r2dot_mps"]).mean())
+
+    def exposure(self, traffic: Environment, parameters: Any) -> Exposure:  # noqa: ARG002 - counted, whatever the laws
         return EXPOSURE
 
     def sources(self) -> Mapping[Method, type[Any]]:

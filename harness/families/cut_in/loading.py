@@ -20,7 +20,7 @@ from harness.errors import CampaignError
 from harness.families.cut_in import laws
 from harness.families.cut_in.lateral import constant_lead
 from harness.families.cut_in.laws import Environment, InitialStates, Wish, build_environment
-from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters, parameter_record
+from harness.families.cut_in.parameters import DEFAULT, SHIPPED_FOLDER, EnvironmentParameters, parameter_record
 from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray, State
 
 PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])
@@ -43,7 +43,7 @@ def load_parameters(settings: EnvironmentSettings) -> EnvironmentParameters:
 
     Raises `CampaignError`: the file is missing or wrong, every place being named, or its laws give no probabilities.
     """
-    file = shipped_or_own(settings.parameters, SHIPPED_FOLDER, "environment.parameters")
+    file = shipped_or_own(settings.named(DEFAULT), SHIPPED_FOLDER, "environment.parameters")
     parameters = read_model(file, EnvironmentParameters)
     require_sound_laws(load_environment(settings, parameters), str(file))
     return parameters

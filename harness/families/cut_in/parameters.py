@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
@@ -12,38 +11,17 @@ import numpy as np
 from pydantic import model_validator
 
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
-from harness.campaign.problems import broken_rule, describe_found
-from harness.campaign.yaml_text import read_yaml
+from harness.campaign.problems import broken_rule
 from harness.families.cut_in import sections
 from harness.families.cut_in.sections import REPLACED, STEP
-from harness.families.numbers import FitRange, ParameterFile
+from harness.families.numbers import FitRange, ParameterFile, completed
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import Record
 
-SHIPPED_FOLDER = Path(__file__).parent
+SHIPPED_FOLDER, DEFAULT = Path(__file__).parent, "ndd-overtaking-2"
 FIXED = {"step_s": STEP_S, "vehicle_length_m": VEHICLE_LENGTH_M}
 """What the compiled motion and SUMO's network are made for: no file can change it, but campaigns' hashes contain it."""
 _NOT_IN_RECORD = ("lateral__", "hazard_table__", "acceptance_steps__")
-
-
-@cache
-def _shipped(name: str) -> dict[str, Any]:
-    return _completed(read_yaml(SHIPPED_FOLDER / f"{name}.yaml")[0])
-
-
-def _completed(given: dict[str, Any]) -> dict[str, Any]:
-    """What a file says, with numbers and sections that it leaves out as in the environment that it is ``like``."""
-    if "like" not in given:
-        return given
-    shipped = sorted(file.stem for file in SHIPPED_FOLDER.glob("*.yaml"))
-    if given["like"] not in shipped:
-        found, expected = describe_found(given["like"]), f"one of {', '.join(shipped)}"
-        raise broken_rule("like", found, expected, "Name one, or write all numbers.")
-    whole = dict(_shipped(given["like"]))
-    for key, of in given.items():
-        both = isinstance(of, dict) and isinstance(whole.get(key), dict)
-        whole[key] = {**whole[key], **of} if both else of
-    return {key: of for key, of in whole.items() if key != "like"}
 
 
 class EnvironmentParameters(ParameterFile):
@@ -66,7 +44,7 @@ class EnvironmentParameters(ParameterFile):
     @model_validator(mode="before")
     @classmethod
     def _is_like_another(cls, given: Any) -> Any:
-        return _completed(given) if isinstance(given, dict) else given
+        return completed(given, SHIPPED_FOLDER) if isinstance(given, dict) else given
 
     @model_validator(mode="after")
     def _one_law_each(self) -> Self:

@@ -61,7 +61,7 @@ _ROUNDING_M = 1e-9
 def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
     """Importance functions of a campaign; ``nde`` and ``forced`` need no challenge tables."""
     testing, sampling = campaign.testing, campaign.sampling
-    recursive = testing.challenge == "recursive"
+    recursive = testing.challenge != "immediate"  # one of the user's own is a probability, too
     none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1, 1), np.bool_)
     return Importance(
         int(recursive),

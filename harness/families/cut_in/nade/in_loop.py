@@ -20,6 +20,7 @@ from harness.families.cut_in.nade.cells import (
 )
 from harness.families.cut_in.nade.decide import decide, finish
 from harness.families.cut_in.nade.functions import Importance, build_importance
+from harness.families.cut_in.nade.own import own_challenge
 from harness.families.cut_in.nade.tables import Tables, build_tables, tables_name
 from harness.families.cut_in.script import beginning, facts_of
 from harness.loop.cells import KernelState, natural_script
@@ -91,15 +92,16 @@ class InLoop(Source):
         if self.campaign.sampling.mixes:
             drivers = resolved.surrogates
             progress.stage("criticality tables", len(drivers))
-            challenge = self.campaign.testing.challenge
-            self.tables = build_tables(resolved.environment, drivers, challenge, progress.advance)
+            name = self.campaign.testing.challenge
+            own = own_challenge(name) if self.campaign.testing.own_challenge else None
+            self.tables = build_tables(resolved.environment, drivers, resolved.challenge, progress.advance, own)
         self.importance = build_importance(self.campaign, self.tables)
 
     @classmethod
     def cached_files(cls, resolved: Resolved) -> list[str]:
         if not resolved.campaign.sampling.mixes:
             return []
-        return [tables_name(resolved.environment, resolved.surrogates, resolved.campaign.testing.challenge)]
+        return [tables_name(resolved.environment, resolved.surrogates, resolved.challenge)]
 
     def tests(self, first_episode: int, n_episodes: int) -> DrawnInLoop:
         states, limit = self.paths(first_episode, n_episodes).start, MOMENT_LIMITS[self.campaign.records.moments]

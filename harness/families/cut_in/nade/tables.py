@@ -77,11 +77,16 @@ def build_one(environment: Environment, driver: RecordArray, challenge: str) -> 
 
 
 def build_tables(
-    environment: Environment, drivers: RecordArray, challenge: str, done: Callable[[int], None] = lambda _: None
+    environment: Environment,
+    drivers: RecordArray,
+    challenge: str,
+    done: Callable[[int], None] = lambda _: None,
+    build: Callable[[Environment, RecordArray, str], Tables] | None = None,
 ) -> Tables:
     """Tables of all surrogates, ``drivers`` (J,), read-only, from the cache if they are there.
 
-    ``challenge`` is ``recursive`` or ``immediate``; ``done`` is called with the number of those that have become ready.
+    ``challenge`` is ``recursive`` or ``immediate``, or what is to be known of the user's own that others ``build``;
+    ``done`` is called with the number of those that have become ready.
     """
     name = tables_name(environment, drivers, challenge)
     if (path := cache.find(name)) is not None:
@@ -89,7 +94,7 @@ def build_tables(
         return _load(path)
 
     def one(j: int) -> Tables:
-        built = build_one(environment, drivers[j : j + 1], challenge)
+        built = (build or build_one)(environment, drivers[j : j + 1], challenge)
         done(1)
         return built
 

@@ -1,0 +1,207 @@
+"""Several families of events in one answer: crashes per hour of driving, by one sum over the strata of all.
+
+R = Σ_f e_f/p_f Σ_s p_fs θ_fs, e_f being how many events of a family there are in an hour, and p_f the probability of
+one in a test. Strata of all families stand side by side, so that limits are those of one likelihood ratio, and narrower
+than any sum of the families' own; pools are independent, so that their variances add. Exposures e_f are taken as they
+are: what is counted and what assumed is said beside the answer, and by what the ratio moves over the assumed ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from harness.estimators.beside import path_errors
+from harness.estimators.likelihood import CRASH, Counts, Level, likelihood_limit, ratio_limits
+from harness.estimators.shells import SeenShells
+from harness.estimators.tally import FEWEST_PATHS, RateLimits, Tally, paths_that_count, pool_variance
+from harness.families.protocol import Exposure
+from harness.vocabulary import FloatArray
+
+
+class OfFamily(NamedTuple):
+    """Tests of one family, and how often its events are met."""
+
+    family: str
+    exposure: Exposure
+    seen: SeenShells
+
+    @property
+    def per_hour(self) -> float:
+        """Tests that an hour of driving stands for."""
+        return self.exposure.per_hour / self.seen.design.p_event
+
+    @property
+    def relative_error(self) -> float:
+        """Relative standard error of that."""
+        return self.seen.design.p_event_se / self.seen.design.p_event
+
+    @property
+    def p(self) -> FloatArray:
+        """Events of each stratum per hour, (S,)."""
+        return self.per_hour * self.seen.design.p
+
+    @property
+    def tally(self) -> Tally:
+        """Counts by stratum; of no test before the first."""
+        return self.seen.tally
+
+    @property
+    def rate(self) -> float:
+        """Crashes per hour."""
+        return float(self.p @ self.tally.share)
+
+    @property
+    def reference_rate(self) -> float:
+        """Crashes per hour of the library's first reference driver; 0 where it has none."""
+        rates = self.seen.design.reference_rate
+        return self.per_hour * float(rates[0]) if rates.size else 0.0
+
+    def limits(self, level: Level) -> RateLimits:
+        """Rate per hour of the family alone."""
+        times, found = self.per_hour, self.seen.limits_of("assumption_free", level)
+        return RateLimits(*(times * each for each in found))
+
+
+class PerHour:
+    """The sum over families; all of their strata, or those inside each library's boundary."""
+
+    def __init__(self, families: Sequence[OfFamily]) -> None:
+        self.families = tuple(families)
+
+    @property
+    def rate(self) -> float:
+        """Crashes per hour."""
+        return math.fsum(of.rate for of in self.families)
+
+    @property
+    def reference_rate(self) -> float:
+        """Crashes per hour of the competent driver."""
+        return math.fsum(of.reference_rate for of in self.families)
+
+    @property
+    def totals(self) -> tuple[int, int, int]:
+        """Tests, crashes and failed tests."""
+        n, crashes, failed = (sum(column) for column in zip(*(of.tally.totals for of in self.families), strict=True))
+        return n, crashes, failed
+
+    def limits(self, level: Level, *, inside: bool = False) -> RateLimits:
+        """Rate per hour with limits; anything is possible where crashes lie on too few paths of a pool."""
+        parts = [(of, slice(0, of.seen.design.n_inside if inside else None)) for of in self.families]
+        p = np.concatenate([of.p[strata] for of, strata in parts])
+        tallies = [(of.p[strata], of.tally.part(strata), of.seen.design.n_independent) for of, strata in parts]
+        rate = math.fsum(float(own @ tally.share) for own, tally, _ in tallies)
+        if any(tally.crashes.any() and paths_that_count(own, tally) < FEWEST_PATHS for own, tally, _ in tallies):
+            return RateLimits(rate, 0.0, math.inf, math.inf, 0.0)
+
+        def limit(side: float, worst: bool) -> tuple[float, float]:
+            each = [tally.failed_as_crashes() if worst else tally for _, tally, _ in tallies]
+            known = zip(tallies, each, strict=True)
+            variance = math.fsum(pool_variance(own, tally, n) for (own, _, n), tally in known)
+            variance += math.fsum((of.relative_error * of.rate) ** 2 for of in self.families)
+            crashes = np.concatenate([tally.crashes for tally in each])
+            tests = np.concatenate([tally.tests for tally in each])
+            return likelihood_limit(p, crashes, tests, level, side, variance), variance
+
+        (low, variance), (high, _) = limit(-1.0, worst=False), limit(1.0, worst=True)
+        from_pool = level.z * math.sqrt(variance)
+        return RateLimits(rate, max(low, 0.0), high, from_pool, from_pool)
+
+    def ratio(self, level: Level) -> tuple[float, float, float]:
+        """Rate over that of the competent driver, with limits; NaN and any where that never crashes."""
+        reference = self.reference_rate
+        if reference <= 0.0 or math.isinf(self.limits(level).high):
+            return (self.rate / reference if reference > 0.0 else math.nan), 0.0, math.inf
+        low = self._ratio_limits(level, worst=False)[0]
+        return self.rate / reference, low, self._ratio_limits(level, worst=True)[1]
+
+    def _ratio_limits(self, level: Level, *, worst: bool) -> tuple[float, float]:
+        errors = np.zeros(3)
+        outcomes: list[Counts] = []
+        for of in self.families:
+            design, cells = of.seen.design, of.seen.cells
+            cells = cells.failed_as_crashes() if worst else cells
+            own = cells.joined(design.joined)
+            outcomes.append(own.outcomes)
+            if design.reference_rate.size:
+                with_reference = design.joined.T @ (cells.crash_mass @ design.crashes_too(0))
+                moments = float(design.reference_rate[0]), float(design.reference_square[0])
+                found = path_errors(design.p, own, with_reference, moments, design.n_independent)
+            else:
+                found = pool_variance(design.p, own, design.n_independent), 0.0, 0.0
+            mine, theirs = of.rate, of.reference_rate
+            errors += of.per_hour**2 * np.array(found)
+            errors += of.relative_error**2 * np.array((mine * mine, mine * theirs, theirs * theirs))
+        of_paths, covariance, of_reference = errors.tolist()
+
+        def variance(x: float) -> float:
+            return max(of_paths - 2.0 * x * covariance + x * x * of_reference, 0.0)
+
+        p = np.concatenate([of.p for of in self.families])
+        below = np.full((p.size, 2), self.reference_rate / p.size)
+        return ratio_limits(np.outer(p, CRASH), below, np.concatenate(outcomes).astype(np.float64), level, variance)
+
+    def over_assumed(self) -> tuple[float, float] | None:
+        """The least and the largest ratio over all ends of the assumed exposures; None where it has none."""
+        ends = [
+            [of.exposure.per_hour] if of.exposure.counted else [of.exposure.low, of.exposure.high]
+            for of in self.families
+        ]
+        ratios = []
+        for chosen in product(*ends):
+            times = [end / of.exposure.per_hour for end, of in zip(chosen, self.families, strict=True)]
+            reference = math.fsum(t * of.reference_rate for t, of in zip(times, self.families, strict=True))
+            if reference <= 0.0:
+                return None
+            ratios.append(math.fsum(t * of.rate for t, of in zip(times, self.families, strict=True)) / reference)
+        return min(ratios), max(ratios)
+
+    def with_exposures(self, exposures: Mapping[str, float]) -> PerHour:
+        """The same tests with other exposures (events per hour), by family."""
+        return PerHour(
+            [of._replace(exposure=own_exposure(of.exposure, exposures.get(of.family))) for of in self.families]
+        )
+
+    def to_json(self, confidence: float, speed_mps: float) -> dict[str, Any]:
+        """All of it, as plain content."""
+        level, (n, n_crashes, n_failed) = Level.two_sided(confidence), self.totals
+        limits, (ratio, low, high) = self.limits(level), self.ratio(level)
+        bound = self.limits(Level.of_bound(confidence, n)).high
+        per_km = 1e6 / (3.6 * speed_mps)  # of a million km, per hour
+        reference = self.families[0].seen.design.references
+        return {
+            "confidence": confidence, "n_episodes": n, "n_crashes": n_crashes, "n_failed": n_failed,
+            "per_hour": {"rate": limits.rate, "ci_low": limits.low, "ci_high": limits.high, "upper_bound": bound,
+                         "rhw": limits.rhw},
+            "mean_speed_mps": speed_mps, "per_1e6_km": limits.rate * per_km,
+            "beside": {
+                "reference": reference[0].name if reference else "", "rate_per_hour": self.reference_rate,
+                "ratio": ratio, "ratio_low": low, "ratio_high": high, "over_assumed": self.over_assumed(),
+            },
+            "families": {of.family: found for of, found in zip(self.families, self._families(level), strict=True)},
+        }  # fmt: skip
+
+    def _families(self, level: Level) -> Iterator[dict[str, Any]]:
+        total = self.rate
+        for of in self.families:
+            limits, (n, n_crashes, n_failed) = of.limits(level), of.tally.totals
+            ratio, low, high = PerHour([of]).ratio(level)
+            yield {
+                "exposure": {**of.exposure._asdict()}, "p_event": of.seen.design.p_event,
+                "n_episodes": n, "n_crashes": n_crashes, "n_failed": n_failed,
+                "rate_per_hour": limits.rate, "ci_low": limits.low, "ci_high": limits.high,
+                "upper_bound": of.limits(Level.of_bound(0.9, n)).high,
+                "share": limits.rate / total if total > 0.0 else math.nan,
+                "reference_rate_per_hour": of.reference_rate, "ratio": ratio, "ratio_low": low, "ratio_high": high,
+            }  # fmt: skip
+
+
+def own_exposure(shipped: Exposure, per_hour: float | None) -> Exposure:
+    """The shipped exposure, or the user's own, which is taken to be known."""
+    if per_hour is None:
+        return shipped
+    return Exposure(per_hour, per_hour, per_hour, None, "given")

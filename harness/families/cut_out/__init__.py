@@ -1,0 +1,1 @@
+"""The vehicle ahead leaves the lane and reveals a slower one: the third family of UN R157."""

@@ -1,0 +1,121 @@
+"""The vehicle ahead leaves the lane and reveals a slower one: how much slower, how late, and how fast it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+import pyarrow as pa
+from scipy.special import ndtr, ndtri
+
+from harness.campaign.sections import Section
+from harness.families.following.approach import Following
+from harness.families.following.family import START_FACTS, FollowingFamily
+from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
+from harness.families.numbers import Number, Share, ordered, within
+from harness.families.protocol import Column
+from harness.vehicles.following import seen_after
+from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import FloatArray, RecordArray
+
+N_DROPS = 12
+TTC_EDGES_S = np.array([0.5, 0.75, 1, 1.25, 1.5, 1.75, 2, 2.25, 2.5, 2.75, 3, 3.5, 4, 4.5, 5, 6, 7, 8, 10, 12])
+N_LATERAL = 7
+_Ttc = Annotated[Number, within(0.1, 60.0)]
+
+
+class Leaving(Section):
+    """Law of the revealed vehicle's speed, of the time to collision with it when the lane is clear, and of leaving."""
+
+    drop_mean: Annotated[Number, within(0.001, 1.0)]
+    standing_share: Share
+    ttc_median_s: _Ttc
+    ttc_log_sd: Annotated[Number, within(0.01, 3.0)]
+    careless_share: Share
+    careless_least_s: _Ttc
+    careless_most_s: _Ttc
+    lateral_median_mps: Annotated[Number, within(0.05, 20.0)]
+    lateral_log_sd: Annotated[Number, within(0.01, 3.0)]
+    clear_m: Annotated[Number, within(0.1, 5.0)]
+    visible_from_m: Annotated[Number, within(0.0, 5.0)]
+    scope_mps2: Annotated[Number, within(0.0, 10.0)]
+    scope_headway_s: Annotated[Number, within(0.0, 5.0)]
+
+    _ranges = ordered(("careless_least_s", "careless_most_s"), equal=False)
+
+
+class CutOutParameters(FollowingParameters):
+    """All numbers of the family."""
+
+    format: Literal["cut-out"]
+    version: Literal[1]
+    leaving: Leaving
+
+    folder: ClassVar[Path] = Path(__file__).parent
+    blocks: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "speed and headway": ("initial_state",),
+        "approach": ("approach", "free_driving"),
+        "cut-out": ("leaving",),
+    }
+
+    def grid(self) -> tuple[RecordArray, FloatArray]:
+        """Speeds exponentially below the leader's, or standing; log-normal or careless times; log-normal leaving."""
+        law = self.leaving
+        edges, mean, standing = np.linspace(0.0, 1.0, N_DROPS + 1), law.drop_mean.value, law.standing_share.value
+        below = -np.expm1(-edges / mean) / -np.expm1(-1.0 / mean)
+        ratio = np.append(1.0 - 0.5 * (edges[:-1] + edges[1:]), 0.0)
+        of_ratio = np.append((1.0 - standing) * np.diff(below), standing)
+        upto = ndtr((np.log(TTC_EDGES_S[1:-1]) - np.log(law.ttc_median_s.value)) / law.ttc_log_sd.value)
+        careful = np.diff(np.concatenate([[0.0], upto, [1.0]]))  # what lies beyond is in the outermost bins
+        least, most = law.careless_least_s.value, law.careless_most_s.value
+        careless = np.diff(np.clip((TTC_EDGES_S - least) / (most - least), 0.0, 1.0))
+        share = law.careless_share.value
+        of_ttc = (1.0 - share) * careful + share * careless / careless.sum()
+        quantiles = (np.arange(N_LATERAL) + 0.5) / N_LATERAL
+        lateral = law.lateral_median_mps.value * np.exp(law.lateral_log_sd.value * ndtri(quantiles))
+        grid: RecordArray = np.full((N_DROPS + 1, TTC_EDGES_S.size - 1, N_LATERAL), NO_EVENT, EVENT_DTYPE)
+        grid["ratio"], grid["lateral_mps"] = ratio[:, None, None], lateral
+        grid["ttc_s"] = (0.5 * (TTC_EDGES_S[:-1] + TTC_EDGES_S[1:]))[None, :, None]
+        of_all = of_ratio[:, None, None] * of_ttc[None, :, None] * np.full(N_LATERAL, 1.0 / N_LATERAL)
+        return grid.ravel(), of_all.ravel()
+
+
+class CutOut(FollowingFamily):
+    """See `harness.families.following.family`."""
+
+    name = "cut_out"
+    vehicles: tuple[str, ...] = ("LV", "SV", "AV")
+    principal, ahead = 1, 0
+    columns: tuple[Column, ...] = (
+        *START_FACTS,
+        Column("revealed_speed_mps", pa.float64(), "m/s", "speed of the vehicle that is revealed"),
+        Column("closing_mps", pa.float64(), "m/s", "speed of the one ahead less that"),
+        Column("ttc_when_clear_s", pa.float64(), "s", "of the one ahead, when it has left the lane"),
+        Column("lateral_speed_mps", pa.float64(), "m/s", "at which it leaves"),
+        Column("visible_s", pa.float64(), "s", "from when the revealed one is seen to the lane being clear"),
+    )
+    shipped = Path(__file__).parent
+    ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-cut-out-1"})
+    default_parameters = "cut-out-1"
+    stride = 10
+    model = CutOutParameters
+
+    def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
+        clear_m, visible_m = (float(traffic.numbers[name]) for name in ("clear_m", "visible_from_m"))
+        seen = [
+            0 if np.isnan(w) else seen_after(clear_m, w, 10**9) - seen_after(visible_m, w, 10**9)
+            for w in events["lateral_mps"]
+        ]
+        return {
+            "revealed_speed_mps": events["ratio"] * speed_mps,
+            "closing_mps": (1.0 - events["ratio"]) * speed_mps,
+            "ttc_when_clear_s": events["ttc_s"],
+            "lateral_speed_mps": events["lateral_mps"],
+            "visible_s": STEP_S * np.array(seen, np.float64),
+        }
+
+
+CUT_OUT = CutOut()

@@ -1,0 +1,255 @@
+"""What families have in common in which the AV follows a vehicle from the start, and the traffic never looks at it.
+
+So the probability of an event depends on no AV, and pools are exact for any. An event is one of a grid.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pyarrow as pa
+
+from harness.campaign.files import read_model, shipped_or_own
+from harness.campaign.sections import EnvironmentSettings
+from harness.compiled import unboxed
+from harness.errors import CampaignError
+from harness.families.following.approach import (
+    AV_START_M,
+    START_DTYPE,
+    Following,
+    drawn_accelerations,
+    empty_motion,
+    starts_from,
+)
+from harness.families.following.follow import STATE, drive_others, enumerate_events, move_others
+from harness.families.following.parameters import NO_EVENT, FollowingParameters
+from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, LeftOpen, Paths, Recorded
+from harness.loop.cells import Script, natural_script
+from harness.vehicles.drivers import Followers, driver_records
+from harness.vehicles.following import seen_after
+from harness.vehicles.kinematics import STEP_S
+from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray, Method, RecordArray
+
+START_FACTS = (
+    Column("start_speed_mps", pa.float64(), "m/s", "initial speed of all but a revealed vehicle"),
+    Column("natural_headway_s", pa.float64(), "s", "headway that people keep on this path"),
+    Column("lead_accelerations", pa.list_(pa.int8()), "0.2 m/s²", "of the vehicle ahead, each second", "n_seconds"),
+    Column("event", pa.int64(), "1", "which of the family's grid, -1 for none"),
+    Column("lead_speed_mps", pa.float64(), "m/s", "speed of the vehicle ahead at the onset"),
+)
+N_SPEEDS = 1024
+"""Quantiles of the speed over which means are taken."""
+
+
+class FollowingFamily:
+    """See `harness.families.protocol.Family`; a family says which parameters, vehicles and facts it has."""
+
+    name: str
+    vehicles: tuple[str, ...]
+    principal: int
+    ahead: int
+    columns: tuple[Column, ...]
+    n_uniforms = 2
+    shipped: Path
+    ladders: Mapping[bool, str]
+    default_parameters: str
+    follows = True
+    stride: int
+    pool_error = 0.01
+
+    model: ClassVar[type[FollowingParameters]]
+
+    def parameters(self, settings: EnvironmentSettings) -> FollowingParameters:
+        file = shipped_or_own(settings.named(self.default_parameters), self.shipped, "environment.parameters")
+        return read_model(file, self.model)
+
+    def traffic(self, settings: EnvironmentSettings, parameters: FollowingParameters | None = None) -> Following:
+        given = parameters or self.parameters(settings)
+        values = given.values()
+        onset = round(values["approach__duration_s"] / STEP_S)
+        steps = {"onset": onset, "max_steps": onset + round(values["approach__after_s"] / STEP_S)}
+        clear = {name: values.get(f"leaving__{name}", math.nan) for name in ("clear_m", "visible_from_m")}
+        scope = {name: values.get(f"leaving__{name}", 0.0) for name in ("scope_mps2", "scope_headway_s")}
+        kernel = ("fit_range__", "initial_state__", "free_driving__", "approach__")
+        known = {name: value for name, value in values.items() if name.startswith(kernel)} | clear | scope
+        dtype = [*((name, "f8") for name in known), *((name, "i8") for name in steps)]
+        numbers = np.array([(*known.values(), *steps.values())], dtype)[0]
+        return Following(numbers, *given.grid())
+
+    def traffic_with(
+        self, settings: EnvironmentSettings, parameters: FollowingParameters, values: Mapping[str, float]
+    ) -> Following | None:
+        try:
+            return self.traffic(settings, parameters.with_values(values))
+        except (CampaignError, ValueError):
+            return None
+
+    def left_open(self, parameters: FollowingParameters) -> LeftOpen | None:  # noqa: ARG002 - its range is no law's
+        return None
+
+    def digest(self, traffic: Following) -> str:
+        numbers = {name: traffic.numbers[name].item() for name in traffic.numbers.dtype.names or ()}
+        digest = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode())
+        digest.update(traffic.grid.tobytes() + traffic.share.tobytes())
+        return digest.hexdigest()[:24]
+
+    def max_steps(self, traffic: Following) -> int:
+        return int(traffic.numbers["max_steps"])
+
+    def sideways_m(self, traffic: Following) -> float:
+        return float(np.nan_to_num(traffic.numbers["clear_m"]))
+
+    def shows(self, traffic: Following) -> bool:  # noqa: ARG002 - when somebody sees it, its drivers know themselves
+        return False
+
+    def mean_distance_m(self, traffic: Following) -> float:
+        return self.mean_speed_mps(traffic) * int(traffic.numbers["max_steps"]) * STEP_S
+
+    def mean_speed_mps(self, traffic: Following) -> float:
+        """Of the vehicle ahead, as it approaches."""
+        paths = Paths(np.arange(N_SPEEDS), np.zeros(N_SPEEDS, START_DTYPE))
+        paths.start["speed_mps"] = _speeds(traffic)
+        speed = self._moved(traffic, self.choose(traffic, 0, paths, np.full(N_SPEEDS, -1)).facts)[1]
+        return float(speed[:, : int(traffic.numbers["onset"]), 0].mean())
+
+    def share_in_scope(self, traffic: Following) -> float:
+        """Share of events that are in scope."""
+        start = np.zeros(N_SPEEDS, START_DTYPE)
+        start["speed_mps"] = _speeds(traffic)
+        found = self.events(traffic, 0, Paths(np.arange(N_SPEEDS), start), Followers(driver_records([])))
+        return float(np.exp(found.log_any).mean())
+
+    def exposure(self, traffic: Following, parameters: FollowingParameters) -> Exposure:
+        given, share = parameters.counted(), self.share_in_scope(traffic)
+        return given._replace(per_hour=given.per_hour * share, low=given.low * share, high=given.high * share)
+
+    def sources(self) -> Mapping[Method, type[Any]]:
+        return {}
+
+    def start(self, traffic: Following, u: FloatArray) -> RecordArray:
+        return starts_from(traffic.numbers, u)
+
+    def events(
+        self,
+        traffic: Following,
+        seed: int,
+        paths: Paths,
+        drivers: Followers,
+        recorded: Recorded = HOLDING,  # noqa: ARG002 - what the AV does moves no probability
+        stride: int = 1,
+        offset: IntArray | None = None,
+    ) -> Events:
+        n, grid = paths.number.size, traffic.grid.size
+        found = Events(np.zeros((n, grid)), np.zeros((n, grid), np.int64), np.zeros(n), np.zeros(n))
+        first = np.zeros(n, np.int64) if offset is None else offset
+        accelerations = drawn_accelerations(traffic.numbers, seed, paths.number, paths.start["speed_mps"])
+        room = empty_motion(traffic)
+        track, at_onset = np.zeros_like(room.x), np.zeros((drivers.drivers.size, STATE))
+        known = unboxed(traffic), unboxed(drivers), unboxed(room)
+        enumerate_events(paths.start, accelerations, stride, first, *known, track, at_onset, unboxed(found))
+        return found
+
+    def learned_crashes(self, *_: Any) -> BoolArray:
+        raise NotImplementedError("no vehicle acts before it may: there are no baseline runs")
+
+    def choose(
+        self,
+        traffic: Following,
+        seed: int,
+        paths: Paths,
+        event: IntArray,
+        *,
+        of_pool: bool = True,  # noqa: ARG002
+    ) -> Chosen:
+        n, seconds = event.size, -(-int(traffic.numbers["onset"]) // 10)
+        lists = [("lead_accelerations", np.int8, (seconds,)), ("n_seconds", np.int64)]
+        real = [(each.name, np.float64) for each in self.columns if each.kind == pa.float64()]
+        facts: RecordArray = np.zeros(n, np.dtype([*real, ("event", np.int64), *lists]))
+        facts["start_speed_mps"] = paths.start["speed_mps"]
+        facts["natural_headway_s"] = paths.start["natural_headway_s"]
+        drawn = drawn_accelerations(traffic.numbers, seed, paths.number, paths.start["speed_mps"])
+        facts["lead_accelerations"], facts["n_seconds"], facts["event"] = drawn, seconds, event
+        onset, events = int(traffic.numbers["onset"]), events_of(traffic, event)
+        script_v, clear = self._moved(traffic, facts)[1:]
+        facts["lead_speed_mps"] = script_v[:, onset - 1, 0]
+        for name, values in self.facts_of(traffic, events, facts["lead_speed_mps"]).items():
+            facts[name] = np.where(event < 0, np.nan, values)
+        lead = np.where(clear - onset < traffic.numbers["max_steps"], clear - onset - 1, 0)
+        return Chosen(facts, np.where(event < 0, -1, onset + lead), np.where(event < 0, 0, lead))
+
+    def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
+        """Facts of the family's own, of events (n,) with a vehicle ahead at a speed."""
+        raise NotImplementedError
+
+    def _moved(self, traffic: Following, facts: RecordArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        n, others = len(facts), len(self.vehicles) - 1
+        x, speed = np.zeros((n, others)), np.zeros((n, self.max_steps(traffic), others))
+        clear = np.zeros(n, np.int64)
+        known = unboxed(traffic), unboxed(empty_motion(traffic))
+        move_others(*beginning(facts), events_of(traffic, facts["event"]), *known, x, speed, clear)
+        return x, speed, clear
+
+    def script(self, traffic: Following, chosen: Chosen) -> Script:
+        facts, onset = chosen.facts, int(traffic.numbers["onset"])
+        ahead, speed, clear = self._moved(traffic, facts)
+        n, steps, others = speed.shape
+        x = np.column_stack((ahead, np.full(n, AV_START_M)))
+        v = np.tile(facts["start_speed_mps"][:, None], (1, others + 1))
+        lane, lanes, visible = np.zeros((n, others + 1), np.int8), np.zeros(speed.shape, np.int8), np.zeros((n, others))
+        lateral = events_of(traffic, facts["event"])["lateral_mps"]
+        if others > 1:
+            v[:, 1] = speed[:, 0, 1]
+            lanes[:, :, 0] = np.arange(1, steps + 1) >= clear[:, None]
+            visible[:, 1] = [
+                onset + seen_after(float(traffic.numbers["visible_from_m"]), w, c - onset) if w > 0.0 else steps + 1
+                for w, c in zip(lateral.tolist(), clear.tolist(), strict=True)
+            ]
+        return natural_script(
+            x, v, lane, speed, lanes, chosen.at, chosen.lead,
+            acts_from=0, visible_from=visible.astype(np.int64), headway_s=facts["natural_headway_s"],
+            sideways_mps=np.nan_to_num(lateral), set_speed_mps=float(traffic.numbers["approach__set_speed_mps"]),
+        )  # fmt: skip
+
+    def drive(
+        self,
+        traffic: Following,
+        chosen: Chosen,
+        start: FloatArray,  # noqa: ARG002 - whoever follows has followed from the start
+        drivers: RecordArray,
+        *,
+        last: bool = False,
+    ) -> Driven:
+        steps, facts = self.max_steps(traffic), chosen.facts
+        end, tracks = np.zeros((len(facts), len(drivers)), np.int64), np.zeros((len(drivers), steps + 1, 2))
+        room = empty_motion(traffic)
+        drive_others(
+            *beginning(facts), events_of(traffic, facts["event"]), unboxed(traffic), drivers, unboxed(room), tracks, end
+        )
+        ahead = np.stack((room.x[:, self.principal], room.v[:, self.principal]), axis=1)
+        return Driven(end, tracks if last else np.zeros((0, 0, 0)), ahead if last else np.zeros((0, 0)))
+
+    def avoidable(self, *_: Any) -> BoolArray | None:
+        return None
+
+
+def beginning(facts: RecordArray) -> tuple[RecordArray, Int8Array]:
+    """How paths of tests (n,) begin, and what the vehicle ahead draws."""
+    start: RecordArray = np.zeros(len(facts), START_DTYPE)
+    start["speed_mps"], start["natural_headway_s"] = facts["start_speed_mps"], facts["natural_headway_s"]
+    return start, np.ascontiguousarray(facts["lead_accelerations"])
+
+
+def events_of(traffic: Following, number: IntArray) -> RecordArray:
+    """Events (n,) by their numbers in the grid; for -1 one in which nothing happens."""
+    return np.append(traffic.grid, NO_EVENT)[number]
+
+
+def _speeds(traffic: Following) -> FloatArray:
+    u = (np.arange(N_SPEEDS) + 0.5) / N_SPEEDS
+    return np.asarray(starts_from(traffic.numbers, np.column_stack((u, u)))["speed_mps"])

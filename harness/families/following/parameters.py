@@ -1,0 +1,139 @@
+"""Numbers of traffic in which the AV follows a vehicle: where a test begins, and how the vehicle ahead drives."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+from pydantic import AfterValidator, model_validator
+
+from harness.campaign.problems import broken_rule
+from harness.campaign.sections import Section
+from harness.families.numbers import (
+    Acceleration,
+    Coefficient,
+    DegreesOfFreedom,
+    FitRange,
+    LogScale,
+    Number,
+    ParameterFile,
+    Scale,
+    Speed,
+    completed,
+    in_whole_steps,
+    ordered,
+    within,
+)
+from harness.families.protocol import Exposure
+from harness.vocabulary import FloatArray, RecordArray
+
+ROAD_S = 55.0
+"""Longest test: the road is 4 km long, and vehicles drive 40 m/s and more."""
+EVENT_DTYPE = np.dtype(
+    [
+        ("peak_mps2", np.float64),  # how hard the vehicle ahead brakes
+        ("held_s", np.float64),  # and how long with that; infinite: until it stands
+        ("jerk_mps3", np.float64),
+        ("ratio", np.float64),  # speed of the vehicle that is revealed over that of the one ahead, NaN: none is
+        ("ttc_s", np.float64),  # to that vehicle, of the one ahead when it has left the lane
+        ("lateral_mps", np.float64),  # at which it leaves
+    ]
+)
+"""One event: the vehicle ahead brakes, or leaves the lane."""
+NO_EVENT = np.array((0.0, 0.0, np.inf, np.nan, np.nan, np.nan), EVENT_DTYPE)
+
+Seconds = Annotated[Number, within(0.0, ROAD_S), AfterValidator(in_whole_steps)]
+
+
+class InitialState(Section):
+    """Speed of the vehicle ahead, and the gap that people keep."""
+
+    v_location_mps: Coefficient
+    v_scale_mps: Scale
+    v_shape: Coefficient
+    r1_shift_m: Coefficient
+    r1_shift_u_m: Coefficient
+    r1_log_mean: Coefficient
+    r1_log_mean_u: Coefficient
+    r1_log_sd: LogScale
+    r1_log_sd_u: LogScale
+
+
+class FreeDriving(Section):
+    """How the vehicle ahead drives before the event, each second anew."""
+
+    df: DegreesOfFreedom
+    location_mps2: Acceleration
+    log_scale: LogScale
+    log_scale_u: LogScale
+    log_scale_uu: LogScale
+    lowest_mps2: Acceleration
+    highest_mps2: Acceleration
+
+    _range = ordered(("lowest_mps2", "highest_mps2"), equal=False)
+
+
+class Approach(Section):
+    """How the AV comes to the event."""
+
+    duration_s: Annotated[Number, within(1.0, ROAD_S), AfterValidator(in_whole_steps)]
+    headway_s: Annotated[Number, within(0.2, 10.0)]
+    after_s: Annotated[Number, within(1.0, ROAD_S), AfterValidator(in_whole_steps)]
+    set_speed_mps: Speed
+
+
+class Counted(Section):
+    """How many events there are in an hour of driving."""
+
+    per_hour: Annotated[Number, within(1e-9, 1e6)]
+
+
+class FollowingParameters(ParameterFile):
+    """All numbers of such a family; how probable which events are says `grid`."""
+
+    fit_range: FitRange
+    initial_state: InitialState
+    free_driving: FreeDriving
+    approach: Approach
+    exposure: Counted
+
+    folder: ClassVar[Path]
+    replicates: ClassVar[None] = None
+    unseen: ClassVar[str] = ""
+    blocks: ClassVar[Mapping[str, tuple[str, ...]]]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_like_another(cls, given: Any) -> Any:
+        return completed(given, cls.folder) if isinstance(given, dict) else given
+
+    @model_validator(mode="after")
+    def _fits_the_road(self) -> Self:
+        if (seconds := self.approach.duration_s.value + self.approach.after_s.value) > ROAD_S:
+            found = f"tests of {seconds:g} s (duration_s and after_s)"
+            raise broken_rule("approach", found, f"at most {ROAD_S:g} s: the road is 4 km long", "Shorten one of both.")
+        return self
+
+    def grid(self) -> tuple[RecordArray, FloatArray]:
+        """Events (E,), `EVENT_DTYPE`, and their probabilities (E,), which sum to 1."""
+        raise NotImplementedError
+
+    def counted(self) -> Exposure:
+        """Events per hour, whether or not they are in scope."""
+        number = self.exposure.per_hour
+        low, high = number.range or (number.value, number.value)
+        return Exposure(number.value, low, high, None, number.note or number.source)
+
+    def without_half(self) -> Mapping[int, Mapping[str, float]]:
+        """There is no kind of events that data have not."""
+        return {}
+
+    def unseen_in(self, kinds: Collection[int]) -> str:  # noqa: ARG002 - there is none
+        """See `without_half`."""
+        return ""
+
+    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
+        """See `without_half`."""
+        return dict(row)

@@ -1,0 +1,1 @@
+"""The vehicle ahead brakes: the second family of UN R157."""

@@ -1,0 +1,100 @@
+"""The answer of several scenarios in words: crashes per hour, beside the competent driver, and each scenario's part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
+from harness.report.lines import columns, wrapped
+from harness.report.words import ENDED
+
+CALLED = {"cut_in": "cut-in", "lead_brakes": "lead brakes", "cut_out": "cut-out"}
+"""Scenarios in words; those of other packages by their names."""
+
+
+def called(family: str) -> str:
+    """A scenario in words."""
+    return CALLED.get(family, family.replace("_", " "))
+
+
+def hour_lines(content: Mapping[str, Any], report: Path | None = None) -> list[str]:
+    """The answer for a terminal, at most ten lines of 100 columns."""
+    n, engine = count(content["n_episodes"]), "SUMO" if content["engine"] == "sumo" else "SUMO’s twin"
+    scenarios = f"{len(content['families'])} scenarios"
+    head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", duration(content["wall_time_s"])]
+    rows = [row for row in (decided(content), *sum_rows(content)) if row]
+    ends = [] if report is None else [f"  report  {report}"]
+    parts = columns([row[1:] for row in family_rows(content)])
+    return [" · ".join(head), *columns(rows), *parts, *wrapped([exposures(content), scope(content)]), *ends]
+
+
+def decided(content: Mapping[str, Any]) -> tuple[str, ...]:
+    """The verdict on a limit; empty where none was asked."""
+    if (decision := content["decision"]) is None:
+        return ()
+    limit = f"{plain(decision['limit'])} × {content['beside']['reference']}"
+    where = {"accepted": f"below {limit}", "rejected": f"above {limit}"}.get(decision["verdict"], f"limit {limit}")
+    low, high = ratio(decision["low"]), ratio(decision["high"])
+    return decision["verdict"].upper(), where, f"{low} to {high}", f"confidence {plain(decision['confidence'])}"
+
+
+def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Crashes per hour, and beside the competent driver: what, value, interval, remark."""
+    hour, beside = content["per_hour"], content["beside"]
+    per_km = f"{number(content['per_1e6_km'])} per million km"
+    if content["n_crashes"]:
+        yield "crashes", f"{number(hour['rate'])} per hour", interval(hour["ci_low"], hour["ci_high"]), per_km
+    else:
+        yield "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen", ""
+    if beside["ratio"] is None:
+        yield "× competent driver", "no ratio", "", "such a driver never crashes here"
+        return
+    low, high = beside["ratio_low"], beside["ratio_high"]
+    apart = "not told apart" if high is None or low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
+    most = "no limit" if high is None else ratio(high)
+    ends = beside["over_assumed"]
+    over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed exposures"
+    value = f"{ratio(beside['ratio'])} ({apart})" if content["n_crashes"] else f"< {most}"
+    yield "× competent driver", value, f"{ratio(low)} to {most}", over
+
+
+def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """A row each: key, name, share of the rate, crashes per hour, ratio, how hard."""
+    order = sorted(content["families"].items(), key=lambda item: -(item[1]["rate_per_hour"] or 0.0))
+    for name, of in order:
+        if of["n_crashes"]:
+            part = "" if of["share"] is None else share(of["share"])
+            rate = f"{number(of['rate_per_hour'])}  {interval(of['ci_low'], of['ci_high'])}"
+            beside = "–" if of["ratio"] is None else f"× {ratio(of['ratio'])}"
+        else:
+            part, rate, beside = "0 %", f"< {number(of['upper_bound'])}", "–"
+        impact = of.get("median_impact_mps")
+        hard = "no crash seen" if impact is None else f"median impact {tenths(impact)} m/s"
+        yield name, called(name), part, rate, beside, hard
+
+
+def exposures(content: Mapping[str, Any]) -> str:
+    """What is counted, what assumed: events per hour."""
+    told: dict[str, list[str]] = {}
+    for name, of in content["families"].items():
+        found = of["exposure"]
+        ends = "" if found["low"] == found["high"] else f" ({_short(found['low'])}–{_short(found['high'])})"
+        kind = "counted" if found["counted"] else "given" if found["source"] == "given" else "assumed"
+        told.setdefault(kind, []).append(f"{called(name)} {_short(found['per_hour'])}{ends}")
+    return "events per hour, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
+
+
+def _short(value: float) -> str:
+    return plain(float(f"{value:.2g}"))
+
+
+def scope(content: Mapping[str, Any]) -> str:
+    """How far the interval goes, and why the tests ended."""
+    ended, target = ENDED.get(content["stopped_by"] or "", "interrupted"), content["asked_rhw"]
+    if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
+        rhw = content["per_hour"]["rhw"]
+        reached = "" if rhw is None else f" ± {share(rhw)}"
+        ended += f"{reached}, asked: ± {share(target)}"
+    return f"sampling error in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"

@@ -1,0 +1,230 @@
+"""Run several families of events for one answer: rounds over the strata of all, each family in a run folder of its own.
+
+So everything that there is for a run, from replay to export, is there for each family; the sum is `FAMILIES`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.campaign.campaign import Campaign
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, HarnessError, RunFolderError
+from harness.estimators.answer import ended_by
+from harness.estimators.estimate import finite_json
+from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
+from harness.estimators.shells import SeenShells
+from harness.estimators.stopping import HourRule
+from harness.estimators.tally import empty_tally
+from harness.families.protocol import Exposure
+from harness.progress import Progress
+from harness.records.folder import read_as, read_manifest, require_place, sole_use, write_sealed
+from harness.records.reader import read_campaign
+from harness.resolved import Resolved, require_ready, resolve
+from harness.runner.kept import Run, require_no_fewer, require_own_folder
+from harness.runner.run import ESTIMATES, EXIT_OF, RunResult, begun, finish, show, with_baseline, workers_of
+from harness.runner.stored import stored_blocks
+from harness.sampling.hours import HourRounds
+from harness.sampling.shells import Shells, round_requests
+from harness.vocabulary import FAMILIES
+
+MEND = "Run the campaign again into the same folder with --resume."
+
+
+@dataclass(frozen=True)
+class Hours:
+    """What a finished campaign of several scenarios left: a run folder each, and ``families.json``, the ``content``.
+
+    ``runs`` are their results. The exit code is 0, or 4 when the budget or a pool was spent before what was asked was
+    known, or 5 where the rate is above the limit that was to be kept.
+    """
+
+    folder: Path
+    content: dict[str, Any]
+    report: Path
+    runs: dict[str, RunResult]
+    exit_code: int
+
+    def __repr__(self) -> str:
+        from harness.report.hour_words import hour_lines  # noqa: PLC0415 - draws
+
+        return "\n".join(hour_lines(self.content, self.report))
+
+
+def run_families(
+    campaign: Campaign, out: Path, *, workers: int | None = None, resume: bool = False, progress: Progress | None = None
+) -> Hours:
+    """Run the scenarios of a campaign until their sum is known; see `harness.run`."""
+    names, progress, began = campaign.scenarios or [], progress or Progress(), time.monotonic()
+    require_no_other(out, names)
+    ready = {name: require_ready(campaign.of_family(name)) for name in names}
+    rule = HourRule(campaign)
+    with ExitStack() as held:
+        held.enter_context(sole_use(out))
+        folders = {name: out / name for name in names}
+        for folder in folders.values():
+            held.enter_context(sole_use(folder))
+        earlier = {name: require_own_folder(folders[name], ready[name], resume=resume) for name in names}
+        hour, results = _run(campaign, ready, folders, earlier, rule, workers, progress)
+    missed = campaign.stop.rhw is not None and not rule.look.stopped
+    code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
+    if (decision := rule.look.decision) is not None:
+        code = EXIT_OF[decision.verdict]
+    asked = {
+        "format": 1, "name": campaign.name, "seed": campaign.seed, "engine": campaign.world.engine,
+        "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
+        "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
+        "vehicle": vehicle_name(campaign), "wall_time_s": round(time.monotonic() - began, 3),
+    }  # fmt: skip
+    impacts = {name: _median_impact(each.estimates) for name, each in results.items()}
+    content = finite_json({**asked, **_answer(hour, ready, impacts, campaign.stop.confidence)})
+    write_sealed(out / FAMILIES, content)
+    from harness.report.hours_page import write_hours_of  # noqa: PLC0415 - draws
+
+    return Hours(out, content, write_hours_of(out, content), results, code)
+
+
+def _run(
+    campaign: Campaign,
+    ready: Mapping[str, Resolved],
+    folders: Mapping[str, Path],
+    earlier: Mapping[str, dict[str, Any]],
+    rule: HourRule,
+    workers: int | None,
+    progress: Progress,
+) -> tuple[PerHour, dict[str, RunResult]]:
+    names = list(ready)
+    with ExitStack() as working:
+        crews = {
+            name: working.enter_context(closing(workers_of(ready[name], workers, n_runs=len(names)))) for name in names
+        }
+        runs: dict[str, Run] = {}
+        try:
+            for name in names:
+                progress.remark = f" ({name.replace('_', ' ')})"
+                run = begun(folders[name], ready[name], earlier[name], crews[name], progress)
+                runs[name] = with_baseline(run, crews[name], progress)
+            progress.remark = ""
+            hour = _empty(campaign, runs)
+            available = [_source(runs[name]).prescribed.available for name in names]
+            rounds = HourRounds(campaign, hour, available, rule)
+            progress.stage("tests of all scenarios", None, done=sum(run.earlier.n_episodes for run in runs.values()))
+            while np.concatenate(added_to := rounds.next_round(hour)).any():
+                for of, added in zip(hour.families, added_to, strict=True):
+                    run = runs[of.family]
+                    places = len(run.blocks), run.n_episodes, campaign.run.smallest_shard
+                    requests = round_requests(of.tally.tests, added, *places) if added.any() else []
+                    for shard in crews[of.family].run(iter(requests), run.known):
+                        run = runs[of.family] = run.with_shard(shard)
+                        of.seen.add(shard.block)
+                        show(run, shard, rule, progress)
+                if rule.observe(hour) and all(run.n_episodes >= run.earlier.n_episodes for run in runs.values()):
+                    break
+            for run in runs.values():
+                run.require_few_failed()
+                require_no_fewer(run.folder, earlier[run.resolved.campaign.scenario], run.n_episodes)
+        except BaseException:
+            for run in runs.values():
+                run.written("interrupted")
+            raise
+        working.close()
+        of_all, rule.look = rule.look, replace(rule.look, decision=None)  # which is about the sum
+        results = {name: finish(runs[name], rule, crews[name].cpus(), progress) for name in names}
+        rule.look = of_all
+        return hour, results
+
+
+def _source(run: Run) -> Shells:
+    if not isinstance(run.source, Shells):
+        raise TypeError("the scenarios do not draw from shells")
+    return run.source
+
+
+def _empty(campaign: Campaign, runs: Mapping[str, Run]) -> PerHour:
+    """Of no test yet."""
+    families = []
+    for name, run in runs.items():
+        seen, design = SeenShells(), _source(run).prescribed.design
+        seen.count(design, empty_tally(design.cell_p.size))
+        families.append(OfFamily(name, _exposure(run.resolved, campaign.exposure), seen))
+    return PerHour(families)
+
+
+def _answer(
+    hour: PerHour, ready: Mapping[str, Resolved], impacts: Mapping[str, float | None], confidence: float
+) -> dict[str, Any]:
+    """The sum, with the mean speed by which hours are kilometres: of a vehicle that follows, where it does."""
+    follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
+    speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
+    found = hour.to_json(confidence, sum(speeds) / len(speeds))
+    for name, impact in impacts.items():
+        found["families"][name]["median_impact_mps"] = impact
+    return found
+
+
+def _median_impact(estimates: Mapping[str, Any]) -> float | None:
+    return None if (severity := estimates.get("severity")) is None else severity["median_mps"]
+
+
+def read_families(folder: Path) -> dict[str, Any]:
+    """``families.json`` of a folder; a `RunFolderError` where it is missing or damaged."""
+    return read_as(dict[str, Any], folder / FAMILIES, mend=MEND)
+
+
+def estimate_families(folder: Path, exposures: Mapping[str, float], confidence: float | None = None) -> dict[str, Any]:
+    """The answer of a folder of several scenarios anew, with other exposures; nothing is run or written.
+
+    Raises `HarnessError`: a run is missing or damaged, or an exposure is of no scenario in it.
+    """
+    stored, families, ready, impacts = read_families(folder), [], {}, {}
+    names = list(stored["families"])
+    if unknown := sorted(set(exposures) - set(names)):
+        found = f"an exposure of {', '.join(unknown)}"
+        raise HarnessError("--exposure", found, f"one of {', '.join(names)}", "Name a scenario of this folder.")
+    given = {**stored["exposure"], **exposures}
+    for name in names:
+        of = folder / name
+        campaign, seen = read_campaign(of, read_manifest(of)), SeenShells()
+        for block in stored_blocks(of, moments=False):
+            seen.add(block)
+        resolved = ready[name] = resolve(campaign)
+        families.append(OfFamily(name, _exposure(resolved, given), seen))
+        impacts[name] = _median_impact(read_as(dict[str, Any], of / ESTIMATES, mend=MEND))
+    answer = _answer(PerHour(families), ready, impacts, confidence or stored["confidence"])
+    return finite_json({**stored, "exposure": given, **answer})
+
+
+def _exposure(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
+    shipped = resolved.family.exposure(resolved.environment, resolved.parameters)
+    return own_exposure(shipped, given.get(resolved.campaign.scenario))
+
+
+def require_no_other(out: Path, names: Sequence[str]) -> None:
+    """Refuse (`RunFolderError`) a folder that holds something else than runs of these scenarios."""
+    require_place(out)
+    known = {*names, FAMILIES, "report.html"}
+    if out.exists() and (
+        other := sorted(each.name for each in out.iterdir() if each.name[0] != "." and each.name not in known)
+    ):
+        expected = "a new or empty folder, or one of the same scenarios"
+        raise RunFolderError(str(out), f"a folder with {other[0]}", expected, "Choose another folder with --out.")
+
+
+def vehicle_name(campaign: Campaign) -> str:
+    """Of the vehicle, as answers have it."""
+    from harness.report.words import vehicle_words  # noqa: PLC0415 - draws
+
+    return vehicle_words(campaign.av)[0]
+
+
+def require_families(folder: Path) -> None:
+    """Refuse (`RunFolderError`) a folder of one scenario."""
+    if not (folder / FAMILIES).is_file():
+        found, expected = "a run of one scenario", "a folder of several, which has families.json"
+        raise RunFolderError(str(folder), found, expected, "Leave out --exposure: one scenario has no rate per hour.")

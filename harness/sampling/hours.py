@@ -1,0 +1,75 @@
+"""Which tests of several families are next: as within one, with the strata of all side by side, by crashes per hour.
+
+The next test goes where it narrows the rate of the sum most. Where each family's own rate is asked for, it is the one
+that is known worst.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from harness.campaign.campaign import Campaign
+from harness.estimators.likelihood import Level
+from harness.estimators.per_hour import PerHour
+from harness.estimators.stopping import HourRule
+from harness.estimators.tally import Tally
+from harness.sampling.allocation import CONFIDENCE, Allocation
+from harness.strata import ShellDesign
+from harness.vocabulary import IntArray
+
+_LEVEL = Level.two_sided(CONFIDENCE)
+
+
+class HourRounds:
+    """Says which tests of each family are driven next, from counts alone.
+
+    ``available`` (S,) of each are the most tests of its strata; ``rule`` looks at each round.
+    """
+
+    def __init__(self, campaign: Campaign, hour: PerHour, available: Sequence[IntArray], rule: HourRule) -> None:
+        self.rule, self._budget, self._each = rule, campaign.stop.episodes, campaign.stop.each_family
+        shells, designs = campaign.testing.shells, [of.seen.design for of in hour.families]
+        self._own = [Allocation.of(shells, *each) for each in zip(designs, available, strict=True)]
+        inside = np.concatenate([np.arange(design.p.size) < design.n_inside for design in designs])
+        self._order = np.argsort(~inside, kind="stable")  # those inside a boundary come first
+        self._ends = np.cumsum([design.p.size for design in designs])[:-1]
+        first = np.concatenate([each.first_tests for each in self._own])[self._order]
+        most = np.concatenate(available)[self._order]
+        joint = _joint(hour, designs, self._order, int(inside.sum()))
+        self._all = Allocation(joint, first, most, shells.statement, shells.smallest_round)
+
+    def next_round(self, hour: PerHour) -> list[IntArray]:
+        """Tests to add per stratum of each family; all 0 when no stratum or no budget is left."""
+        tallies = [of.tally for of in hour.families]
+        left = self._budget - hour.totals[0]
+        if self._each and all(tally.tests.any() for tally in tallies):
+            worst = int(np.argmax([of.limits(_LEVEL).rhw for of in hour.families]))
+            of_each = [np.zeros_like(tally.tests) for tally in tallies]
+            of_each[worst] = self._own[worst].next_round(tallies[worst], left)
+            return of_each
+        joined = _side_by_side(tallies, self._order)
+        found = self._all.next_round(joined, left, inner_rhw=lambda _: hour.limits(_LEVEL, inside=True).rhw)
+        self.rule.of_first_tests = self._all.is_first(joined.tests, found)
+        added = np.zeros_like(found)
+        added[self._order] = found
+        return np.split(added, self._ends)
+
+
+def _joint(hour: PerHour, designs: Sequence[ShellDesign], order: IntArray, n_inside: int) -> ShellDesign:
+    names = [f"{of.family} {name}" for of in hour.families for name in of.seen.design.strata]
+    p = np.concatenate([of.p for of in hour.families])[order]
+    n, none = p.size, np.zeros(0)
+    return replace(
+        designs[0], pool="", strata=tuple(names[place] for place in order.tolist()), cell_stratum=tuple(range(n)),
+        cell_references=(0,) * n, cell_p=p, references=(), reference_rate=none, reference_square=none,
+        n_inside=n_inside, p_unreachable=0.0, available=(), shadow_runs=False, candidates=0,
+    )  # fmt: skip
+
+
+def _side_by_side(tallies: Sequence[Tally], order: IntArray) -> Tally:
+    tests, crashes, failed = (np.concatenate(column)[order] for column in list(zip(*tallies, strict=True))[:3])
+    no_mass = np.zeros((tests.size, tests.size))
+    return Tally(tests, crashes, failed, no_mass, no_mass)

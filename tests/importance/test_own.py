@@ -1,0 +1,86 @@
+"""A challenge of the user's own: tabulated as it says, part of the hash, refused where it is none, run if trusted."""
+
+import numpy as np
+import pytest
+
+import harness
+from harness.campaign.drivers import IDMParameters
+from harness.errors import CampaignError, RunFolderError
+from harness.families.cut_in.nade.challenge import LEVELS
+from harness.families.cut_in.nade.grid import AFTER, points_of
+from harness.families.cut_in.nade.own import own_challenge
+from harness.resolved import resolve
+from harness.vehicles.drivers import driver_records
+from harness.vocabulary import ACCELERATIONS_MPS2
+from tests.kernels import environment
+from tests.stored_runs import edit
+
+DRIVER = driver_records([IDMParameters(min_acceleration_mps2=-5.0)])
+FORMULA = "np.clip((gap < 20 + a) * (rate < -5) * (1 - s / 24) * v / 45 + d.min_acceleration_mps2 / 100, 0, 1)"
+SETTINGS = ["world.engine=twin", "testing.method=episode_mixture", "environment.parameters=ndd-overtaking-1"]
+FEW = [*SETTINGS, "stop.rhw=null", "stop.episodes=20"]
+
+
+def own(folder, formula=FORMULA, first="import numpy as np"):
+    (folder / "my.py").write_text(f"{first}\ndef mine(d, v, gap, rate, a, s):\n    return {formula}\n")
+    return f"{folder}/my.py:mine"
+
+
+def campaign(name):
+    return harness.load_campaign("idm", [*FEW, f"testing.challenge={name}"])
+
+
+def test_tables_hold_what_it_says(tmp_path):
+    tables = own_challenge(own(tmp_path))(environment(), DRIVER, "")
+    v, gap, rate = (points[at] for points, at in zip(points_of(AFTER), (3, 20, 40), strict=True))
+    expected = [(1 - level / 24) * v / 45 - 0.05 for level in range(1, LEVELS + 1)]
+    assert gap < 16.0
+    assert rate < -5.0
+    np.testing.assert_allclose(tables.value[1:, 3, 20, 40], expected, rtol=1e-6)
+    assert not tables.value[0].any()
+    harder = np.where(gap < 20.0 + ACCELERATIONS_MPS2, 0.5 * v / 45 - 0.05, 0.0)
+    np.testing.assert_allclose(tables.maneuvers[3, 20, 40], harder, rtol=1e-6)
+    assert tables.before.max() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("formula", "said"),
+    [
+        ("-gap", "from 0 to 1"),
+        ("gap * np.nan", "gives nan"),
+        ("v[:3]", "challenges of shape (150, 121)"),
+        ("x", "name 'x'"),
+    ],
+)
+def test_what_is_no_challenge_is_refused(formula, said, tmp_path):
+    with pytest.raises(CampaignError) as caught:
+        own_challenge(own(tmp_path, formula))(environment(), DRIVER, "")
+    assert caught.value.where == "testing.challenge"
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "said"), [("no.py:mine", "no file"), ("recursiv", "Did you mean 'recursive'?")])
+def test_one_that_is_not_there_is_named(name, said):
+    with pytest.raises(CampaignError, match=said) as caught:
+        campaign(name)
+    assert "testing.challenge" in str(caught.value)
+
+
+def test_its_file_s_content_is_part_of_the_hash_and_its_place_is_not(tmp_path):
+    folders = [tmp_path / each for each in "abc"]
+    for folder in folders:
+        folder.mkdir()
+    names = own(folders[0]), own(folders[1]), own(folders[2], "1.0")
+    first, same, other = (resolve(campaign(name)) for name in names)
+    assert (first.content_hash, first.challenge) == (same.content_hash, same.challenge)
+    assert first.content_hash != other.content_hash
+
+
+def test_a_folder_from_elsewhere_runs_it_only_if_trusted(tmp_path):
+    name = own(tmp_path)
+    harness.run(campaign(name), tmp_path / "run", workers=1)
+    assert harness.replay(tmp_path / "run", 3).bit_equal
+    edit(tmp_path / "run", signature="of another user")
+    with pytest.raises(RunFolderError, match=r"my\.py:mine, which would be run"):
+        harness.replay(tmp_path / "run", 3)
+    assert harness.replay(tmp_path / "run", 3, trust=True).bit_equal
