@@ -103,6 +103,9 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     Raises `CampaignError`: a file that it names is missing or wrong, or something of the campaign does not go with the
     command.
     """
+    if campaign.scenarios is not None:
+        mend = f"Write --set scenarios=null --set scenario={campaign.scenarios[0]}, or `harness run`, which does all."
+        raise CampaignError("scenarios", ", ".join(campaign.scenarios), "one scenario", mend)
     family = family_named(campaign.scenario)
     parameters = family.parameters(campaign.environment)
     environment = family.traffic(campaign.environment, parameters)

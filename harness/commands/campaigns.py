@@ -56,7 +56,10 @@ def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_j
     from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
     from harness.resolved import require_ready  # noqa: PLC0415 - slow to import: only once the campaign is right
 
-    campaign = require_ready(campaign).campaign
+    if campaign.scenarios is None:
+        campaign = require_ready(campaign).campaign
+    for name in campaign.scenarios or ():
+        require_ready(campaign.of_family(name))
     if as_json:
         print_json(campaign.model_dump(mode="json"))
     else:

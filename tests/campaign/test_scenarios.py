@@ -151,7 +151,8 @@ HASHES = "1acd10707ea15dc2"
 
 def test_hashes_stay():
     """Of the shipped campaigns, of one of them with one change each, and with each vehicle of the panel."""
-    shipped = {file.stem: resolve(load_campaign(file)).content_hash for file in SCENARIOS}
+    one = {file.stem: load_campaign(file) for file in SCENARIOS if file.stem != "r157"}  # which is of three
+    shipped = {name: resolve(campaign).content_hash for name, campaign in one.items()}
     changed = {change: load_campaign(SHELLS, [change]).content_hash("p") for change in (*CHANGES, *ALSO)}
     driven = {name: load_campaign(SHELLS, av=name).content_hash("p") for name in load_panel().avs}
     found = json.dumps([shipped, changed, driven], sort_keys=True)
