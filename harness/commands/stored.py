@@ -51,6 +51,12 @@ LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_tt
     multiple=True,
     help="Events per hour of driving, where DIR holds several scenarios. May be given several times.",
 )
+@click.option(
+    "--exposure-uncertainty",
+    "counts",
+    is_flag=True,
+    help="Of several scenarios: counted exposures are in the interval.",
+)
 @json_option
 @click.pass_context
 def estimate(
@@ -62,6 +68,7 @@ def estimate(
     write: bool,
     environment: str | None,
     exposures: Sequence[str],
+    counts: bool,
     as_json: bool,
 ) -> None:
     """Estimate the crash rate again from the records in DIR, with any estimator.
@@ -75,10 +82,10 @@ def estimate(
     seconds, and so are most other vehicles tested in the same pool. The answer tells what they leave open, and with
     --write, in the run's own traffic, so do estimates.json and the page. DIR may be that of a comparison, too.
     """
-    if exposures or (folder / FAMILIES).is_file():
+    if exposures or counts or (folder / FAMILIES).is_file():
         if estimators or environment is not None:
             raise click.UsageError("-e and --environment are for the folder of one scenario, such as DIR/cut_in.")
-        _estimate_hours(folder, exposures, confidence, write=write, as_json=as_json)
+        _estimate_hours(folder, exposures, confidence, counts=counts, write=write, as_json=as_json)
         return
     if environment is not None:
         if estimators:
@@ -119,7 +126,7 @@ def estimate(
 
 
 def _estimate_hours(
-    folder: Path, exposures: Sequence[str], confidence: float | None, *, write: bool, as_json: bool
+    folder: Path, exposures: Sequence[str], confidence: float | None, *, counts: bool, write: bool, as_json: bool
 ) -> None:
     """What stored tests of several scenarios say, with other exposures."""
     from harness.campaign.files import parse_override  # noqa: PLC0415 - keeps --help fast
@@ -134,7 +141,7 @@ def _estimate_hours(
             found = f"{words(value)}, of {read.path[0]}"
             raise HarnessError("--exposure", found, "events per hour, above 0", "Write --exposure lead_brakes=0.3.")
         given[".".join(read.path)] = float(value)
-    content, page = estimate_families(folder, given, confidence), None
+    content, page = estimate_families(folder, given, confidence, counts=counts), None
     if write:
         from harness.records.folder import write_sealed  # noqa: PLC0415 - keeps --help fast
         from harness.report.hours_page import write_hours_of  # noqa: PLC0415

@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 
 from harness.estimators.beside import path_errors
 from harness.estimators.likelihood import CRASH, Counts, Level, likelihood_limit, ratio_limits
@@ -114,6 +115,35 @@ class PerHour:
         from_pool = level.z * math.sqrt(variance)
         return RateLimits(rate, max(low, 0.0), high, from_pool, from_pool)
 
+    def limits_with_counts(self, level: Level) -> tuple[float, float]:
+        """Limits of the rate where counted exposures are as uncertain as their counts.
+
+        Of k events an exposure x times the counted one costs k (x - 1 - ln x) of the threshold, the Poisson law's
+        likelihood ratio: a limit is the outermost over x of that with what is left of it. The threshold is that of few
+        events, however many crashes there are.
+        """
+        counted = [of.exposure.counted[0] if of.exposure.counted else 0.0 for of in self.families]
+        free = np.flatnonzero(counted)
+
+        def limit(log_x: FloatArray, side: int) -> float:
+            x = np.ones(len(self.families))
+            x[free] = np.exp(log_x)
+            lost = float(np.array(counted) @ (x - 1.0 - np.log(x)))
+            if lost >= level.threshold:
+                return math.inf
+            left = Level(level.threshold - lost, level.z * math.sqrt(1.0 - lost / level.threshold))
+            exposures = {
+                of.family: of.exposure.per_hour * own for of, own in zip(self.families, x.tolist(), strict=True)
+            }
+            found = self.with_exposures(exposures).limits(left)
+            return found.low if side < 0 else -found.high
+
+        if not free.size:
+            return self.limits(level)[1:3]
+        ends = (minimize(limit, np.zeros(free.size), (side,), method="Nelder-Mead").fun for side in (-1, 1))
+        low, high = (float(end) for end in ends)
+        return low, -high
+
     def ratio(self, level: Level) -> tuple[float, float, float]:
         """Rate over that of the competent driver, with limits; NaN and any where that never crashes."""
         reference = self.reference_rate
@@ -169,10 +199,12 @@ class PerHour:
             [of._replace(exposure=own_exposure(of.exposure, exposures.get(of.family))) for of in self.families]
         )
 
-    def to_json(self, confidence: float, speed_mps: float) -> dict[str, Any]:
-        """All of it, as plain content."""
+    def to_json(self, confidence: float, speed_mps: float, *, counts: bool = False) -> dict[str, Any]:
+        """All of it, as plain content; with ``counts`` those of exposures are in the interval of the sum."""
         level, (n, n_crashes, n_failed) = Level.two_sided(confidence), self.totals
         limits, (ratio, low, high) = self.limits(level), self.ratio(level)
+        if counts:
+            limits = limits._replace(**dict(zip(("low", "high"), self.limits_with_counts(level), strict=True)))
         bound = self.limits(Level.of_bound(confidence, n)).high
         per_km = 1e6 / (3.6 * speed_mps)  # of a million km, per hour
         reference = self.families[0].seen.design.references
@@ -180,7 +212,7 @@ class PerHour:
             "confidence": confidence, "n_episodes": n, "n_crashes": n_crashes, "n_failed": n_failed,
             "per_hour": {"rate": limits.rate, "ci_low": limits.low, "ci_high": limits.high, "upper_bound": bound,
                          "rhw": limits.rhw},
-            "mean_speed_mps": speed_mps, "per_1e6_km": limits.rate * per_km,
+            "counts_in_interval": counts, "mean_speed_mps": speed_mps, "per_1e6_km": limits.rate * per_km,
             "beside": {
                 "reference": reference[0].name if reference else "", "rate_per_hour": self.reference_rate,
                 "ratio": ratio, "ratio_low": low, "ratio_high": high, "over_assumed": self.over_assumed(),

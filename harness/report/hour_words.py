@@ -104,4 +104,5 @@ def scope(content: Mapping[str, Any]) -> str:
         rhw = content["per_hour"]["rhw"]
         reached = "" if rhw is None else f" ± {share(rhw)}"
         ended += f"{reached}, asked: ± {share(target)}"
-    return f"sampling error in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"
+    counted = ", and counts of exposures," if content["counts_in_interval"] else ""
+    return f"sampling error{counted} in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"

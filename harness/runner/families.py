@@ -157,12 +157,17 @@ def _empty(campaign: Campaign, runs: Mapping[str, Run]) -> PerHour:
 
 
 def _answer(
-    hour: PerHour, ready: Mapping[str, Resolved], impacts: Mapping[str, float | None], confidence: float
+    hour: PerHour,
+    ready: Mapping[str, Resolved],
+    impacts: Mapping[str, float | None],
+    confidence: float,
+    *,
+    counts: bool = False,
 ) -> dict[str, Any]:
     """The sum, with the mean speed by which hours are kilometres: of a vehicle that follows, where it does."""
     follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
     speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
-    found = hour.to_json(confidence, sum(speeds) / len(speeds))
+    found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
     for name, impact in impacts.items():
         found["families"][name]["median_impact_mps"] = impact
     return found
@@ -177,8 +182,12 @@ def read_families(folder: Path) -> dict[str, Any]:
     return read_as(dict[str, Any], folder / FAMILIES, mend=MEND)
 
 
-def estimate_families(folder: Path, exposures: Mapping[str, float], confidence: float | None = None) -> dict[str, Any]:
+def estimate_families(
+    folder: Path, exposures: Mapping[str, float], confidence: float | None = None, *, counts: bool = False
+) -> dict[str, Any]:
     """The answer of a folder of several scenarios anew, with other exposures; nothing is run or written.
+
+    With ``counts`` the interval of the sum holds what few counted events leave open of their exposures.
 
     Raises `HarnessError`: a run is missing or damaged, or an exposure is of no scenario in it.
     """
@@ -196,7 +205,7 @@ def estimate_families(folder: Path, exposures: Mapping[str, float], confidence: 
         resolved = ready[name] = resolve(campaign)
         families.append(OfFamily(name, _exposure(resolved, given), seen))
         impacts[name] = _median_impact(read_as(dict[str, Any], of / ESTIMATES, mend=MEND))
-    answer = _answer(PerHour(families), ready, impacts, confidence or stored["confidence"])
+    answer = _answer(PerHour(families), ready, impacts, confidence or stored["confidence"], counts=counts)
     return finite_json({**stored, "exposure": given, **answer})
 
 
