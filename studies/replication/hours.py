@@ -1,0 +1,101 @@
+"""How often the interval of crashes per hour over three scenarios holds, pools and tests drawn anew each time.
+
+``python -m studies.replication.hours --replications 40`` runs built-in vehicles in the twin until the half-width is
+0.3 of the rate. The truth is what the enumeration of independent paths says of the same driver.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import harness
+from harness.campaign.drivers import IDMParameters, Reflexes
+from harness.campaign.sections import EnvironmentSettings
+from harness.families import family_named
+from harness.families.protocol import Paths
+from harness.random_stream import INITIAL, uniforms
+from harness.runner.families import Hours
+from harness.vehicles.drivers import Followers, driver_records
+
+NAMES = ("cut_in", "lead_brakes", "cut_out")
+VEHICLES = {
+    "idm": (IDMParameters(), Reflexes()),
+    "late 1 s": (IDMParameters(), Reflexes(delay_s=1.0)),
+    "brakes 6 m/s²": (IDMParameters(min_acceleration_mps2=-6.0), Reflexes()),
+    "0.5 s behind, late 1 s": (IDMParameters(time_headway_s=0.5), Reflexes(delay_s=1.0)),
+}
+TRUTH_SEED, BLOCK = 77_000_001, 1024
+POOL_ERROR = 0.03
+"""Of the pools that are drawn anew: coarser than by default, so that their error is part of what is judged."""
+
+
+def truths(paths: int) -> dict[str, tuple[float, float]]:
+    """Crashes per hour of each vehicle, with standard errors, from so many paths of each scenario."""
+    drivers, reactions = zip(*VEHICLES.values(), strict=True)
+    total, variance = np.zeros((2, len(VEHICLES)))
+    for name in NAMES:
+        family, settings = family_named(name), EnvironmentSettings()
+        traffic = family.traffic(settings)
+        followers = Followers(driver_records(drivers, reactions, see_onset=family.shows(traffic)))
+        n = paths if family.follows else 16 * paths
+        rates = np.zeros((n, len(VEHICLES) + 1))
+        for first in range(0, n, BLOCK):
+            u = uniforms(TRUTH_SEED, first, BLOCK, INITIAL, family.n_uniforms)
+            given = Paths(first + np.arange(BLOCK), family.start(traffic, u))
+            offset = np.random.default_rng(first).integers(0, family.stride, BLOCK)
+            found = family.events(traffic, TRUTH_SEED, given, followers, stride=family.stride, offset=offset)
+            for d in range(len(VEHICLES)):
+                rates[first : first + BLOCK, d] = np.where(found.crashes >> d & 1, found.probability, 0.0).sum(1)
+            rates[first : first + BLOCK, -1] = found.probability.sum(1)
+        per_hour = family.exposure(traffic, family.parameters(settings)).per_hour / rates[:, -1].mean()
+        total += per_hour * rates[:, :-1].mean(0)
+        variance += per_hour**2 * rates[:, :-1].var(0) / n
+    return dict(zip(VEHICLES, zip(total.tolist(), np.sqrt(variance).tolist(), strict=True), strict=True))
+
+
+def one(vehicle: str, seed: int, folder: Path) -> tuple[float, float, float, int]:
+    """Rate per hour with its limits, and tests, of one campaign."""
+    parameters, reaction = VEHICLES[vehicle]
+    given = [f"av.parameters.{key}={value}" for key, value in parameters.model_dump(exclude_defaults=True).items()]
+    given += [f"av.reaction.{key}={value}" for key, value in reaction.model_dump(exclude_defaults=True).items()]
+    campaign = harness.load_campaign(
+        "idm",
+        [f"scenarios=[{', '.join(NAMES)}]", "world.engine=twin", f"seed={seed}", f"pool.seed={seed}", *given,
+         f"pool.relative_error={POOL_ERROR}", "pool.events_per_shell=5000", "stop.below_reference=null",
+         "stop.episodes=60000"],
+    )  # fmt: skip
+    found = harness.run(campaign, folder, workers=1)
+    assert isinstance(found, Hours)
+    hour = found.content["per_hour"]
+    return hour["rate"], hour["ci_low"], hour["ci_high"], found.content["n_episodes"]
+
+
+def main() -> None:
+    """Print a row a vehicle."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("--replications", type=int, default=40)
+    options.add_argument("--paths", type=int, default=32 * BLOCK, help="of the truth, a multiple of 1,024")
+    options.add_argument("--first-seed", type=int, default=1000)
+    asked = options.parse_args()
+    truth = truths(asked.paths)
+    seen: dict[str, list[tuple[float, float, float, int]]] = {name: [] for name in VEHICLES}
+    for seed in range(asked.first_seed, asked.first_seed + asked.replications):
+        for name, rows in seen.items():
+            with tempfile.TemporaryDirectory() as folder:
+                rows.append(one(name, seed, Path(folder) / "run"))
+        sys.stderr.write(f"{seed}\n")
+    print("| vehicle | truth per hour | held | mean rate / truth | tests, median |\n| --- | --- | --- | --- | --- |")  # noqa: T201
+    for name, rows in seen.items():
+        rate, low, high, n = np.array(rows).T
+        (mu, error), held = truth[name], int(((low <= truth[name][0]) & (truth[name][0] <= high)).sum())
+        told = f"{mu:.3g} ± {error:.1g} | {held} of {len(rows)} | {rate.mean() / mu:.2f} | {np.median(n):,.0f} |"
+        print(f"| {name} | {told}")  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()
