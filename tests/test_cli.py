@@ -98,7 +98,7 @@ def test_wrong_calls_end_with_2(capsys, arguments):
     assert out == ""
     if arguments:
         assert err.startswith("error: ")
-        assert [line.split()[0] for line in err.splitlines()[1:]] == ["found:", "expected:", "mend:"]
+        assert [line.split()[0] for line in err.splitlines()[1:]] == ["found:", "expected:", "fix:"]
         assert ("Did you mean" in err) == (arguments[-1] in ("estimat", "--quite"))
     else:
         assert "Usage: harness" in err
@@ -149,7 +149,7 @@ WRONG = "episodes/0.parquet", "half a file", "a whole one", "Delete it."
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (RunFolderError(*WRONG), 2, "\n  found:    half a file\n  expected: a whole one\n  mend:     Delete it.\n"),
+        (RunFolderError(*WRONG), 2, "\n  found:    half a file\n  expected: a whole one\n  fix:      Delete it.\n"),
         (TooManyFailedError(*WRONG), 3, "half a file"),
         (KeyboardInterrupt(), 130, "--resume"),
         (errno.ENOSPC, 2, "Free some space"),

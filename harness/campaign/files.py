@@ -326,7 +326,7 @@ def validated(data: dict[str, Any], model: type[Model], place: Places) -> Model:
     if not more:
         raise first
     at_least = "at least " if len(problems) == MOST_SHOWN else ""
-    together = CampaignError(place.path, f"{at_least}{len(problems)} problems", "none", "Mend each:")
+    together = CampaignError(place.path, f"{at_least}{len(problems)} problems", "none", "Fix each:")
     together.problems = (first, *more)
     raise together
 

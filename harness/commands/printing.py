@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from harness.campaign.campaign import Campaign
 
 _WIDTH_OF_FILES = 140
-_PARTS = "found", "expected", "mend"
+_PARTS = {"found": "found", "expected": "expected", "fix": "mend"}
+"""Parts of an error, by what they are called on the screen."""
 
 
 def say(*lines: object, err: bool = False) -> None:
@@ -46,8 +47,10 @@ def show_error(error: HarnessError) -> None:
         say(f" {error.where}: {error.found}", err=True)
     for part in error.problems or (error,):
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
-        told = (getattr(part, each).replace("`", "'") for each in _PARTS)  # commands in docs and in Python have these
-        say(f" {part.where}", *(f"  {each + ':':<9} {text}" for each, text in zip(_PARTS, told, strict=True)), err=True)
+        told = {
+            shown: getattr(part, of).replace("`", "'") for shown, of in _PARTS.items()
+        }  # commands in docs have these
+        say(f" {part.where}", *(f"  {shown + ':':<9} {text}" for shown, text in told.items()), err=True)
 
 
 _AGAIN = "Nothing finished is lost: then give the same command again (`run` with --resume)."

@@ -50,7 +50,7 @@ def own_code(name: str, where: str = "av.controller", what: str = _A_CONTROLLER)
     except (Exception, SystemExit) as error:
         cause = f"{name}, whose module cannot be imported ({cause_of(error)})"
         meant = did_you_mean(module_name, [file.stem for file in Path.cwd().glob("*.py")])
-        mend = "Mend the module." if is_file else "Name its file, my_av.py:Class, or install it beside the harness."
+        mend = "Fix the module." if is_file else "Name its file, my_av.py:Class, or install it beside the harness."
         raise CampaignError(where, cause, "a Python module that can be imported", meant or mend) from error
     found = getattr(module, class_name, None)
     if not callable(found):
@@ -111,7 +111,7 @@ def build_host(
         raise
     except (Exception, SystemExit) as error:  # who looks for an attribute runs the user's code, too
         found = f"{av.controller}, of which looking at its attributes fails ({cause_of(error)})"
-        mend = "Mend what is raised: a __getattr__ raises AttributeError for what is not there."
+        mend = "Fix what is raised: a __getattr__ raises AttributeError for what is not there."
         raise CampaignError("av.controller", found, _A_CONTROLLER, mend) from error
     return BatchHost(*told, first) if is_batch else VehicleHost(*told, make, n_cells, first)
 
@@ -218,7 +218,7 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     with guard:
         controller, wrong = guard.call(make, makes=True)
     if wrong is not None:
-        mend = "Mend its constructor, or what it needs (av.parameters; av.limits.construction_time_s, if that is time)."
+        mend = "Fix its constructor, or what it needs (av.parameters; av.limits.construction_time_s, if that is time)."
         raise CampaignError("av.controller", f"{name}, whose constructor failed: {wrong}", "a controller", mend)
     guard.require_untouched()
     _require_controller(controller, name)

@@ -34,7 +34,7 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         script = Script(name, dict(av.parameters))
     except SyntaxError as error:
         found, place = f"{name}, which is no Python", f"{error.msg} in line {error.lineno}"
-        raise CampaignError("av.controller", found, "a TraCI script", f"Mend it: {place}.") from error
+        raise CampaignError("av.controller", found, "a TraCI script", f"Fix it: {place}.") from error
     os.environ.setdefault("SUMO_HOME", sumo_data.__path__[0])  # as libsumo does: scripts look for it
     ego = style.ego
     if ego is None:
@@ -45,7 +45,7 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         wrong = f"calls its vehicle {ego}, as one of the others is called" if ego in OTHERS else ""
     if wrong or ego is None:
         found = f"{name}, which {wrong}"
-        mend = "Mend the script, or name its vehicle: --set av.traci_style.ego=NAME."
+        mend = "Fix the script, or name its vehicle: --set av.traci_style.ego=NAME."
         raise CampaignError("av.controller", found, "a script that commands one vehicle", mend)
 
     guard.hint = "; bound commands as its vehicle type does: av.traci_style.decel_mps2, accel_mps2"

@@ -63,7 +63,7 @@ class OwnState(Nade):
             rate, std_error = found if isinstance(found, tuple) and len(found) == 2 else (np.nan, np.nan)
             if not (np.isfinite(rate) and std_error >= 0.0):
                 expected = "a rate and its standard error, or an Estimate"
-                raise HarnessError(f"{self._name}, result", repr(found), expected, "Mend what it returns.")
+                raise HarnessError(f"{self._name}, result", repr(found), expected, "Fix what it returns.")
             found = self.estimate(float(rate), float(std_error), None, confidence)
         return replace(found, warnings=(*found.warnings, note("own")))
 
@@ -71,7 +71,7 @@ class OwnState(Nade):
         try:
             return work(*given)
         except (Exception, SystemExit) as error:
-            mend = "Mend the class; it has to bear being copied, too."
+            mend = "Fix the class; it has to bear being copied, too."
             raise HarnessError(self._name, cause_of(error), "an estimator that raises nothing", mend) from error
 
 

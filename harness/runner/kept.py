@@ -301,7 +301,7 @@ def require_few_failed(
             "run.max_failed_share",
             f"{causes.total()} of {n} {what} failed{cause}",
             f"a share of at most {most:g}",
-            "Mend the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
+            "Fix the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
             f"are in the column 'failure' of {where}.",
         )
 

@@ -285,7 +285,7 @@ class Workers:
         mend = "Look for a memory limit (fewer --workers), then continue with --resume."
         if exit_code not in SENT_FROM_OUTSIDE and has_foreign_code(self._campaign.av):
             how = f"because {death_cause(exit_code, self._campaign.av.limits)}"
-            mend = "Mend the controller: look for os._exit or a crash of compiled code (`harness av-check`)."
+            mend = "Fix the controller: look for os._exit or a crash of compiled code (`harness av-check`)."
         raise WorkerLostError(
             f"shard {job.request.index} (from episode {job.request.first_episode})",
             f"{ATTEMPTS} worker processes that died, the last {how}",
@@ -304,7 +304,7 @@ class Workers:
                 f"{len(fatal)} of the first {n_begun} episodes of shard {job.request.index} ended their worker "
                 f"process, the last of them episode {episode}: {cause}",
                 f"a share of at most {share:g}",
-                "Mend the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
+                "Fix the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
             )
 
 

@@ -113,8 +113,8 @@ def test_an_object_is_asked_as_it_is_and_knows_the_campaign_of_a_stored_run(file
 @pytest.mark.parametrize(
     ("name", "found", "mend"),
     [
-        ("Raises", r"ZeroDivisionError: no weight \(.*mine.py:\d+\)", "Mend the class"),
-        ("Nothing", r"\(nan, 1.0\)", "Mend what it returns"),
+        ("Raises", r"ZeroDivisionError: no weight \(.*mine.py:\d+\)", "Fix the class"),
+        ("Nothing", r"\(nan, 1.0\)", "Fix what it returns"),
         ("Anywhere", "methods .*'shells'", "Write methods ="),
         ("NoResult", "NoResult without result", "Add what is missing"),
         ("Meen", "no class or function Meen", "Did you mean 'Mean'"),

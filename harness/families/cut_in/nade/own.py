@@ -50,7 +50,7 @@ def own_challenge(name: str) -> Callable[[Environment, RecordArray, str], Tables
 
 
 def _asked(name: str, function: Callable[..., Any], *given: Any) -> Any:
-    shape, mend = np.broadcast_shapes(*map(np.shape, given[1:])), "Mend the function; numpy's clip limits."
+    shape, mend = np.broadcast_shapes(*map(np.shape, given[1:])), "Fix the function; numpy's clip limits."
     try:
         found = np.broadcast_to(np.asarray(function(*given), np.float64), shape)
     except (Exception, SystemExit) as error:
