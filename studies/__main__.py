@@ -109,7 +109,7 @@ def validate(
     short_help="Reproduce a paper's case study, and answer its claims.",
     epilog=examples(
         f"{_ME} case scenarios/case_study/study.yaml --out runs/quick --quick   # minutes: tiny sizes",
-        f"{_ME} case scenarios/case_study/study.yaml --out runs/case_study      # 45 minutes on two cores",
+        f"{_ME} case scenarios/case_study/study.yaml --out runs/case_study      # 40 minutes on one core",
     ),
 )
 @click.argument("study_file", metavar="STUDY", type=CAMPAIGN)
