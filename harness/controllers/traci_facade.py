@@ -117,7 +117,7 @@ class VehicleDomain(Domain):
 
     _path = "traci.vehicle"
 
-    def __init__(self, set_speed_mps: float = math.nan) -> None:
+    def __init__(self, set_speed_mps: float, lv_name: str, bv_name: str) -> None:
         self.legacy_leader = True
         self._plan: Iterator[float] = iter(())
         """Accelerations (m/s²) of the coming steps; empty without a command."""
@@ -129,14 +129,22 @@ class VehicleDomain(Domain):
         self._speed_mode = _ACCEL | _DECEL
         self._subscribed: dict[str, tuple[int, ...]] = {}
         self._lv, self._bv, self._own = Seen(1, MAX_SPEED_MPS), Seen(1, MAX_SPEED_MPS), Seen(0, set_speed_mps)
-        self._seen = {"LV": self._lv, "BV": self._bv, VEH_ID: self._own}
+        named = (lv_name, self._lv), (bv_name, self._bv), (VEH_ID, self._own)
+        self._vehicles = {name: vehicle for name, vehicle in named if name}
+        self._seen = self._vehicles.copy()
         self._begun = False
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""
         for other, there in ((self._lv, now.lv), (self._bv, now.bv)):
-            other.acceleration = (there.speed_mps - other.speed) / STEP_S if self._begun else 0.0
+            change = there.speed_mps - other.speed if self._begun else math.nan  # also where it was not seen before
+            other.acceleration = 0.0 if math.isnan(change) else change / STEP_S
             other.position, other.speed, other.lane = there
+        self._seen = {
+            name: one for name, one in self._vehicles.items() if one is self._own or not math.isnan(one.position)
+        }
+        self._lv.sideways = 0.0 if now.lv.lane else now.lv_lateral_m
+        self._lv.sideways_speed = now.lv_lateral_speed_mps
         # SUMO counts to the left; once BV overlaps it counts as a vehicle of the right lane, in its middle.
         self._bv.sideways = 0.0 if now.bv_overlaps else -now.bv_lateral_m
         self._bv.sideways_speed = -now.bv_lateral_speed_mps
@@ -163,7 +171,9 @@ class VehicleDomain(Domain):
         try:
             return self._seen[vehID]
         except KeyError:
-            raise TraCIException(f"Vehicle '{vehID}' is not known: a cell has LV, BV and AV.") from None
+            *first, last = self._vehicles
+            there = f"a cell has {', '.join(first)} and {last}"
+            raise TraCIException(f"Vehicle '{vehID}' is not known, or not seen yet: {there}.") from None
 
     # -- questions --
 
@@ -191,7 +201,8 @@ class VehicleDomain(Domain):
 
     def getSubscriptionResults(self, objectID: str) -> dict[int, Any]:
         """Values of what has been subscribed to, by number; none without."""
-        return {number: getattr(self, _VARIABLES[number])(objectID) for number in self._subscribed.get(objectID, ())}
+        asked = self._subscribed.get(objectID, ()) if objectID in self._seen else ()
+        return {number: getattr(self, _VARIABLES[number])(objectID) for number in asked}
 
     def getAllSubscriptionResults(self) -> dict[str, dict[int, Any]]:
         """The same of all vehicles that have been subscribed to."""
@@ -359,8 +370,8 @@ class Traci(Domain):
     TraCIException = TraCIException
     _path = "traci"
 
-    def __init__(self, set_speed_mps: float = math.nan) -> None:
-        self.vehicle, self.simulation = VehicleDomain(set_speed_mps), SimulationDomain()
+    def __init__(self, set_speed_mps: float = math.nan, lv_name: str = "LV", bv_name: str = "BV") -> None:
+        self.vehicle, self.simulation = VehicleDomain(set_speed_mps, lv_name, bv_name), SimulationDomain()
         self.exceptions = self  # so that ``traci.exceptions.TraCIException`` is found
 
     @property
