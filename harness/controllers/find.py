@@ -89,9 +89,16 @@ def _of_file(file: Path) -> ModuleType:
 
 
 def build_host(
-    av: AutomatedVehicle, *, n_cells: int, seed: int, before_test: BeforeTest = lambda _: None
+    av: AutomatedVehicle,
+    *,
+    n_cells: int,
+    seed: int,
+    before_test: BeforeTest = lambda _: None,
+    names: tuple[str, str] = ("LV", "BV"),
 ) -> ControllerHost | None:
     """Host of the AV's controller, or None for an AV that needs none (built in, or driven by SUMO).
+
+    ``names`` are those of the vehicles that it sees as LV and BV.
 
     Raises `CampaignError`: the controller cannot be found or made, or is of neither kind.
     """
@@ -101,7 +108,7 @@ def build_host(
     if av.fmu is not None:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
-        return VehicleHost(*told, fmu_maker(av.fmu), n_cells)
+        return VehicleHost(*told, fmu_maker(av.fmu), n_cells, names=names)
     try:
         make = _script(av, guard) or _maker(av)
         guard.restore_modes()
@@ -113,7 +120,9 @@ def build_host(
         found = f"{av.controller}, of which looking at its attributes fails ({cause_of(error)})"
         mend = "Fix what is raised: a __getattr__ raises AttributeError for what is not there."
         raise CampaignError("av.controller", found, _A_CONTROLLER, mend) from error
-    return BatchHost(*told, first) if is_batch else VehicleHost(*told, make, n_cells, first)
+    if is_batch:
+        return BatchHost(*told, first, names=names)
+    return VehicleHost(*told, make, n_cells, first, names=names)
 
 
 def _script(av: AutomatedVehicle, guard: Guard) -> Callable[[], Any] | None:

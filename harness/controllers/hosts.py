@@ -12,7 +12,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import parent_process
 from pathlib import Path
@@ -242,12 +242,16 @@ def optional(name: str, *arguments: Any) -> Callable[[Any], None]:
 
 @dataclass
 class Host:
-    """What both hosts are told: the vehicle, the campaign's seed, who makes the calls, and who is told of tests."""
+    """What both hosts are told: the vehicle, the campaign's seed, who makes the calls, and who is told of tests.
+
+    ``names`` are those of the vehicles that controllers see as LV and BV.
+    """
 
     av: AutomatedVehicle
     seed: int
     guard: Guard
     before_test: BeforeTest
+    names: tuple[str, str] = field(default=("LV", "BV"), kw_only=True)
 
     def __post_init__(self) -> None:
         self.acts_before_event, self.warm_up_steps = self.av.acts_before_event, self.av.warm_up_steps
@@ -277,7 +281,7 @@ class VehicleHost(Host):
                 if wrong is None and self._controllers[k] is None:
                     self._controllers[k], wrong = self.guard.call(self.make, makes=True)
                 if wrong is None:
-                    start = EpisodeStart(index, STEP_S, controller_random(self.seed, index), set_speed)
+                    start = EpisodeStart(index, STEP_S, controller_random(self.seed, index), set_speed, *self.names)
                     _, wrong = self.guard.call(optional("start", start), self._controllers[k])
                 if wrong is not None:
                     failures[k] = f"start: {wrong}"
@@ -318,10 +322,8 @@ class VehicleHost(Host):
 
 def _step(controller: VehicleController, seen: list[Any]) -> Any:
     """Answer to a row of a `BatchObservation`, without cell and episode."""
-    *row, bv_position_m, bv_speed_mps, bv_lane, lv_position_m, lv_speed_mps = seen[:-4]
-    lateral_m, lateral_mps, overlaps, set_speed_mps = seen[-4:]
-    row += [Neighbour(bv_position_m, bv_speed_mps, bv_lane), Neighbour(lv_position_m, lv_speed_mps, 1)]
-    row += [lateral_m, lateral_mps, bool(overlaps), set_speed_mps]
+    row, (lateral_m, lateral_mps, overlaps, *rest) = seen[:6], seen[12:]
+    row += [Neighbour(*seen[6:9]), Neighbour(*seen[9:12]), lateral_m, lateral_mps, bool(overlaps), *rest]
     return controller.step(Observation(*row))
 
 

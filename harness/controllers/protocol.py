@@ -27,14 +27,17 @@ class Neighbour(NamedTuple):
 class EpisodeStart:
     """What a per-vehicle controller is told when an episode begins: its index, and the time (s) between two steps.
 
-    ``set_speed_mps`` is the speed at which its vehicle cruises. ``random`` is the only randomness that a controller may
-    use: seeded by campaign and episode, so that a replay sees the same.
+    ``set_speed_mps`` is the speed at which its vehicle cruises. ``lv_name`` and ``bv_name`` are what the vehicles are
+    called that it sees as ``lv`` and ``bv``, empty where there is none. ``random`` is the only randomness that a
+    controller may use: seeded by campaign and episode, so that a replay sees the same.
     """
 
     episode: int
     step_s: float
     random: np.random.Generator
     set_speed_mps: float = math.nan
+    lv_name: str = "LV"
+    bv_name: str = "BV"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,16 +53,20 @@ class Observation:
     gap_m, lead_speed_mps : float
         Bumper-to-bumper gap to, and speed of, the vehicle ahead on the AV's lane; infinite and NaN without one.
     bv, lv : Neighbour
-        Background and leading vehicle.
+        The vehicle that the event is about, and the one ahead of it: BV and LV where vehicles cut in, SV and LV in
+        cut-outs, LV and none where that brakes. NaN of one that is not there, or not seen yet.
     bv_lateral_m : float
         How far BV has come over from its lane, from 0 to the way to overlap (1.7 m), where it is counted no further.
-        Where cut-ins are one step there is nothing between.
+        Where cut-ins are one step there is nothing between. In other scenarios it is 0.
     bv_lateral_speed_mps : float
         How fast it comes over; 0 before the onset, and from the overlap on.
     bv_overlaps : bool
-        Whether it is on the AV's lane. Until then the gap is infinite: one that sees only its own lane sees nobody.
+        Whether it is seen on the AV's lane. Until a BV is, the gap is infinite: one that sees only its own lane sees
+        nobody.
     set_speed_mps : float
-        The speed at which the AV cruises where nobody is ahead: that at which the episode began.
+        The speed at which the AV cruises where nobody is ahead: that at which the episode began, or the scenario's.
+    lv_lateral_m, lv_lateral_speed_mps : float
+        In cut-outs how far LV has moved towards the other lane, until the AV's is clear (1.9 m), and how fast; else 0.
     """
 
     time_s: float
@@ -74,6 +81,8 @@ class Observation:
     bv_lateral_speed_mps: float = 0.0
     bv_overlaps: bool = False
     set_speed_mps: float = math.nan
+    lv_lateral_m: float = 0.0
+    lv_lateral_speed_mps: float = 0.0
 
 
 class BatchObservation(NamedTuple):
@@ -96,10 +105,13 @@ class BatchObservation(NamedTuple):
     bv_lane: IntArray
     lv_position_m: FloatArray
     lv_speed_mps: FloatArray
+    lv_lane: IntArray
     bv_lateral_m: FloatArray
     bv_lateral_speed_mps: FloatArray
     bv_overlaps: IntArray
     set_speed_mps: FloatArray
+    lv_lateral_m: FloatArray
+    lv_lateral_speed_mps: FloatArray
 
 
 class VehicleController(Protocol):

@@ -19,7 +19,7 @@ from harness.controllers.traci_vehicle import VEH_ID, Seen
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
-OTHERS = "LV", "BV"
+OTHERS = "LV", "BV", "SV"
 SPEED_MPS = 25.0
 
 
@@ -50,8 +50,8 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
 
     guard.hint = "; bound commands as its vehicle type does: av.traci_style.decel_mps2, accel_mps2"
 
-    def vehicle(set_speed_mps: float) -> ScriptVehicles:
-        made = ScriptVehicles(set_speed_mps, ego)
+    def vehicle(set_speed_mps: float, lv_name: str, bv_name: str) -> ScriptVehicles:
+        made = ScriptVehicles(set_speed_mps, ego, lv_name, bv_name)
         for bound, value in (made.setAccel, style.accel_mps2), (made.setDecel, style.decel_mps2):
             if value is not None:
                 bound(ego, value)

@@ -38,8 +38,8 @@ class Traci(Domain):
     TraCIException, FatalTraCIError = TraCIException, FatalTraCIError
     _path = "traci"
 
-    def __init__(self, set_speed_mps: float = math.nan, ego: str = VEH_ID) -> None:
-        self.vehicle, self.simulation = VehicleDomain(set_speed_mps, ego), SimulationDomain()
+    def __init__(self, set_speed_mps: float = math.nan, lv_name: str = "LV", bv_name: str = "BV") -> None:
+        self.vehicle, self.simulation = VehicleDomain(set_speed_mps, VEH_ID, lv_name, bv_name), SimulationDomain()
         self.exceptions = self  # so that ``traci.exceptions.TraCIException`` is found
 
     @property

@@ -320,7 +320,7 @@ class ScriptController:
 
     _traci: ScriptTraci
 
-    def __init__(self, script: Script, vehicle: Callable[[float], ScriptVehicles]) -> None:
+    def __init__(self, script: Script, vehicle: Callable[[float, str, str], ScriptVehicles]) -> None:
         self._script, self._vehicle = script, vehicle
         self._run: greenlet | None = None
 
@@ -328,7 +328,7 @@ class ScriptController:
         """See `harness.controllers.VehicleController`."""
         with suppress(ScriptError):  # the last test's
             self.close()
-        self._traci = ScriptTraci(self._vehicle(episode.set_speed_mps))
+        self._traci = ScriptTraci(self._vehicle(episode.set_speed_mps, episode.lv_name, episode.bv_name))
         seed = partial(episode.random.integers, 2**63)
         self._run = greenlet(partial(self._script.run, self._traci, lambda: int(seed())))
 

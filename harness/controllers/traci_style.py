@@ -40,7 +40,7 @@ class TraciStyleController:
 
     def start(self, episode: EpisodeStart) -> None:
         """See `harness.controllers.VehicleController`."""
-        self._traci = Traci(episode.set_speed_mps)
+        self._traci = Traci(episode.set_speed_mps, episode.lv_name, episode.bv_name)
         self.on_start(episode.random)
 
     def step(self, observation: Observation) -> float:

@@ -130,7 +130,9 @@ class VehicleDomain(Domain):
 
     _path = "traci.vehicle"
 
-    def __init__(self, set_speed_mps: float = math.nan, ego: str = VEH_ID) -> None:
+    def __init__(
+        self, set_speed_mps: float = math.nan, ego: str = VEH_ID, lv_name: str = "LV", bv_name: str = "BV"
+    ) -> None:
         self.legacy_leader = True
         self._ego = ego
         self._plan: Iterator[float] = iter(())
@@ -145,14 +147,23 @@ class VehicleDomain(Domain):
         self._around: dict[str, tuple[float, tuple[int, ...]]] = {}
         """Range (m) and variables of what has been subscribed to around a vehicle."""
         self._lv, self._bv, self._own = Seen(1, MAX_SPEED_MPS), Seen(1, MAX_SPEED_MPS), Seen(0, set_speed_mps)
-        self._seen = {"LV": self._lv, "BV": self._bv, ego: self._own}
+        self._others = {name: other for name, other in ((lv_name, self._lv), (bv_name, self._bv)) if name}
+        self._seen = {**self._others, ego: self._own}
         self._begun = False
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""
         for other, there in ((self._lv, now.lv), (self._bv, now.bv)):
-            other.acceleration = (there.speed_mps - other.speed) / STEP_S if self._begun else 0.0
+            change = there.speed_mps - other.speed if self._begun else math.nan  # also where it was not seen before
+            other.acceleration = 0.0 if math.isnan(change) else change / STEP_S
             other.position, other.speed, other.lane = there
+        for name, other in self._others.items():
+            if math.isnan(other.position):
+                self._seen.pop(name, None)
+            else:
+                self._seen[name] = other
+        self._lv.sideways = 0.0 if now.lv.lane else now.lv_lateral_m
+        self._lv.sideways_speed = now.lv_lateral_speed_mps
         # SUMO counts to the left; once BV overlaps it counts as a vehicle of the right lane, in its middle.
         self._bv.sideways = 0.0 if now.bv_overlaps else -now.bv_lateral_m
         self._bv.sideways_speed = -now.bv_lateral_speed_mps
@@ -184,7 +195,7 @@ class VehicleDomain(Domain):
             return self._seen[vehID]
         except KeyError:
             raise TraCIException(
-                f"Vehicle '{vehID}' is not known: there are {', '.join(self._seen) or 'none'}."
+                f"Vehicle '{vehID}' is not known, or not seen yet: there are {', '.join(self._seen) or 'none'}."
             ) from None
 
     # -- questions --
@@ -208,7 +219,7 @@ class VehicleDomain(Domain):
 
     def getSubscriptionResults(self, objectID: str) -> dict[int, Any]:
         """Values of what has been subscribed to, by number; none without."""
-        return self._values(objectID, self._subscribed.get(objectID, ()))
+        return self._values(objectID, self._subscribed.get(objectID, ()) if objectID in self._seen else ())
 
     def _values(self, objectID: str, variables: Sequence[int]) -> dict[int, Any]:
         return {number: getattr(self, _VARIABLES[number])(objectID) for number in variables}

@@ -64,6 +64,7 @@ def follow(k: int, kernel: KernelState) -> None:
     headway_s = headway_of(driver, script.headway_s[cell.row], script.v[cell.row, script.v.shape[1] - 1])
     memory = follow_on(driver, headway_s, memory, cell.step - reacts, waits, speed, lead, revealed)
     cells.acceleration[k], cell.danger = memory.acceleration, memory.danger
+    cell.took_over_step = 0
 
 
 @compiled_inline
@@ -109,7 +110,7 @@ def observe(kernel: KernelState) -> int:
         if cell.row < 0 or cell.step < cell.acts_from:
             continue
         leader, comes = leader_of(k, kernel), 0 <= cell.onset_step < cell.step
-        on_lane = cells.lane_before[k, bv] == cells.lane_before[k, av]
+        on_lane = cells.lane_before[k, bv] == cells.lane_before[k, av] and is_visible(k, bv, kernel)
         out.cell[n], out.episode[n], out.time_s[n] = k, cell.announced_index, cell.step * STEP_S
         out.position_m[n], out.speed_mps[n] = x[k, av], v[k, av]
         out.acceleration_mps2[n] = cells.acceleration[k]
@@ -118,9 +119,16 @@ def observe(kernel: KernelState) -> int:
         out.bv_position_m[n], out.bv_speed_mps[n] = seen_of(k, bv, kernel)
         out.bv_lane[n] = cells.lane_before[k, bv]
         out.lv_position_m[n], out.lv_speed_mps[n] = seen_of(k, lv, kernel)
-        out.bv_lateral_m[n] = lateral_position(cell.step, cell.planned, cell.lead, distance_m) if comes else 0.0
-        out.bv_lateral_speed_mps[n] = distance_m / (cell.lead * STEP_S) if comes and not on_lane else 0.0
+        out.lv_lane[n] = cells.lane_before[k, lv] if lv >= 0 else 0
         out.bv_overlaps[n], out.set_speed_mps[n] = 1 if on_lane else 0, cell.set_speed
+        out.bv_lateral_m[n] = out.bv_lateral_speed_mps[n] = out.lv_lateral_m[n] = out.lv_lateral_speed_mps[n] = 0.0
+        if comes and kernel.script.sideways_mps[cell.row] > 0.0:  # the one ahead leaves
+            leaving = kernel.script.sideways_mps[cell.row]
+            out.lv_lateral_m[n] = min(leaving * ((cell.step - cell.onset_step) * STEP_S), distance_m)
+            out.lv_lateral_speed_mps[n] = leaving if cell.step <= cell.planned else 0.0
+        elif comes and distance_m > 0.0:
+            out.bv_lateral_m[n] = lateral_position(cell.step, cell.planned, cell.lead, distance_m)
+            out.bv_lateral_speed_mps[n] = 0.0 if on_lane else distance_m / (cell.lead * STEP_S)
         n += 1
     return n
 
@@ -160,7 +168,7 @@ def seen_of(k: int, other: int, kernel: KernelState) -> tuple[float, float]:
 
 def empty_observation(n_cells: int) -> BatchObservation:
     """Room for the observations of K cells: rows of one array of whole numbers and of one of floats."""
-    return _rows(np.zeros((4, n_cells), np.int64), np.zeros((13, n_cells)))
+    return _rows(np.zeros((5, n_cells), np.int64), np.zeros((15, n_cells)))
 
 
 def first(observation: BatchObservation, n: int) -> BatchObservation:
@@ -201,14 +209,16 @@ class Past:
         nobody, bv = (np.full(known.shape, math.inf), absent), (x[self._principal], v[self._principal])
         lv = (x[self._ahead], v[self._ahead]) if self._ahead >= 0 else (absent, absent)
         set_speed = np.broadcast_to(seen.set_speed_mps, known.shape)
-        real = (step - ago) * STEP_S, x[-1], v[-1], zero, *nobody, *bv, *lv, zero, zero, set_speed
-        whole = read_only(np.stack((seen.cell, seen.episode, np.ones_like(seen.cell), np.zeros_like(seen.cell))))
+        real = (step - ago) * STEP_S, x[-1], v[-1], zero, *nobody, *bv, *lv, zero, zero, set_speed, zero, zero
+        left = np.ones_like(seen.cell)
+        whole = read_only(np.stack((seen.cell, seen.episode, left, left, np.zeros_like(left))))
         return [_rows(whole, rows) for rows in read_only(np.stack(real, axis=1))]
 
 
 def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
-    cell, episode, bv_lane, bv_overlaps = whole
-    return BatchObservation._make([cell, episode, *real[:8], bv_lane, *real[8:12], bv_overlaps, real[12]])
+    cell, episode, bv_lane, lv_lane, bv_overlaps = whole
+    others = *real[6:8], bv_lane, *real[8:10], lv_lane
+    return BatchObservation._make([cell, episode, *real[:6], *others, *real[10:12], bv_overlaps, *real[12:]])
 
 
 @compiled

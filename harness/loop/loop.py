@@ -46,6 +46,11 @@ class Scenario(NamedTuple):
     driver: RecordArray
     columns: tuple[Any, ...]
 
+    @property
+    def shown(self) -> tuple[str, str]:
+        """Names of the vehicles that controllers see as LV and BV; empty without one."""
+        return self.vehicles[self.ahead] if self.ahead >= 0 else "", self.vehicles[self.principal]
+
 
 class RecordPolicy(NamedTuple):
     """Of which tests the motion is recorded."""

@@ -71,7 +71,7 @@ def _run_here(
 ) -> Again:
     clock, found = Clock(held=held), list[Bits]()
     with clock.shown():
-        host = build_host(av, n_cells=n_cells, seed=scenario.seed)
+        host = build_host(av, n_cells=n_cells, seed=scenario.seed, names=scenario.shown)
         with closing(EpisodeLoop(TwinWorld(n_cells, scenario.vehicles), scenario, keep, host)) as loop:
             for first, traffic in tests:
                 shard = loop.run(first, traffic)

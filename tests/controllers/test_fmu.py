@@ -88,7 +88,7 @@ def test_inputs_that_are_named_as_observations_and_an_only_output_need_no_wiring
         0.0, 1.0, 2.0, 3.0, 4.0, 5.0, Neighbour(6.0, 7.0, 1), Neighbour(8.0, 9.0, 1), 10.0, 11.0, True, 12.0
     )
     assert [read(seen) for read in found.readings] == [4.0, 7.0]
-    assert [read(seen) for read in OBSERVATIONS.values()] == [0, 1, 2, 3, 4, 5, 6, 7, 1, 8, 9, 10, 11, 1, 12]
+    assert [read(seen) for read in OBSERVATIONS.values()] == [0, 1, 2, 3, 4, 5, 6, 7, 1, 8, 9, 1, 10, 11, 1, 12, 0, 0]
     with pytest.raises(CampaignError, match=r"inputs gap_m, v;.*--set 'av.fmu.inputs="):
         wire(own, variables(gap_m="input", v="input", a="output"))
     with pytest.raises(CampaignError, match=r"av.fmu.output: found a, b;.*--set av.fmu.output=NAME"):

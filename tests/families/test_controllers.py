@@ -1,0 +1,111 @@
+"""What a vehicle of the user's own sees of lead braking and cut-outs, in each of its forms."""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from harness.sampling import prepare
+from harness.vocabulary import CRASH
+from harness.worlds.twin import TwinWorld
+from tests.families.test_same_bits import LADDERS, require_same, resolved_of, run, source_of
+from tests.families.watching import SEEN
+
+SET_SPEED_MPS = 40.0
+
+
+def traffic_from(name: str, n: int):
+    """Tests from all shells of the pool."""
+    rows = np.linspace(0, len(source_of(name).pool.events.at) - 1, n).astype(np.int64)
+    return source_of(name).prescribed.of_rows(rows, np.zeros(n, np.int64))
+
+
+def drive(name: str, controller: str, traffic, cells=16):
+    source = prepare(resolved_of(name, None, f"av.controller={controller}"))
+    with closing(TwinWorld(cells, source.scenario.vehicles)) as world:
+        loop = source.loop(world, traces="all")
+        with closing(loop):
+            return loop.run(0, traffic)
+
+
+@pytest.mark.parametrize("name", LADDERS)
+def test_the_same_model_has_the_same_bits_in_every_form(name):
+    """Where the vehicle ahead brakes they are those of the built-in one; before a cut-out that looks ahead of it."""
+    traffic, resolved = traffic_from(name, 40), resolved_of(name)
+    shards = [drive(name, f"examples.{form}:IDM", traffic) for form in ("idm", "idm_batch", "idm_traci_style")]
+    shards += [run(TwinWorld, resolved, traffic, "all")] if name == "lead_brakes" else []
+    for shard in shards:
+        assert not shard.failures
+        require_same(shard, shards[0])
+    assert 3 < (shards[0].episode["outcome"] == CRASH).sum() < 37
+
+
+def ahead_on_lane(trace, step, visible):
+    """Gap (m) to, and place of, the nearest that is seen ahead on the AV's lane."""
+    av = trace[step, -1, 0]
+    there = [(trace[step, i, 0] - 5.0 - av, i) for i in range(trace.shape[1] - 1) if trace[step, i, 3] == 0.0]
+    return min((gap, i) for gap, i in there if step >= visible[i])
+
+
+@pytest.mark.parametrize("name", LADDERS)
+def test_a_controller_follows_from_the_first_step_and_sees_who_is_revealed_in_time(name):
+    traffic = traffic_from(name, 12)
+    SEEN.clear()
+    shard = drive(name, "tests.families.watching:Watching", traffic, cells=1)
+    vehicles = shard.scenario.vehicles
+    assert [len(seen) for _, seen in SEEN] == shard.episode["n_steps"].tolist()
+    for row, (start, steps) in enumerate(SEEN):
+        assert (start.set_speed_mps, steps[0].time_s, steps[0].set_speed_mps) == (SET_SPEED_MPS, 0.0, SET_SPEED_MPS)
+        assert (start.lv_name, start.bv_name) == {"lead_brakes": ("", "LV"), "cut_out": ("LV", "SV")}[name]
+        trace, visible = shard.traces[row], traffic.script.visible_from[row]
+        for step, seen in enumerate(steps):
+            gap, leader = ahead_on_lane(trace, step, visible)
+            assert (seen.gap_m, seen.lead_speed_mps) == (gap, trace[step, leader, 1])
+            if name == "lead_brakes":
+                assert math.isnan(seen.lv.position_m)
+                assert (*seen.bv, seen.bv_lateral_m, seen.lv_lateral_m) == (*trace[step, 0, [0, 1, 3]], 0.0, 0.0)
+                continue
+            assert seen.lv == tuple(trace[step, 0, [0, 1, 3]])
+            assert math.isnan(seen.bv.position_m) == (step < visible[1]) == (not seen.bv_overlaps)
+            assert step < visible[1] or seen.bv == tuple(trace[step, 1, [0, 1, 3]])
+            clear, way = step > traffic.script.at[row], seen.lv_lateral_m
+            assert leader == vehicles.index("SV" if clear else "LV")
+            assert (way >= 0.375 - 1e-9) == (step >= visible[1])
+            assert (way == 1.9) == clear == (trace[step, 0, 3] == 1.0)
+            assert (seen.lv_lateral_speed_mps > 0.0) == (
+                not clear and step > traffic.script.at[row] - traffic.script.lead[row]
+            )
+            assert seen.bv_lateral_m == 0.0
+
+
+@pytest.mark.parametrize("name", LADDERS)
+def test_a_traci_script_knows_the_vehicles_by_the_scenarios_names(name):
+    """Who is not seen yet is not there; a speed's first change is none."""
+    traffic = traffic_from(name, 12)
+    SEEN.clear()
+    shard = drive(name, "tests.families.watching:WatchingTraci", traffic, cells=1)
+    assert not shard.failures
+    vehicles = shard.scenario.vehicles
+    for row, (_, steps) in enumerate(SEEN):
+        trace, visible = shard.traces[row], traffic.script.visible_from[row]
+        assert len(steps) == shard.episode["n_steps"][row]
+        for step, (known, (leader, gap), allowed) in enumerate(steps):
+            there = [i for i in range(len(vehicles) - 1) if step >= visible[i]]
+            assert list(known) == [*(vehicles[i] for i in there), "AV"]
+            assert (gap, vehicles.index(leader)) == ahead_on_lane(trace, step, visible)
+            assert allowed == SET_SPEED_MPS
+            for i in there:
+                position, speed, acceleration, lane, sideways = known[vehicles[i]]
+                assert (position, speed, lane) == tuple(trace[step, i, [0, 1, 3]])
+                before = trace[step - 1, i, 1] if step > visible[i] else speed
+                assert acceleration == (speed - before) / 0.1
+                assert 0.0 <= sideways < 1.9
+                assert (sideways > 0.0) == (
+                    vehicles[i] == "LV"
+                    and name == "cut_out"
+                    and lane == 0.0
+                    and step > traffic.script.at[row] - traffic.script.lead[row]
+                )
