@@ -150,7 +150,11 @@ class VehicleDomain(Domain):
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""
-        for other, there in ((self._lv, now.lv), (self._bv, now.bv)):
+        for name, other, there in (("LV", self._lv, now.lv), ("BV", self._bv, now.bv)):
+            if there.position_m != there.position_m:  # NaN: nobody is there
+                self._seen.pop(name, None)
+            elif name not in self._seen:
+                self._seen[name] = other
             other.acceleration = (there.speed_mps - other.speed) / STEP_S if self._begun else 0.0
             other.position, other.speed, other.lane = there
         # SUMO counts to the left; once BV overlaps it counts as a vehicle of the right lane, in its middle.
