@@ -115,6 +115,8 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[shows])
     named = campaign.environment.named(family.default_parameters)
     campaign = campaign.replaced(("environment", "parameters"), named)
+    error = campaign.pool.relative_error or family.pool_error
+    campaign = campaign.replaced(("pool", "relative_error"), error)
     return Resolved(
         campaign,
         parameters,

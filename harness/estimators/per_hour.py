@@ -92,19 +92,22 @@ class PerHour:
     def limits(self, level: Level, *, inside: bool = False) -> RateLimits:
         """Rate per hour with limits; anything is possible where crashes lie on too few paths of a pool."""
         parts = [(of, slice(0, of.seen.design.n_inside if inside else None)) for of in self.families]
+        tallies = [of.tally.part(strata) for of, strata in parts]
         p = np.concatenate([of.p[strata] for of, strata in parts])
-        tallies = [(of.p[strata], of.tally.part(strata), of.seen.design.n_independent) for of, strata in parts]
-        rate = math.fsum(float(own @ tally.share) for own, tally, _ in tallies)
-        if any(tally.crashes.any() and paths_that_count(own, tally) < FEWEST_PATHS for own, tally, _ in tallies):
-            return RateLimits(rate, 0.0, math.inf, math.inf, 0.0)
+        rate = math.fsum(float(of.p[strata] @ tally.share) for (of, strata), tally in zip(parts, tallies, strict=True))
+        for (of, strata), tally in zip(parts, tallies, strict=True):
+            if tally.crashes.any() and paths_that_count(of.seen.design.p[strata], tally) < FEWEST_PATHS:
+                return RateLimits(rate, 0.0, math.inf, math.inf, 0.0)
 
-        def limit(side: float, worst: bool) -> tuple[float, float]:
-            each = [tally.failed_as_crashes() if worst else tally for _, tally, _ in tallies]
-            known = zip(tallies, each, strict=True)
-            variance = math.fsum(pool_variance(own, tally, n) for (own, _, n), tally in known)
-            variance += math.fsum((of.relative_error * of.rate) ** 2 for of in self.families)
-            crashes = np.concatenate([tally.crashes for tally in each])
-            tests = np.concatenate([tally.tests for tally in each])
+        def limit(side: float, *, worst: bool) -> tuple[float, float]:
+            each = [tally.failed_as_crashes() if worst else tally for tally in tallies]
+            variance = 0.0
+            for (of, strata), tally in zip(parts, each, strict=True):  # masses are per test, as a design's p is
+                own = pool_variance(of.seen.design.p[strata], tally, of.seen.design.n_independent)
+                variance += of.per_hour**2 * own + (of.relative_error * of.rate) ** 2
+            crashes, tests = (
+                np.concatenate(column) for column in zip(*((t.crashes, t.tests) for t in each), strict=True)
+            )
             return likelihood_limit(p, crashes, tests, level, side, variance), variance
 
         (low, variance), (high, _) = limit(-1.0, worst=False), limit(1.0, worst=True)

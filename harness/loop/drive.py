@@ -41,17 +41,14 @@ def follow(k: int, kernel: KernelState) -> None:
     """Acceleration of a built-in AV that follows from the start; see `harness.vehicles.following`."""
     cells, driver, script = kernel.cells, kernel.driver[0], kernel.script
     cell, speed = cells.cell[k], kernel.v[k, kernel.x.shape[1] - 1]
-    late, perceived, reacts, nobody = (
-        reaction_steps(driver, kernel.seed, cell.episode),
-        0,
-        NEVER,
-        Ahead(speed, math.inf, 0.0),
-    )
-    lead, revealed = nobody, nobody
+    late, perceived, reacts = reaction_steps(driver, kernel.seed, cell.episode), 0, NEVER
+    lead = revealed = Ahead(speed, math.inf, 0.0)
     if cell.onset_step >= 0:
         clear, perceived = cell.planned + 1 - cell.onset_step, cell.onset_step + 1
         if script.sideways_mps[cell.row] > 0.0:
             perceived = cell.onset_step + seen_after(driver.perceives_lateral_m, script.sideways_mps[cell.row], clear)
+        for other in range(kernel.x.shape[1] - 1):
+            perceived = max(perceived, script.visible_from[cell.row, other])
         reacts = perceived + late
     for other in range(kernel.x.shape[1] - 1):
         hidden = script.visible_from[cell.row, other] > 0

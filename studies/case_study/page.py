@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import groupby
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from harness import numbers
 from harness.errors import HarnessError
 from harness.records.folder import write_bytes
-from studies.case_study.figures import LOW_MEAN_WEIGHT, Verdict, is_settled, verdict
+from studies.case_study.figures import LOW_MEAN_WEIGHT, Verdict, is_settled, marked, range_of, verdict
 from studies.case_study.plots import plots_of
 from studies.case_study.study import Made, Study
 
@@ -43,6 +42,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
         lstrip_blocks=True,
     )
     environment.filters.update(shown=shown, number=numbers.number, point=point, count=count, cell=cell, spans=spans)
+    environment.filters["mark"] = lambda found, row: marked(found, settled=row["settled"])
     steps = [(name, step, made[name].result) for name, step in study.steps.items()]
     page = environment.get_template("case_study.md.j2").render(
         study=study,
@@ -129,13 +129,29 @@ def count(value: float | None) -> str:
     return numbers.count(value) if value is None or abs(value) < 1e6 else numbers.number(value)
 
 
-def claim_rows(claims: list[dict[str, Any]], answer: Verdict) -> Iterator[tuple[str, str, str, str]]:
-    """Numbers, words, the paper's and our number; neighbours share a row if but the last word and the former differ."""
-    of = [(number, claim) for number, claim in enumerate(claims, start=1) if claim["verdict"] == answer]
-    for (_, here), group in groupby(of, lambda each: (each[1]["says"].rpartition(" ")[0], shown(each[1]["found"]))):
-        numbered, same = zip(*group, strict=True)
-        ends = (claim["says"].rpartition(" ")[2] for claim in same[1:])
-        yield spans(numbered), cell(", ".join([same[0]["says"], *ends])), ", ".join(map(_asked_for, same)), here
+def claim_rows(claims: list[dict[str, Any]], answer: Verdict) -> list[tuple[str, str, str, str]]:
+    """Numbers, words, the paper's and our number, a row for each fact.
+
+    Claims share a row that are the same fact, or of which but the last word and the paper's number differ.
+    """
+    groups: dict[Any, list[tuple[int, dict[str, Any]]]] = {}
+    for number, claim in enumerate(claims, start=1):
+        if claim["verdict"] == answer:
+            key = claim["fact"] or (claim["says"].rpartition(" ")[0], shown(claim["found"]))
+            groups.setdefault(key, []).append((number, claim))
+    rows = []
+    for group in groups.values():
+        numbered, (first, *others) = [number for number, _ in group], [claim for _, claim in group]
+        ends = [claim["says"].rpartition(" ")[2] for claim in others]
+        says, paper = ", ".join([first["says"], *ends]), ", ".join(map(_asked_for, (first, *others)))
+        here = shown(first["found"])
+        if first["fact"]:
+            says = first["fact"]
+            least, *_, most = sorted([claim["paper"] for claim in (first, *others)] * 2)
+            paper = f"{numbers.number(least)} to {numbers.number(most)}"
+            here = shown(range_of([claim["found"] for claim in (first, *others)]))
+        rows.append((spans(numbered), cell(says), paper, here))
+    return rows
 
 
 def _asked_for(claim: dict[str, Any]) -> str:

@@ -12,6 +12,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter
 
 from harness.estimators.block import MAX_CONTROL_STEPS
 from harness.records.folder import read_table
@@ -22,8 +24,10 @@ from studies.case_study.study import Convergence, Line, Made, Study, Variants
 
 INK, BLUE, VERMILLION, GREEN, GREY = "#1c2126", "#0067a8", "#c94f0a", "#00795a", "#8b95a0"
 STYLE: list[Any] = ["default", "seaborn-v0_8-whitegrid", {"font.size": 9.0, "axes.titlelocation": "left"}]
+WIDTH_IN = 7.6
+"""Of the text on a page, so that letters are as large as its own."""
 MOST_RATE, LEAST_GAIN = 3.0, 0.1
-"""Times the known rate up to which rates are drawn; the least gain: worse ones are on the axis."""
+"""Times the known rate up to which rates are drawn; the least gain that is: where there is more, captions say so."""
 _COLOURS = {"low": GREY, "nade": BLUE, "scv": VERMILLION, "nde": INK, "": GREEN}
 """Of a method in all plots, by what its step or label contains."""
 _HOLLOW: dict[str, Any] = {"markerfacecolor": "none", "markersize": 7, "linewidth": 0.9}
@@ -48,7 +52,7 @@ def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str
                 known = made[step.reference].result["figures"]["crash_rate"]["value"]
                 plots[name] = settings_plot(made[name].result["variants"], known, study.rhw)
             elif step.kind == "control_variates":
-                plots[f"{name}_growth"] = growth_plot(made[name].result["looks"], study.rhw)
+                plots[f"{name}_growth"] = growth_plot(made[name].result, study.rhw)
                 if strata := made[name].result["strata"]:
                     plots[name] = strata_plot(strata)
                     plots[f"{name}_results"] = spread_plot(read_table(made[name].folder / SPREAD))
@@ -57,18 +61,19 @@ def plots_of(study: Study, made: Mapping[str, Made], ours: Mapping[str, dict[str
 
 def _figure(height_in: float, *titles: str) -> tuple[Figure, list[Axes]]:
     """Panels side by side."""
-    figure = Figure(figsize=(8.6, height_in), layout="constrained")
+    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
     panels = figure.subplots(1, len(titles), squeeze=False)[0].tolist()
     for axes, title in zip(panels, titles, strict=True):
         axes.set_title(title)
     return figure, panels
 
 
-def _drawn(figure: Figure, caption: str, legend: Literal["best", "lower left"] = "best") -> Plot:
+def _drawn(figure: Figure, caption: str, legend: Literal["best", "lower left", "upper right"] = "best") -> Plot:
     for axes in figure.axes:
+        axes.xaxis.set_minor_formatter(NullFormatter())
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8, loc=legend)
-    figure.savefig(buffer := io.BytesIO(), format="png", dpi=160, metadata={"Software": None})
+    figure.savefig(buffer := io.BytesIO(), format="png", dpi=180, metadata={"Software": None})
     return Plot(caption, buffer.getvalue())
 
 
@@ -78,10 +83,14 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
         return None
     figure, (axes,) = _figure(3.6, f"tests for a relative half-width of {rhw:g}")
     axes.set_yscale("log")
-    for line in ("NDE", "NADE", "SCV claims"):
-        at = [place for place, label in enumerate(ours) if label.partition("\n")[0] == line]
-        axes.plot(at, [picture[list(ours)[place]].paper or np.nan for place in at], ":D", color=INK, **_HOLLOW)
-        axes.plot(at, [found["value"] or np.nan for found in (list(ours.values())[place] for place in at)], color=BLUE)
+    method = [label.partition("\n")[0] for label in ours]
+    for line, paper in dict.fromkeys(zip(method, (picture[label].paper for label in ours), strict=True)):
+        if paper is not None:  # one number of theirs beside all of ours that it stands for
+            at = [place for place, label in enumerate(ours) if (method[place], picture[label].paper) == (line, paper)]
+            axes.plot(at, [paper] * len(at), ":", color=INK, linewidth=0.9)
+            axes.plot(np.mean(at), paper, "D", color=INK, **_HOLLOW)
+    at = [place for place, line in enumerate(method) if line == "NADE"]
+    axes.plot(at, [found["value"] or np.nan for found in (list(ours.values())[place] for place in at)], color=BLUE)
     for place, (label, found) in enumerate(ours.items()):
         if (value := found["value"] or found["low"]) is None:
             continue
@@ -100,30 +109,34 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
         )
     axes.margins(y=0.15)
     axes.set_xticks(range(len(ours)), list(ours), fontsize=8)
+    axes.set_xlabel("method")
     axes.grid(visible=False, axis="x")
-    caption = "Tests by method. Filled: here (triangles: lower limits; grey, †: not converged). Hollow: the paper's."
-    return _drawn(figure, caption)
+    axes.plot([], "o", color=INK, markersize=7, label="here")
+    axes.plot([], "^", color=INK, markersize=7, label="here, at least")
+    axes.plot([], "D", color=INK, label="the paper, whose ε is not published", **_HOLLOW)
+    return _drawn(figure, "Tests by method, AV = SM-I. Grey, †: not converged.", "upper right")
 
 
 def convergence_plot(name: str, step: Convergence, made: Mapping[str, Made], rhw: float, confidence: float) -> Plot:
     """Crash rate with its band, and RHW, against tests."""
     table = read_table(made[name].folder / CURVES)
     reference = made[step.reference].result["figures"]["crash_rate"]["value"] or 0.0
-    figure, (left, right) = _figure(3.4, "crash rate per test", "RHW")
+    figure, (left, right) = _figure(3.2, "crash rate per test", "relative half-width")
     for label in step.of:
         colour = next(colour for name, colour in _COLOURS.items() if name in label)
         rows = table.filter(pc.equal(table.column("step"), label))
         n, rate, half = (rows.column(column).to_numpy() for column in ("n", "crash_rate", "half_width"))
         known = (rate > 0.0) & np.isfinite(half)
         left.fill_between(n, np.maximum(rate - half, 0.0), rate + half, color=colour, alpha=0.16, linewidth=0)
-        left.plot(n, rate, color=colour, label=label)
-        right.plot(n[known], half[known] / rate[known], color=colour, label=label)
-    left.axhline(reference, **_DASHED)
+        left.plot(n, rate, color=colour)
+        right.plot(n[known], half[known] / rate[known], color=colour, label=step.words.get(label, label))
+    known_by = step.words.get(step.reference, step.reference)
+    left.axhline(reference, **_DASHED, label=known_by)
     left.set(xlabel="tests", xscale="log", ylim=(0.0, MOST_RATE * reference or 1.0))
-    right.axhline(rhw, **_DASHED)
+    right.axhline(rhw, **_DASHED, label=f"asked: {rhw:g}")
     right.set(xlabel="tests", xscale="log", yscale="log")
-    caption = f"Crash rates with {confidence:.0%} bands (dashed: {step.reference}), and RHW, by tests."
-    return _drawn(figure, caption)
+    cut = f"what is above {MOST_RATE:g} times the rate of {known_by} is cut off"
+    return _drawn(figure, f"By tests: crash rates with {confidence:.0%} bands ({cut}), and relative half-widths.")
 
 
 def strata_plot(strata: list[dict[str, Any]]) -> Plot | None:
@@ -133,37 +146,51 @@ def strata_plot(strata: list[dict[str, Any]]) -> Plot | None:
         return None
     steps, most = [row["control_steps"] for row in shown], max(row["sd_before"] for row in shown)
     figure, (left, right) = _figure(3.2, "number in a stratum", "standard deviation of results")
-    for key, label, colour in (("n", "tests", INK), ("columns", "control variates", GREY), ("rank", "rank", GREEN)):
-        left.plot(steps, [max(row[key], 0.8) for row in shown], "o-", color=colour, label=label, markersize=3)
+    kinds = ("n", "tests", INK), ("columns", "control variates", GREY), ("rank", "their rank", GREEN)
+    for key, label, colour in kinds:
+        left.plot(steps, [row[key] for row in shown], "o-", color=colour, label=label, markersize=2.5)
     for key, label, colour, width in (("sd_before", "Y, NADE", BLUE, 4.0), ("sd_after", "Z, SCV", VERMILLION, 1.4)):
         spread = [row[key] if row[key] > most / 1e4 else np.nan for row in shown]  # beneath it is what rounding left
         right.plot(steps, spread, "o-", color=colour, label=label, markersize=3, linewidth=width)
-    beneath = "control steps l; from 10 on columns are of the first 9"
-    left.set(xlabel=beneath, yscale="log")
-    right.set(xlabel=beneath, yscale="log" if most else "linear")
-    return _drawn(figure, "By control steps: tests, columns and their rank; spread of results of NADE (Y) and SCV (Z).")
+    left.set_yscale("symlog", linthresh=1.0)  # with a place for a rank of 0
+    left.set(xlabel="control steps l", ylim=(-0.2, None))
+    right.set(xlabel="control steps l", yscale="log" if most else "linear")
+    columns = f"tests, control variates (of the first {MAX_CONTROL_STEPS} steps) and their rank"
+    return _drawn(figure, f"By control steps: {columns}; spread of results of NADE (Y) and of SCV (Z).")
 
 
-def growth_plot(looks: list[dict[str, Any]], rhw: float) -> Plot | None:
+_GAINS = {
+    "claimed": ("as claimed", _COLOURS["scv"]),
+    "degrees_of_freedom": ("by degrees of freedom", INK),
+    "leave_one_out": ("leaving one out", GREEN),
+}
+
+
+def growth_plot(result: Mapping[str, Any], rhw: float) -> Plot | None:
     """RHW of NADE and of SCV against tests, and the gain that SCV claims, corrected, and between parts of the run."""
-    known = [row for row in looks if row["nade_rhw"] and row["scv_rhw"] and row["gain_claimed"]]
+    known = [row for row in result["looks"] if row["nade_rhw"] and row["scv_rhw"] and row["gain_claimed"]]
     if not known:
         return None
     n = [row["n"] for row in known]
-    figure, (left, right) = _figure(3.4, "relative half-width", "NADE's variance over SCV's")
+    figure, (left, right) = _figure(3.2, "relative half-width", "NADE's variance over SCV's")
     for key, label, width in (("nade", "NADE", 4.0), ("scv", "SCV, as it claims", 1.4)):
         values = [row[f"{key}_rhw"] for row in known]
         left.plot(n, values, "o-", label=label, color=_COLOURS[key], linewidth=width, markersize=3)
-    for key, colour in (("claimed", _COLOURS["scv"]), ("degrees_of_freedom", INK), ("leave_one_out", GREEN)):
-        gains = [max(row[f"gain_{key}"] or np.nan, LEAST_GAIN) for row in known]
-        right.plot(n, gains, "o-", color=colour, markersize=3, label=key.replace("_", " "))
-    again = [row["gain_replicated"]["value"] or np.nan for row in known]
-    right.plot(n, again, "D", color=BLUE, label="replication", **_HOLLOW)
-    left.axhline(rhw, **_DASHED)
+    caption = "By tests: relative half-widths; SCV's gain as claimed, corrected in two ways, and replicated."
+    for key, (label, colour) in _GAINS.items():
+        gains = np.array([row[f"gain_{key}"] or np.nan for row in known])
+        below = gains < LEAST_GAIN
+        right.plot(n, np.maximum(gains, LEAST_GAIN), "-", color=colour)
+        right.plot(n, np.where(below, np.nan, gains), "o", color=colour, markersize=3)
+        right.plot(n, np.where(below, LEAST_GAIN, np.nan), "v", color=colour, markersize=5)
+        right.plot([], "o-", color=colour, markersize=3, label=label)
+        caption += f" Triangles: below {LEAST_GAIN:g}." if below.any() else ""
+    again = [(row["n"], row["gain_replicated"]["value"]) for row in result["sizes"] if row["gain_replicated"]["value"]]
+    right.plot(*np.transpose(again or [(np.nan, np.nan)]), "D", color=BLUE, label="by replication", **_HOLLOW)
+    left.axhline(rhw, **_DASHED, label=f"asked: {rhw:g}")
     right.axhline(1.0, **_DASHED)
     for axes in (left, right):
         axes.set(xlabel="tests", xscale="log", yscale="log")
-    caption = "By tests: RHW, and SCV's gain as claimed, corrected and replicated."
     return _drawn(figure, caption, "lower left")
 
 
@@ -174,34 +201,36 @@ def spread_plot(results: pa.Table) -> Plot | None:
         return None
     y, z = y / (scale := np.median(y[y > 0.0])), z / scale
     side = np.geomspace(1e-2, 2.0 * max(np.abs(y).max(), np.abs(z).max()), 25)
-    figure = Figure(figsize=(8.6, 3.4), layout="constrained")
-    panels = figure.subplots(2, 5, sharex=True, sharey=True).ravel()
-    for level, axes in enumerate(panels, start=1):
-        rows = steps == level if level <= MAX_CONTROL_STEPS else np.full(len(steps), True)
-        for values, key, label in ((y, "nade", "Y, NADE"), (z, "scv", "Z, SCV")):
-            axes.hist(
-                values[rows],
-                [*-side[::-1], *side],
-                label=label if level == 1 else None,
-                histtype="step",
-                color=_COLOURS[key],
-            )
-        axes.set_title(f"l = {level}" if level <= MAX_CONTROL_STEPS else "all")
+    levels = {f"l = {level}": steps == level for level in range(1, MAX_CONTROL_STEPS + 1)}
+    shown = {title: rows for title, rows in levels.items() if rows.any()} | {"all": np.full(len(steps), True)}
+    figure, across = Figure(figsize=(WIDTH_IN, 3.6), layout="constrained"), -(-len(shown) // 2)
+    panels = figure.subplots(2, across, sharey=True, squeeze=False).ravel()
+    for (title, rows), axes in zip(shown.items(), panels, strict=False):
+        for values, key in ((y, "nade"), (z, "scv")):
+            axes.hist(values[rows], [*-side[::-1], *side], histtype="step", color=_COLOURS[key])
+        axes.set_title(title)
         axes.set_xscale("symlog", linthresh=1e-2, linscale=0.5)
         axes.set_yscale("symlog", linthresh=1.0)
         axes.set_xticks([-1.0, 0.0, 1.0], ["-1", "0", "1"])
-    panels[0].set_ylabel("tests")
-    return _drawn(figure, "By control steps l: results over the median crash, of NADE (Y) and SCV (Z); zeros left out.")
+    for axes in panels[len(shown) :]:
+        axes.remove()
+    figure.supxlabel("result over the median crash", fontsize=9)
+    figure.supylabel("tests", fontsize=9)
+    lines = [Line2D([], [], color=_COLOURS[key]) for key in ("nade", "scv")]
+    figure.legend(lines, ["Y, NADE", "Z, SCV"], loc="outside upper right", ncols=2, fontsize=8)
+    left_out = "numbers of steps without a result, and results that are 0, are left out"
+    return _drawn(figure, f"By control steps l: results of NADE (Y) and SCV (Z); {left_out}.")
 
 
 def settings_plot(variants: list[dict[str, Any]], known_rate: float, rhw: float) -> Plot:
     """Of each setting tests as claimed, by replication and over shuffles; mean weight and rate over the known one."""
-    figure, (left, right) = _figure(3.4, f"tests for a relative half-width of {rhw:g}", "should be 1")
-    looks = (("claimed", "as claimed", "o", GREY), ("rnot", "RNoT", "s", GREEN), ("true", "by replication", "o", BLUE))
-    for key, label, marker, colour in looks:
+    figure, (left, right) = _figure(3.2, f"tests for a relative half-width of {rhw:g}", "should be 1")
+    ways = ("claimed", "as claimed", "o", GREY), ("rnot", "RNoT", "s", GREEN), ("true", "by replication", "o", BLUE)
+    for key, label, marker, colour in ways:
         style: dict[str, Any] = {"color": colour, "linestyle": "none", "markersize": 8 if key == "claimed" else 5}
         left.plot([row[key]["value"] or np.nan for row in variants], marker, label=label, **style)
         left.plot([np.nan if row[key]["value"] else row[key]["low"] or np.nan for row in variants], "^", **style)
+    left.plot([], "^", color=INK, markersize=5, linestyle="none", label="at least")
     left.set_yscale("log")
     right.plot([row["mean_weight"] for row in variants], "o-", color=INK, label="mean weight", markersize=4)
     rates = [(row["nade_rate"]["value"] or np.nan) / known_rate for row in variants]
@@ -209,5 +238,6 @@ def settings_plot(variants: list[dict[str, Any]], known_rate: float, rhw: float)
     right.axhline(1.0, **_DASHED)
     right.set_ylim(bottom=0.0)
     for axes in (left, right):
-        axes.set_xticks(range(len(variants)), [row["variant"] for row in variants], fontsize=8, rotation=30)
-    return _drawn(figure, "By ε: tests (triangles: lower limits); mean weight, and rate over the known one.")
+        axes.set_xticks(range(len(variants)), [row["variant"].rpartition(" ")[2] for row in variants])
+        axes.set_xlabel("ε")
+    return _drawn(figure, "By ε, AV = SM-I: tests; mean weight, and rate over the known one.")

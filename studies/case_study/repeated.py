@@ -12,6 +12,7 @@ from scipy.stats import ttest_1samp
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.estimators.doubly_robust import DoublyRobust
 from harness.estimators.scv import Scv
 from harness.resolved import resolve
 from harness.sampling import prepare
@@ -95,24 +96,29 @@ def claims_in_twin(
     asked: tuple[EstimatorName, ...] = ("nade", "scv") if campaign.testing.method == "step_mixture" else ("nade",)
     source, whole = twin_episodes(campaign, campaign.seed, asked), Claims(with_scv=False)
     rows, parts, steps = list[dict[str, Any]](), list[Tests](), np.zeros(0, np.int64)
-    known = None
+    known, left = None, (list[float](), list[float]())
     if step.means:
         others, stop = Scv(), n * step.replications + step.means
         for first in range(n * step.replications, stop, AT_ONCE):
             others.add(source(first, min(AT_ONCE, stop - first)))
         known = KnownMeans(others)
     for start in range(0, n * step.replications, n):
-        claims = Claims()
+        claims, dr = Claims(), DoublyRobust()
         for first in range(start, start + n, AT_ONCE):
             block = source(first, min(AT_ONCE, start + n - first))
             whole.add(block)
             claims.add(block)
             if known:
                 known.add(block)
+            if campaign.sampling.mixes:
+                dr.add(block)
             parts.append(Tests.of(block.first_episode, block.outcome, block.log_weight))
             counts = np.bincount(block.n_control_steps, minlength=len(steps))
             steps = counts + np.pad(steps, (0, len(counts) - len(steps)))
         rows.append(claims.row(rhw, confidence))
+        if details := dr.result(confidence).details if rows[-1]["nade_rhw"] and campaign.sampling.mixes else {}:
+            left[0].append(details["plain_std_error"] ** 2)
+            left[1].append(details["residual_std_error"] ** 2)
     prepared_twin.cache_clear()  # or a worker would keep the tables of all variants
     row = whole.row(rhw, confidence)
     tests = {name: [each[f"{name}_tests"] or math.nan for each in rows] for name in ("nade", "scv")}
@@ -132,6 +138,7 @@ def claims_in_twin(
         "gain_claimed": marked(ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
         "gain_true": ratio_of_variances(rates["nade"], rates["scv"], confidence),
         **(known.row(confidence) if known else {}),
+        "gain_dr": marked(ratio_of_means(*left, confidence), settled=row["settled"]),
         "difference": max((each["difference"] for each in rows if each["difference"] is not None), default=None),
     }
 

@@ -44,6 +44,7 @@ class Convergence(Section):
     kind: Literal["convergence"]
     of: list[StepName] = Field(min_length=1, max_length=4, description="steps of kind twin_tests or run")
     reference: StepName = Field(description="step whose crash rate the others are compared with")
+    words: dict[StepName, str] = Field({}, description="what to call them in the plot")
 
 
 class ControlVariates(Section):
@@ -137,6 +138,7 @@ class Claim(Section):
     tolerance: Positive | None = Field(None, description="distance that counts as the same, instead of a factor")
     at_most: bool = Field(False, description="whether the paper's number is a limit that ours does not exceed")
     why: str = Field("", description="why ours differs, as far as known; printed unless it is reproduced")
+    fact: str = Field("", description="what several claims say, told in one row with the range of their numbers")
     ours_to_choose: bool = Field(False, description="whether a setting of ours decides it, so that nothing is judged")
 
 

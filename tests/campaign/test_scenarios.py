@@ -146,7 +146,7 @@ ALSO = [
     *("run.shard_size=7", "pool.library=ladder-1"),
 ]
 SHELLS = FOLDER / "overtaking_shells.yaml"
-HASHES = "cdc55b5b28aea63a"
+HASHES = "1acd10707ea15dc2"
 
 
 def test_hashes_stay():

@@ -78,7 +78,7 @@ def test_the_pool_knows_the_rate_and_a_run_of_shells_finds_it(engine, tmp_path):
 def test_an_installed_package_brings_a_family_by_an_entry_point(monkeypatch):
     entry = EntryPoint("fake", "tests.families.fake:FAKE", families.GROUP)
     monkeypatch.setattr(families, "entry_points", lambda *, group: [entry] if group == families.GROUP else [])
-    assert set(INSTALLED()) == {"cut_in", "fake"}
+    assert set(INSTALLED()) == {"cut_in", "lead_brakes", "cut_out", "fake"}
     assert INSTALLED()["fake"] is FAKE
 
 

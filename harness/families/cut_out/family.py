@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 import pyarrow as pa
+from pydantic import model_validator
 from scipy.special import ndtr, ndtri
 
+from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
-from harness.families.following.approach import Following
+from harness.families.following.approach import NEVER, Following
 from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
 from harness.families.numbers import Number, Share, ordered, within
@@ -46,6 +48,11 @@ class Leaving(Section):
 
     _ranges = ordered(("careless_least_s", "careless_most_s"), equal=False)
 
+    def lateral_mps(self) -> FloatArray:
+        """Speeds of leaving (m/s), equally probable ones."""
+        quantiles = (np.arange(N_LATERAL) + 0.5) / N_LATERAL
+        return np.asarray(self.lateral_median_mps.value * np.exp(self.lateral_log_sd.value * ndtri(quantiles)))
+
 
 class CutOutParameters(FollowingParameters):
     """All numbers of the family."""
@@ -61,6 +68,18 @@ class CutOutParameters(FollowingParameters):
         "cut-out": ("leaving",),
     }
 
+    @model_validator(mode="after")
+    def _happens_in_tests(self) -> Self:
+        law, after_s = self.leaving, self.approach.after_s.value
+        if law.careless_least_s.value >= TTC_EDGES_S[-1] or law.careless_most_s.value <= TTC_EDGES_S[0]:
+            found = f"careless drivers from {law.careless_least_s.value:g} to {law.careless_most_s.value:g} s"
+            expected = f"some between {TTC_EDGES_S[0]:g} and {TTC_EDGES_S[-1]:g} s, where events are"
+            raise broken_rule("leaving.careless_least_s", found, expected, "Move one of both ends.")
+        if (slowest_s := law.clear_m.value / law.lateral_mps().min()) > after_s:
+            found, expected = f"a lane that is left in {slowest_s:.3g} s", f"at most {after_s:g} s (approach.after_s)"
+            raise broken_rule("leaving.lateral_median_mps", found, expected, "Let all leave faster, or look longer.")
+        return self
+
     def grid(self) -> tuple[RecordArray, FloatArray]:
         """Speeds exponentially below the leader's, or standing; log-normal or careless times; log-normal leaving."""
         law = self.leaving
@@ -74,10 +93,8 @@ class CutOutParameters(FollowingParameters):
         careless = np.diff(np.clip((TTC_EDGES_S - least) / (most - least), 0.0, 1.0))
         share = law.careless_share.value
         of_ttc = (1.0 - share) * careful + share * careless / careless.sum()
-        quantiles = (np.arange(N_LATERAL) + 0.5) / N_LATERAL
-        lateral = law.lateral_median_mps.value * np.exp(law.lateral_log_sd.value * ndtri(quantiles))
         grid: RecordArray = np.full((N_DROPS + 1, TTC_EDGES_S.size - 1, N_LATERAL), NO_EVENT, EVENT_DTYPE)
-        grid["ratio"], grid["lateral_mps"] = ratio[:, None, None], lateral
+        grid["ratio"], grid["lateral_mps"] = ratio[:, None, None], law.lateral_mps()
         grid["ttc_s"] = (0.5 * (TTC_EDGES_S[:-1] + TTC_EDGES_S[1:]))[None, :, None]
         of_all = of_ratio[:, None, None] * of_ttc[None, :, None] * np.full(N_LATERAL, 1.0 / N_LATERAL)
         return grid.ravel(), of_all.ravel()
@@ -105,10 +122,8 @@ class CutOut(FollowingFamily):
 
     def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
         clear_m, visible_m = (float(traffic.numbers[name]) for name in ("clear_m", "visible_from_m"))
-        seen = [
-            0 if np.isnan(w) else seen_after(clear_m, w, 10**9) - seen_after(visible_m, w, 10**9)
-            for w in events["lateral_mps"]
-        ]
+        clear = [0 if np.isnan(w) else seen_after(clear_m, w, NEVER) for w in events["lateral_mps"]]
+        seen = [c - seen_after(visible_m, w, c) if c else 0 for c, w in zip(clear, events["lateral_mps"], strict=True)]
         return {
             "revealed_speed_mps": events["ratio"] * speed_mps,
             "closing_mps": (1.0 - events["ratio"]) * speed_mps,

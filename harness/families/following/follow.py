@@ -61,8 +61,7 @@ def meet(
     natural_s: float,
     event: Record,
     clear: int,
-    onset: int,
-    until: int,
+    numbers: Record,
     motion: Motion,
     acceleration: float,
     track: FloatArray,
@@ -72,12 +71,13 @@ def meet(
     That is also the case where both stand; then the test is over.
     """
     headway_s, memory = headway_of(driver, natural_s, motion.v[0, LEAD]), Memory(acceleration, math.inf, 0.0)
-    reveals = clear < NEVER
+    onset, reveals = numbers.onset, clear < NEVER
     perceived = onset + 1
-    if reveals:
-        perceived = onset + seen_after(driver.perceives_lateral_m, event.lateral_mps, clear - onset)
+    if reveals:  # nobody sees through the one that leaves
+        least_m = max(driver.perceives_lateral_m, numbers.visible_from_m)
+        perceived = onset + seen_after(least_m, event.lateral_mps, clear - onset)
     reacts = perceived + int(driver.delay_steps)
-    for step in range(onset, until):
+    for step in range(onset, numbers.max_steps):
         x, v = track[step, 0], track[step, 1]
         nobody = Ahead(v, math.inf, 0.0)
         lead = behind(motion, LEAD, step, x) if step < clear else nobody
@@ -146,7 +146,7 @@ def enumerate_events(
                     continue
                 track[n.onset, 0], track[n.onset, 1] = at_onset[d, 0], at_onset[d, 1]
                 natural_s, a = start[i].natural_headway_s, at_onset[d, 2]
-                end = meet(drivers[d], natural_s, event, clear, n.onset, n.max_steps, motion, a, track)
+                end = meet(drivers[d], natural_s, event, clear, n, motion, a, track)
                 if end != NO_CRASH and hits_hard_enough(end, clear, above, motion, track):
                     found.crashes[i, e] |= 1 << d
         found.log_any[i] = math.log(min(total, 1.0)) if total > 0.0 else -math.inf
@@ -201,4 +201,4 @@ def drive_others(
             track[:] = 0.0
             end[i, d], a = approach(drivers[d], natural_s, n.onset, motion, track)
             if end[i, d] == NO_CRASH:
-                end[i, d] = meet(drivers[d], natural_s, event[i], clear, n.onset, n.max_steps, motion, a, track)
+                end[i, d] = meet(drivers[d], natural_s, event[i], clear, n, motion, a, track)

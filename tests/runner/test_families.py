@@ -1,0 +1,122 @@
+"""Several scenarios in one run: one answer, a run folder each, the same bits whatever the workers, and resumed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import harness
+from harness.cli import main
+from harness.errors import CampaignError, RunFolderError
+from harness.records.folder import read_manifest
+from harness.runner.families import estimate_families
+
+NAMES = ("cut_in", "lead_brakes", "cut_out")
+QUICK = [
+    f"scenarios=[{', '.join(NAMES)}]", "world.engine=twin", "pool.relative_error=0.2", "pool.events_per_shell=400",
+    "stop.below_reference=null", "stop.rhw=0.6",
+]  # fmt: skip
+
+
+def campaign(*overrides):
+    return harness.load_campaign("idm", [*QUICK, *overrides])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return harness.run(campaign(), tmp_path_factory.mktemp("hours") / "run", workers=1)
+
+
+def bits(folder):
+    """Of all tests, and of the answer."""
+    answer = json.loads((folder / "families.json").read_text())
+    kept = {key: value for key, value in answer.items() if key not in ("wall_time_s", "crc32")}
+    return [harness.read(folder / name).table("episodes") for name in NAMES], kept
+
+
+def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
+    assert run.exit_code == 0
+    told = run.content
+    assert list(told["families"]) == list(NAMES)
+    total = 0.0
+    for name, of in told["families"].items():
+        own = json.loads((run.folder / name / "estimates.json").read_text())["estimates"]["shells"]
+        per_hour = of["exposure"]["per_hour"] / own["details"]["p_event"]
+        assert of["rate_per_hour"] == pytest.approx(per_hour * own["crash_rate"], rel=1e-12)
+        assert (of["ci_low"], of["ci_high"]) == pytest.approx([per_hour * own[end] for end in ("ci_low", "ci_high")])
+        total += of["rate_per_hour"]
+    hour = told["per_hour"]
+    assert hour["rate"] == pytest.approx(total)
+    assert hour["ci_low"] < total < hour["ci_high"]
+    assert (hour["ci_high"] - hour["ci_low"]) / 2.0 / total <= 0.6
+    assert told["n_episodes"] == sum(read_manifest(run.folder / name)["n_episodes"] for name in NAMES)
+    assert told["families"]["lead_brakes"]["share"] > 0.9  # idm brakes with 4 m/s² at most
+    assert told["beside"]["ratio"] > 1.0 > told["families"]["cut_in"]["ratio"]
+    low, high = told["beside"]["over_assumed"]
+    assert low < told["beside"]["ratio"] < high
+
+
+def test_workers_and_interruptions_change_no_bit(run, tmp_path):
+    both, stopped = tmp_path / "two", tmp_path / "stopped"
+    harness.run(campaign(), both, workers=2)
+    assert bits(both) == bits(run.folder)
+    harness.run(campaign("stop.rhw=2.0"), stopped, workers=1)
+    held = json.loads((stopped / "families.json").read_text())["n_episodes"]
+    assert held < run.content["n_episodes"]
+    harness.run(campaign(), stopped, workers=1, resume=True)
+    assert bits(stopped) == bits(run.folder)
+    with pytest.raises(RunFolderError, match="already begun"):
+        harness.run(campaign(), stopped)
+
+
+def test_each_familys_own_precision_can_be_asked_for(tmp_path):
+    """That of the one which is known worst takes most tests."""
+    found = harness.run(campaign("stop.each_family=true", "stop.episodes=1500"), tmp_path / "run", workers=1)
+    of = found.content["families"]
+    assert found.content["stopped_by"] in ("episodes", "pool")
+    assert of["lead_brakes"]["n_episodes"] < of["cut_out"]["n_episodes"]
+
+
+def test_other_exposures_need_no_new_tests(run, capsys):
+    """All e_f twice: all rates twice; one alone moves its own part."""
+    told = run.content
+    twice = {name: 2.0 * of["exposure"]["per_hour"] for name, of in told["families"].items()}
+    found = estimate_families(run.folder, twice)
+    for key in ("rate", "ci_low", "ci_high"):
+        assert found["per_hour"][key] == pytest.approx(2.0 * told["per_hour"][key], rel=1e-9)
+    assert found["beside"]["ratio"] == pytest.approx(told["beside"]["ratio"])
+    assert main(["estimate", str(run.folder), "--exposure", "lead_brakes=0.3"]) == 0
+    assert "given: lead brakes 0.3" in capsys.readouterr().out
+    again = estimate_families(run.folder, {})
+    assert {key: of for key, of in again.items() if key != "crc32"} == told
+    assert main(["estimate", str(run.folder), "--exposure", "lane_change=0.3"]) == 2
+    assert "cut_in, lead_brakes, cut_out" in capsys.readouterr().err
+    assert main(["estimate", str(run.folder / "cut_in"), "--exposure", "cut_in=0.3"]) == 2
+    assert "families.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("overrides", "where"),
+    [
+        (["testing.method=forced", "stop.rhw=null"], "testing.method"),
+        (["accept.crash_rate_below=1e-7"], "accept"),
+        (["pool.library=ladder-2"], "pool.library"),
+        (["exposure.cut_inn=1"], "exposure"),
+        (["scenarios=[cut_in, cut_in]"], "scenarios"),
+        (["scenarios=[cut_in, lead_breaks]"], "scenario"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(overrides, where, tmp_path):
+    with pytest.raises(CampaignError) as refused:
+        harness.run(campaign(*overrides), tmp_path / "run")
+    assert where in str(refused.value.where)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_with_something_else_is_left_alone(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(RunFolderError, match=r"mine\.txt"):
+        harness.run(campaign(), tmp_path)
+    assert [each.name for each in Path(tmp_path).iterdir()] == ["mine.txt"]
