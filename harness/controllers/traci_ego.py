@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
+from typing import Any
 
 import numpy as np
 import sumo_data
@@ -127,8 +128,12 @@ def _found(script: Script) -> tuple[str | None, str]:
 def _commanded(script: Script, ego: str) -> tuple[list[str], str]:
     """Names of the vehicles that a script commands when a car cuts in before it; and what it raises."""
     tried = _Tried(ego)
+
+    def made(*_: Any) -> _Tried:
+        return tried
+
     try:
-        with closing(ScriptController(script, lambda _: tried)) as controller:
+        with closing(ScriptController(script, made)) as controller:
             _drive(controller)
     except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a user's code raises
         return list(tried.commanded), cause_of(error)

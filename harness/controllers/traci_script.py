@@ -7,6 +7,7 @@ half a microsecond, a thread 29; and it is the main thread, in which a script th
 from __future__ import annotations
 
 import builtins
+import importlib
 import random
 import sys
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from functools import partial
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Any, ClassVar, NoReturn
+from typing import Any, NoReturn
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
@@ -37,43 +38,24 @@ class ScriptError(Exception):
     """A script that ends before its test does, or never."""
 
 
-class StepListener:
-    """As ``traci.StepListener``."""
-
-    def step(self, t: float = 0.0) -> bool:  # noqa: ARG002 - TraCI's signature
-        """Whether it stays."""
-        return True
-
-    def cleanUp(self) -> None:
-        """It is removed."""
-
-    def setID(self, ID: int) -> None:
-        """Take the number that removes it."""
-        self._ID = ID
-
-    def getID(self) -> int:
-        """That number."""
-        return self._ID
-
-
 class _Simulation(SimulationDomain):
+    """Vehicles depart in the first step, and have arrived when the test has ended."""
+
     over = False
     n_steps = 0
 
-    def __init__(self, names: tuple[str, ...]) -> None:
-        self._names = names
+    def __init__(self, vehicles: VehicleDomain) -> None:
+        self._vehicles = vehicles
+        self.arrived: tuple[str, ...] = ()
 
     def getDepartedIDList(self) -> tuple[str, ...]:
-        """All, in the first step."""
-        return self._names if self.n_steps == 1 else ()
+        return self._vehicles.getIDList() if self.n_steps == 1 else ()
 
     def getArrivedIDList(self) -> tuple[str, ...]:  # type: ignore[override]
-        """All, when the test has ended."""
-        return self._names if self.over else ()
+        return self.arrived
 
     def getMinExpectedNumber(self) -> int:
-        """None is left at the end."""
-        return 0 if self.over else len(self._names)
+        return self._vehicles.getIDCount()
 
     getLoadedIDList = getDepartedIDList
 
@@ -105,16 +87,19 @@ class _Gui(Domain):
 class ScriptTraci(Traci):
     """What stands for ``traci`` and ``libsumo`` in one run of a script; its time begins with the run."""
 
-    StepListener: ClassVar[type] = StepListener
     simulation: _Simulation
 
     def __init__(self, vehicle: ScriptVehicles) -> None:
         super().__init__()
-        self.vehicle, self.simulation = vehicle, _Simulation(vehicle.getIDList())
+        self.vehicle, self.simulation = vehicle, _Simulation(vehicle)
         self.gui, self.route = _Gui(), _Routes()
         self._listeners: dict[int, Any] = {}
         self._n_listeners = self._n_after = 0
         self.importing = False
+
+    @property
+    def StepListener(self) -> type:
+        return importlib.import_module("traci").StepListener  # type: ignore[no-any-return]
 
     @property
     def __all__(self) -> list[str]:
@@ -126,7 +111,7 @@ class ScriptTraci(Traci):
 
     def end(self) -> None:
         """Nobody is left."""
-        self.simulation.over = True
+        self.simulation.over, self.simulation.arrived = True, self.vehicle.getIDList()
         self.vehicle.leave()
 
     def start(self, *_arguments: Any, **_named: Any) -> tuple[int, str]:
@@ -144,16 +129,13 @@ class ScriptTraci(Traci):
     switch = setOrder = setTraceFile = staticmethod(lambda *_: None)
 
     def connect(self, *_arguments: Any, **_named: Any) -> ScriptTraci:
-        """Begin the run; the connection is the module."""
         self.start()
         return self
 
     def getConnection(self, label: str = "default") -> ScriptTraci:  # noqa: ARG002 - there is one
-        """The connection is the module."""
         return self
 
     def isLoaded(self) -> bool:
-        """Whether the test goes on."""
         return not self.simulation.over
 
     def close(self, wait: bool = True) -> None:  # noqa: ARG002 - TraCI's signature
@@ -204,14 +186,12 @@ class ScriptTraci(Traci):
         raise FatalTraCIError("Connection closed by SUMO.")
 
     def addStepListener(self, listener: Any) -> int:
-        """Call it after each step, until it answers something false."""
         self._n_listeners += 1
         self._listeners[self._n_listeners] = listener
-        getattr(listener, "setID", lambda _: None)(self._n_listeners)
+        listener.setID(self._n_listeners)
         return self._n_listeners
 
     def removeStepListener(self, listenerID: int) -> bool:
-        """Whether it was there."""
         listener = self._listeners.pop(listenerID, None)
         getattr(listener, "cleanUp", lambda: None)()
         return listener is not None

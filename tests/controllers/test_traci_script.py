@@ -13,7 +13,10 @@ from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
+from harness.resolved import resolve
+from harness.sampling import prepare
 from harness.worlds.sumo import SumoWorld
+from harness.worlds.twin import TwinWorld
 from tests.worlds.running import drive, motion
 
 SCRIPTS = Path(__file__).parent / "scripts"
@@ -240,3 +243,11 @@ def test_av_check_finds_nothing(capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["deterministic"]
     assert found["failures"] == {}
+
+
+def test_where_there_is_no_other_vehicle_no_name_of_one_is_there(tmp_path):
+    (tmp_path / "my.py").write_text(text("assert traci.vehicle.getIDList() == ('BV', 'ego')"), "utf-8")
+    changes = [*FORCED, "scenario=lead_brakes", "world.engine=twin", HELD]
+    ready = prepare(resolve(load_campaign(str(tmp_path / "my.py"), changes)))
+    with closing(ready.loop(TwinWorld(8, ready.scenario.vehicles))) as loop:
+        assert loop.run(0, ready.tests(0, 20)).failures == {}
