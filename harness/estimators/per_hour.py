@@ -14,7 +14,6 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from harness.estimators.beside import path_errors
 from harness.estimators.likelihood import CRASH, Counts, Level, likelihood_limit, ratio_limits
@@ -122,6 +121,8 @@ class PerHour:
         likelihood ratio: a limit is the outermost over x of that with what is left of it. The threshold is that of few
         events, however many crashes there are.
         """
+        from scipy.optimize import minimize  # noqa: PLC0415 - slow to import, and seldom asked for
+
         counted = [of.exposure.counted[0] if of.exposure.counted else 0.0 for of in self.families]
         free = np.flatnonzero(counted)
 

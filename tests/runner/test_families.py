@@ -71,7 +71,7 @@ def test_workers_and_interruptions_change_no_bit(run, tmp_path):
         harness.run(campaign(), stopped)
 
 
-def test_each_familys_own_precision_can_be_asked_for(tmp_path):
+def test_a_precision_of_each_family_can_be_asked_for(tmp_path):
     """That of the one which is known worst takes most tests."""
     found = harness.run(campaign("stop.each_family=true", "stop.episodes=1500"), tmp_path / "run", workers=1)
     of = found.content["families"]
