@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from harness.report.motion import write_motion
     from harness.report.page import write_report
     from harness.runner.compare import compare_campaigns as compare
+    from harness.runner.families import estimate_families
     from harness.runner.look import check_av as av_check
     from harness.runner.other_traffic import estimate_in_other_traffic
     from harness.runner.run import run_campaign as run
@@ -35,6 +36,7 @@ __all__ = [
     "av_check",
     "compare",
     "estimate",
+    "estimate_families",
     "estimate_in_other_traffic",
     "fit",
     "load_campaign",
@@ -51,6 +53,7 @@ _PLACES = {
     "av_check": ("harness.runner.look", "check_av"),
     "compare": ("harness.runner.compare", "compare_campaigns"),
     "estimate": ("harness.runner.stored", "estimate_run"),
+    "estimate_families": ("harness.runner.families", "estimate_families"),
     "estimate_in_other_traffic": ("harness.runner.other_traffic", "estimate_in_other_traffic"),
     "fit": ("harness.fitting.files", "fit_files"),
     "load_campaign": ("harness.campaign.files", "load_campaign"),

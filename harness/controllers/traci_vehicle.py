@@ -194,9 +194,8 @@ class VehicleDomain(Domain):
         try:
             return self._seen[vehID]
         except KeyError:
-            raise TraCIException(
-                f"Vehicle '{vehID}' is not known, or not seen yet: there are {', '.join(self._seen) or 'none'}."
-            ) from None
+            there = ", ".join(self._seen) or "none"
+            raise TraCIException(f"Vehicle '{vehID}' is not known, or not seen yet: there are {there}.") from None
 
     # -- questions --
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.arguments import Confidence, checked
 from harness.campaign.campaign import Campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, HarnessError, RunFolderError
 from harness.estimators.answer import ended_by
@@ -182,15 +183,30 @@ def read_families(folder: Path) -> dict[str, Any]:
     return read_as(dict[str, Any], folder / FAMILIES, mend=MEND)
 
 
+@checked("harness.estimate_families")
 def estimate_families(
-    folder: Path, exposures: Mapping[str, float], confidence: float | None = None, *, counts: bool = False
+    folder: str | Path,
+    exposures: Mapping[str, float] | None = None,
+    confidence: Confidence | None = None,
+    *,
+    counts: bool = False,
 ) -> dict[str, Any]:
-    """The answer of a folder of several scenarios anew, with other exposures; nothing is run or written.
+    """Answer anew from the tests of several scenarios; returns the content of ``families.json``.
 
-    With ``counts`` the interval of the sum holds what few counted events leave open of their exposures.
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of several scenarios; nothing is run or written.
+    exposures : mapping of str to float, optional
+        Events per hour of driving, by scenario, in place of the campaign's.
+    confidence : float, optional
+        Level of the intervals, by default the campaign's.
+    counts : bool
+        Whether the interval of the sum holds what few counted events leave open of their exposures.
 
     Raises `HarnessError`: a run is missing or damaged, or an exposure is of no scenario in it.
     """
+    folder, exposures = Path(folder), exposures or {}
     stored, families, ready, impacts = read_families(folder), [], {}, {}
     names = list(stored["families"])
     if unknown := sorted(set(exposures) - set(names)):
