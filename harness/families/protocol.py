@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, TypeAlias
 import numpy as np
 import pyarrow as pa
 
+from harness.campaign.drivers import Surrogate
 from harness.campaign.sections import EnvironmentSettings
+from harness.families.words import Shown, Words
 from harness.loop.cells import Script
 from harness.vehicles.drivers import Followers
 from harness.vocabulary import BoolArray, FloatArray, IntArray, Method, RecordArray
@@ -207,6 +209,11 @@ class Family(Protocol):
         Events of a path between two that a pool asks.
     pool_error : float
         Relative standard error of its surrogates' crash rates where nothing is said.
+    crosses : int
+        Place of the vehicle that changes lanes, -1 for none.
+    words, maps, stand_ins
+        What pages say of events, the axes (x, y) of their maps, and who is driven in the AV's place: by name a phrase
+        and the driver, the reference driver first.
     """
 
     name: str
@@ -222,6 +229,11 @@ class Family(Protocol):
     follows: bool
     stride: int
     pool_error: float
+
+    crosses: int
+    words: Words
+    maps: tuple[tuple[Shown, Shown], ...]
+    stand_ins: Mapping[str, tuple[str, Surrogate]]
 
     def parameters(self, settings: EnvironmentSettings) -> Parameters:
         """The numbers that a campaign's environment names.
@@ -299,6 +311,12 @@ class Family(Protocol):
 
     def choose(self, traffic: Environment, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
         """Events of paths (m,), one of each, -1 for none; those of a pool are drawn each for itself."""
+
+    def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:
+        """Steps (m,) at whose end chosen events begin; what happens in them may be later."""
+
+    def told(self, facts: Mapping[str, Any]) -> str:
+        """What an event is like, by the columns of its test, as a phrase behind that of its onset; may be empty."""
 
     def script(self, traffic: Environment, chosen: Chosen) -> Script:
         """The motion that chosen events are, from their facts alone."""

@@ -98,7 +98,7 @@ def build_pool(
     progress = progress or Progress()
     aim = take_aim(family, environment, library, settings, progress)
     n = planned_number(aim, settings)
-    progress.stage("pool of cut-ins", n)
+    progress.stage(f"pool of {family.words.events}", n)
     paths = aim.enumerator.run(PILOT_PATHS, n, progress)
     places = np.array([list(library.surrogates).index(name) for name in order], np.int64) if order else None
     return pool_of(family, paths, settings.seed ^ POOL_SEED, places, environment, library, settings, key)

@@ -1,4 +1,4 @@
-"""The page of a comparison: both answers, what lies between them, and the cut-ins on which only one vehicle crashes."""
+"""The page of a comparison: both answers, what lies between them, and the events on which only one vehicle crashes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 import pyarrow as pa
 
 from harness.errors import HarnessError, RunFolderError
+from harness.families import family_named
+from harness.families.protocol import Family
 from harness.numbers import count, tenths
 from harness.records.folder import read_as
 from harness.report.crashes import rows_of
@@ -49,6 +51,7 @@ def write_comparison(folder: str | Path) -> Path:
 def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder]) -> Path:
     """Write the page of a comparison in hand."""
     pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
+    family = family_named(runs[0].campaign.scenario)
     return write_page(
         folder / "report.html", "compare.html.j2",
         compared=stored, asked=asked, given=asked is not stored,
@@ -56,21 +59,21 @@ def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder
         answers=[short_answer(run.campaign, run.manifest, run.estimates) for run in runs],
         to_decide=deciding_words(stored), above=runs[0].campaign.crash.counts_above_mps,
         sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
-        plot=pairs.plot, scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
+        family=family, words=family.words, plot=pairs.plot(family),
+        scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
     )  # fmt: skip
 
 
 class Pairs(NamedTuple):
-    """Pairs with a crash: who of `WHO`, what it adds to the rate, gap (m) and closing speed (m/s) at the cut-in, (n,).
+    """Pairs with a crash: who of `WHO`, what it adds to the rate, and of the event what a map's axes show, (2, n).
 
-    The cut-in is that of the vehicle that crashes, A's where both do. ``episode`` and ``impact_mps`` are of A and B,
+    The event is that of the vehicle that crashes, A's where both do. ``episode`` and ``impact_mps`` are of A and B,
     (2, n); a failed test, which counts as no crash, has no impact, and a negative episode.
     """
 
     who: IntArray
     weight: FloatArray
-    gap_m: FloatArray
-    closing_mps: FloatArray
+    values: FloatArray
     episode: IntArray
     impact_mps: FloatArray
 
@@ -79,15 +82,14 @@ class Pairs(NamedTuple):
         """Pairs by who crashes."""
         return {name: int(np.count_nonzero(self.who == place)) for place, name in enumerate(WHO)}
 
-    @property
-    def plot(self) -> Plot | None:
+    def plot(self, family: Family) -> Plot | None:
         """Their map; None without any."""
-        return pairs_plot(self.who, self.weight, self.gap_m, self.closing_mps)
+        return pairs_plot(self.who, self.weight, self.values, family)
 
 
 def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> Pairs:
     """Pairs on which A or B crashes, by the records: the i-th test of a shell of A and of B."""
-    columns = ("episode", "component", "impact_speed_mps", "event_gap_m", "event_rate_mps")
+    axes = family_named(runs[0].campaign.scenario).maps[0]
     n_pairs, found = [shell["n_pairs"] for shell in shells], []
     for run in runs:
         rows = run.tests.rows
@@ -97,7 +99,7 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
             raise RunFolderError(str(run.path), "fewer tests than pairs", f"those of {COMPARISON}", MEND)
         tests, outcome = rows.take(np.concatenate(first)), rows["outcome"].cast(pa.string())
         outcome = outcome.take(np.concatenate(first)).to_numpy()
-        values = {name: floats(tests[name]) for name in columns}
+        values = {name: floats(tests[name]) for name in tests.column_names if name not in ("outcome", "contact")}
         above = run.campaign.crash.counts_above_mps  # what is no harder is none here, as in the rates
         hard = (values["impact_speed_mps"] > above) | (above == 0.0)
         episode = np.where(outcome == "failed", -1.0, values["episode"])
@@ -105,14 +107,15 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
     a, b = (each["crash"] for each in found)
     weight = np.repeat(weight_of_a_test(np.array([shell["p"] for shell in shells]), np.array(n_pairs)), n_pairs)
     kept = a | b
-    gap, rate = (np.where(a, found[0][name], found[1][name])[kept] for name in columns[-2:])
+    of_map = np.stack([np.where(a, axis.of(found[0]), axis.of(found[1]))[kept] for axis in axes])
     episode, impact = (np.stack([of[name][kept] for of in found]) for name in ("episode", "impact_speed_mps"))
     who = np.where(a & b, 0, np.where(a, 1, 2))[kept]
-    return Pairs(who, weight[kept], gap, -rate, episode.astype(np.int64), impact)
+    return Pairs(who, weight[kept], of_map, episode.astype(np.int64), impact)
 
 
 def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:
-    """The hardest crashes of B alone, then of A alone, beside the other vehicle on the same cut-in."""
+    """The hardest crashes of B alone, then of A alone, beside the other vehicle on the same event."""
+    family = family_named(runs[0].campaign.scenario)
     for side, other in ((1, 0), (0, 1)):
         name, impact = "AB"[side], pairs.impact_mps[side]
         places = np.flatnonzero((pairs.who == 1 + side) & (pairs.episode[other] >= 0))
@@ -123,7 +126,7 @@ def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:
             if trace is None:
                 continue
             scene = Scenes(runs[side].campaign, None).scene(row, trace)
-            scene = beside_other(scene, name, "AB"[other], motion_of(runs[other], episodes[other])[1])
+            scene = beside_other(scene, name, "AB"[other], motion_of(runs[other], episodes[other])[1], family)
             where = " and ".join(f"test {count(n)} of {of}" for n, of in zip(episodes, "AB", strict=True))
             yield {**scene, "episode": f"only {name}, {told}", "title": f"Only {name} crashes, at {told} ({where})"}
 

@@ -10,9 +10,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.estimators.severity import weighted_quantiles
-from harness.families.protocol import Environment
+from harness.families import family_named
+from harness.families.protocol import Environment, Family
+from harness.families.words import Shown
 from harness.numbers import tenths
-from harness.report.player import OTHERS, UNKNOWN, Scene, Scenes
+from harness.report.player import UNKNOWN, Scene, Scenes
 from harness.report.summary import RunFolder, RunSummary
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
@@ -20,7 +22,7 @@ CANDIDATES, SHOWN = 50, 3
 """Crashes considered and shown per ranking: with a share of traces only some of the worst have one."""
 MOST_JUDGED, MOST_TRACED = 20_000, 1_000
 """Hardest crashes of which it is asked who would have avoided them; of vehicles whose motion the traces must tell."""
-SHOWN_COLUMNS = ("impact_speed_mps", "crash_time_s", "weight", "cut_in_s", "event_gap_m", "event_rate_mps")
+SHOWN_COLUMNS = ("impact_speed_mps", "crash_time_s", "weight", "event_s")
 """Of a crash in the table, beside its episode; as in `RunSummary`."""
 
 
@@ -29,11 +31,17 @@ class GalleryRow(NamedTuple):
 
     episode: int
     crash: dict[str, float]
+    shown: list[float]
     reason: str
     share_of_estimate: float
     component: str
     avoided_by: str
     scene: int | None
+
+
+def shown_of(family: Family) -> list[Shown]:
+    """What a table of crashes says of events: each axis of the family's maps once."""
+    return list({id(each): each for axes in family.maps for each in axes}.values())
 
 
 def worst_crashes(key: FloatArray, episode: FloatArray, among: BoolArray) -> list[int]:
@@ -50,7 +58,8 @@ def crash_gallery(
     Of shells the outermost in place of the latter. Crashes that nobody avoids are left out, unless there are no others.
     Traced crashes go first where some of the worst have no trace: a scene is worth more than a rank.
     """
-    crashes, scenes = summary.crashes, Scenes(run.campaign, environment)
+    crashes, scenes, family = summary.crashes, Scenes(run.campaign, environment), family_named(run.campaign.scenario)
+    facts = [each.of(crashes) for each in shown_of(family)]
     episode = crashes["episode"]
     ends = _ends(run, scenes, episode, crashes["impact_speed_mps"])
     avoided = (ends < 0) & (ends != UNKNOWN)
@@ -68,14 +77,15 @@ def crash_gallery(
     for place, why in reasons.items():
         crash = {name: float(crashes[name][place]) for name in SHOWN_COLUMNS}
         number, component = int(episode[place]), _component_name(run, int(crashes["component"][place]))
-        names = [name for name, avoids in zip(OTHERS, avoided[place], strict=True) if avoids]
+        names = [name for name, avoids in zip(family.stand_ins, avoided[place], strict=True) if avoids]
         by, scene = ", ".join(names) or ("–" if UNKNOWN in ends[place] else "nobody"), None
         if traces is not None and number in traced:
             impact, scene = tenths(crash["impact_speed_mps"]), len(shown)
             row, trace = (each.filter(pc.equal(each["episode"], number)) for each in (stored, traces))
             shown.append(scenes.scene(row, trace, why=f"impact at {impact} m/s ({', '.join(why)})"))
         share = crash["weight"] / total if total > 0.0 else math.nan
-        rows.append(GalleryRow(number, crash, ", ".join(why), share, component, by, scene))
+        shown_facts = [float(each[place]) for each in facts]
+        rows.append(GalleryRow(number, crash, shown_facts, ", ".join(why), share, component, by, scene))
     return rows, shown
 
 
@@ -95,8 +105,8 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
 
 
 def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArray) -> IntArray:
-    """After which step `OTHERS` crash where the AV has (n, D), below zero for never."""
-    ends = np.full((episode.size, len(OTHERS)), UNKNOWN, np.int64)
+    """After which step the family's `stand_ins` crash where the AV has (n, D), below zero for never."""
+    ends = np.full((episode.size, scenes.n_stand_ins), UNKNOWN, np.int64)
     acts = run.campaign.av.acts_before_event
     judged = np.sort(np.argsort(-impact, kind="stable")[: MOST_TRACED if acts else MOST_JUDGED])
     asked = {int(each) for each in episode[judged]}

@@ -6,17 +6,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
 from harness.report.words import ENDED
 
-CALLED = {"cut_in": "cut-in", "lead_brakes": "lead brakes", "cut_out": "cut-out"}
-"""Scenarios in words; those of other packages by their names."""
-
 
 def called(family: str) -> str:
     """A scenario in words."""
-    return CALLED.get(family, family.replace("_", " "))
+    return family_named(family).words.called
 
 
 def hour_lines(content: Mapping[str, Any], report: Path | None = None) -> list[str]:

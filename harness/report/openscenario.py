@@ -1,8 +1,8 @@
 """An episode as OpenSCENARIO XML 1.2 on an OpenDRIVE road, by scenariogeneration (extra ``harness[export]``).
 
 Every vehicle follows a polyline with a point for each step of 0.1 s, so that a player shows what was simulated and
-decides nothing. BV goes on sideways as fast after the overlap as before it; only a cut-in of one step crosses the lane
-within 0.1 s.
+decides nothing. A vehicle that changes lanes goes on sideways as fast as it began; only one that does so in one step
+crosses the lane within 0.1 s.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from scenariogeneration import xodr, xosc
 from harness.files import write_atomically
 from harness.report.player import LANE_M, share_over
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
-from harness.vocabulary import VEHICLES
 
 WIDTH_M, HEIGHT_M = 1.9, 1.5
 """Of every vehicle [assumed]: their length alone is simulated."""
@@ -32,7 +31,8 @@ AHEAD_M = 200.0
 def write_openscenario(trace: pa.Table, file: Path) -> None:
     """Write the trace of an episode as ``file`` (.xosc), and its road beside it (.xodr)."""
     roads, init, entities = file.with_suffix(".xodr"), xosc.Init(), xosc.Entities()
-    tracks = {name: trace.filter(pc.equal(trace.column("vehicle").cast(pa.string()), name)) for name in VEHICLES}
+    names = dict.fromkeys(trace.column("vehicle").cast(pa.string()).to_pylist())
+    tracks = {name: trace.filter(pc.equal(trace.column("vehicle").cast(pa.string()), name)) for name in names}
     story = xosc.StoryBoard(init, _at((len(tracks["AV"]) - 1) * STEP_S, "stop"))
     for name, track in tracks.items():
         positions = _positions(track)

@@ -15,7 +15,7 @@ from harness.families import family_named
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.records.reader import table_sizes
-from harness.report.crashes import crash_gallery
+from harness.report.crashes import crash_gallery, shown_of
 from harness.report.drawing import Plot
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
@@ -55,7 +55,7 @@ def write_report(folder: str | Path) -> Path:
 
 def write_page_of(run: RunFolder) -> Path:
     """Write the page of a run in hand: none of its files is read but traces of crashes."""
-    folder, summary, traffic = run.path, summarise(run), run.traffic
+    folder, summary, traffic, family = run.path, summarise(run), run.traffic, family_named(run.campaign.scenario)
     plots = _plots(run, summary)
     gallery, scenes = crash_gallery(run, summary, traffic)
     answer = short_answer(run.campaign, run.manifest, run.estimates)
@@ -63,7 +63,7 @@ def write_page_of(run: RunFolder) -> Path:
         folder / "report.html", "report.html.j2",
         run=run, answer=answer, summary=summary, gallery=gallery, scenes=scenes, lateral=lateral_facts(run),
         sizes=table_sizes(run.manifest["parts"]), figures={plot.name: plot for plot in plots},
-        tabled=len(getattr(traffic, "accepted", ())) > 0,  # a table that families have or not
+        family=family, words=family.words, shown=shown_of(family),
         outcomes=list(zip(OUTCOMES, summary.count, summary.weight, strict=True)),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         warnings=[*answer.warnings, *uncovered(run, summary)], diagnostics=diagnostics(run),

@@ -3,10 +3,10 @@
 "use strict";
 (() => {
   const STEP = 0.1, LENGTH = 5, WIDTH = 1.9, LANE = 3.6, BRAKES = -0.5, NEAR = 1e-6;
-  const COLOURS = { LV: "green", BV: "vermillion", AV: "blue", "r157-cc": "reference", "brakes-8": "muted" };
+  const COLOURS = { LV: "green", BV: "vermillion", SV: "vermillion", POV: "vermillion", AV: "blue", "r157-cc": "reference", "brakes-8": "muted" };
   Object.assign(COLOURS, { A: "blue", B: "reference" });
   const SPEEDS = [0.1, 0.25, 0.5, 1], TICKS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200];
-  const COLUMNS = ["", "speed", "acceleration", "gap to BV", "closing", "time to collision"];
+  const COLUMNS = ["", "speed", "acceleration", "gap to", "closing", "time to collision"];
   const STAR = "M0-15 3.5-5 12-10 6-1 15 3 5 5 6 14 0 7-6 14-5 5-15 3-6-1-12-10-3.5-5Z";
   const SVG = document.querySelector(".player svg").namespaceURI;
 
@@ -26,7 +26,7 @@
 
   function play(root) {
     const scenes = JSON.parse(root.querySelector("script").textContent);
-    let scene, tracks, others, first, end, t, scale, anchor, width, road, moving, charts, cells, playing, before;
+    let scene, tracks, main, ahead, others, first, end, t, scale, anchor, width, road, moving, charts, cells, playing, before;
 
     const pick = add(root, "div", { class: "pick" });
     const title = add(root, "h3");
@@ -47,21 +47,27 @@
     const dashed = (track) => (others.includes(track) ? " dashed" : "");
     const last = (track) => (scene.first + track.x.length - 1) * STEP;
     const there = (track) => t <= last(track) + NEAR;
-    const apart = (track) => !others.includes(track) || t > (scene.onset + 1) * STEP - NEAR;
-    const gap = (track, time) => at(tracks.BV, time).x - LENGTH - at(track, time).x;
+    const apart = (track) => !others.includes(track) || t > scene.apart * STEP - NEAR;
+    const gap = (track, time) => at(main, time).x - LENGTH - at(track, time).x;
     function at(track, time) {
       const most = track.x.length - 1, place = clamp(time / STEP - scene.first, 0, most);
       const i = Math.min(Math.floor(place + NEAR), Math.max(most - 1, 0)), part = place - i;
       const v = track.v[i], change = (track.v[i + 1] ?? v) - v;
       return { x: track.x[i] + (v + (change * part) / 2) * part * STEP, v: v + change * part, a: change / STEP };
     }
+    function sideways({ over = [1] }) {
+      const place = clamp(t / STEP - scene.first, 0, over.length - 1), i = Math.floor(place + NEAR);
+      return over[i] + (place - i) * ((over[i + 1] ?? over[i]) - over[i]);
+    }
     const moved = (track, from, to) => at(track, to).x - at(track, from).x;
-    const camera = (time) => at(tracks.AV, time).x + Math.max(moved(tracks.BV, last(tracks.AV), time), 0);
+    const camera = (time) => at(tracks.AV, time).x + Math.max(moved(main, last(tracks.AV), time), 0);
 
     function load(index) {
       run(false);
       scene = scenes[index];
       tracks = Object.fromEntries(scene.tracks.map((track) => [track.name, track]));
+      main = tracks[scene.principal];
+      ahead = scene.tracks.filter((track) => track !== main && track !== tracks.AV);
       others = scene.ghosts;
       first = scene.first * STEP;
       end = Math.max(first + STEP, ...[...scene.tracks, ...others].map(last));
@@ -74,25 +80,27 @@
       for (const each of [facts, table]) each.replaceChildren();
       for (const fact of scene.facts) fact.forEach((text, i) => add(facts, i ? "dd" : "dt", {}, text));
       const head = add(add(table, "thead"), "tr"), body = add(table, "tbody");
-      for (const each of COLUMNS) add(head, "th", { scope: "col" }, each);
-      cells = [tracks.AV, ...others, tracks.BV, tracks.LV].map((track) => {
+      for (const each of COLUMNS) {
+        add(head, "th", { scope: "col" }, each === "gap to" ? `gap to ${main.name}` : each);
+      }
+      cells = [tracks.AV, ...others, main, ...ahead].map((track) => {
         const row = add(body, "tr");
         add(row, "th", { scope: "row", class: `key${dashed(track)}`, style: colour(track) }, called(track));
         return [track, COLUMNS.slice(1).map(() => add(row, "td"))];
       });
-      t = Math.max(first, ((scene.cut_in ?? 0) - 5) * STEP);
+      t = Math.max(first, ((scene.event ?? 0) - 5) * STEP);
       layout();
     }
 
     // -- drawing: once for a scene and a width, then for each moment --
     function layout() {
       width = view.clientWidth || 320;
-      let ahead = 5, behind = 2;
+      let front = 5, behind = 2;
       for (let time = Math.max(first, (scene.onset - 8) * STEP); time <= end; time += STEP) {
-        if (time <= last(tracks.AV)) ahead = Math.max(ahead, gap(tracks.AV, time));
+        if (time <= last(tracks.AV)) front = Math.max(front, gap(tracks.AV, time));
         for (const each of others) if (time <= last(each)) behind = Math.max(behind, camera(time) - at(each, time).x);
       }
-      scale = width / clamp(ahead + behind + 2 * LENGTH + 8, 40, 100);
+      scale = width / clamp(front + behind + 2 * LENGTH + 8, 40, 100);
       anchor = Math.min((behind + LENGTH + 3) * scale, width / 2);
       const [lane, w, l] = [LANE, WIDTH, LENGTH].map((each) => each * scale);
       const top = 18, low = top + 2 * lane, height = low + 36;
@@ -105,7 +113,7 @@
       set(middle, { "stroke-dasharray": `${4 * scale} ${8 * scale}` });
       set(ruler, { "stroke-dasharray": `1.5 ${10 * scale - 1.5}` });
       add(view, "text", { class: "tick", x: width - 4, y: height - 4, "text-anchor": "end" }, "ticks: 10 m");
-      moving = [...others, tracks.LV, tracks.AV, tracks.BV].map((track) => {
+      moving = [...others, ...ahead, tracks.AV, main].map((track) => {
         const ghost = others.indexOf(track);
         const group = add(view, "g", { class: `car${dashed(track)}`, style: colour(track) });
         add(group, "rect", { class: "body", x: -l, y: -w / 2, width: l, height: w, rx: w * 0.28 });
@@ -117,8 +125,8 @@
       road = { lane, top, low, middle, ruler, star: add(view, "path", { class: "star", d: STAR }) };
       curves.replaceChildren();
       charts = [
-        chart("gap to BV, m", [...others, tracks.AV], gap, 0),
-        chart("speed, m/s", [tracks.LV, tracks.BV, ...others, tracks.AV], (track, time) => at(track, time).v),
+        chart(`gap to ${main.name}, m`, [...others, tracks.AV], gap, 0),
+        chart("speed, m/s", [...ahead, main, ...others, tracks.AV], (track, time) => at(track, time).v),
       ];
       draw();
     }
@@ -173,23 +181,21 @@
       const { lane, top, low, middle, ruler, star } = road, eye = camera(t) - anchor / scale;
       set(middle, { "stroke-dashoffset": (eye % 12) * scale });
       set(ruler, { "stroke-dashoffset": (eye % 10) * scale });
-      const place = clamp(t / STEP - scene.first, 0, scene.over.length - 1), i = Math.floor(place + NEAR);
-      const over = scene.over[i] + (place - i) * ((scene.over[i + 1] ?? scene.over[i]) - scene.over[i]);
       for (const { track, ghost, group, lights, label } of moving) {
         const now = at(track, t), x = (now.x - eye) * scale, rear = x - LENGTH * scale;
-        const y = top + lane * (0.5 + (track === tracks.LV ? 0 : track === tracks.BV ? over : 1));
+        const y = top + lane * (0.5 + sideways(track));
         const gone = !there(track), crashed = gone && track.crash !== null, seen = apart(track) && (crashed || !gone);
         show(group, seen);
-        group.classList.toggle("faded", crashed || (track === tracks.BV && !there(tracks.AV)));
+        group.classList.toggle("faded", crashed || (track === main && !there(tracks.AV)));
         set(group, { transform: `translate(${x.toFixed(2)} ${y.toFixed(2)})` });
         show(lights, !gone && now.a <= BRAKES);
-        const ahead = rear > width - 8, far = Math.round(now.x - at(tracks.AV, t).x - LENGTH);
-        show(label, seen && (ghost >= 0 || ahead));
+        const beyond = rear > width - 8, far = Math.round(now.x - at(tracks.AV, t).x - LENGTH);
+        show(label, seen && (ghost >= 0 || beyond));
         const name = `${x < 8 ? "◂ " : ""}${called(track)}${crashed ? " crashed" : ""}`;
-        label.textContent = ahead ? `${name} ${far} m ▸` : name;
-        const height = ghost >= 0 ? low + 18 + 14 * ghost : track === tracks.LV ? top - 5 : y + 11;
-        const from = ahead ? width - 6 : clamp(rear, 4, width - 130);
-        set(label, { x: from, y: height, "text-anchor": ahead ? "end" : "start" });
+        label.textContent = beyond ? `${name} ${far} m ▸` : name;
+        const height = ghost >= 0 ? low + 18 + 14 * ghost : sideways(track) < 0.5 ? top - 5 : y + 11;
+        const from = beyond ? width - 6 : clamp(rear, 4, width - 130);
+        set(label, { x: from, y: height, "text-anchor": beyond ? "end" : "start" });
       }
       const hit = `${(at(tracks.AV, t).x - eye) * scale} ${top + 1.5 * lane}`;
       show(star, tracks.AV.crash !== null && t >= tracks.AV.crash * STEP - NEAR);
@@ -197,9 +203,9 @@
       clock.textContent = `${t.toFixed(2)} s`;
       slider.value = Math.round(t / STEP);
       for (const [track, boxes] of cells) {
-        const now = at(track, t), closing = now.v - at(tracks.BV, t).v, room = gap(track, t), on = there(track);
+        const now = at(track, t), closing = now.v - at(main, t).v, room = gap(track, t), on = there(track);
         const texts = on ? [tenths(now.v, "m/s"), tenths(now.a, "m/s²")] : [];
-        if (on && track !== tracks.LV && track !== tracks.BV) texts.push(tenths(room, "m"), tenths(closing, "m/s"));
+        if (on && (track === tracks.AV || others.includes(track))) texts.push(tenths(room, "m"), tenths(closing, "m/s"));
         if (texts.length > 2 && closing > 0.05 && room > 0) texts.push(tenths(room / closing, "s"));
         boxes.forEach((box, i) => { box.textContent = texts[i] ?? "–"; });
       }

@@ -1,7 +1,7 @@
 """An episode to watch: its motion, and that of others in the AV's place, as the script of a page plays it.
 
-The others meet the same cut-in in the twin, from where the AV was at its onset. What BV does after it was hit is drawn
-as if it had not been.
+The others meet the same event in the twin: from where the AV was at its onset or, where all follow from the start, from
+there on. What the vehicle ahead does after it was hit is drawn as if it had not been.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.drivers import Surrogate
 from harness.families import family_named
-from harness.families.protocol import Driven, Environment
+from harness.families.protocol import Driven, Environment, Family
 from harness.numbers import tenths
 from harness.pool.kept import onset_steps
 from harness.records.schemas import chosen_from
@@ -27,14 +26,6 @@ from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import library_records
 from harness.vocabulary import FloatArray, IntArray
 
-OTHERS = {
-    "r157-cc": ("a careful and competent driver", Surrogate(model="r157-cc")),
-    "brakes-8": (
-        "braking at once, at up to 8 m/s²",
-        Surrogate.model_validate({"model": "idm", "parameters": {"min_acceleration_mps2": -8.0}}),
-    ),
-}
-"""Who is driven in the AV's place, and in words: the reference driver first."""
 UNKNOWN = -9
 """How it ends for them where the AV acts before the cut-in and its motion is not on record."""
 MOTION = ("x_m", "v_mps")
@@ -60,10 +51,18 @@ class Scenes:
         self._name, self._acts = campaign.name, campaign.av.acts_before_event
         self._family, self._environment = family_named(campaign.scenario), environment
 
+    @property
+    def n_stand_ins(self) -> int:
+        """How many others are driven in the AV's place."""
+        return len(self._family.stand_ins)
+
     def ends(self, rows: pa.Table, traces: pa.Table | None) -> IntArray:
-        """After which step each of `OTHERS` runs into BV in episodes with a cut-in, below zero for never, (n, D)."""
+        """After which step each stand-in runs into the principal vehicle in episodes with an event, negative for never.
+
+        Shape (n, D).
+        """
         if self._environment is None or not rows.num_rows:
-            return np.full((rows.num_rows, len(OTHERS)), UNKNOWN)
+            return np.full((rows.num_rows, self.n_stand_ins), UNKNOWN)
         return self._drive(self._environment, rows, traces).end
 
     def _drive(
@@ -74,44 +73,62 @@ class Scenes:
         if traces is not None:
             episode, step, x, v = (floats(_of(traces, "AV").column(name)) for name in ("episode", "step", *MOTION))
             row = np.searchsorted(floats(rows.column("episode")), episode)
-            begins = step == onset_steps(chosen.at, chosen.lead)[row] + 1
+            begins = step == self._family.onset(environment, chosen)[row] + 1
             start[row[begins]] = np.stack((x, v), axis=1)[begins]
-        drivers = library_records([driver for _, driver in OTHERS.values()], self._family.shows(environment))
+        drivers = library_records(
+            [driver for _, driver in self._family.stand_ins.values()], self._family.shows(environment)
+        )
         driven = self._family.drive(environment, chosen, start, drivers, last=last)
         if self._acts:
             driven.end[np.isnan(start[:, 0])] = UNKNOWN
         return driven
 
     def scene(self, row: pa.Table, trace: pa.Table, *, why: str = "") -> Scene:
-        """One episode, given its row and its trace, from shortly before the cut-in on; all of one without."""
+        """One episode, given its row and its trace, from shortly before the event on; all of one without."""
+        trace = with_lateral(row, trace, self._family, self._environment)
         episode, outcome, cut = (row.column(name)[0].as_py() for name in ("episode", "outcome", "event_step"))
-        tracks = [{"name": name, **_states(_of(trace, name)), "crash": None} for name in self._family.vehicles]
+        tracks = [
+            {"name": name, **_states(of), "crash": None, "over": share_over(of)}
+            for name in self._family.vehicles
+            for of in [_of(trace, name)]
+        ]
         bv, av = tracks[self._family.principal], tracks[-1]
-        last, over = av["x"].size - 1, share_over(_of(trace, bv["name"]))
+        last = av["x"].size - 1
         av["crash"] = last if outcome == "crash" else None
         first, onset, ghosts = 0, None, list[Scene]()
         if cut is not None and cut < last:
             chosen = chosen_from(row, self._family)
-            onset = int(onset_steps(chosen.at, chosen.lead)[0])
+            known = self._environment is not None
+            onset = int(
+                (self._family.onset(self._environment, chosen) if known else onset_steps(chosen.at, chosen.lead))[0]
+            )
             first = max(min(onset - BEFORE, last - FEWEST), 0)
             if self._environment is not None:
                 ghosts = self._ghosts(self._environment, row, trace, onset, bv, av)
         for each in (*tracks, *ghosts):
             each |= {key: each[key][first:] for key in "xv"}
             each["brakes"] = _brakes(each["v"], first)
-        moments = [(cut, f"{bv['name']} cuts in"), (av["brakes"], "AV brakes"), (av["crash"], "crash")]
-        moments += [(onset, f"{bv['name']} comes over")] if onset != cut else []
+        for each in tracks:
+            over = each["over"][first:]
+            each["over"] = over if (over != over[0]).any() else over[:1]
+        words = self._family.words
+        moments = [(cut, " ".join(words.happens)), (av["brakes"], "AV brakes"), (av["crash"], "crash")]
+        moments += [(onset, " ".join(words.shows))] if onset != cut else []
         scene = {
-            "campaign": self._name, "episode": episode, "title": f"Episode {episode:,}: {why or outcome}",
-            "first": first, "onset": onset, "cut_in": cut, "over": over[first:], "tracks": tracks, "ghosts": ghosts,
+            "campaign": self._name, "scenario": self._family.name, "episode": episode,
+            "title": f"Episode {episode:,}: {why or outcome}",
+            "first": first, "onset": onset, "event": cut, "principal": bv["name"],
+            "apart": None if onset is None else first if self._family.follows else onset + 1,
+            "tracks": tracks, "ghosts": ghosts,
             "moments": sorted(each for each in moments if each[0] is not None),
         }  # fmt: skip
-        return {**scene, "facts": _facts(scene, bv, av)}
+        told = self._family.told(row.to_pylist()[0]) if onset is not None else ""
+        return {**scene, "facts": _facts(scene, bv, av, self._family, told)}
 
     def _ghosts(
         self, environment: Environment, row: pa.Table, trace: pa.Table, onset: int, bv: Scene, av: Scene
     ) -> list[Scene]:
-        """`OTHERS` along an episode from its begin; after a crash BV goes on as long as they are shown."""
+        """Stand-ins along an episode from its begin; after a crash the one ahead goes on as long as they are shown."""
         [end], motion, ahead = self._drive(environment, row, trace, last=True)
         last = shown = av["x"].size - 1
         if av["crash"] is not None:
@@ -120,31 +137,34 @@ class Scenes:
             bv["x"] = np.append(bv["x"], ahead[last + 1 : shown + 1, 0])
             bv["v"] = np.append(bv["v"], ahead[last + 1 : shown + 1, 1])
         ghosts = []
-        for name, ended, driven in zip(OTHERS, end.tolist(), motion, strict=True):
-            until = min(shown, onset + int(np.count_nonzero(driven[:, 0])))
-            own = driven[onset + 1 : until + 1].T
-            begun = {key: np.append(av[key][: onset + 1], own[k]) for k, key in enumerate("xv")}
+        for name, ended, driven in zip(self._family.stand_ins, end.tolist(), motion, strict=True):
+            there = np.flatnonzero(driven[:, 0])
+            begins, until = (int(there[0]), min(shown, int(there[-1]))) if there.size else (onset + 1, onset)
+            own = driven[begins : until + 1].T
+            begun = {key: np.append(av[key][:begins], own[k]) for k, key in enumerate("xv")}
             ghosts.append({"name": name, **begun, "crash": ended if ended == until else None})
         return ghosts
 
 
-def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None) -> Scene:
-    """The scene of a crash of the vehicle ``label``, and who met the same cut-in without a crash, if it was traced.
+def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None, family: Family) -> Scene:
+    """The scene of a crash of the vehicle ``label``, and who met the same event without a crash, if it was traced.
 
-    The scene is one without ghosts. BV goes on after the crash as in the other's test.
+    The scene is one without ghosts. The vehicle ahead goes on after the crash as in the other's test.
     """
-    first, (_, bv, av), ghosts = scene["first"], scene["tracks"], list[Scene]()
+    first, av, ghosts = scene["first"], scene["tracks"][-1], list[Scene]()
+    bv = scene["tracks"][family.principal]
     told = {other: "does not crash; its motion is not on record, and it cannot be run again"}
     if trace is not None:
-        ghost, goes_on = (_states(_of(trace, name)) for name in ("AV", "BV"))
+        ghost, goes_on = (_states(_of(trace, name)) for name in ("AV", bv["name"]))
         crash = first + av["x"].size - 1
         shown = _over(crash, -1, ghost["v"], goes_on["v"]) + 1
         for key in "xv":
             bv[key] = np.append(bv[key], goes_on[key][crash + 1 : shown])
             ghost[key] = ghost[key][first:shown]
         ghosts.append(ghost | {"name": other, "crash": None, "brakes": _brakes(ghost["v"], first)})
-        told[other] = _ending(ghosts[0], bv, scene)
-    facts = [(name.replace("AV", label), phrase) for name, phrase in _facts(scene, bv, av)]
+        told[other] = _ending(ghosts[0], bv, scene, family)
+    said = scene["facts"]
+    facts = [(name.replace("AV", label), phrase) for name, phrase in said]
     moments = [(step, name.replace("AV", label)) for step, name in scene["moments"]]
     av["label"] = label
     return {**scene, "ghosts": ghosts, "facts": [*facts, *told.items()], "moments": moments}
@@ -154,12 +174,31 @@ def _states(rows: pa.Table) -> dict[str, Any]:
     return {"x": floats(rows.column("x_m")), "v": floats(rows.column("v_mps"))}
 
 
-def share_over(track: pa.Table) -> FloatArray:
-    """How far a vehicle has come over from the left lane in each row of its trace, 0 to 1, and until it is all over.
+def with_lateral(row: pa.Table, trace: pa.Table, family: Family, environment: Environment | None) -> pa.Table:
+    """The trace of an episode with how far the vehicle that leaves its lane has moved sideways, ``lateral_m``.
 
-    Where lane changes take time, it moves on as fast after the overlap, with which its record of it ends.
+    Records have it of vehicles that come over; where the environment is not known it is left out.
+    """
+    if environment is None or "lateral_m" in trace.column_names or not row.column("event_step")[0].is_valid:
+        return trace
+    chosen = chosen_from(row, family)
+    sideways_mps = float(family.script(environment, chosen).sideways_mps[0])
+    if sideways_mps == 0.0 or family.crosses < 0:
+        return trace
+    steps = np.maximum(floats(trace.column("step")) - int(family.onset(environment, chosen)[0]), 0.0)
+    moves = np.asarray(pc.equal(trace.column("vehicle").cast(pa.string()), family.vehicles[family.crosses]))
+    lateral_m = np.where(moves, np.minimum(sideways_mps * STEP_S * steps, LANE_M), 0.0)
+    return trace.append_column("lateral_m", pa.array(lateral_m))
+
+
+def share_over(track: pa.Table) -> FloatArray:
+    """Where a vehicle is between the left lane (0) and the right one (1) in each row of its trace, until it is over.
+
+    Where lane changes take time, one that comes over moves on as fast after the overlap, with which its record ends.
     """
     over: FloatArray = 1.0 - floats(track.column("lane"))
+    if "lateral_m" in track.column_names and over[0] == 1.0:
+        return 1.0 - floats(track.column("lateral_m")) / LANE_M
     overlap = int(np.count_nonzero(over == 0.0))
     if "lateral_m" not in track.column_names or not overlap:
         return over
@@ -190,41 +229,45 @@ def _brakes(v: FloatArray, first: int) -> int | None:
     return first + int(braking[0]) if braking.size else None
 
 
-def _facts(scene: Scene, bv: Scene, av: Scene) -> list[tuple[str, str]]:
+def _facts(scene: Scene, bv: Scene, av: Scene, family: Family, event: str) -> list[tuple[str, str]]:
     """What happens, as pairs of a name and a phrase."""
-    first, onset, cut = scene["first"], scene["onset"], scene["cut_in"]
+    first, onset, cut, words = scene["first"], scene["onset"], scene["event"], family.words
     if onset is None:
-        return [("BV", "does not cut in")]
+        return [(words.shows[0], words.none)]
     rate, hardest = _closing(av, bv, cut - first), tenths(-float(np.diff(av["v"]).min()) / STEP_S)
+    where = f"{tenths(_gap(av, bv, cut - first))} m ahead and {tenths(abs(rate))} m/s "
+    where += "slower" if rate > 0.0 else "faster"
+    shows = event or f"{tenths(_gap(av, bv, onset - first))} m ahead"
     told = {
-        f"{bv['name']} comes over": f"{tenths(_gap(av, bv, onset - first))} m ahead",
-        f"{bv['name']} cuts in": f"{tenths(_gap(av, bv, cut - first))} m ahead and {tenths(abs(rate))} m/s "
-        + ("slower" if rate > 0.0 else "faster"),
+        " ".join(words.happens): where if bv["name"] == words.happens[0] else f"{bv['name']} is {where}",
+        " ".join(words.shows): shows if onset != cut else ", ".join(filter(None, (event, where))),
         "AV brakes": f"at up to {hardest} m/s²",
     }
-    facts = [(name, f"{_when(step, cut)}: {told[name]}") for step, name in scene["moments"] if name in told]
+    facts = [
+        (name, f"{_when(step, cut, words.since)}: {told[name]}") for step, name in scene["moments"] if name in told
+    ]
     facts += [("AV brakes", "never")] if av["brakes"] is None else []
-    facts.append(("AV", _ending(av, bv, scene)))
+    facts.append(("AV", _ending(av, bv, scene, family)))
     for each in scene["ghosts"]:
-        facts.append((each["name"], f"{OTHERS[each['name']][0]}: {_ending(each, bv, scene)}"))
+        facts.append((each["name"], f"{family.stand_ins[each['name']][0]}: {_ending(each, bv, scene, family)}"))
     return facts
 
 
-def _ending(track: Scene, bv: Scene, scene: Scene) -> str:
-    """How it ends for one who follows BV from its cut-in on."""
-    first, cut, crash = scene["first"], scene["cut_in"], track["crash"]
+def _ending(track: Scene, bv: Scene, scene: Scene, family: Family) -> str:
+    """How it ends for one who follows the principal vehicle from its event on."""
+    first, cut, crash, name = scene["first"], scene["event"], track["crash"], bv["name"]
     if crash is None:
         places = range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
         closest, end = min(_gap(track, bv, place) for place in places), places[-1]
         gap = f"{tenths(closest)} m" if closest >= 0.05 else "< 0.1 m"
         if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:
-            return f"no crash until the test ends, {gap} behind BV and still {tenths(rate)} m/s faster"
+            return f"no crash until the test ends, {gap} behind {name} and still {tenths(rate)} m/s faster"
         return f"avoids it, {gap} at the closest"
     v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
-    from_the_side = scene["onset"] < cut and crash == cut + 1
-    who = "BV strikes it from the side" if from_the_side else "strikes BV from behind"
+    from_the_side = family.crosses == family.principal and scene["onset"] < cut and crash == cut + 1
+    who = f"{name} strikes it from the side" if from_the_side else f"strikes {name} from behind"
     impact = tenths(_closing(track, bv, crash - first))
-    return f"crashes at {_when(crash, cut)}: {who}, {v} m/s into {v_bv} m/s, impact {impact} m/s"
+    return f"crashes at {_when(crash, cut, family.words.since)}: {who}, {v} m/s into {v_bv} m/s, impact {impact} m/s"
 
 
 def _gap(track: Scene, bv: Scene, place: int) -> float:
@@ -235,14 +278,15 @@ def _closing(track: Scene, bv: Scene, place: int) -> float:
     return float(track["v"][place] - bv["v"][place])
 
 
-def _when(step: int, cut: int) -> str:
-    """The time of a step, and how far it is from the cut-in."""
+def _when(step: int, cut: int, since: str) -> str:
+    """The time of a step, and how far it is from the event, which happens at ``since``."""
     if step == cut:
         return f"{STEP_S * step:.1f} s"
     side = "after" if step > cut else "before"
-    return f"{STEP_S * step:.1f} s, {STEP_S * abs(step - cut):.1f} s {side} the cut-in"
+    return f"{STEP_S * step:.1f} s, {STEP_S * abs(step - cut):.1f} s {side} {since}"
 
 
 def write_player(scene: Scene, file: str | Path) -> None:
     """Write a page with nothing but the player of a scene."""
-    write_page(Path(file), "replay.html.j2", scene=scene, scenes=[scene])
+    family = family_named(scene["scenario"])
+    write_page(Path(file), "replay.html.j2", scene=scene, scenes=[scene], family=family, words=family.words)

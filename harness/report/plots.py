@@ -1,21 +1,22 @@
-"""What pages draw: the rate, where it comes from, which cut-ins crash, and on which of them only one vehicle does."""
+"""What pages draw: the rate, where it comes from, which events crash, and on which of them only one vehicle does."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
 from harness.estimators.answer import Estimates
 from harness.estimators.traffic import Sensitivity
 from harness.families.protocol import Environment, Family
+from harness.families.words import Shown
 from harness.numbers import count, number, plain, share
 from harness.report.drawing import Axis, Panel, Plot
-from harness.report.player import OTHERS
 from harness.report.summary import RunFolder, RunSummary, ShownShells
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.library import library_records
-from harness.vocabulary import CRASH, FAILED, FloatArray, IntArray
+from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray
 
 POOL = "pool’s own error"
 WEIGHTED = (
@@ -29,11 +30,11 @@ IN_ROUNDS = (
 )
 DASHED, DOTTED = "4 3", "1 3"
 SHARES = {0.0: "grid", 0.25: "red-1", 0.5: "red-2", 0.75: "red-4", 1.0: "red-6"}
-"""Up to which share of cut-ins that crash a cell of the map has a colour."""
+"""Up to which share of events that crash a cell of the map has a colour."""
 WHO = {"both": "grey", "only A": "blue", "only B": "reference"}
 """Who crashes, and the colour: on the page the player draws B in that of reference drivers."""
 MOST_BARS = 16
-LARGEST, CELL_M, CELL_MPS = 9.0, 1.0, 0.5
+LARGEST = 9.0
 
 
 def severity_plot(estimates: Estimates) -> Plot | None:
@@ -206,70 +207,97 @@ def _open_question(found: ShownShells, names: tuple[str, ...], half_widths: list
 
 
 def where_plot(summary: RunSummary, family: Family, environment: Environment | None) -> Plot | None:
-    """Map of the share of cut-ins that crash, over gap and closing speed, and what others avoid; None without any.
+    """Maps of the share of events that crash, over the family's axes, and what others avoid; None without any.
 
     ``environment`` is that in which others can be driven, None where that is not known any more.
     """
-    rows = summary.rows
-    cut_in = np.isfinite(rows["event_gap_m"]) & np.isfinite(rows["event_rate_mps"]) & (rows["outcome"] != FAILED)
-    if not cut_in.any():
+    rows, words = summary.rows, family.words
+    met = np.isfinite(rows["event_gap_m"]) & np.isfinite(rows["event_rate_mps"]) & (rows["outcome"] != FAILED)
+    if not met.any():
         return None
-    gap, closing = rows["event_gap_m"][cut_in], np.maximum(-rows["event_rate_mps"][cut_in], 0.0)
-    weight, crash = rows["weight"][cut_in], rows["outcome"][cut_in] == CRASH
-    of = crash if crash.any() else np.ones_like(crash)
-    far, fast = 1.4 * float(np.quantile(gap[of], 0.98)) + 1.0, 1.15 * float(np.quantile(closing[of], 0.98)) + 1.0
-    cells = int(np.clip(0.7 * math.sqrt(gap.size), 12, 40))  # with few cut-ins each in one of its own
-    x, y = np.linspace(0.0, far, cells + 1), np.linspace(0.0, fast, cells // 2 + 1)
+    weight, crash = rows["weight"][met], rows["outcome"][met] == CRASH
+    panels = [_map(axes, rows, met, weight, crash, words.events) for axes in family.maps]
+    fast = panels[0].y.high
+    lines = {} if environment is None else limits_of_others(family, environment, summary, fast)
+    for (name, (speeds, gaps)), colour, dash in zip(lines.items(), ("ink", "blue"), ("", DASHED), strict=False):
+        panels[0].add("line", colour, gaps, speeds, dash=dash, label=f"{name}’s limit")
+    x, y = (_bare(each.words) for each in family.maps[0])
+    text = (
+        f"Each of {count(met.sum())} {words.events} by its {x} and {y}; {count(crash.sum())} of them crashed. "
+        "Where no cell is drawn, nothing was tested."
+    )
+    return Plot("where", panels, text + words.limits * bool(lines), text + words.limits * bool(lines))
+
+
+def _bare(words: str) -> str:
+    """What an axis shows, without when."""
+    return words.partition(" at ")[0].partition(" of ")[0].partition(" when ")[0]
+
+
+def _map(
+    axes: tuple[Shown, Shown],
+    rows: Mapping[str, FloatArray],
+    met: BoolArray,
+    weight: FloatArray,
+    crash: BoolArray,
+    events: str,
+) -> Panel:
+    """Share of events that crash in cells; ``weight`` and ``crash`` are those of the rows that ``met`` one."""
+    of, n = crash if crash.any() else np.ones_like(crash), crash.size
+    cells = int(np.clip(0.7 * math.sqrt(n), 12, 40))  # with few events each in one of its own
+    values, edges = list[FloatArray](), list[FloatArray]()
+    for axis, number_of in zip(axes, (cells, cells // 2), strict=True):
+        value = np.maximum(axis.of(rows)[met], 0.0)
+        values.append(value)
+        if axis.edges.size:
+            last = np.searchsorted(axis.edges, axis.beyond * float(value[of].max())) + 1
+            edges.append(axis.edges[max(int(np.searchsorted(axis.edges, value.min())) - 1, 0) : int(last)])
+        else:
+            most = axis.beyond * float(np.quantile(value[of], 0.98)) + 1.0
+            edges.append(np.linspace(0.0, most, number_of + 1))
+    (gap, closing), (x, y) = values, edges
     every, crashed = (np.histogram2d(gap, closing, (x, y), weights=w)[0].T for w in (weight, weight * crash))
     shares = np.divide(crashed, every, out=np.full_like(every, -1.0), where=every > 0.0)
-    axes = Axis("gap at the cut-in, m", 0.0, far), Axis("closing speed, m/s", 0.0, fast)
-    panel = Panel("Share of cut-ins that crash", *axes, height=300.0)
+    across, up = (Axis(each.axis, float(of[0]), float(of[-1])) for each, of in zip(axes, edges, strict=True))
+    panel = Panel(f"Share of {events} that crash", across, up, height=300.0)
     for low, (high, colour) in zip((-0.5, *SHARES), SHARES.items(), strict=False):
         if ((shares > low) & (shares <= high)).any():
             row, column = np.nonzero((shares > low) & (shares <= high))
             label = f"≤ {share(high)}" if high else "tested, none"
             panel.add("boxes", colour, x[column], x[column + 1], y[row], y[row + 1], label=label)
-    lines = {} if environment is None else limits_of_others(family, environment, summary, fast)
-    for (name, (speeds, gaps)), colour, dash in zip(lines.items(), ("ink", "blue"), ("", DASHED), strict=False):
-        panel.add("line", colour, gaps, speeds, dash=dash, label=f"{name}’s limit")
-    text = (
-        f"Each of {count(cut_in.sum())} cut-ins by its gap and closing speed; {count(crash.sum())} of them crashed. "
-        "Where no cell is drawn, nothing was tested."
-    )
-    if lines:
-        text += (
-            " Left of its line the competent driver (r157-cc), or the best of brakes (8 m/s² at once), crashes in the "
-            "vehicle’s place, too, if the car that cuts in keeps its speed."
-        )
-    return Plot("where", [panel], text, text)
+    return panel
 
 
 def limits_of_others(
     family: Family, environment: Environment, summary: RunSummary, fastest_mps: float
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Closing speeds (m/s), and the smallest gap (m) at which each of `OTHERS` avoids a crash; none where unknown."""
+    """Closing speeds (m/s), and the smallest gap (m) at which each stand-in avoids a crash; none where unknown."""
     speeds, gaps = np.linspace(0.5, fastest_mps, 40), np.linspace(0.25, 60.0, 240)
     speed, gap = (each.ravel() for each in np.meshgrid(speeds, gaps, indexing="ij"))
-    drivers = library_records([driver for _, driver in OTHERS.values()], see_onset=False)
+    drivers = library_records([driver for _, driver in family.stand_ins.values()], see_onset=False)
     avoided = family.avoidable(environment, summary.rows, np.stack((gap, speed)), drivers)
     if avoided is None:
         return {}
-    crashes = ~avoided.reshape(speeds.size, gaps.size, len(OTHERS))
+    crashes = ~avoided.reshape(speeds.size, gaps.size, len(family.stand_ins))
     last = np.where(crashes.any(1), gaps[gaps.size - 1 - np.argmax(crashes[:, ::-1], axis=1)], 0.0)
-    return {name: (speeds, last[:, d]) for d, name in enumerate(OTHERS)}
+    return {name: (speeds, last[:, d]) for d, name in enumerate(family.stand_ins)}
 
 
-def pairs_plot(who: IntArray, weight: FloatArray, gap_m: FloatArray, closing_mps: FloatArray) -> Plot | None:
-    """Map of the cut-ins (n,) on which a vehicle crashes, by ``who`` of `WHO`; None without any."""
+def pairs_plot(who: IntArray, weight: FloatArray, values: FloatArray, family: Family) -> Plot | None:
+    """Map of the events (n,) on which a vehicle crashes, by ``who`` of `WHO`; None without any.
+
+    ``values`` (2, n) are those of the axes of the family's first map.
+    """
+    (first, second), words = family.maps[0], family.words
     if not who.size:
         return None
-    cells = np.stack((who, gap_m // CELL_M, closing_mps // CELL_MPS))
+    cells = np.stack((who, values[0] // first.cell, values[1] // second.cell))
     (kind, *_), place = np.unique(cells, axis=1, return_inverse=True)
     place = place.ravel()  # numpy 2.0 gives it another axis
     adds = np.bincount(place, weight)
-    gap, closing = (np.bincount(place, weight * x) / adds for x in (gap_m, closing_mps))
-    axes = Axis("gap at the cut-in, m", 0.0, 1.1 * gap.max()), Axis("closing speed, m/s", 0.0, 1.1 * closing.max())
-    panel = Panel("Cut-ins that crash, by who crashes", *axes, height=300.0)
+    gap, closing = (np.bincount(place, weight * x) / adds for x in values)
+    axes = Axis(first.axis, 0.0, 1.1 * gap.max()), Axis(second.axis, 0.0, 1.1 * closing.max())
+    panel = Panel(f"{words.events.capitalize()} that crash, by who crashes", *axes, height=300.0)
     told = []
     for code, (name, colour) in enumerate(WHO.items()):
         of, n = kind == code, count(int(np.count_nonzero(who == code)))
@@ -277,7 +305,8 @@ def pairs_plot(who: IntArray, weight: FloatArray, gap_m: FloatArray, closing_mps
         panel.add("dots", colour, gap[of], closing[of], radius, opacity=0.7, label=f"{name} ({n})")
         told.append(f"{name} on {n}")
     text = (
-        f"Cut-ins on which a vehicle crashes: {', '.join(told)}. A disc’s area is what cut-ins within {CELL_M:g} m "
-        f"and {CELL_MPS:g} m/s add to the rate, {number(float(adds.max()))} per test for the largest."
+        f"{words.events.capitalize()} on which a vehicle crashes: {', '.join(told)}. A disc’s area is what "
+        f"{words.events} within {first.cell:g} {first.unit} and {second.cell:g} {second.unit} add to the rate, "
+        f"{number(float(adds.max()))} per test for the largest."
     )
     return Plot("pairs", [panel], text, text)

@@ -192,10 +192,10 @@ class RunSummary:
 
     @property
     def crashes(self) -> dict[str, FloatArray]:
-        """`rows` of the crashes alone, and when they were: ``cut_in_s`` and ``response_s`` (s)."""
+        """`rows` of the crashes alone, and when they were: ``event_s`` and ``response_s`` (s)."""
         crashes = {name: column[self.rows["outcome"] == CRASH] for name, column in self.rows.items()}
-        cut_in_s = STEP_S * crashes["event_step"]
-        return {**crashes, "cut_in_s": cut_in_s, "response_s": crashes["crash_time_s"] - cut_in_s}
+        event_s = STEP_S * crashes["event_step"]
+        return {**crashes, "event_s": event_s, "response_s": crashes["crash_time_s"] - event_s}
 
     def per_test(self, weight: float) -> float:
         """How often per naturalistic test something happens whose weights add up to ``weight``."""

@@ -27,6 +27,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import ended_by
 from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
 from harness.estimators.stopping import PairRule
+from harness.families import family_named
 from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
@@ -73,11 +74,12 @@ class Comparison:
         return "\n".join(pair_lines(self.content, last.campaign.crash.counts_above_mps, self.report, s_per_pair))
 
     def _repr_html_(self) -> str:
-        """The short answer, and the map of cut-ins on which one of them crashes, as a notebook shows them."""
+        """The short answer, and the map of events on which one of them crashes, as a notebook shows them."""
         from harness.report.compare_page import crashing_pairs  # noqa: PLC0415 - draws
         from harness.report.page import shown_with  # noqa: PLC0415
 
-        return shown_with(repr(self), crashing_pairs(self.shown, self.content["shells"]).plot)
+        plot = crashing_pairs(self.shown, self.content["shells"]).plot(family_named(self.shown[0].campaign.scenario))
+        return shown_with(repr(self), plot)
 
 
 @checked("harness.compare")

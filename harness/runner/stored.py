@@ -21,6 +21,7 @@ from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables, joined
 from harness.estimators.one_pass import SPACING
 from harness.estimators.own import asked_for
+from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.files import write_atomically
 from harness.processes import SharedFile, made_ahead
@@ -232,10 +233,11 @@ def _result(
     compared: tuple[str, ...],
     suspected: str | None = None,
 ) -> ReplayResult:
-    from harness.report.player import Scenes  # noqa: PLC0415 - `run` and `estimate` draw nothing
+    from harness.report.player import Scenes, with_lateral  # noqa: PLC0415 - `run` and `estimate` draw nothing
 
     (row,), traces = tables["episodes"].to_pylist(), tables["traces"]
     scene = Scenes(campaign, traffic).scene(tables["episodes"], traces)
+    traces = with_lateral(tables["episodes"], traces, family_named(campaign.scenario), traffic)
     return ReplayResult(str(row["outcome"]), row, traces, bit_equal, compared, scene, suspected)
 
 

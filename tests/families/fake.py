@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
 from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure
 from harness.loop.cells import natural_script
 
@@ -55,6 +56,7 @@ class Fake:
     n_uniforms = 1
     default_parameters, follows, stride, pool_error = "two-events", False, 4, 0.005
     shipped = Path(__file__).parent
+    crosses, words, maps, stand_ins = 0, WORDS, ((GAP, CLOSING),), STAND_INS
     ladders = {False: "ladder-2", True: "ladder-2"}
 
     def parameters(self, settings):
@@ -108,6 +110,12 @@ class Fake:
         facts = np.zeros(len(event), [("gap_m", float), ("event", np.int64)])
         facts["gap_m"], facts["event"] = paths.start["gap_m"], event
         return Chosen(facts, np.where(event < 0, -1, AT[event]), np.zeros(len(event), np.int64))
+
+    def onset(self, traffic, chosen):
+        return chosen.at
+
+    def told(self, facts):
+        return ""
 
     def script(self, traffic, chosen):
         n = len(chosen.facts)

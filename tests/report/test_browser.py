@@ -110,7 +110,7 @@ def test_it_plays_at_the_chosen_speed_and_stops_and_leads_to_moments_by_keys_and
 def test_the_slider_shows_each_step_as_it_was_and_to_scale(opened, replayed):
     page, [scene] = opened(replayed), scenes_in(replayed.read_text())
     _, bv, av = scene["tracks"]
-    for step in (scene["first"], scene["cut_in"], scene["cut_in"] + 2, av["crash"]):
+    for step in (scene["first"], scene["event"], scene["event"] + 2, av["crash"]):
         page.fill(".bar input", str(step))
         i, place = step - scene["first"], {}
         assert seconds(page) == pytest.approx(STEP_S * step)
@@ -149,7 +149,7 @@ def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
     file = write_comparison(copy_of(compared, tmp_path / "out"))
     page, scene = opened(file, 400, "dark"), scenes_in(file.read_text())[0]
     assert page.evaluate("document.documentElement.scrollWidth") <= 400
-    for step, hit in ((scene["cut_in"], False), (scene["tracks"][2]["crash"], True)):
+    for step, hit in ((scene["event"], False), (scene["tracks"][2]["crash"], True)):
         page.fill(".bar input", str(step))
         for name, track in (("B", scene["tracks"][2]), ("A", scene["ghosts"][0])):
             assert cell(page, name, "speed") == f"{track['v'][step - scene['first']]:.1f} m/s"

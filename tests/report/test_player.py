@@ -11,10 +11,12 @@ import pytest
 import harness
 from harness.campaign.files import load_campaign
 from harness.cli import main
+from harness.families.cut_in.family import CUT_IN
+from harness.families.cut_in.words import STAND_INS
 from harness.records.reader import traffic_of
 from harness.report import crashes, player
 from harness.report.page import write_report
-from harness.report.player import OTHERS, UNKNOWN, Scenes
+from harness.report.player import UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
 from harness.resolved import resolve
 from tests.in_process import run_here
@@ -53,7 +55,7 @@ def test_a_page_holds_the_motion_to_the_last_bit(name, stored_run, tmp_path):
         crash = n - 1 if result.outcome == "crash" else None
         assert [track["crash"] for track in scene["tracks"]] == [None, None, crash]
         cut_in = result.row["event_step"]
-        assert scene["cut_in"] == cut_in
+        assert scene["event"] == cut_in
         assert scene["onset"] == result.row.get("onset_step", cut_in)
         assert len(scene["ghosts"]) == (0 if cut_in is None else 2)
         touched = [fact for name, fact in scene["facts"] if name == "AV" and "BV strikes it from the side" in fact]
@@ -127,7 +129,7 @@ def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_n
     summary = summarise(run)
     impact = summary.crashes["impact_speed_mps"]
     by_rank = np.argsort(-impact, kind="stable")
-    ends = np.full((impact.size, len(OTHERS)), 30)
+    ends = np.full((impact.size, len(STAND_INS)), 30)
     for rank, end in who.items():
         ends[by_rank[rank]] = end
     monkeypatch.setattr(crashes, "_ends", lambda *_: ends)
@@ -179,7 +181,7 @@ def test_replay_says_what_happens_and_writes_the_page(stored_run, tmp_path, caps
     assert first == f"episode {episode}: crash; bit for bit as stored"
     assert last == str(file)
     told = {line[2:15].strip(): line[16:] for line in lines}
-    assert set(told) == {"BV comes over", "BV cuts in", "AV brakes", "AV", *OTHERS}
+    assert set(told) == {"BV comes over", "BV cuts in", "AV brakes", "AV", *STAND_INS}
     row = harness.replay(folder, episode).row
     assert f"crashes at {row['crash_time_s']:.1f} s" in told["AV"]
     assert f"impact {row['impact_speed_mps']:.1f} m/s" in told["AV"]
@@ -204,6 +206,6 @@ def test_a_crash_that_was_not_traced_is_listed_without_a_scene(reports):
 )
 def test_a_test_that_ends_while_the_vehicle_closes_in_has_avoided_nothing(speed, ahead, said):
     time_s = np.arange(6) / 10
-    bv = {"x": ahead + 20.0 * time_s, "v": np.full(6, 20.0)}
+    bv = {"name": "BV", "x": ahead + 20.0 * time_s, "v": np.full(6, 20.0)}
     av = {"x": speed * time_s, "v": np.full(6, speed), "crash": None}
-    assert player._ending(av, bv, {"first": 0, "cut_in": 0, "onset": 0}).startswith(said)
+    assert player._ending(av, bv, {"first": 0, "event": 0, "onset": 0}, CUT_IN).startswith(said)

@@ -8,8 +8,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
+from harness.campaign.drivers import Surrogate
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
 from harness.errors import CampaignError
@@ -22,7 +24,9 @@ from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
 from harness.families.cut_in.unseen import left_open
+from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
 from harness.families.protocol import Chosen, Column, Exposure, Paths
+from harness.families.words import Shown
 from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
 
 _STATE_DOCS = (
@@ -69,6 +73,10 @@ class CutIn:
     default_parameters = DEFAULT
     follows, stride, pool_error = False, 4, 0.005  # `benchmarks.pool_stride` says what other strides would cost
     ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-2", True: "ladder-lateral-1"})
+
+    crosses, words = BV, WORDS
+    maps: tuple[tuple[Shown, Shown], ...] = ((GAP, CLOSING),)
+    stand_ins: Mapping[str, tuple[str, Surrogate]] = STAND_INS
 
     parameters = staticmethod(load_parameters)
     traffic = staticmethod(load_environment)
@@ -126,6 +134,12 @@ class CutIn:
     def choose(self, traffic: Environment, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
         maneuvers = write_maneuvers(seed, paths, event, traffic, FREE_DRAWS_PER_CUT_IN if of_pool else 0)
         return Chosen(facts_of(paths.start, maneuvers), event, maneuvers.lead)
+
+    def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:  # noqa: ARG002 - records have its lead
+        return np.asarray(np.maximum(chosen.at - chosen.lead, 0))
+
+    def told(self, facts: Mapping[str, Any]) -> str:  # noqa: ARG002 - where and how fast is all
+        return ""
 
     def avoidable(
         self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -14,17 +14,18 @@ from scipy.special import ndtr, ndtri
 
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
+from harness.families.cut_out.words import CLOSING, TTC, TTC_EDGES_S, WORDS
 from harness.families.following.approach import NEVER, Following
 from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
 from harness.families.numbers import Number, Share, ordered, within
 from harness.families.protocol import Column
+from harness.families.words import Shown
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, RecordArray
 
 N_DROPS = 12
-TTC_EDGES_S = np.array([0.5, 0.75, 1, 1.25, 1.5, 1.75, 2, 2.25, 2.5, 2.75, 3, 3.5, 4, 4.5, 5, 6, 7, 8, 10, 12])
 N_LATERAL = 7
 _Ttc = Annotated[Number, within(0.1, 60.0)]
 
@@ -117,8 +118,15 @@ class CutOut(FollowingFamily):
     shipped = Path(__file__).parent
     ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-cut-out-1"})
     default_parameters = "cut-out-1"
+    crosses, words = 0, WORDS
+    maps: tuple[tuple[Shown, Shown], ...] = ((CLOSING, TTC),)
     stride = 10
     model = CutOutParameters
+
+    def told(self, facts: Mapping[str, Any]) -> str:
+        speed = facts["revealed_speed_mps"]
+        what = f"one at {speed:.1f} m/s, {facts['closing_mps']:.1f} m/s slower" if speed > 0.0 else "one that stands"
+        return f"at {facts['lateral_speed_mps']:.1f} m/s sideways, and reveals {what}"
 
     def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
         clear_m, visible_m = (float(traffic.numbers[name]) for name in ("clear_m", "visible_from_m"))

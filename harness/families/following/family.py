@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pyarrow as pa
 
+from harness.campaign.drivers import Surrogate
 from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
@@ -29,7 +30,9 @@ from harness.families.following.approach import (
 )
 from harness.families.following.follow import STATE, drive_others, enumerate_events, move_others
 from harness.families.following.parameters import NO_EVENT, FollowingParameters
+from harness.families.following.words import STAND_INS
 from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, LeftOpen, Paths, Recorded
+from harness.families.words import Shown, Words
 from harness.loop.cells import Script, natural_script
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vehicles.following import seen_after
@@ -62,6 +65,10 @@ class FollowingFamily:
     follows = True
     stride: int
     pool_error = 0.01
+    crosses: int
+    words: Words
+    maps: tuple[tuple[Shown, Shown], ...]
+    stand_ins: Mapping[str, tuple[str, Surrogate]] = STAND_INS
 
     model: ClassVar[type[FollowingParameters]]
 
@@ -215,6 +222,12 @@ class FollowingFamily:
             acts_from=0, visible_from=visible.astype(np.int64), headway_s=facts["natural_headway_s"],
             sideways_mps=np.nan_to_num(lateral), set_speed_mps=float(traffic.numbers["approach__set_speed_mps"]),
         )  # fmt: skip
+
+    def onset(self, traffic: Following, chosen: Chosen) -> IntArray:
+        return np.where(chosen.at < 0, -1, int(traffic.numbers["onset"]))
+
+    def told(self, facts: Mapping[str, Any]) -> str:
+        raise NotImplementedError
 
     def drive(
         self,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -16,8 +16,10 @@ from harness.campaign.sections import Section
 from harness.families.following.approach import Following
 from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
+from harness.families.lead_brakes.words import HEADWAY, HELD, PEAK, WORDS
 from harness.families.numbers import Number, Share, ordered, within
 from harness.families.protocol import Column
+from harness.families.words import Shown
 from harness.vocabulary import FloatArray, RecordArray
 
 PEAK_BIN_MPS2 = 0.2
@@ -88,8 +90,14 @@ class LeadBrakes(FollowingFamily):
     shipped = Path(__file__).parent
     ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-lead-1"})
     default_parameters = "lead-brakes-1"
+    crosses, words = -1, WORDS
+    maps: tuple[tuple[Shown, Shown], ...] = ((HEADWAY, PEAK), (HELD, PEAK))
     stride = 37  # of 840 events; each stride that divides them meets one jerk alone
     model = LeadBrakesParameters
+
+    def told(self, facts: Mapping[str, Any]) -> str:
+        held = f"for {facts['held_s']:.1f} s" if facts["held_s"] < math.inf else "to a standstill"
+        return f"with {facts['peak_mps2']:.1f} m/s² {held}"
 
     def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:  # noqa: ARG002
         return {name: events[name] for name in ("peak_mps2", "held_s", "jerk_mps3")}

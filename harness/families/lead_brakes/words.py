@@ -1,0 +1,59 @@
+"""What pages say of lead braking."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from harness.families.words import Shown, Words
+
+WORDS = Words(
+    called="lead brakes",
+    event="braking",
+    events="brakings",
+    since="the onset",
+    kicker="How often an automated vehicle (AV) collides with the vehicle ahead (LV) when that brakes, on a motorway",
+    same="vehicles ahead that brake",
+    such=" of such following",
+    none="Nobody braked.",
+    strikes="In every crash the AV strikes LV from behind.",
+    who="LV the one ahead, which brakes",
+    shows=("LV", "brakes"),
+    happens=("LV", "brakes"),
+    tests=lambda _: (
+        "the vehicle follows another one on a straight road, at the distance that it chooses; after 30 s that brakes, "
+        "and releases or stands"
+    ),
+    rests=lambda *_: (
+        "how hard, how long and how abruptly the vehicle ahead brakes, which is assumed, and it is per braking: how "
+        "many "
+        "there are in an hour of driving is assumed, too"
+    ),
+    unlikely="These are brakings of 3 m/s² or more, one in each test.",
+)
+HEADWAY = Shown(
+    "headway at the onset",
+    "s",
+    ("Headway at", "onset"),
+    lambda of: np.asarray(of["event_gap_m"] / (of["lead_speed_mps"] - of["event_rate_mps"])),
+    beyond=1.2,
+    cell=0.1,
+)
+PEAK = Shown(
+    "peak deceleration",
+    "m/s²",
+    ("Peak", "deceleration"),
+    lambda of: of["peak_mps2"],
+    beyond=1.2,
+    cell=0.2,
+    edges=np.arange(0.2, 15.1, 0.4),
+)
+HELD_AT_MOST_S = 6.0
+HELD = Shown(
+    "held for (at the right end: longer, or to standstill)",
+    "s",
+    ("Held",),
+    lambda of: np.minimum(of["held_s"], HELD_AT_MOST_S - 1e-3),
+    beyond=1.0,
+    cell=0.5,
+    edges=np.arange(0.0, HELD_AT_MOST_S + 0.1, 0.5),
+)
