@@ -52,9 +52,9 @@ if TYPE_CHECKING:
 def check(
     campaign_file: Path, *, overrides: Sequence[str], av: str | None, scenario: str | None, as_json: bool
 ) -> None:
-    """Validate CAMPAIGN, or that of VEHICLE, and print it with every default filled in.
+    """Validate CAMPAIGN, or that of VEHICLE, and print it as a campaign file with every default filled in.
 
-    No test is run and nothing is written. The output is itself a campaign file.
+    No test is run, nothing is written.
     """
     campaign = harness.load_campaign(campaign_file, [*(of_scenario(scenario) if scenario else ()), *overrides], av=av)
     from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
@@ -223,8 +223,7 @@ def av_check(
     Shown are whether it gives the same bits in another order and in other cells, whether it stays finite and within
     limits, how it reacts to cut-ins, and its time per step beside the built-in IDM. Nothing is written.
 
-    Exit code 3 says that episodes failed, were not reproduced, or ended the process; 2 that the campaign or the
-    controller is wrong.
+    Exit code 3: episodes failed, were not reproduced, or ended the process; 2: campaign or controller are wrong.
     """
     campaign = harness.load_campaign(campaign_file, overrides, av=av)
     from harness.report.av_check import rows, verdict  # noqa: PLC0415 - slow to import: only once the campaign is right
@@ -297,9 +296,9 @@ def compare(
         raise click.UsageError("Name a second campaign, or say with --against or --against-av what is different in B.")
     stored = source_a if source_a.is_dir() else None
     file_a = source_a if stored is None else stored / "campaign.yaml"
-    one = one_scenario(scenario, "compare")
-    a = harness.load_campaign(file_a, [*one, *overrides], av=av)
-    b = harness.load_campaign(file_b or file_a, [*one, *overrides, *against], av=against_av or av)
+    overrides = [*one_scenario(scenario, "compare"), *overrides]
+    a = harness.load_campaign(file_a, overrides, av=av)
+    b = harness.load_campaign(file_b or file_a, [*overrides, *against], av=against_av or av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
     from harness.campaign.files import parse_override  # noqa: PLC0415 - keeps --help fast
@@ -335,7 +334,6 @@ def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str],
     """Build the pool that belongs to the environment and surrogate library of CAMPAIGN, and show what is in it.
 
     Of a VEHICLE it is the one that `harness run VEHICLE` draws from; the vehicle itself does not matter.
-
     Shown are the surrogates from careful to careless with their crash rates, and how probable it is that an event is
     the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
     """
