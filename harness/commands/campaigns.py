@@ -23,6 +23,7 @@ from harness.commands.options import (
     json_option,
     junit_option,
     of_scenario,
+    one_scenario,
     progress_bar,
     scenario_option,
     set_option,
@@ -45,14 +46,17 @@ if TYPE_CHECKING:
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
 @av_option
+@scenario_option
 @set_option
 @json_option
-def check(campaign_file: Path, overrides: Sequence[str], av: str | None, *, as_json: bool) -> None:
-    """Validate CAMPAIGN, or that of VEHICLE, and print it with every default filled in.
+def check(
+    campaign_file: Path, *, overrides: Sequence[str], av: str | None, scenario: str | None, as_json: bool
+) -> None:
+    """Validate CAMPAIGN, or that of VEHICLE, and print it as a campaign file with every default filled in.
 
-    No test is run and nothing is written. The output is itself a campaign file.
+    No test is run, nothing is written.
     """
-    campaign = harness.load_campaign(campaign_file, overrides, av=av)
+    campaign = harness.load_campaign(campaign_file, [*(of_scenario(scenario) if scenario else ()), *overrides], av=av)
     from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
     from harness.resolved import require_ready  # noqa: PLC0415 - slow to import: only once the campaign is right
 
@@ -222,8 +226,7 @@ def av_check(
     Shown are whether it gives the same bits in another order and in other cells, whether it stays finite and within
     limits, how it reacts to cut-ins, and its time per step beside the built-in IDM. Nothing is written.
 
-    Exit code 3 says that episodes failed, were not reproduced, or ended the process; 2 that the campaign or the
-    controller is wrong.
+    Exit code 3: episodes failed, were not reproduced, or ended the process; 2: campaign or controller are wrong.
     """
     campaign = harness.load_campaign(campaign_file, overrides, av=av)
     from harness.report.av_check import rows, verdict  # noqa: PLC0415 - slow to import: only once the campaign is right
@@ -250,21 +253,18 @@ def av_check(
 @click.argument("file_b", metavar="[B]", type=CAMPAIGN, required=False)
 @click.option("--out", "folder", type=FOLDER, help="Folder of the run folders a and b. Default: runs/A-B.")
 @click.option(
-    "--against",
-    multiple=True,
-    metavar="A.B=C",
+    "--against", multiple=True, metavar="A.B=C",
     help="Value that B has instead; with it B may be left out. May be given several times.",
-)
+)  # fmt: skip
 @click.option("--against-av", metavar="VEHICLE", help="Vehicle that B has instead; with it B may be left out.")
 @click.option(
-    "--margin",
-    type=click.FloatRange(min=0.0),
-    metavar="R",
+    "--margin", type=click.FloatRange(min=0.0), metavar="R",
     help="Run until it is known whether B's crash rate is at most 1 + R times A's, whatever the precision.",
-)
+)  # fmt: skip
 @workers_option
 @junit_option
 @av_option
+@scenario_option
 @set_option
 @json_option
 @click.pass_context
@@ -280,18 +280,18 @@ def compare(
     workers: int | None,
     junit: Path | None,
     av: str | None,
+    scenario: str | None,
     overrides: Sequence[str],
     as_json: bool,
 ) -> None:
     """Drive the AVs of A and B, campaigns or vehicles, in the same traffic; print the difference.
 
-    Both meet the same cut-ins (testing.method: shells), round by round, until it is known who crashes less often, or
+    Both meet the same events (testing.method: shells), round by round, until it is known who crashes less often, or
     the half-width of the difference is 0.1 of the larger rate, or both crash less than stop.below_reference says; or
     until --margin is decided; or, with --set stop.rhw=R, until that half-width is R.
 
     A may be a run folder: its tests are copied and not driven again. Finished parts of an earlier call with the same
-    --out are used again, too. The folder receives the run folders a and b, compare.json and
-    report.html.
+    --out are used again, too. The folder receives the run folders a and b, compare.json and report.html.
 
     Exit code 5 says that B is worse than A by more than --margin; 4 that budget or pool were spent before it was known.
     """
@@ -299,6 +299,7 @@ def compare(
         raise click.UsageError("Name a second campaign, or say with --against or --against-av what is different in B.")
     stored = source_a if source_a.is_dir() else None
     file_a = source_a if stored is None else stored / "campaign.yaml"
+    overrides = [*one_scenario(scenario, "compare"), *overrides]
     a = harness.load_campaign(file_a, overrides, av=av)
     b = harness.load_campaign(file_b or file_a, [*overrides, *against], av=against_av or av)
     if stored is not None:  # how far it was run before says nothing about now
@@ -325,21 +326,21 @@ def compare(
 
 
 @click.command(
-    short_help="Build the pool of cut-ins, and show its shells.",
+    short_help="Build the pool of events, and show its shells.",
     epilog=examples("harness pool scenarios/smoke.yaml", "harness pool idm --set environment.cut_in_lead_s=0.5"),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
+@scenario_option
 @set_option
 @json_option
-def pool(campaign_file: Path, *, overrides: Sequence[str], as_json: bool) -> None:
+def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str], as_json: bool) -> None:
     """Build the pool that belongs to the environment and surrogate library of CAMPAIGN, and show what is in it.
 
     Of a VEHICLE it is the one that `harness run VEHICLE` draws from; the vehicle itself does not matter.
-
-    Shown are the surrogates from careful to careless with their crash rates, and how probable it is that a cut-in is
+    Shown are the surrogates from careful to careless with their crash rates, and how probable it is that an event is
     the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
     """
-    campaign = harness.load_campaign(campaign_file, overrides)
+    campaign = harness.load_campaign(campaign_file, [*one_scenario(scenario, "pool"), *overrides])
     with progress_bar() as bar:
         from harness.pool.build import campaign_pool  # noqa: PLC0415 - slow to import: the bar is there meanwhile
         from harness.resolved import resolve  # noqa: PLC0415 - slow to import

@@ -90,6 +90,16 @@ def of_scenario(text: str) -> list[str]:
     return [f"scenarios=[{', '.join(names)}]"]
 
 
+def one_scenario(text: str | None, command: str) -> list[str]:
+    """The same, for a command that is about one alone."""
+    if text is None:
+        return []
+    if text == "all" or "," in text:
+        found, expected = f"several scenarios ({text})", f"one, as `harness {command}` looks at one pool of events"
+        raise HarnessError("--scenario", found, expected, "Name one of them, and ask again for each of the others.")
+    return of_scenario(text)
+
+
 def progress_bar() -> Progress:
     """What a command shows of its work, unless it is to be quiet."""
     from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast

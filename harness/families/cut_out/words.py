@@ -11,10 +11,9 @@ WORDS = Words(
     called="cut-out",
     event="cut-out",
     events="cut-outs",
-    since="the lane being clear",
+    since="the lane was clear",
     kicker="How often an automated vehicle (AV) collides with a slower vehicle (SV) that the one ahead (LV) reveals "
-    "when "
-    "it leaves the lane, on a motorway",
+    "when it leaves the lane, on a motorway",
     same="vehicles that others reveal",
     such=" of such following",
     none="Nobody left the lane.",
@@ -28,8 +27,7 @@ WORDS = Words(
     ),
     rests=lambda *_: (
         "how slow the vehicle is that is revealed, and how late, which is assumed, and it is per cut-out: how many "
-        "there "
-        "are in an hour of driving is assumed, too"
+        "there are in an hour of driving is assumed, too"
     ),
     unlikely="Cut-outs that ask for little braking of anybody are not among them.",
 )
