@@ -6,7 +6,6 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +16,7 @@ from harness.commands.options import (
     CAMPAIGN,
     FOLDER,
     RUNS,
+    accepting,
     av_option,
     examples,
     executor_option,
@@ -25,6 +25,7 @@ from harness.commands.options import (
     of_scenario,
     one_scenario,
     progress_bar,
+    run_folder,
     scenario_option,
     set_option,
     workers_option,
@@ -143,7 +144,7 @@ def run(
     seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
     scenarios = [] if scenario is None else of_scenario(scenario)
     campaign = harness.load_campaign(campaign_file, [*scenarios, *seeds, *overrides, *limit, *where], av=av)
-    chosen, folder = folder is None, folder or _run_folder(campaign.name, resume=resume)
+    chosen, folder = folder is None, folder or run_folder(campaign.name, resume=resume)
     if campaign.run.executor == "local":
         start_server()
     with named_if_written(folder, chosen=chosen), progress_bar() as bar:
@@ -177,15 +178,6 @@ def _told_of_several(found: Hours, junit: Path | None, *, as_json: bool) -> None
     print_either(found.content, told, as_json=as_json)
 
 
-def accepting(limit: str) -> list[str]:
-    """What ``--accept`` sets: crashes per test, or a reference driver by its name."""
-    try:
-        keys, value = ("crash_rate_below", "times_reference"), f"{float(limit)!r}"
-    except ValueError:
-        keys, value = ("times_reference", "crash_rate_below"), f"{{driver: {limit}}}"
-    return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
-
-
 @contextmanager
 def named_if_written(folder: Path, *, chosen: bool) -> Iterator[None]:
     """Say where a run is that was not finished, if its folder was ``chosen`` here and there is something."""
@@ -197,16 +189,6 @@ def named_if_written(folder: Path, *, chosen: bool) -> Iterator[None]:
         raise
 
 
-def _run_folder(name: str, *, resume: bool) -> Path:
-    """``runs/NAME``, or the first ``runs/NAME-2``, ``-3``, … that is not there; to resume, the last that is there."""
-    last, folder = None, RUNS / name
-    for number in count(2):
-        if not folder.exists():
-            return last if resume and last is not None else folder
-        last, folder = folder, RUNS / f"{name}-{number}"
-    raise AssertionError  # count() has no end
-
-
 @click.command(
     name="av-check",
     short_help="Look at the AV before a campaign is spent on it.",
@@ -214,21 +196,29 @@ def _run_folder(name: str, *, resume: bool) -> Path:
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
 @click.option("--episodes", type=click.IntRange(min=2), default=48, show_default=True, help="Episodes to run.")
+@scenario_option
 @av_option
 @set_option
 @json_option
 @click.pass_context
 def av_check(
-    ctx: click.Context, campaign_file: Path, *, episodes: int, av: str | None, overrides: Sequence[str], as_json: bool
+    ctx: click.Context,
+    campaign_file: Path,
+    *,
+    episodes: int,
+    scenario: str | None,
+    av: str | None,
+    overrides: Sequence[str],
+    as_json: bool,
 ) -> None:
     """Run a few dozen cut-ins with VEHICLE, or that of CAMPAIGN, twice, and say what it is like.
 
     Shown are whether it gives the same bits in another order and in other cells, whether it stays finite and within
-    limits, how it reacts to cut-ins, and its time per step beside the built-in IDM. Nothing is written.
+    limits, how it follows and reacts, and its time per step beside the built-in IDM. Nothing is written.
 
     Exit code 3: episodes failed, were not reproduced, or ended the process; 2: campaign or controller are wrong.
     """
-    campaign = harness.load_campaign(campaign_file, overrides, av=av)
+    campaign = harness.load_campaign(campaign_file, [*one_scenario(scenario, "av-check"), *overrides], av=av)
     from harness.report.av_check import rows, verdict  # noqa: PLC0415 - slow to import: only once the campaign is right
     from harness.runner.look import check_av_apart  # noqa: PLC0415
 

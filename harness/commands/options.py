@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -120,3 +121,22 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON o
 def examples(*lines: str, heading: str = "Examples:") -> str:
     """Lay out lines below a help text, kept as they are (the backspace is click's mark for that)."""
     return f"\b\n{heading}\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def accepting(limit: str) -> list[str]:
+    """What ``--accept`` sets: crashes per test, or a reference driver by its name."""
+    try:
+        keys, value = ("crash_rate_below", "times_reference"), f"{float(limit)!r}"
+    except ValueError:
+        keys, value = ("times_reference", "crash_rate_below"), f"{{driver: {limit}}}"
+    return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
+
+
+def run_folder(name: str, *, resume: bool) -> Path:
+    """``runs/NAME``, or the first ``runs/NAME-2``, ``-3``, … that is not there; to resume, the last that is there."""
+    last, folder = None, RUNS / name
+    for number in count(2):
+        if not folder.exists():
+            return last if resume and last is not None else folder
+        last, folder = folder, RUNS / f"{name}-{number}"
+    raise AssertionError  # count() has no end

@@ -14,14 +14,20 @@ IN_WORDS = {
     "max_acceleration_mps2": "hardest acceleration, m/s²",
     "share_at_min": "share of steps at its hardest allowed braking",
     "share_at_max": "share of steps at its hardest allowed acceleration",
-    "reaction_s": "from the onset of a cut-in to the first braking, median, s",
-    "braking_share": "share of cut-ins after which it braked",
-    "n_events": "cut-ins",
-    "n_crashes": "crashes (no rate: cut-ins are forced)",
+    "reaction_s": "from the onset to the first braking, median, s",
+    "braking_share": "share of {events} after which it braked",
+    "n_events": "{events}",
+    "n_crashes": "crashes (no rate: {events} are forced)",
     "us_per_step": "time per step, µs",
     "episodes_per_s": "tests per second",
     "construction_s": "time that its constructor takes, median, s",
     "constructions": "times that each worker of a run calls it",
+}
+FOLLOWING = {
+    "headway_s": "headway at the onset, median, s",
+    "smallest_gap_m": "smallest gap before it, m",
+    "speed_mps": "faster than the vehicle ahead at the onset, median, m/s",
+    "n_hit": "tests in which it hit the vehicle ahead before",
 }
 CAUSES: dict[Cause, str] = {
     "remembers": "It differs after another episode: it remembers the last one. Set all its state in start.",
@@ -42,7 +48,9 @@ def verdict(found: AvCheck) -> str:
     if found.differing:
         return f"NOT REPRODUCIBLE: {len(found.differing)} of {n} tests came out otherwise. {cause(found)}"
     if not seen.n_events or not seen.braking_share > 0.0:
-        return f"LOOK AGAIN: it braked after none of {seen.n_events} cut-ins. Does it see BV?"
+        return f"LOOK AGAIN: it braked after none of {seen.n_events} {found.events}. Does it see the other vehicle?"
+    if found.follows is not None and found.follows.n_hit:
+        return f"LOOK AGAIN: in {found.follows.n_hit} of {n} tests it hit the vehicle ahead before anything happened."
     longest, moved = max(found.moved_mps2.items(), default=(0.0, 0.0))
     if longest and moved > MOVES_MPS2:
         return (
@@ -58,7 +66,7 @@ def verdict(found: AvCheck) -> str:
         )
     return (
         f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
-        f"cut-ins, {seen.reaction_s:.1f} s after they began (median, also where it had no need to brake sooner); "
+        f"{found.events}, {seen.reaction_s:.1f} s after they began (median, also where no need was sooner); "
         f"a step takes {slower:.1f} times that of IDM.{advice}"
     )
 
@@ -73,15 +81,18 @@ def cause(found: AvCheck) -> str:
 def rows(found: AvCheck) -> list[dict[str, Any]]:
     """A table: what was found, beside the built-in IDM."""
     told = found.to_json()
+    of_following = {} if found.follows is None else FOLLOWING
     own, idm = ({**told[f"{who}behaviour"], **told[f"{who}speed"]} for who in ("", "idm_"))
-    cut_ins = "cut-ins that take time" if found.shows else "cut-ins of one step"
+    kind = f"{found.events} that take time" if found.shows else f"{found.events} of one step"
+    kind = found.events if found.follows is not None else kind
     shown = [
-        ("kind of vehicle, engine, method", f"{found.source}, {found.engine}, {found.method}, {cut_ins}", ""),
+        ("kind of vehicle, engine, method", f"{found.source}, {found.engine}, {found.method}, {kind}", ""),
         ("tests", found.n_episodes, ""),
         *((f"failed: {why}", n, "") for why, n in (told["failures"] or {"none": 0}).items()),
         ("tests that came out otherwise", told["differing"] or "none", ""),
         ("accelerations allowed, m/s²", [*told["limits_mps2"]], ""),
-        *((text, own[name], idm[name]) for name, text in IN_WORDS.items()),
+        *((text.format(events=found.events), own[name], idm[name]) for name, text in IN_WORDS.items()),
+        *((text, told["follows"][name], told["idm_follows"][name]) for name, text in of_following.items()),
         *(
             (f"its first answer with a warm-up of {s:g} s moves by up to, m/s²", moved, "")
             for s, moved in found.moved_mps2.items()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections import Counter
@@ -28,8 +29,8 @@ from harness.resolved import require_world, resolve
 from harness.runner.again import Bits, Tests, bits_of, run_elsewhere
 from harness.sampling import prepare
 from harness.sampling.protocol import Source
-from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import AV, CRASH, FAILED, FloatArray
+from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
+from harness.vocabulary import CRASH, FAILED, FloatArray
 from harness.worlds import build_world
 from harness.worlds.twin import TwinWorld
 
@@ -69,6 +70,20 @@ class Behaviour:
 
 
 @dataclass(frozen=True)
+class Follows:
+    """How the AV follows before the onset, in scenarios in which it does: of tests, the median and the least.
+
+    ``headway_s`` is that at the onset, ``smallest_gap_m`` the least gap of the approach, ``speed_mps`` the AV's speed
+    at the onset less the leader's. ``n_hit`` tests ended before it in a crash.
+    """
+
+    headway_s: float
+    smallest_gap_m: float
+    speed_mps: float
+    n_hit: int
+
+
+@dataclass(frozen=True)
 class Speed:
     """Time per episode step, episodes per second, and what a worker of a run constructs before its cells are full."""
 
@@ -88,7 +103,8 @@ class AvCheck:
     count as its limits; ``moved_mps2`` says by how much first answers move at most if the warm-up takes so many seconds
     (key) instead of ``av.warm_up_s``. The built-in IDM has driven the same episodes in the same cells. Cut-ins are of
     one step, also where they ``show`` before in the campaign, for a vehicle that acts before them: a look makes no
-    baseline runs, which would tell the onset.
+    baseline runs, which would tell the onset. ``events`` are what the scenario calls them; where the AV follows from
+    the start, ``follows`` says how.
     """
 
     source: str
@@ -106,6 +122,9 @@ class AvCheck:
     idm_behaviour: Behaviour
     speed: Speed
     idm_speed: Speed
+    events: str = "cut-ins"
+    follows: Follows | None = None
+    idm_follows: Follows | None = None
 
     @property
     def exit_code(self) -> int:
@@ -152,7 +171,8 @@ def check_av(campaign: Campaign | str | Path, n_episodes: Annotated[int, Field(g
     limits = own.min_acceleration_mps2, own.max_acceleration_mps2
     differing = tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i])
     cause, clock_read_at = _likely_cause(source, differing[0]) if differing else (None, ())
-    early = tested.av.acts_before_event
+    family = source.resolved.family
+    early = tested.av.acts_before_event or family.follows
     return AvCheck(
         source=tested.av.source,
         engine=tested.world.engine,
@@ -164,11 +184,14 @@ def check_av(campaign: Campaign | str | Path, n_episodes: Annotated[int, Field(g
         likely_cause=cause,
         clock_read_at=clock_read_at,
         limits_mps2=limits,
-        moved_mps2=_moved_by_warm_up(source, min(n_episodes, WARM_UP_EPISODES)),
+        moved_mps2={} if family.follows else _moved_by_warm_up(source, min(n_episodes, WARM_UP_EPISODES)),
         behaviour=_behaviour(first, limits, early=early),
         idm_behaviour=_behaviour(of_idm, limits, early=early),
         speed=own_speed,
         idm_speed=idm_speed,
+        events=family.words.events,
+        follows=_follows(first) if family.follows else None,
+        idm_follows=_follows(of_idm) if family.follows else None,
     )
 
 
@@ -309,6 +332,23 @@ def _likely_cause(source: Source, episode: int) -> tuple[Cause | None, Sequence[
     return "shares", ()
 
 
+def _follows(shard: Shard) -> Follows:
+    """Behind the vehicle ahead, which is the first of the scenario's."""
+    headways, gaps, faster, n_hit = [], [], [], 0
+    for row, trace in shard.traces.items():
+        onset = int(shard.episode["onset_step"][row])
+        until = min(onset if onset >= 0 else len(trace) - 1, len(trace) - 1)
+        gap = trace[: until + 1, 0, 0] - VEHICLE_LENGTH_M - trace[: until + 1, -1, 0]
+        gaps.append(float(gap.min()))
+        n_hit += bool(shard.episode["outcome"][row] == CRASH and until == len(trace) - 1)
+        if trace[until, -1, 1] > 0.0:
+            headways.append(float(gap[-1] / trace[until, -1, 1]))
+        faster.append(float(trace[until, -1, 1] - trace[until, 0, 1]))
+    empty = math.nan
+    median = float(np.median(headways)) if headways else empty
+    return Follows(median, min(gaps, default=empty), float(np.median(faster)) if faster else empty, n_hit)
+
+
 def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
     episode = shard.episode
     acted, reactions = [], []
@@ -316,7 +356,7 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         cut, onset = int(episode["event_step"][row]), int(episode["onset_step"][row])
         if episode["outcome"][row] == FAILED:
             continue
-        commanded = trace[:-1, AV, 2]  # the last row commands nothing
+        commanded = trace[:-1, -1, 2]  # the last row commands nothing
         if early or cut >= 0:
             acted.append(commanded[0 if early else onset + 1 :])
         if cut >= 0:

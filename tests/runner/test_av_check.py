@@ -327,3 +327,22 @@ def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_at_one_that_acts_befo
 def test_a_controller_that_acts_early_is_checked_without_forcing():
     found = check("Steady", "av.before_event=controller", "testing.method=nde")
     assert (found.method, found.exit_code) == ("step_mixture", 0)
+
+
+@pytest.mark.parametrize("scenario", ["lead_brakes", "cut_out"])
+def test_of_a_vehicle_that_follows_it_is_said_how(scenario):
+    """IDM keeps 1 s and some metres to a vehicle of its own speed; words are the scenario's."""
+    found = check_av(load_campaign("idm", [f"scenario={scenario}"]), 6)
+    assert found.follows == found.idm_follows
+    assert 1.0 < found.follows.headway_s < 2.0
+    assert found.follows.smallest_gap_m > 10.0
+    assert found.follows.n_hit == 0
+    assert found.moved_mps2 == {}
+    told = [row["what"] for row in rows(found)]
+    assert found.events in told
+    assert "headway at the onset, median, s" in told
+    assert "cut-in" not in " ".join(told)
+    blind = check_av(
+        load_campaign("idm", [f"scenario={scenario}", "av={model: constant, parameters: {acceleration_mps2: 2}}"]), 6
+    )
+    assert blind.follows.headway_s > found.follows.headway_s  # it does nothing before the event
