@@ -71,7 +71,7 @@ def require_same(one, other):
 @pytest.mark.parametrize("name", LADDERS)
 def test_sumo_and_the_twin_have_the_same_bits(name):
     """Also where cells are used again after a crash, in which vehicles run through each other."""
-    resolved, (_, rows) = resolved_of(name, CARELESS[name]), some(name, 300)
+    resolved, (_, rows) = resolved_of(name, CARELESS[name]), some(name, 100)
     rows = np.random.default_rng(1).permutation(rows)
     sumo, twin = (run(world, resolved, of_rows(name, rows), "all") for world in (SumoWorld, TwinWorld))
     require_same(sumo, twin)
