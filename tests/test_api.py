@@ -147,6 +147,7 @@ def test_a_path_is_taken_where_a_campaign_is_and_a_number_of_numpy_s_where_a_num
 EXAMPLES = ("run", "estimate", "read", "replay", "compare")
 
 
+@pytest.mark.slow
 def test_examples_in_docstrings_give_what_they_say(tmp_path, monkeypatch):
     """In one folder, in this order: the run of the first is that of the others."""
     monkeypatch.chdir(tmp_path)

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 
 from harness.campaign.files import load_campaign
 from harness.cli import cli, main
-from harness.commands.campaigns import _run_folder
+from harness.commands.options import run_folder
 from harness.commands.printing import say
 from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.numbers import interval, words
@@ -316,7 +316,7 @@ def test_a_run_without_a_folder_gets_a_new_one_and_resumes_the_last(tmp_path, mo
     for held, fresh, resumed in ((None, "mine", "mine"), ("mine", "mine-2", "mine"), ("mine-2", "mine-3", "mine-2")):
         if held is not None:
             Path("runs", held).mkdir(parents=True)
-        assert (_run_folder("mine", resume=False), _run_folder("mine", resume=True)) == (
+        assert (run_folder("mine", resume=False), run_folder("mine", resume=True)) == (
             Path("runs", fresh),
             Path("runs", resumed),
         )

@@ -82,6 +82,7 @@ def test_a_new_surrogate_is_a_driver_by_name_or_by_numbers(tmp_path):
     assert 1.0e-7 < estimates["estimates"]["mixture_cv"]["crash_rate"] < 1.8e-7
 
 
+@pytest.mark.slow
 def test_a_new_criticality_is_a_function_in_a_file(tmp_path):
     """It steers well, and the rate stays that of the traffic: 1.352e-7 by 12 million tests (tests/reference)."""
     assert "bit for bit as stored" in ran(laid_out("A new criticality", tmp_path), tmp_path)

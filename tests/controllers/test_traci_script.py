@@ -222,9 +222,8 @@ def test_without_a_name_of_a_class_a_module_of_vehicles_is_none(tmp_path, monkey
 # -- through the command line --
 
 
-@pytest.mark.parametrize(
-    ("name", "engine"), [("main_guard.py", "sumo"), pytest.param("remembers.py", "twin", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("name", "engine"), [("main_guard.py", "sumo"), ("remembers.py", "twin")])
+@pytest.mark.slow
 def test_from_the_command_line_with_workers_of_its_own_resumed_and_repeated(name, engine, tmp_path):
     short = [f"--set={each}" for each in (*FORCED, f"world.engine={engine}", "run.shard_size=40")]
     run = ["run", str(SCRIPTS / name), "--out", str(tmp_path / "run"), "--quiet", *short]

@@ -30,7 +30,8 @@ def campaign_of(name: str, method: str, *more: str):
     return load_campaign("idm", [f"scenario={name}", av, *small, *more])
 
 
-@pytest.mark.parametrize("name", ["lead_brakes", pytest.param("cut_out", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", LADDERS)
+@pytest.mark.slow
 def test_naturalistic_forced_and_shells_have_the_rate_of_the_pool(name, tmp_path):
     """Within four standard errors of both; a false alarm in 16,000."""
     pool, n = source_of(name).pool, 4000
