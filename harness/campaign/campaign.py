@@ -94,7 +94,9 @@ class Campaign(Section):
 
     def of_family(self, name: str) -> Campaign:
         """The campaign of one of its scenarios; ``environment`` is that of cut-ins where others are beside them."""
-        given = {"environment": EnvironmentSettings()} if name != "cut_in" else {}
+        given: dict[str, Any] = {}
+        if name != "cut_in":  # where the vehicle drives from the start in any case
+            given = {"environment": EnvironmentSettings(), "av": self.av.replaced(("before_event",), "hold_speed")}
         stop = self.stop.model_copy(update={"each_family": False})
         return self.model_copy(update={"scenario": name, "scenarios": None, "exposure": {}, "stop": stop, **given})
 
@@ -230,6 +232,13 @@ REFUSED = (
         "a limit of crashes per test, with several scenarios",
         "times_reference: their tests are not of one kind",
         "Write accept: {times_reference: {driver: r157-cc}}, or one scenario.",
+    ),
+    Combination(
+        "testing.shells.statement",
+        lambda c, _: c.scenarios is not None and c.testing.shells.statement != "assumption_free",
+        "{testing.shells.statement}, with several scenarios",
+        "assumption_free: the sum is over all strata, and each library has a boundary of its own",
+        "Delete the key, or write one scenario.",
     ),
     Combination(
         "pool.library",

@@ -218,11 +218,11 @@ class PerHour:
                 "reference": reference[0].name if reference else "", "rate_per_hour": self.reference_rate,
                 "ratio": ratio, "ratio_low": low, "ratio_high": high, "over_assumed": self.over_assumed(),
             },
-            "families": {of.family: found for of, found in zip(self.families, self._families(level), strict=True)},
+            "families": {of.family: found for of, found in zip(self.families, self._families(confidence), strict=True)},
         }  # fmt: skip
 
-    def _families(self, level: Level) -> Iterator[dict[str, Any]]:
-        total = self.rate
+    def _families(self, confidence: float) -> Iterator[dict[str, Any]]:
+        level, total = Level.two_sided(confidence), self.rate
         for of in self.families:
             limits, (n, n_crashes, n_failed) = of.limits(level), of.tally.totals
             ratio, low, high = PerHour([of]).ratio(level)
@@ -230,7 +230,7 @@ class PerHour:
                 "exposure": {**of.exposure._asdict()}, "p_event": of.seen.design.p_event,
                 "n_episodes": n, "n_crashes": n_crashes, "n_failed": n_failed,
                 "rate_per_hour": limits.rate, "ci_low": limits.low, "ci_high": limits.high,
-                "upper_bound": of.limits(Level.of_bound(0.9, n)).high,
+                "upper_bound": of.limits(Level.of_bound(confidence, n)).high,
                 "share": limits.rate / total if total > 0.0 else math.nan,
                 "reference_rate_per_hour": of.reference_rate, "ratio": ratio, "ratio_low": low, "ratio_high": high,
             }  # fmt: skip

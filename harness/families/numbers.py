@@ -108,6 +108,20 @@ class FitRange(Section):
     _ranges = ordered(("v_min_mps", "v_max_mps"), ("r1_min_m", "r1_max_m"), equal=False)
 
 
+class SpeedsAndGaps(Section):
+    """Laws of a vehicle's speed, and of the gap that people keep to the one ahead (`harness.families.flow`)."""
+
+    v_location_mps: Coefficient
+    v_scale_mps: Scale
+    v_shape: Coefficient
+    r1_shift_m: Coefficient
+    r1_shift_u_m: Coefficient
+    r1_log_mean: Coefficient
+    r1_log_mean_u: Coefficient
+    r1_log_sd: LogScale
+    r1_log_sd_u: LogScale
+
+
 class ParameterFile(Section):
     """Sections of numbers, which are known by flat names ``section__name``."""
 

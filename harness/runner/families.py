@@ -16,7 +16,7 @@ import numpy as np
 
 from harness.arguments import Confidence, checked
 from harness.campaign.campaign import Campaign
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, HarnessError, RunFolderError
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
@@ -65,6 +65,7 @@ def run_families(
     names, progress, began = campaign.scenarios or [], progress or Progress(), time.monotonic()
     require_no_other(out, names)
     ready = {name: require_ready(campaign.of_family(name)) for name in names}
+    require_same_driver(campaign, ready)
     rule = HourRule(campaign)
     with ExitStack() as held:
         held.enter_context(sole_use(out))
@@ -228,6 +229,18 @@ def estimate_families(
 def _exposure(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
     shipped = resolved.family.exposure(resolved.environment, resolved.parameters)
     return own_exposure(shipped, given.get(resolved.campaign.scenario))
+
+
+def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> None:
+    """Refuse (`CampaignError`) a limit beside another driver than the one that the sum is held against."""
+    if campaign.accept is None or campaign.accept.times_reference is None:
+        return
+    asked = campaign.accept.times_reference.driver
+    for name, each in ready.items():
+        if (first := next(iter(each.library.references), "")) != asked:
+            expected = f"{first}, the first reference driver of {name}: the sum is held against that of each scenario"
+            mend = f"Write {first}, or one scenario."
+            raise CampaignError("accept.times_reference.driver", f"'{asked}'", expected, mend)
 
 
 def require_no_other(out: Path, names: Sequence[str]) -> None:

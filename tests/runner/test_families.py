@@ -103,6 +103,8 @@ def test_other_exposures_need_no_new_tests(run, capsys):
         (["testing.method=forced", "stop.rhw=null"], "testing.method"),
         (["accept.crash_rate_below=1e-7"], "accept"),
         (["pool.library=ladder-2"], "pool.library"),
+        (["testing.shells.statement=library"], "testing.shells.statement"),
+        (["accept={times_reference: {driver: r157-fsm}}", "stop.rhw=null"], "accept.times_reference.driver"),
         (["exposure.cut_inn=1"], "exposure"),
         (["scenarios=[cut_in, cut_in]"], "scenarios"),
         (["scenarios=[cut_in, lead_breaks]"], "scenario"),

@@ -28,6 +28,7 @@ from harness.families.numbers import (
     Scale,
     Share,
     Speed,
+    SpeedsAndGaps,
     Time,
     in_whole_steps,
     ordered,
@@ -53,18 +54,9 @@ class Scenario(Section):
     """At most 25 s: BV's free driving has 256 random numbers for each cut-in, and the road is 4 km long."""
 
 
-class InitialState(Section):
+class InitialState(SpeedsAndGaps):
     """Distribution of (v_BV, R1, R1dot, R2, R2dot)."""
 
-    v_location_mps: Coefficient
-    v_scale_mps: Scale
-    v_shape: Coefficient
-    r1_shift_m: Coefficient
-    r1_shift_u_m: Coefficient
-    r1_log_mean: Coefficient
-    r1_log_mean_u: Coefficient
-    r1_log_sd: LogScale
-    r1_log_sd_u: LogScale
     r1dot_df: DegreesOfFreedom
     r1dot_location_mps: Coefficient
     r1dot_location_u: Coefficient

@@ -13,14 +13,13 @@ from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
 from harness.families.numbers import (
     Acceleration,
-    Coefficient,
     DegreesOfFreedom,
     FitRange,
     LogScale,
     Number,
     ParameterFile,
-    Scale,
     Speed,
+    SpeedsAndGaps,
     completed,
     in_whole_steps,
     ordered,
@@ -43,22 +42,6 @@ EVENT_DTYPE = np.dtype(
 )
 """One event: the vehicle ahead brakes, or leaves the lane."""
 NO_EVENT = np.array((0.0, 0.0, np.inf, np.nan, np.nan, np.nan), EVENT_DTYPE)
-
-Seconds = Annotated[Number, within(0.0, ROAD_S), AfterValidator(in_whole_steps)]
-
-
-class InitialState(Section):
-    """Speed of the vehicle ahead, and the gap that people keep."""
-
-    v_location_mps: Coefficient
-    v_scale_mps: Scale
-    v_shape: Coefficient
-    r1_shift_m: Coefficient
-    r1_shift_u_m: Coefficient
-    r1_log_mean: Coefficient
-    r1_log_mean_u: Coefficient
-    r1_log_sd: LogScale
-    r1_log_sd_u: LogScale
 
 
 class FreeDriving(Section):
@@ -94,7 +77,7 @@ class FollowingParameters(ParameterFile):
     """All numbers of such a family; how probable which events are says `grid`."""
 
     fit_range: FitRange
-    initial_state: InitialState
+    initial_state: SpeedsAndGaps
     free_driving: FreeDriving
     approach: Approach
     exposure: Counted
