@@ -29,7 +29,7 @@ ENDED = {
     "rhw": "precise enough",
     "below_reference": "clearly below the competent driver",
     "accept": "verdict reached",
-    "episodes": "budget of tests used up",
+    "episodes": "budget of tests (stop.episodes) used up",
     "pool": "the pool has no further event that would narrow it",
     "pool_error": "the pool’s own error is too wide",
 }
@@ -100,7 +100,7 @@ def vehicle_words(av: AutomatedVehicle) -> tuple[str, list[tuple[str, str]]]:
 
 
 def unseen_words(where: str) -> str:
-    """The same where it is not known by what the rate may rise."""
+    """What a rate has only an upper limit for: no lane change was seen there."""
     return f"no lane change was seen at {where} in the data of this traffic: rates have only an upper limit"
 
 

@@ -22,11 +22,11 @@ WORDS = Words(
     shows=("LV", "leaves the lane"),
     happens=("LV", "has left it"),
     tests=lambda _: (
-        "the vehicle follows another one on a straight road, at the distance that it chooses; after 30 s that leaves "
-        "the lane and reveals a slower one"
+        "the vehicle follows another one on a straight road, at the distance that it chooses; after 30 s the one "
+        "ahead leaves the lane and reveals a slower one"
     ),
     rests=lambda *_: (
-        "how slow the vehicle is that is revealed, and how late, which is assumed, and it is per cut-out: how many "
+        "how slow the vehicle is that is revealed, and how late, which is assumed; it is per cut-out, and how many "
         "there are in an hour of driving is assumed, too"
     ),
     unlikely="Cut-outs that ask for little braking of anybody are not among them.",

@@ -20,13 +20,12 @@ WORDS = Words(
     shows=("LV", "brakes"),
     happens=("LV", "brakes"),
     tests=lambda _: (
-        "the vehicle follows another one on a straight road, at the distance that it chooses; after 30 s that brakes, "
-        "and releases or stands"
+        "the vehicle follows another one on a straight road, at the distance that it chooses; after 30 s the one "
+        "ahead brakes, for a time or to a standstill"
     ),
     rests=lambda *_: (
-        "how hard, how long and how abruptly the vehicle ahead brakes, which is assumed, and it is per braking: how "
-        "many "
-        "there are in an hour of driving is assumed, too"
+        "how hard, how long and how abruptly the vehicle ahead brakes, which is assumed; it is per braking, and how "
+        "many there are in an hour of driving is assumed, too"
     ),
     unlikely="These are brakings of 3 m/s² or more, one in each test.",
 )
