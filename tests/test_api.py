@@ -144,6 +144,16 @@ def test_a_path_is_taken_where_a_campaign_is_and_a_number_of_numpy_s_where_a_num
     assert harness.replay(tmp_path / "run", np.int16(3)).bit_equal
 
 
+def test_estimates_and_campaigns_show_themselves_in_a_few_lines(stored_run):
+    folder = stored_run("mixture-twin")
+    head, *rows = repr(harness.estimate(folder)).splitlines()
+    assert re.search(r"[1-9]\d* crashes in [\d,]+ tests; crash rate per test \(90 %\)", head)
+    assert {row.split()[0] for row in rows} >= {"nade", "mixture_cv"}
+    shown = repr(harness.load_campaign("idm", ["stop.rhw=0.2"]))
+    assert "rhw=0.2" in shown
+    assert len(shown) < 400
+
+
 EXAMPLES = ("run", "estimate", "read", "replay", "compare")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -50,6 +50,13 @@ class Section(BaseModel):
             return validate(data)
         except ValidationError as error:
             raise in_words(error, cls) from None
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """What is not as it would be if nobody had said anything."""
+        for name, value in super().__repr_args__():
+            field = type(self).model_fields[name or ""]
+            if field.is_required() or value != field.get_default(call_default_factory=True):
+                yield name, value
 
     def at(self, path: Sequence[str]) -> Any:
         """Value at a path such as ``("av", "fmu", "file")``; None where a section on the way is left out."""

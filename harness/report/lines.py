@@ -35,6 +35,16 @@ def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None 
     return [" · ".join(head), *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
 
 
+def estimate_lines(content: Mapping[str, Any]) -> list[str]:
+    """The estimators of ``estimates.json``, a line each; those that its records do not allow are not named."""
+    head = f"{content['campaign']}: {count(content['n_crashes'])} crashes in {count(content['n_episodes'])} tests"
+    found = {name: each for name, each in content["estimates"].items() if each["crash_rate"] is not None}
+    rows = [
+        (name, interval(each.get("ci_low"), each.get("ci_high"), each["crash_rate"])) for name, each in found.items()
+    ]
+    return [f"{head}; crash rate per test ({share(content['confidence'])})", *(columns(rows) if rows else ())]
+
+
 def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Rows of equally many texts, each column as wide as its widest; a row too long for that is pushed together."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

@@ -42,14 +42,23 @@ FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
+class Estimates(dict[str, Any]):
+    """Content of ``estimates.json``; shown, a line an estimator."""
+
+    def __repr__(self) -> str:
+        from harness.report.lines import estimate_lines  # noqa: PLC0415 - draws
+
+        return "\n".join(estimate_lines(self))
+
+
 @checked("harness.estimate")
 def estimate_run(
     folder: str | Path,
     *,
     estimators: Annotated[Sequence[str | Any], Field(min_length=1)] | None = None,
     confidence: Confidence | None = None,
-) -> dict[str, Any]:
-    """Estimate a stored run from its records; returns the content of ``estimates.json``.
+) -> Estimates:
+    """Estimate a stored run from its records; returns the content of ``estimates.json``, a dict.
 
     Parameters
     ----------
@@ -67,9 +76,12 @@ def estimate_run(
     Of the run that `harness.run` shows:
 
     >>> import harness
-    >>> found = harness.estimate("runs/idm", estimators=["nade"], confidence=0.5)["estimates"]["nade"]
-    >>> f"{found['crash_rate']:.2e}, {found['ci_low']:.2e} to {found['ci_high']:.2e}"
-    '1.95e-07, 1.45e-07 to 2.69e-07'
+    >>> found = harness.estimate("runs/idm", estimators=["nade"], confidence=0.5)
+    >>> print(found)
+    idm: 95 crashes in 1,000 tests; crash rate per test (50 %)
+      nade  1.95 (1.45 to 2.69) × 10⁻⁷
+    >>> round(found["estimates"]["nade"]["n_effective"], 2)
+    6.82
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -77,7 +89,7 @@ def estimate_run(
     require_trust(folder, manifest, campaign.testing.estimator, "Read that code, and run campaign.yaml yourself.")
     asked = asked_for(estimators or ESTIMATORS, "harness.estimate(estimators=…)")
     blocks = stored_blocks(folder, moments=not {*asked} < {*ESTIMATORS} - {"scv"})
-    return estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence)
+    return Estimates(estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence))
 
 
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
