@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from harness.errors import EXIT_BAD_INPUT, HarnessError, TrajectoryError
-from harness.fitting.observations import Tally, observations, require_distinct, require_enough
+from harness.families.cut_in.fitting.observations import Tally, observations, require_distinct, require_enough
 from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
 
