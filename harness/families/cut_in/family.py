@@ -123,6 +123,9 @@ class CutIn:
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:  # noqa: ARG002 - counted, whatever the laws
         return EXPOSURE
 
+    def milder(self, traffic: Environment) -> None:
+        """There are none: all cut-ins count."""
+
     def sources(self) -> Mapping[Method, type[Any]]:
         from harness.families.cut_in.nade.in_loop import InLoop  # noqa: PLC0415 - imports what draws on families
 
