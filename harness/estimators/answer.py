@@ -65,7 +65,7 @@ class Estimates:
     """Content of ``estimates.json``, as it is written here and the page reads it; without a crash no severity.
 
     ``unmet`` are the conditions of the stop rule that were met last, or not at all; ``traffic`` is what replicates
-    leave open.
+    leave open, ``milder`` see `harness.sampling.milder.Milder`.
     """
 
     campaign: str
@@ -87,6 +87,7 @@ class Estimates:
     decision: dict[str, Any] | None = None
     traffic: TrafficError | None = None
     elsewhere: Elsewhere | None = None
+    milder: dict[str, Any] | None = None
 
     @property
     def best(self) -> Estimate:
@@ -126,7 +127,7 @@ def estimate_blocks(
         severity=done.severity,
         assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
         stopped_by=manifest.get("stopped_by"), unmet=tuple(Note(**each) for each in manifest.get("unmet", ())),
-        decision=manifest.get("decision"),
+        decision=manifest.get("decision"), milder=manifest.get("milder"),
     )  # fmt: skip
     return finite_json(told)
 

@@ -242,7 +242,7 @@ class Run:
             "n_episodes": self.n_episodes,
             "parts": self.parts,
             "before": self.parts_before,
-            **{COUNTED[name]: _counted(tables) for name, tables in self.before.items()},
+            **{COUNTED[name]: _counted(tables) for name, tables in self.before.items() if name in COUNTED},
         }
 
 

@@ -27,6 +27,7 @@ WORDS = Words(
         "there are in an hour of driving is assumed, too"
     ),
     unlikely="Cut-outs that ask for little braking of anybody are not among them.",
+    milder="leaving.scope_mps2: 0.5",
 )
 CLOSING = Shown(
     "closing speed of the one that leaves",
