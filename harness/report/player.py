@@ -210,6 +210,11 @@ def share_over(track: pa.Table) -> FloatArray:
     return np.minimum(lateral_m / LANE_M, 1.0)
 
 
+def tracks_of(trace: pa.Table) -> dict[str, pa.Table]:
+    """The rows of each vehicle of an episode's trace."""
+    return {name: _of(trace, name) for name in dict.fromkeys(trace.column("vehicle").cast(pa.string()).to_pylist())}
+
+
 def _of(traces: pa.Table, vehicle: str) -> pa.Table:
     return traces.filter(pc.equal(traces.column("vehicle").cast(pa.string()), vehicle))
 
