@@ -185,7 +185,7 @@ class Testing(Section):
         return alpha
 
 
-LEAST_POOL_ERROR, MOST_CUT_INS = 0.001, 1_000_000
+LEAST_POOL_ERROR, MOST_EVENTS = 0.001, 1_000_000
 
 
 class PoolSettings(Section):
@@ -196,7 +196,7 @@ class PoolSettings(Section):
     relative_error: float | None = Field(None, ge=LEAST_POOL_ERROR, le=0.2)
     """relative standard error of the surrogates' crash rates, four times that beyond the boundary; none: the
     scenario's, 0.005 or 0.01"""
-    events_per_shell: Whole = Field(25_000, ge=100, le=MOST_CUT_INS)
+    events_per_shell: Whole = Field(25_000, ge=100, le=MOST_EVENTS)
     """cut-ins kept of each shell: its most tests"""
     shadow_paths: Whole = Field(500, ge=50, le=100_000)
     """baseline runs of a vehicle that acts before the cut-in"""

@@ -116,7 +116,7 @@ def campaign_of(source, crashed, impact, rows, rng):
         chosen = np.concatenate([rng.choice(rows[s], k) for s, k in enumerate(added.tolist()) if k])
         n, crash = stratum.size, crashed[chosen]
         columns = {
-            "cut_in": np.ones(n, bool), "stratum": stratum, "cell": stratum, "impact_mps": impact[chosen],
+            "happened": np.ones(n, bool), "stratum": stratum, "cell": stratum, "impact_mps": impact[chosen],
             "cell_mass": np.zeros((n, design.p.size)),
         }  # fmt: skip
         outcome = np.where(crash, CRASH, TIMEOUT).astype(np.int8)
