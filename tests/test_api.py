@@ -75,7 +75,7 @@ def test_load_run_estimate_and_replay_in_a_few_lines(tmp_path):
     replayed = harness.replay(str(folder), 17)
     assert (replayed.bit_equal, replayed.outcome) == (True, replayed.row["outcome"])
     assert replayed.trace.num_rows == 3 * (replayed.row["n_steps"] + 1)
-    with pytest.raises(harness.HarnessError, match="no episode 10000"):
+    with pytest.raises(harness.HarnessError, match="no test 10000"):
         harness.replay(folder, 10_000)
     with pytest.raises(harness.HarnessError, match="--resume"):
         harness.run(harness.load_campaign(MIXTURE_FILE, SMALL), folder)

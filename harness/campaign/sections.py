@@ -207,27 +207,27 @@ class PoolSettings(Section):
 
 
 class World(Section):
-    """Where episodes are simulated."""
+    """Where tests are simulated."""
 
     engine: Literal["sumo", "twin"] = Field("sumo", description="sumo, or twin: the same motion without SUMO")
     cells: Whole = Field(64, ge=1, le=4096)
-    """episodes side by side, in SUMO at most 256; never changes a result"""
+    """tests side by side, in SUMO at most 256; never changes a result"""
 
 
 class Records(Section):
-    """What is kept of every episode."""
+    """What is kept of every test."""
 
     moments: Literal["all", "first_9", "none"] = "first_9"
     """control steps kept: all, first_9 (which scv needs) or none"""
     traces: Literal["all", "crash", "critical", "none"] = "none"
-    """episodes whose motion is kept: all, crash, critical or none"""
-    trace_share: Probability = Field(0.0, description="share of episodes traced whatever their outcome")
+    """tests whose motion is kept: all, crash, critical or none"""
+    trace_share: Probability = Field(0.0, description="share of tests traced whatever their outcome")
 
 
 class Stop(Section):
     """When the campaign is long enough."""
 
-    episodes: Whole = Field(100_000, ge=1, le=10**10, description="most episodes to run")
+    episodes: Whole = Field(100_000, ge=1, le=10**10, description="most tests to run")
     rhw: float | None = Field(None, gt=0.0, lt=10.0)
     """stop at this half-width of the interval over the rate; not for step_mixture"""
     below_reference: float | None = Field(
@@ -300,7 +300,7 @@ class Run(Section):
     """How the work is spread; nothing here changes a result."""
 
     shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = None
-    """episodes per task; none: 5,000, and more in long runs"""
+    """tests per task; none: 5,000, and more in long runs"""
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
     executor: Literal["local", "ray"] = "local"
     """workers run on this machine (local) or on a Ray cluster (ray)"""

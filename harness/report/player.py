@@ -116,7 +116,7 @@ class Scenes:
         moments += [(onset, " ".join(words.shows))] if onset != cut else []
         scene = {
             "campaign": self._name, "scenario": self._family.name, "episode": episode,
-            "title": f"Episode {episode:,}: {why or outcome}",
+            "title": f"Test {episode:,}: {why or outcome}",
             "first": first, "onset": onset, "event": cut, "principal": bv["name"],
             "apart": None if onset is None else first if self._family.follows else onset + 1,
             "tracks": tracks, "ghosts": ghosts,

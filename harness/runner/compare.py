@@ -286,7 +286,7 @@ def require_comparable(a: Campaign, b: Campaign) -> None:
     if apart := [key for key in of_a | of_b if of_a.get(key) != of_b.get(key)]:
         where = apart[0]
         more = f"; also {', '.join(apart[1:])}" if len(apart) > 1 else ""
-        expected = f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of episodes need equal settings"
+        expected = f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of tests need equal settings"
         mend = f"Make them equal, e.g. with --set {where}=…, which holds for both."
         raise CampaignError(where, f"{of_a.get(where)} in A and {of_b.get(where)} in B{more}", expected, mend)
 

@@ -292,7 +292,7 @@ def cpu_name() -> str:
 
 
 def require_few_failed(
-    causes: Counter[str], n: int, campaign: Campaign, what: str = "episodes", where: str = "the episodes table"
+    causes: Counter[str], n: int, campaign: Campaign, what: str = "tests", where: str = "the table `episodes`"
 ) -> None:
     """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
     if causes.total() > (most := campaign.run.max_failed_share) * n:

@@ -240,7 +240,7 @@ def test_from_the_command_line_with_workers_of_its_own_resumed_and_repeated(name
 
 
 def test_av_check_finds_nothing(capsys):
-    assert main(["av-check", str(SCRIPTS / "remembers.py"), "--episodes", "20", "--json"]) == 0
+    assert main(["av-check", str(SCRIPTS / "remembers.py"), "--tests", "20", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["deterministic"]
     assert found["failures"] == {}
