@@ -204,6 +204,7 @@ def test_in_a_notebook_it_is_the_short_answer_and_the_map(name, stored_run, tmp_
 REFERENCE = json.loads((ROOT / "tests/reference/default.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_the_answer_is_that_of_the_reference(tmp_path, capsys):
     """Fixed seeds on both sides: beyond 2 standard errors with a probability of 5 % once, and none after.
 
