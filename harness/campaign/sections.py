@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -50,6 +50,13 @@ class Section(BaseModel):
             return validate(data)
         except ValidationError as error:
             raise in_words(error, cls) from None
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """What is not as it would be if nobody had said anything."""
+        for name, value in super().__repr_args__():
+            field = type(self).model_fields[name or ""]
+            if field.is_required() or value != field.get_default(call_default_factory=True):
+                yield name, value
 
     def at(self, path: Sequence[str]) -> Any:
         """Value at a path such as ``("av", "fmu", "file")``; None where a section on the way is left out."""
@@ -178,7 +185,7 @@ class Testing(Section):
         return alpha
 
 
-LEAST_POOL_ERROR, MOST_CUT_INS = 0.001, 1_000_000
+LEAST_POOL_ERROR, MOST_EVENTS = 0.001, 1_000_000
 
 
 class PoolSettings(Section):
@@ -189,7 +196,7 @@ class PoolSettings(Section):
     relative_error: float | None = Field(None, ge=LEAST_POOL_ERROR, le=0.2)
     """relative standard error of the surrogates' crash rates, four times that beyond the boundary; none: the
     scenario's, 0.005 or 0.01"""
-    events_per_shell: Whole = Field(25_000, ge=100, le=MOST_CUT_INS)
+    events_per_shell: Whole = Field(25_000, ge=100, le=MOST_EVENTS)
     """cut-ins kept of each shell: its most tests"""
     shadow_paths: Whole = Field(500, ge=50, le=100_000)
     """baseline runs of a vehicle that acts before the cut-in"""

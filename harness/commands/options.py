@@ -76,13 +76,11 @@ quiet_option = click.option(
 """Common to all commands: `progress_bar` asks for it."""
 
 
-ALL_SCENARIOS = ("cut_in", "lead_brakes", "cut_out")
-"""Those of UN Regulation No. 157."""
-
-
 def of_scenario(text: str) -> list[str]:
     """What ``--scenario`` sets."""
-    names = ALL_SCENARIOS if text == "all" else tuple(name.strip() for name in text.split(","))
+    from harness.families import R157  # noqa: PLC0415 - keeps --help fast
+
+    names = R157 if text == "all" else tuple(name.strip() for name in text.split(","))
     if len(names) == 1:
         return [f"scenario={names[0]}", "scenarios=null"]
     return [f"scenarios=[{', '.join(names)}]"]

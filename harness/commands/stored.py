@@ -10,14 +10,12 @@ from typing import Any
 import click
 
 import harness
-from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar
+from harness.commands.options import FILE, FOLDER, RUN_FOLDER, examples, json_option, progress_bar
 from harness.commands.printing import answer_lines, print_either, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share, words
 from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 
-FCD = ".xml"
-"""Suffix of SUMO's floating car data."""
 LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_ttc_s", "contact")
 """What a replay tells of a cut-in that takes time."""
 
@@ -243,13 +241,14 @@ def _motion_files(_ctx: click.Context, _parameter: click.Parameter, files: tuple
         from harness.records.folder import require_place  # noqa: PLC0415 - keeps --help fast
         from harness.report.motion import writer_of  # noqa: PLC0415
 
-        if len(twice := [str(file) for file in files if file.suffix == FCD]) > 1:
-            raise HarnessError("--out", " and ".join(twice), "one file of SUMO's", "Copy it.")
         for file in files:
-            if file.suffix != FCD:
-                writer_of(file)
+            writer_of(file)
             require_place(file.parent)
     return files
+
+
+def _sumo_files(ctx: click.Context, parameter: click.Parameter, folder: Path | None) -> tuple[Path, ...]:
+    return _motion_files(ctx, parameter, () if folder is None else (folder / "test.sumocfg",))
 
 
 @click.command(
@@ -258,7 +257,8 @@ def _motion_files(_ctx: click.Context, _parameter: click.Parameter, files: tuple
         "harness replay runs/smoke 17",
         "harness replay runs/smoke 17 --out test_17.html   # or .csv, .xosc, .xml",
         "harness replay runs/smoke 17 --stored --out test_17.csv",
-        "harness replay runs/smoke 17 --gui",
+        "harness replay runs/smoke 17 --gui                # halts at the onset",
+        "harness replay runs/smoke 17 --sumo test_17       # then: sumo -c test_17/test.sumocfg",
     ),
 )
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
@@ -269,14 +269,26 @@ def _motion_files(_ctx: click.Context, _parameter: click.Parameter, files: tuple
     ".xosc, OpenSCENARIO XML 1.2 and its road (.xodr; extra 'export'); .xml, SUMO's floating car data. May be given "
     "several times.",
 )  # fmt: skip
-@click.option("--gui", is_flag=True, help="Show it in sumo-gui (extra 'sumo').")
+@click.option("--gui", is_flag=True, help="Show it in sumo-gui, halted at the onset (extra 'sumo').")
+@click.option(
+    "--sumo", "sumo_files", metavar="DIR", type=FOLDER, callback=_sumo_files,
+    help="Write what SUMO needs to repeat it: DIR/test.sumocfg, which sumo and sumo-gui run (-c), and its files.",
+)  # fmt: skip
 @click.option(
     "--stored", is_flag=True, help="Use the motion that the run has kept: nothing is simulated, no code of others runs."
 )
 @click.option("--trust", is_flag=True, help="Run the vehicle's code even if DIR was not made by you on this machine.")
 @json_option
 def replay(
-    folder: Path, episode: int, *, files: Sequence[Path], gui: bool, stored: bool, trust: bool, as_json: bool
+    folder: Path,
+    episode: int,
+    *,
+    files: Sequence[Path],
+    gui: bool,
+    sumo_files: Sequence[Path],
+    stored: bool,
+    trust: bool,
+    as_json: bool,
 ) -> None:
     """Simulate test number TEST of the run in DIR again, bit for bit, and say what happens when.
 
@@ -291,13 +303,13 @@ def replay(
     from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
     from harness.records.origin import code_of  # noqa: PLC0415
     from harness.records.reader import read_campaign  # noqa: PLC0415
+    from harness.report.sumo_files import gui_program, watch  # noqa: PLC0415
 
     if not stored and (code := code_of(read_campaign(folder, read_manifest(folder)).av)) is not None:
         say(f"The vehicle is {code}.", err=True)
-    fcd = next((file for file in files if file.suffix == FCD), None)
-    result = harness.replay(folder, episode, gui=gui, fcd=fcd, stored=stored, trust=trust)
-    written = [] if fcd is None else [fcd]
-    written += [each for file in files if file.suffix != FCD for each in harness.write_motion(result, file)]
+    program = gui_program() if gui else None
+    result = harness.replay(folder, episode, stored=stored, trust=trust)
+    written = [each for file in (*files, *sumo_files) for each in harness.write_motion(result, file)]
     content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
     content |= {"files": [str(file) for file in written]}
     content |= {name: result.row[name] for name in LATERAL if name in result.row}
@@ -305,6 +317,8 @@ def replay(
     words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
+    if program is not None:
+        watch(result, program)
     if result.bit_equal is False:
         found = "a replay that differs from the stored motion"
         raise WorldDisagreementError(f"test {episode} of {folder}", found, "the same bits", str(result.suspects))

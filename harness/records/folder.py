@@ -34,8 +34,8 @@ SHELLS = "shells.json"
 SENSITIVITY = "sensitivity.json"
 """Strata of a shells campaign, as its estimates need them."""
 TABLES = ("episodes", "moments", "traces")
-SHADOW, PILOT = BEFORE = ("shadow", "pilot")
-"""Tables of what comes before tests that count: baseline runs, which keep their first name, and pilot tests."""
+SHADOW, PILOT, MILDER = BEFORE = ("shadow", "pilot", "milder")
+"""Tables of what comes before tests that count: baseline runs, which keep their first name, pilots, milder ones."""
 MEND_PART = "Delete this file and run again with --resume: the same tests are made anew."
 SEAL = "crc32"
 """Key of a JSON file's checksum."""

@@ -9,7 +9,7 @@ from typing import Any
 from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
-from harness.report.words import ENDED, scope_words
+from harness.report.words import ENDED, milder_words, scope_words
 
 
 def called(family: str) -> str:
@@ -25,7 +25,8 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None) -> list[s
     rows = [row for row in (decided(content), *sum_rows(content)) if row]
     ends = [] if report is None else [f"  report  {report}"]
     parts = columns([(row[1], f"{row[2]} of crashes", *row[3:]) for row in family_rows(content)])
-    return [" · ".join(head), *columns(rows), *parts, *wrapped([exposures(content), scope(content)]), *ends]
+    under = wrapped([*milder(content), exposures(content), scope(content)])
+    return [" · ".join(head), *columns(rows), *parts, *under, *ends]
 
 
 def decided(content: Mapping[str, Any]) -> tuple[str, ...]:
@@ -71,6 +72,12 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         impact = of.get("median_impact_mps")
         hard = "no crash seen" if impact is None else f"median impact {tenths(impact)} m/s"
         yield name, called(name), part, rate, beside, hard
+
+
+def milder(content: Mapping[str, Any]) -> Iterator[str]:
+    """Warnings of crashes on events too mild to count."""
+    for name, of in content["milder"].items():
+        yield from (f"! {text}" for text in milder_words(name, of))
 
 
 def exposures(content: Mapping[str, Any]) -> str:

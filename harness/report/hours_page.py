@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from harness.report.hour_words import called, decided, exposures, family_rows, scope, sum_rows
+from harness.report.hour_words import called, decided, exposures, family_rows, milder, scope, sum_rows
 from harness.report.templates import write_page
 from harness.runner.families import read_families
 
@@ -26,5 +26,5 @@ def write_hours_of(folder: Path, content: dict[str, Any]) -> Path:
         folder / "report.html", "hours.html.j2",
         content=content, sums=list(sum_rows(content)), verdict=decided(content),
         rows=list(zip(rows, sizes, strict=True)),
-        exposures=exposures(content), scope=scope(content), called=called,
+        warnings=list(milder(content)), exposures=exposures(content), scope=scope(content), called=called,
     )  # fmt: skip

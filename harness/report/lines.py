@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.numbers import count, duration, interval, number, plain, ratio
+from harness.numbers import count, duration, interval, number, plain, ratio, share
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
 from harness.report.words import ENDED, ShortAnswer, scope_words
 
@@ -33,6 +33,16 @@ def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None 
         head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
     table = columns([row.texts for row in rows])
     return [" · ".join(head), *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+
+
+def estimate_lines(content: Mapping[str, Any]) -> list[str]:
+    """The estimators of ``estimates.json``, a line each; those that its records do not allow are not named."""
+    head = f"{content['campaign']}: {count(content['n_crashes'])} crashes in {count(content['n_episodes'])} tests"
+    found = {name: each for name, each in content["estimates"].items() if each["crash_rate"] is not None}
+    rows = [
+        (name, interval(each.get("ci_low"), each.get("ci_high"), each["crash_rate"])) for name, each in found.items()
+    ]
+    return [f"{head}; crash rate per test ({share(content['confidence'])})", *(columns(rows) if rows else ())]
 
 
 def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:

@@ -66,6 +66,9 @@ NOTES = {
     "by {by:.3g}, farther than the interval reaches: only more tests can rule that out",
     "plain_width": "fewer than {least:.0f} effective crashes: the interval is as wide as that of the plain mean of "
     "weighted crashes",
+    "due_not_drawn": "on some paths surrogates predict crashes of large weight that were not drawn: tests vary "
+    "{times:.2g} times as much as their crashes show, and the rate of `nade` is too low, or its interval too narrow. "
+    "Use shells",
     "saturated": "{n} of {of} strata are saturated (l = {levels:first}): with as many independent columns as tests, "
     "less one, any results are fitted. The gain claimed in all is {claimed:.3g}, and {corrected:.3g} with degrees of "
     "freedom",

@@ -17,6 +17,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.answer import Elsewhere, Estimates
 from harness.estimators.severity import TOUCH_MPS
+from harness.families import family_named
 from harness.numbers import WIDEST_RHW, count, leaves, number, plain, share, words
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, rows_of
@@ -104,9 +105,20 @@ def unseen_words(where: str) -> str:
     return f"no lane change was seen at {where} in the data of this traffic: rates have only an upper limit"
 
 
+def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[str]:
+    """That a vehicle crashes on events too mild to count, if it does."""
+    if milder is not None and milder["n_crashes"]:
+        words, n, of = family_named(scenario).words, count(milder["n_crashes"]), count(milder["n_tests"])
+        yield (
+            f"{n} of {of} MILDER {words.events} crash, too, {number(milder['per_hour'])} an hour, not in this rate: "
+            f"set {words.milder} in a file of environment.parameters"
+        )
+
+
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[str]:
     """What changes the meaning of the rows, a line each."""
     best, severity, assumed = told.best, told.severity, told.assumed
+    yield from milder_words(campaign.scenario, told.milder)
     yield from map(note_words, best.cautions)
     repeated = manifest.get("repeated") or {}
     if n := len(repeated.get("differing", ())):

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from harness.estimators.stopping import Rule, Verdict
 from harness.files import remove_unfinished
 from harness.pool.moved import assumed_in
 from harness.progress import Progress
-from harness.records.folder import SHELLS, StoppedBy, parquet, sole_use, write_sealed
+from harness.records.folder import MILDER, SHELLS, StoppedBy, parquet, sole_use, write_sealed
 from harness.records.shown import ShownTests
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import (
@@ -37,7 +37,8 @@ from harness.runner.kept import (
 from harness.runner.stored import even
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
-from harness.sampling.baseline import IN_WORDS, begin, stored_baseline, stored_table
+from harness.sampling.baseline import IN_WORDS, begin, prescribed_requests, stored_baseline, stored_table
+from harness.sampling.milder import milder_of, milder_tests
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
 
@@ -189,9 +190,11 @@ def show(run: Run, shard: ShardResult, rule: Rule, progress: Progress) -> None:
 
 
 def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
-    """Drive the vehicle along all paths without a cut-in, and in pilot tests, if tests follow from some."""
-    if (paths := run.source.baseline_paths) is None:
-        return run
+    """Drive the vehicle along all paths without a cut-in, and in pilot tests, if tests follow from some.
+
+    Where there are events too mild to count, it meets a few of them.
+    """
+    paths, mild = run.source.baseline_paths, milder_tests(run.resolved)
 
     def drive(name: str, requests: Sequence[ShardRequest]) -> pa.Table:
         """What comes before tests that count, but for what an earlier run has done of it."""
@@ -207,6 +210,11 @@ def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
         return pa.concat_tables(run.before[name])
 
     try:
+        if mild is not None:
+            driven = drive(MILDER, list(prescribed_requests(mild, MILDER)))
+            run = run.noting(milder=milder_of(run.resolved, driven))
+        if paths is None:
+            return run
         table, runs = begin(run.source, drive)
     except BaseException:
         run.written("interrupted")
@@ -231,6 +239,7 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference")
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     if decision is not None:
+        decision = replace(decision, n_milder=crashes_beyond(run))
         code = EXIT_OF[decision.verdict]
         decided["decision"] = decision.to_json()
     decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
@@ -250,6 +259,11 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
     shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
     return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
+
+
+def crashes_beyond(run: Run) -> int:
+    """Crashes on events too mild to count."""
+    return int(run.facts["milder"]["n_crashes"]) if "milder" in run.facts else 0
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:

@@ -124,7 +124,7 @@ class ShardRunner:
         """Run a shard; tests that are known to be ``fatal`` fail before they begin, with these causes."""
         self._fatal = dict(fatal or {})
         source, paths = self._source, self._source.baseline_paths
-        if paths is not None and request.baseline:
+        if request.before:
             return run_baseline(self._loop, paths, source.resolved, request)
         if paths is not None and not self._begun:
             self._begun = True

@@ -163,6 +163,7 @@ def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undist
     assert noted is None or note.read_text().count("closed") >= noted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("episodes", "n", "share"), quick(1, [(400, 200, 0.005), (40, 40, 0.04)]))
 def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
     """They end a campaign halfway; one with fewer tests than that takes has no answer either."""
@@ -287,6 +288,7 @@ def test_one_that_always_ends_its_process_is_named_after_a_few_workers(how, wher
     assert "run.max_failed_share" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", quick(1, ["run", "check", "av-check --tests 4"]))
 def test_what_a_controller_starts_does_not_outlive_the_command(command, tmp_path):
     assert _main(command, tmp_path, _of("StartsPrograms", note=f"{tmp_path}/started")) == EXIT_DONE

@@ -60,6 +60,7 @@ def test_a_run_of_ones_own_is_run_again_wherever_it_was_moved_to(made, tmp_path,
     assert err.startswith(f"The vehicle is {made.parent}/av.py:Av.")
 
 
+@pytest.mark.slow
 def test_of_somebody_else_it_takes_trust(made, elsewhere, capsys, tmp_path):
     traced, untraced = crashed(elsewhere)
     for episode in (traced, untraced):

@@ -177,6 +177,7 @@ def test_a_controller_that_is_not_reproduced_is_found_out(name, why):
         assert (did.reaction_s, did.braking_share, did.share_at_min) == (0.0, 1.0, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "moves"),
     [
@@ -281,6 +282,7 @@ def test_a_vehicle_that_does_the_same_again_is_said_to(name, stored_run):
     assert manifest["repeated"]["n_episodes"] > 5
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, run, tmp_path):
     folders = [run_av(GLOBAL, name="1"), run_av(GLOBAL, name="2", run=run, workers=2)]
     one, two = (read_manifest(folder) for folder in folders)

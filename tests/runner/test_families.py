@@ -58,6 +58,7 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
     assert low < told["beside"]["ratio"] < high
 
 
+@pytest.mark.slow
 def test_workers_and_interruptions_change_no_bit(run, tmp_path):
     both, stopped = tmp_path / "two", tmp_path / "stopped"
     harness.run(campaign(), both, workers=2)
@@ -71,6 +72,7 @@ def test_workers_and_interruptions_change_no_bit(run, tmp_path):
         harness.run(campaign(), stopped)
 
 
+@pytest.mark.slow
 def test_a_precision_of_each_family_can_be_asked_for(tmp_path):
     """That of the one which is known worst takes most tests."""
     found = harness.run(campaign("stop.each_family=true", "stop.episodes=1500"), tmp_path / "run", workers=1)

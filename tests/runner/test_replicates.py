@@ -38,6 +38,7 @@ def told(content):
     return answer(content, golden("shells-twin"))
 
 
+@pytest.mark.slow
 def test_the_rate_moves_with_the_share_that_does_not_look_and_the_ratio_does_not(stored_run, tmp_path):
     folder = stored_run("shells-twin")
     mine = fitted(tmp_path, **{LOOK: [0.005, 0.01, 0.015, 0.02, 0.03]})
@@ -78,6 +79,7 @@ def test_what_was_found_once_is_not_looked_for_again(stored_run, tmp_path, monke
     assert estimate_in_other_traffic(folder, mine) == first
 
 
+@pytest.mark.slow
 def test_replicates_that_tests_cannot_answer_leave_the_interval_open(stored_run, tmp_path):
     """One in which the AV closes in faster than in any test, one whose laws are none."""
     columns = {"initial_state__r2dot_min_mps": [-10.0, -16.0, -10.0], "cut_in__intercept": [-8.7, -8.7, 900.0]}

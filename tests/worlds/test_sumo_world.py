@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import libsumo
 import numpy as np
@@ -58,19 +56,6 @@ def test_a_second_simulation_is_refused_and_closing_twice_leaves_the_next_one_al
     second = driving(2)
     first.close()
     drive(second)
-
-
-def test_without_its_extra_or_a_screen_the_gui_is_refused_in_words(open_world, monkeypatch):
-    monkeypatch.setitem(sys.modules, "sumo", None)
-    with pytest.raises(
-        CampaignError, match=r"found no sumo-gui; expected the extra .* -c requirements.lock -e '\.\[sumo\]'"
-    ):
-        open_world(1, gui=True)
-    monkeypatch.setattr("harness.worlds.sumo.sumo_program", Path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    with pytest.raises(CampaignError, match="DISPLAY is not set"):
-        open_world(1, gui=True)
-    assert open_world(1).n_cells == 1
 
 
 # -- a world that disobeys --
