@@ -110,8 +110,8 @@ def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[st
     if milder is not None and milder["n_crashes"]:
         words, n, of = family_named(scenario).words, count(milder["n_crashes"]), count(milder["n_tests"])
         yield (
-            f"{n} of {of} MILDER {words.events} crash, too, {number(milder['per_hour'])} an hour, not in this rate: "
-            f"set {words.milder} in a file of environment.parameters"
+            f"{n} of {of} MILDER {words.events} end in a crash, too: {number(milder['per_hour'])} per hour, which this "
+            f"rate leaves out; to count them, set {words.milder} in a file of environment.parameters"
         )
 
 
