@@ -31,8 +31,9 @@ ENDED = {
     "below_reference": "far enough below the competent driver",
     "accept": "decision reached",
     "episodes": "budget spent",
-    "pool": "the pool has no further cut-in that would narrow it",
+    "pool": "the pool has no further event that would narrow it",
     "pool_error": "the pool’s own error is too wide",
+    "sum": "the sum of all scenarios, which was asked for",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
 
@@ -111,7 +112,7 @@ def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[st
         words, n, of = family_named(scenario).words, count(milder["n_crashes"]), count(milder["n_tests"])
         yield (
             f"{n} of {of} MILDER {words.events} crash, too, {number(milder['per_hour'])} an hour, not in this rate: "
-            f"set {words.milder} in a file of environment.parameters"
+            f"run it alone with environment.parameters that say {words.milder}"
         )
 
 
@@ -158,7 +159,7 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         return elsewhere_words(told.elsewhere)
     best, stopped_by = told.best, told.stopped_by
     ended, target = ENDED.get(stopped_by or "", "interrupted"), campaign.stop.rhw
-    if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept"):
+    if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept", "sum"):
         within = campaign.testing.shells.statement != ASSUMPTION_FREE and best.details.get("within")
         asked = end(within["rhw"]) if within else best.precision
         reached = f" ± {share(asked)}" if asked <= WIDEST_RHW else f" at over ± {share(WIDEST_RHW)}"
