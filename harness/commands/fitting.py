@@ -14,7 +14,7 @@ from harness.commands.printing import print_json, say
 
 
 @click.command(
-    short_help="Fit traffic to trajectories.",
+    short_help="Fit traffic of your own to recorded trajectories.",
     epilog=examples(
         "harness fit trajectories.parquet --out my-traffic.yaml",
         "harness fit 01_tracks.csv 02_tracks.csv --mapping highd --out highway.yaml",

@@ -29,7 +29,7 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
     told = json.loads(capsys.readouterr().out)
     assert told["recordings"] == told["lane_changes"] == 24
     assert main(["fit", "rows.parquet", "--out", "other.yaml", "--replicates", "5", "--quiet"]) == 0
-    assert "! 5 replicates (a 90 % interval needs 20 at least)" in capsys.readouterr().out
+    assert "! only 5 replicates (a 90 % interval needs at least 20)" in capsys.readouterr().out
     parameters = load_parameters(EnvironmentSettings(parameters="./a #1: b.yaml"))
     assert len(read_replicates("./a #1: b.yaml", parameters, SHIPPED_FOLDER)) == 5
     page = (tmp_path / "a #1: b.html").read_text()

@@ -131,6 +131,9 @@ class CutIn:
 
         return CutInFitter()
 
+    def milder(self, traffic: Environment) -> None:
+        """There are none: all cut-ins count."""
+
     def sources(self) -> Mapping[Method, type[Any]]:
         from harness.families.cut_in.nade.in_loop import InLoop  # noqa: PLC0415 - imports what draws on families
 

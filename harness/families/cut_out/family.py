@@ -17,7 +17,7 @@ from harness.campaign.sections import Section
 from harness.families.cut_out.words import CLOSING, TTC, WORDS
 from harness.families.following.approach import NEVER, Following
 from harness.families.following.family import START_FACTS, FollowingFamily
-from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
+from harness.families.following.parameters import FollowingParameters, grid_of
 from harness.families.numbers import Number, Share, ordered, within
 from harness.families.protocol import Column
 from harness.families.words import Shown
@@ -98,11 +98,8 @@ class CutOutParameters(FollowingParameters):
         careless = np.diff(np.clip((TTC_EDGES_S - least) / (most - least), 0.0, 1.0))
         share = law.careless_share.value
         of_ttc = (1.0 - share) * careful + share * careless / careless.sum()
-        grid: RecordArray = np.full((N_DROPS + 1, TTC_EDGES_S.size - 1, N_LATERAL), NO_EVENT, EVENT_DTYPE)
-        grid["ratio"], grid["lateral_mps"] = ratio[:, None, None], law.lateral_mps()
-        grid["ttc_s"] = (0.5 * (TTC_EDGES_S[:-1] + TTC_EDGES_S[1:]))[None, :, None]
-        of_all = of_ratio[:, None, None] * of_ttc[None, :, None] * np.full(N_LATERAL, 1.0 / N_LATERAL)
-        return grid.ravel(), of_all.ravel()
+        ttc_s, lateral = 0.5 * (TTC_EDGES_S[:-1] + TTC_EDGES_S[1:]), np.full(N_LATERAL, 1.0 / N_LATERAL)
+        return grid_of(ratio=(ratio, of_ratio), ttc_s=(ttc_s, of_ttc), lateral_mps=(law.lateral_mps(), lateral))
 
 
 class CutOut(FollowingFamily):

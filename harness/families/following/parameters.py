@@ -44,6 +44,17 @@ EVENT_DTYPE = np.dtype(
 NO_EVENT = np.array((0.0, 0.0, np.inf, np.nan, np.nan, np.nan), EVENT_DTYPE)
 
 
+def grid_of(**laws: tuple[FloatArray, FloatArray]) -> tuple[RecordArray, FloatArray]:
+    """Events (E,) and their probabilities, of fields with ``laws`` of their own: values and probabilities of each."""
+    grid: RecordArray = np.full([values.size for values, _ in laws.values()], NO_EVENT, EVENT_DTYPE)
+    share: FloatArray = np.ones(1)
+    for axis, (name, (values, probabilities)) in enumerate(laws.items()):
+        others = tuple(range(1, len(laws) - axis))
+        grid[name] = np.expand_dims(values, others)
+        share = share * np.expand_dims(probabilities, others)
+    return grid.ravel(), share.ravel()
+
+
 class FreeDriving(Section):
     """How the vehicle ahead drives before the event, each second anew."""
 
