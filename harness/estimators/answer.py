@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import LEAST_POOL_ERROR, MOST_CUT_INS
+from harness.campaign.sections import LEAST_POOL_ERROR, MOST_EVENTS
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Note, Number, Point, Unavailable, finite_json
 from harness.estimators.likelihood import Level
@@ -65,7 +65,7 @@ class Estimates:
     """Content of ``estimates.json``, as it is written here and the page reads it; without a crash no severity.
 
     ``unmet`` are the conditions of the stop rule that were met last, or not at all; ``traffic`` is what replicates
-    leave open.
+    leave open, ``milder`` what `harness.sampling.milder` says.
     """
 
     campaign: str
@@ -87,6 +87,7 @@ class Estimates:
     decision: dict[str, Any] | None = None
     traffic: TrafficError | None = None
     elsewhere: Elsewhere | None = None
+    milder: dict[str, Any] | None = None
 
     @property
     def best(self) -> Estimate:
@@ -126,7 +127,7 @@ def estimate_blocks(
         severity=done.severity,
         assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
         stopped_by=manifest.get("stopped_by"), unmet=tuple(Note(**each) for each in manifest.get("unmet", ())),
-        decision=manifest.get("decision"),
+        decision=manifest.get("decision"), milder=manifest.get("milder"),
     )  # fmt: skip
     return finite_json(told)
 
@@ -174,7 +175,7 @@ def pool_remedy(rule: Rule, campaign: Campaign, stopped_by: StoppedBy) -> dict[s
     own = target / math.sqrt(2.0) / Level.two_sided(campaign.stop.confidence).z  # a pool has some paths in any case
     error = min((pool.relative_error or family_named(campaign.scenario).pool_error) / math.sqrt(finer), own)
     kept = two_digits_up(min(pool.events_per_shell * times, 1e9))
-    if error < LEAST_POOL_ERROR or kept > MOST_CUT_INS:
+    if error < LEAST_POOL_ERROR or kept > MOST_EVENTS:
         return {}
     changes: dict[str, float | None] = {"pool.relative_error": math.floor(error * 1e4) / 1e4} if finer > 1.0 else {}
     return changes | ({"pool.events_per_shell": kept} if times > 1.0 else {})

@@ -75,6 +75,7 @@ class Decision:
     ``limit`` is in crashes per test, or in crash rates of a reference ``driver``, as are ``low`` and ``high``, between
     which the rate lies after ``n_episodes`` tests. Even where the limit is the rate itself, at most 1 - ``confidence``
     of campaigns take the wrong side, whatever the budget.
+    With ``n_milder`` crashes on events too mild to count nothing is accepted.
     """
 
     limit: float
@@ -84,13 +85,14 @@ class Decision:
     high: float
     n_episodes: int = 0
     driver: str | None = None
+    n_milder: int = 0
 
     @property
     def verdict(self) -> Verdict:
         """On which side of the limit the interval lies, if that can be said."""
         if self.low > self.limit:
             return "rejected"
-        return "accepted" if self.high < self.limit else "undecided"
+        return "accepted" if self.high < self.limit and not self.n_milder else "undecided"
 
     def to_json(self) -> dict[str, Any]:
         """All of it."""

@@ -267,6 +267,9 @@ class Family(Protocol):
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:
         """How often there are events, as `Events.probability` counts them."""
 
+    def milder(self, traffic: Environment) -> Environment | None:
+        """The same with events that are too mild to count, of which some are driven all the same; None without any."""
+
     def mean_distance_m(self, traffic: Environment) -> float:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens."""
 

@@ -34,8 +34,8 @@ SHELLS = "shells.json"
 SENSITIVITY = "sensitivity.json"
 """Strata of a shells campaign, as its estimates need them."""
 TABLES = ("episodes", "moments", "traces")
-SHADOW, PILOT = BEFORE = ("shadow", "pilot")
-"""Tables of what comes before tests that count: baseline runs, which keep their first name, and pilot tests."""
+SHADOW, PILOT, MILDER = BEFORE = ("shadow", "pilot", "milder")
+"""Tables of what comes before tests that count: baseline runs, which keep their first name, pilots, milder ones."""
 MEND_PART = "Delete this file and run again with --resume: the same tests are made anew."
 SEAL = "crc32"
 """Key of a JSON file's checksum."""
@@ -217,13 +217,14 @@ def damaged(path: Path, error: Exception, mend: str = MEND_PART) -> RunFolderErr
 
 def no_episodes(folder: Path) -> RunFolderError:
     """What to say of a run that was ended before its first shard was finished."""
-    found = "a run that has not finished an episode yet"
-    return RunFolderError(str(folder), found, "episodes on record", "Let `harness run` go on with --resume.")
+    found = "a run that has not finished a test yet"
+    return RunFolderError(str(folder), found, "tests on record", "Let `harness run` go on with --resume.")
 
 
-StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "pool_error"]
+StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "pool_error", "sum"]
 """The asked precision, a rate far enough below a reference driver's, a decision about the limit, the budget, the last
-cut-in that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that."""
+event that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that; of one of
+several scenarios that their sum had ended."""
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 TablePath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
 

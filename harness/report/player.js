@@ -255,7 +255,7 @@
     };
     button.onclick = keys[" "];
     slider.oninput = () => go(slider.value * STEP, true);
-    add(pick, "span", { class: "small" }, "Crash in episode");
+    add(pick, "span", { class: "small" }, "Crash in test");
     if (scenes.length < 2) pick.remove();
     scenes.forEach((each, i) => { add(pick, "button", { title: each.title }, each.episode).onclick = () => load(i); });
     document.addEventListener("click", ({ target }) => target.dataset.scene && load(+target.dataset.scene));

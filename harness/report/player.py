@@ -119,7 +119,7 @@ class Scenes:
         moments += [*seen, (onset, " ".join(words.shows))] if onset != cut else seen
         scene = {
             "campaign": self._name, "scenario": self._family.name, "episode": episode,
-            "title": f"Episode {episode:,}: {why or outcome}",
+            "title": f"Test {episode:,}: {why or outcome}",
             "first": first, "onset": onset, "event": cut, "principal": bv["name"],
             "apart": None if onset is None else first if self._family.follows else onset + 1,
             "tracks": tracks, "ghosts": ghosts,

@@ -76,13 +76,16 @@ def run_families(
         hour, results = _run(campaign, ready, folders, earlier, rule, workers, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
+    milder = {name: of for name, each in results.items() if (of := each.estimates.get("milder"))}
+    beyond = sum(of["n_crashes"] for of in milder.values())
     if (decision := rule.look.decision) is not None:
+        decision = replace(decision, n_milder=beyond)
         code = EXIT_OF[decision.verdict]
     asked = {
         "format": 1, "name": campaign.name, "seed": campaign.seed, "engine": campaign.world.engine,
         "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
         "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
-        "vehicle": vehicle_name(campaign), "wall_time_s": round(time.monotonic() - began, 3),
+        "milder": milder, "vehicle": vehicle_name(campaign), "wall_time_s": round(time.monotonic() - began, 3),
     }  # fmt: skip
     impacts = {name: _median_impact(each.estimates) for name, each in results.items()}
     content = finite_json({**asked, **_answer(hour, ready, impacts, campaign.stop.confidence)})
@@ -137,7 +140,7 @@ def _run(
             raise
         working.close()
         of_all, rule.look = rule.look, replace(rule.look, decision=None)  # which is about the sum
-        results = {name: finish(runs[name], rule, crews[name].cpus(), progress) for name in names}
+        results = {name: finish(runs[name], rule, crews[name].cpus(), progress, of_sum=True) for name in names}
         rule.look = of_all
         return hour, results
 

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from harness.estimators.stopping import Rule, Verdict
 from harness.files import remove_unfinished
 from harness.pool.moved import assumed_in
 from harness.progress import Progress
-from harness.records.folder import SHELLS, StoppedBy, parquet, sole_use, write_sealed
+from harness.records.folder import MILDER, SHELLS, StoppedBy, parquet, sole_use, write_sealed
 from harness.records.shown import ShownTests
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import (
@@ -37,7 +37,8 @@ from harness.runner.kept import (
 from harness.runner.stored import even
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
-from harness.sampling.baseline import IN_WORDS, begin, stored_baseline, stored_table
+from harness.sampling.baseline import IN_WORDS, begin, prescribed_requests, stored_baseline, stored_table
+from harness.sampling.milder import milder_of, milder_tests
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
 
@@ -138,7 +139,7 @@ def run_campaign(
             stop = resolved.campaign.stop
             # Until a precision or a decision nobody knows how many.
             most = stop.episodes if resolved.campaign.accept is None and stop.rhw is None else None
-            progress.stage(f"episodes{crew.where}", most, done=run.earlier.n_episodes)
+            progress.stage(f"tests{crew.where}", most, done=run.earlier.n_episodes)
             rounds = run.source.rounds(run.earlier.n_episodes)
             run = tested(run, rounds, crew, progress)
         require_no_fewer(out, earlier, run.n_episodes)
@@ -189,9 +190,11 @@ def show(run: Run, shard: ShardResult, rule: Rule, progress: Progress) -> None:
 
 
 def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
-    """Drive the vehicle along all paths without a cut-in, and in pilot tests, if tests follow from some."""
-    if (paths := run.source.baseline_paths) is None:
-        return run
+    """Drive the vehicle along all paths without a cut-in, and in pilot tests, if tests follow from some.
+
+    Where there are events too mild to count, it meets a few of them.
+    """
+    paths, mild = run.source.baseline_paths, milder_tests(run.resolved)
 
     def drive(name: str, requests: Sequence[ShardRequest]) -> pa.Table:
         """What comes before tests that count, but for what an earlier run has done of it."""
@@ -207,6 +210,11 @@ def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
         return pa.concat_tables(run.before[name])
 
     try:
+        if mild is not None:
+            driven = drive(MILDER, list(prescribed_requests(mild, MILDER)))
+            run = run.noting(milder=milder_of(run.resolved, driven))
+        if paths is None:
+            return run
         table, runs = begin(run.source, drive)
     except BaseException:
         run.written("interrupted")
@@ -224,13 +232,17 @@ def keep_design(run: Run) -> None:
         write_sealed(run.folder / SHELLS, STORED_DESIGN.dump_python(run.source.design, mode="json"))
 
 
-def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResult:
-    """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left."""
+def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress, *, of_sum: bool = False) -> RunResult:
+    """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left.
+
+    Of one of several scenarios the rule is about their sum.
+    """
     campaign, decision, decided = run.resolved.campaign, rule.look.decision, dict[str, Any]()
-    stopped_by = ended_by(campaign, rule, run.n_episodes)
-    missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference")
+    stopped_by: StoppedBy = "sum" if of_sum else ended_by(campaign, rule, run.n_episodes)
+    missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     if decision is not None:
+        decision = replace(decision, n_milder=run.facts.get("milder", {}).get("n_crashes", 0))
         code = EXIT_OF[decision.verdict]
         decided["decision"] = decision.to_json()
     decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None

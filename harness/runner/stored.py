@@ -39,14 +39,23 @@ FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
+class Estimates(dict[str, Any]):
+    """Content of ``estimates.json``; shown, a line an estimator."""
+
+    def __repr__(self) -> str:
+        from harness.report.lines import estimate_lines  # noqa: PLC0415 - draws
+
+        return "\n".join(estimate_lines(self))
+
+
 @checked("harness.estimate")
 def estimate_run(
     folder: str | Path,
     *,
     estimators: Annotated[Sequence[str | Any], Field(min_length=1)] | None = None,
     confidence: Confidence | None = None,
-) -> dict[str, Any]:
-    """Estimate a stored run from its records; returns the content of ``estimates.json``.
+) -> Estimates:
+    """Estimate a stored run from its records; returns the content of ``estimates.json``, a dict.
 
     Parameters
     ----------
@@ -64,9 +73,12 @@ def estimate_run(
     Of the run that `harness.run` shows:
 
     >>> import harness
-    >>> found = harness.estimate("runs/idm", estimators=["nade"], confidence=0.5)["estimates"]["nade"]
-    >>> f"{found['crash_rate']:.2e}, {found['ci_low']:.2e} to {found['ci_high']:.2e}"
-    '1.95e-07, 1.45e-07 to 2.69e-07'
+    >>> found = harness.estimate("runs/idm", estimators=["nade"], confidence=0.5)
+    >>> print(found)
+    idm: 95 crashes in 1,000 tests; crash rate per test (50 %)
+      nade  1.95 (1.45 to 2.69) × 10⁻⁷
+    >>> round(found["estimates"]["nade"]["n_effective"], 2)
+    6.82
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -74,7 +86,7 @@ def estimate_run(
     require_trust(folder, manifest, campaign.testing.estimator, "Read that code, and run campaign.yaml yourself.")
     asked = asked_for(estimators or ESTIMATORS, "harness.estimate(estimators=…)")
     blocks = stored_blocks(folder, moments=not {*asked} < {*ESTIMATORS} - {"scv"})
-    return estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence)
+    return Estimates(estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence))
 
 
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
@@ -103,14 +115,14 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     n = 0
     for block in made_ahead(read, manifest["parts"], N_READERS):
         if block.first_episode != n:
-            raise _incomplete(folder, f"a part that begins at episode {block.first_episode}", f"episode {n}")
+            raise _incomplete(folder, f"a part that begins at test {block.first_episode}", f"test {n}")
         counted = block.take(slice(0, n_counted - n))
         n += len(counted)
         if len(counted):
             yield counted
         if n == n_counted:
             return
-    raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")
+    raise _incomplete(folder, f"{n} tests on record", f"{n_counted} (manifest.json)")
 
 
 def even(blocks: Iterable[Block]) -> Iterator[Block]:
@@ -155,8 +167,8 @@ class ReplayResult:
     suspects: str | None = None
 
     def __repr__(self) -> str:
-        facts = [f"  {name:<13} {fact}" for name, fact in self.scene["facts"]]
-        return "\n".join([f"episode {self.row['episode']}: {self.outcome}", *facts])
+        facts = [f"  {name:<18} {fact}" for name, fact in self.scene["facts"]]
+        return "\n".join([f"test {self.row['episode']}: {self.outcome}", *facts])
 
 
 @checked("harness.replay")
@@ -203,7 +215,7 @@ def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False
         return _simulated(folder, manifest, campaign, tables, episode)
     if "traces" not in tables or not tables["traces"].num_rows:
         mend = "Simulate it again (without --stored), or run with --set records.traces=all, say."
-        raise RunFolderError(str(folder), f"no stored motion of episode {episode}", "an episode that is traced", mend)
+        raise RunFolderError(str(folder), f"no stored motion of test {episode}", "a test that is traced", mend)
     return _result(campaign, traffic_of(campaign, manifest), tables, None, ())
 
 
@@ -264,8 +276,8 @@ def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
     elif campaign.av.model is None:
         same = "Versions, CPU and the controller's source file are the run's. " if not other else ""
         found.append(
-            f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier episodes, "
-            "or a file that it reads. `harness av-check` looks at that."
+            f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier tests, "
+            "or a file that it reads. `harness av-check` looks for that."
         )
     return " ".join(found) or "Versions and CPU are the run's: the records have been changed, or it is a defect."
 
@@ -277,11 +289,11 @@ def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:
     if repeated:
         raise CampaignError(
             "av",
-            f"a run that is not reproducible: {len(repeated['differing'])} of {repeated['n_episodes']} tests "
-            "that it repeated itself came out otherwise",
+            f"a run that is not reproducible: {len(repeated['differing'])} of the {repeated['n_episodes']} tests "
+            "that it ran twice differed",
             "an AV that does the same again, given the same observations and the same random stream",
-            "Draw only from the generator handed over in start, ask no clock, and keep nothing across episodes "
-            "(`harness av-check` tells whether that is so). The kept traces (--stored) are what happened.",
+            "Draw only from the generator handed over in start, ask no clock, and keep nothing from one test to the "
+            "next (`harness av-check` finds the cause). The kept traces (--stored) are what happened.",
         )
     found = "a run that is not reproducible: a program outside of the harness drove the AV"
     mend = "Look at the traces that the run has kept (--stored; records.traces: crash), or let the program write a log."
@@ -296,8 +308,8 @@ def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, p
             return {name: table.filter(pc.equal(table["episode"], episode)) for name, table in tables.items()}
     if not manifest["n_episodes"]:
         raise no_episodes(folder)
-    mend = "The report and the episodes table list the episodes of interest."
-    raise RunFolderError(str(folder), f"no episode {episode}", f"an index from 0 to {manifest['n_episodes'] - 1}", mend)
+    mend = "The report lists the tests of interest, the table `episodes` all."
+    raise RunFolderError(str(folder), f"no test {episode}", f"a number from 0 to {manifest['n_episodes'] - 1}", mend)
 
 
 def _equal(again: pa.Table, stored: pa.Table) -> bool:

@@ -1,9 +1,9 @@
-"""Before tests that count: baseline runs, and the pilot tests that a surrogate is learned from.
+"""Before tests that count: baseline runs, pilot tests that a surrogate is learned from, and tests of milder events.
 
-A vehicle that acts before the cut-in is driven along each path without one, to know where it is.
+A vehicle that acts before the event is driven along each path without one, to know where it is.
 
-A test repeats the path with a cut-in, and tells the vehicle the index of the baseline run, so that both see the same
-random stream. What the vehicle did through the step of the cut-in must be the same to the last bit, or the test fails.
+A test repeats the path with an event, and tells the vehicle the index of the baseline run, so that both see the same
+random stream. What the vehicle did through the step of the event must be the same to the last bit, or the test fails.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
 from harness.pool.learned import Following, Learned, learn
 from harness.pool.vehicle_pool import BaselinePaths
-from harness.records.folder import PILOT, SHADOW, Part, read_kept
-from harness.records.schemas import baseline_table, padded, pilot_table
+from harness.records.folder import MILDER, PILOT, SHADOW, Part, read_kept
+from harness.records.schemas import baseline_table, episodes_table, padded, pilot_table
 from harness.resolved import Resolved
 from harness.sampling.protocol import ShardRequest, Source
 from harness.vocabulary import FAILED
 
 SHARD_RUNS = 50
 """Baseline runs of one task: half a second of a slow controller."""
-IN_WORDS = {SHADOW: "baseline runs", PILOT: "pilot tests"}
+IN_WORDS = {SHADOW: "baseline runs", PILOT: "pilot tests", MILDER: "milder events"}
 """Of each table."""
 LEARNED = b"harness.learned"
 """Key in the metadata of the baseline runs as workers get them."""
@@ -55,22 +55,25 @@ class BaselineResult:
 def baseline_requests(n: int) -> Iterator[ShardRequest]:
     """All baseline runs of a campaign, in order."""
     firsts = enumerate(range(0, n, SHARD_RUNS))
-    return (ShardRequest(index, first, min(SHARD_RUNS, n - first), baseline=True) for index, first in firsts)
+    return (ShardRequest(index, first, min(SHARD_RUNS, n - first), before=SHADOW) for index, first in firsts)
 
 
-def pilot_requests(prescribed: Traffic) -> Iterator[ShardRequest]:
-    """All pilot tests, in order."""
+def prescribed_requests(prescribed: Traffic, name: str) -> Iterator[ShardRequest]:
+    """All pilot tests, or those of milder events, in order."""
     for index, first in enumerate(range(0, len(prescribed), SHARD_RUNS)):
         of_rows = prescribed.rows(slice(first, first + SHARD_RUNS))
-        yield ShardRequest(index, first, len(of_rows), baseline=True, prescribed=of_rows)
+        yield ShardRequest(index, first, len(of_rows), before=name, prescribed=of_rows)
 
 
-def run_baseline(loop: EpisodeLoop, paths: BaselinePaths, resolved: Resolved, request: ShardRequest) -> BaselineResult:
-    """Drive the loop's vehicle along a range of paths, or in pilot tests."""
+def run_baseline(
+    loop: EpisodeLoop, paths: BaselinePaths | None, resolved: Resolved, request: ShardRequest
+) -> BaselineResult:
+    """Drive the loop's vehicle along a range of paths, or in prescribed tests."""
     if request.prescribed is not None:
-        return BaselineResult(
-            request, pilot_table(loop.beside(keep=ALL_MOTION).run(request.first_episode, request.prescribed))
-        )
+        shard = loop.beside(keep=ALL_MOTION).run(request.first_episode, request.prescribed)
+        seed, is_pilot = resolved.campaign.seed, request.before == PILOT
+        return BaselineResult(request, pilot_table(shard) if is_pilot else episodes_table(shard, seed))
+    assert paths is not None
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     some = Paths(paths.index[rows], paths.start[rows])
     shard = without_event(loop, resolved, paths.seed, some, request.first_episode)
@@ -83,11 +86,15 @@ def stored_table(folder: Path, before: Mapping[str, Part], name: str) -> pa.Tabl
     return read_kept(folder, before[name], name) if there else None
 
 
-def stored_baseline(stored: pa.Table | None, paths: BaselinePaths, request: ShardRequest) -> BaselineResult | None:
+def stored_baseline(
+    stored: pa.Table | None, paths: BaselinePaths | None, request: ShardRequest
+) -> BaselineResult | None:
     """A range that is ``stored``, or None; a `RunFolderError` if that is of other paths."""
     if stored is None or stored.num_rows < request.first_episode + request.n_episodes:
         return None
     table = stored.slice(request.first_episode, request.n_episodes)
+    if paths is None or request.before == MILDER:  # which they are the campaign says
+        return BaselineResult(request, table)
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     name, wanted = "path", paths.index[rows]
     if request.prescribed is not None:
@@ -95,7 +102,7 @@ def stored_baseline(stored: pa.Table | None, paths: BaselinePaths, request: Shar
     if not np.array_equal(table.column(name).to_numpy(), wanted):
         expected = "those of this campaign and this version of the harness"
         mend = "Use a new folder, or the version that the run was begun with (manifest.json)."
-        raise RunFolderError(PILOT if request.prescribed else SHADOW, "runs on other paths", expected, mend)
+        raise RunFolderError(request.before, "runs on other paths", expected, mend)
     return BaselineResult(request, table)
 
 
@@ -108,7 +115,7 @@ def begin(source: Source, drive: Callable[[str, Sequence[ShardRequest]], pa.Tabl
     runs = as_recorded(table, source.scenario.max_steps)
     source.begin_after(runs)
     if (pilot := source.pilot()) is not None:
-        learned = learned_from(drive(PILOT, list(pilot_requests(pilot))), runs)
+        learned = learned_from(drive(PILOT, list(prescribed_requests(pilot, PILOT))), runs)
         source.begin_after(runs, learned)
     return table.replace_schema_metadata({LEARNED: pickle.dumps(learned)}), runs
 

@@ -41,16 +41,16 @@ from harness.worlds import World
 
 @dataclass(frozen=True)
 class ShardRequest:
-    """A fixed range of episodes, or of ``baseline`` runs; ``draws`` says which events they are, where that is so.
+    """A fixed range of episodes; ``draws`` says which events they are, where that is so.
 
-    Pilot tests have their traffic ``prescribed``.
+    What comes ``before`` tests that count has the name of its table; but for baseline runs traffic is ``prescribed``.
     """
 
     index: int
     first_episode: int
     n_episodes: int
     draws: tuple[Draw, ...] = ()
-    baseline: bool = False
+    before: str = ""
     prescribed: Traffic | None = None
 
 

@@ -69,6 +69,9 @@ class Fake:
     def left_open(self, parameters):
         return None
 
+    def milder(self, traffic):
+        return None
+
     def traffic(self, settings, parameters=None):
         return "fake"
 

@@ -8,7 +8,8 @@ import pytest
 
 from harness.pool.learned import Learned
 from harness.pool.vehicle_pool import vehicle_pool
-from harness.sampling.baseline import learned_from, pilot_requests, run_baseline
+from harness.records.folder import PILOT
+from harness.sampling.baseline import learned_from, prescribed_requests, run_baseline
 from harness.strata import LEARNED, OUTSIDE
 from harness.vocabulary import CRASH
 from tests.pool.test_vehicle_pool import acting, prepared_after
@@ -22,7 +23,8 @@ def after_pilot(*more: str):
     """Campaign, loop and runs after the baseline runs, and what the pilot tests teach."""
     ready, loop, runs = prepared_after(acting("Speeds", AS_NEEDED, *more))
     paths = ready.baseline_paths
-    tables = [run_baseline(loop, paths, ready.resolved, each).table for each in pilot_requests(ready.pilot())]
+    requests = prescribed_requests(ready.pilot(), PILOT)
+    tables = [run_baseline(loop, paths, ready.resolved, each).table for each in requests]
     return ready, loop, runs, pa.concat_tables(tables)
 
 

@@ -134,7 +134,7 @@ def test_a_record_that_was_tampered_with_is_noticed(table, column, twin_run, tmp
     assert main(["replay", str(folder), str(episode)]) == 3
     out, err = capsys.readouterr()
     assert "NOT as stored" in out
-    assert f"episode {episode}" in err
+    assert f"test {episode} of" in err
 
 
 @pytest.mark.parametrize("engine", ["sumo", "twin"])

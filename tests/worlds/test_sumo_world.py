@@ -129,11 +129,11 @@ def run_in(world) -> Shard:
 
 def test_a_flag_that_the_positions_do_not_show_or_lack_stops_the_run_and_names_the_episode():
     run = run_in(TwinWorld(16)).episode
-    crashes = {f"episode {500 + row}, step {run['n_steps'][row]}" for row in np.flatnonzero(run["outcome"] == CRASH)}
+    crashes = {f"test {500 + row}, step {run['n_steps'][row]}" for row in np.flatnonzero(run["outcome"] == CRASH)}
     with pytest.raises(WorldDisagreementError, match="found no collision where the positions show one") as raised:
         run_in(LyingTwin(16, nervous=False))
     assert raised.value.where in crashes
-    with pytest.raises(WorldDisagreementError, match="episode 503, step 20: found a collision that the positions do"):
+    with pytest.raises(WorldDisagreementError, match="test 503, step 20: found a collision that the positions do"):
         run_in(LyingTwin(16, nervous=True))
 
 

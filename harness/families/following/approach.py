@@ -131,9 +131,13 @@ def clear_after(event: Record, numbers: Record) -> int:
 
 @compiled_inline
 def in_scope(event: Record, speed_mps: float, numbers: Record) -> bool:
-    """Whether a follower at some headway has to brake harder than a limit: else the event is no danger to anyone."""
+    """Whether a follower at some headway has to brake harder than a limit: else the event is no danger to anyone.
+
+    Nor harder than another one, where those are asked for that are milder than the ones in scope.
+    """
     if math.isnan(event.ratio):
         return True
     closing = (1.0 - event.ratio) * speed_mps
     room = event.ttc_s * closing + numbers.scope_headway_s * speed_mps
-    return bool(closing * closing >= 2.0 * numbers.scope_mps2 * room)
+    asked = closing * closing
+    return bool(2.0 * numbers.scope_mps2 * room <= asked < 2.0 * numbers.below_mps2 * room)

@@ -48,6 +48,8 @@ START_FACTS = (
 )
 N_SPEEDS = 1024
 """Quantiles of the speed over which means are taken."""
+MILDEST_MPS2 = 0.5
+"""Braking that an event asks for: below this nothing is tested [assumed]."""
 
 
 class FollowingFamily:
@@ -83,6 +85,7 @@ class FollowingFamily:
         steps = {"onset": onset, "max_steps": onset + round(values["approach__after_s"] / STEP_S)}
         clear = {name: values.get(f"leaving__{name}", math.nan) for name in ("clear_m", "visible_from_m")}
         scope = {name: values.get(f"leaving__{name}", 0.0) for name in ("scope_mps2", "scope_headway_s")}
+        scope["below_mps2"] = math.inf
         kernel = ("fit_range__", "initial_state__", "free_driving__", "approach__")
         known = {name: value for name, value in values.items() if name.startswith(kernel)} | clear | scope
         dtype = [*((name, "f8") for name in known), *((name, "i8") for name in steps)]
@@ -134,7 +137,15 @@ class FollowingFamily:
 
     def exposure(self, traffic: Following, parameters: FollowingParameters) -> Exposure:
         given, share = parameters.counted(), self.share_in_scope(traffic)
-        return given._replace(per_hour=given.per_hour * share, low=given.low * share, high=given.high * share)
+        counted = given.counted and (given.counted[0], given.counted[1] / share)
+        return Exposure(given.per_hour * share, given.low * share, given.high * share, counted, given.source)
+
+    def milder(self, traffic: Following) -> Following | None:
+        if (scope := float(traffic.numbers["scope_mps2"])) <= MILDEST_MPS2:
+            return None
+        numbers = traffic.numbers.copy()
+        numbers["scope_mps2"], numbers["below_mps2"] = MILDEST_MPS2, scope
+        return traffic._replace(numbers=numbers)
 
     def sources(self) -> Mapping[Method, type[Any]]:
         return {}

@@ -1,0 +1,36 @@
+"""Events that are milder than those that count: some are driven, so that it is said where the vehicle crashes there.
+
+They enter no rate, and a vehicle that crashes on them is not accepted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from harness.loop.repeat import Traffic
+from harness.progress import Progress
+from harness.resolved import Resolved
+from harness.sampling.forced import Forced
+
+N_TESTS = 36
+"""One that crashes on a tenth of them is found out 98 times in 100."""
+
+
+def milder_tests(resolved: Resolved) -> Traffic | None:
+    """The milder events that are driven, (`N_TESTS`,); None where there are none."""
+    if (environment := resolved.family.milder(resolved.environment)) is None:
+        return None
+    return Forced(replace(resolved, environment=environment), Progress()).tests(0, N_TESTS)
+
+
+def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, float]:
+    """Tests, crashes and failures, by their table of episodes, and how many such events an hour of driving has."""
+    family, crashes = resolved.family, pc.equal(table.column("outcome").cast(pa.string()), "crash")
+    if above := resolved.campaign.crash.counts_above_mps:
+        crashes = pc.and_(crashes, pc.fill_null(pc.greater(table.column("impact_speed_mps"), above), fill_value=False))
+    exposure = family.exposure(family.milder(resolved.environment), resolved.parameters)
+    counts = {"n_tests": len(table), "n_crashes": pc.sum(crashes).as_py()}
+    return {**counts, "n_failed": len(table) - table.column("failure").null_count, "per_hour": exposure.per_hour}
