@@ -91,7 +91,7 @@ class Reference(Following):
     time_headway_s: Delay | Literal["natural"] = 1.0  # type: ignore[assignment]
     """T; natural: as people keep it, where the vehicle follows from the start [cutin]"""
     perceives_braking_mps2: float = Field(3.0, ge=0.0, le=20.0)
-    """how hard the vehicle ahead brakes when that is a danger [assumed; 5 by the regulation, UN R157]"""
+    """how hard the vehicle ahead brakes when that is a danger, 0: at once [assumed; 5 by the regulation, UN R157]"""
     min_acceleration_mps2: Braking = -7.59294
     """hardest braking, 0.774 g [JRC-FSM: CC_max_deceleration]"""
     braking_jerk_mps3: Positive = Field(12.65, le=1000.0)

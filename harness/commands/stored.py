@@ -146,7 +146,7 @@ def _estimate_hours(
 
         write_sealed(folder / FAMILIES, content)
         page = write_hours_of(folder, content)
-    print_either(content, hour_lines(content, page), as_json=as_json)
+    print_either(content, hour_lines(content, page, readings=True), as_json=as_json)
 
 
 def _compared_elsewhere(folder: Path, environment: str, confidence: float | None, *, as_json: bool) -> None:

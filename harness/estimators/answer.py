@@ -65,7 +65,7 @@ class Estimates:
     """Content of ``estimates.json``, as it is written here and the page reads it; without a crash no severity.
 
     ``unmet`` are the conditions of the stop rule that were met last, or not at all; ``traffic`` is what replicates
-    leave open, ``milder`` see `harness.sampling.milder.Milder`.
+    leave open, ``milder`` what `harness.sampling.milder` says.
     """
 
     campaign: str

@@ -24,11 +24,15 @@ from harness.vocabulary import FloatArray
 
 
 class OfFamily(NamedTuple):
-    """Tests of one family, and how often its events are met."""
+    """Tests of one family, how often its events are met, and by which ``reading`` the competent driver acts.
+
+    A reading is a reference driver of the library by name; where it has none so called, its first one.
+    """
 
     family: str
     exposure: Exposure
     seen: SeenShells
+    reading: str = ""
 
     @property
     def per_hour(self) -> float:
@@ -56,10 +60,22 @@ class OfFamily(NamedTuple):
         return float(self.p @ self.tally.share)
 
     @property
+    def readings(self) -> list[str]:
+        """The competent driver, and other readings of it: references that are named after the first one."""
+        names = [each.name for each in self.seen.design.references]
+        return [name for name in names if name == names[0] or name.startswith(f"{names[0]}-")]
+
+    @property
+    def reference(self) -> int:
+        """Place of its reading among the library's references."""
+        names = [each.name for each in self.seen.design.references]
+        return names.index(self.reading) if self.reading in names else 0
+
+    @property
     def reference_rate(self) -> float:
-        """Crashes per hour of the library's first reference driver; 0 where it has none."""
+        """Crashes per hour of the competent driver; 0 where the library has none."""
         rates = self.seen.design.reference_rate
-        return self.per_hour * float(rates[0]) if rates.size else 0.0
+        return self.per_hour * float(rates[self.reference]) if rates.size else 0.0
 
     def limits(self, level: Level) -> RateLimits:
         """Rate per hour of the family alone."""
@@ -162,8 +178,9 @@ class PerHour:
             own = cells.joined(design.joined)
             outcomes.append(own.outcomes)
             if design.reference_rate.size:
-                with_reference = design.joined.T @ (cells.crash_mass @ design.crashes_too(0))
-                moments = float(design.reference_rate[0]), float(design.reference_square[0])
+                r = of.reference
+                with_reference = design.joined.T @ (cells.crash_mass @ design.crashes_too(r))
+                moments = float(design.reference_rate[r]), float(design.reference_square[r])
                 found = path_errors(design.p, own, with_reference, moments, design.n_independent)
             else:
                 found = pool_variance(design.p, own, design.n_independent), 0.0, 0.0
@@ -203,22 +220,29 @@ class PerHour:
     def to_json(self, confidence: float, speed_mps: float, *, counts: bool = False) -> dict[str, Any]:
         """All of it, as plain content; with ``counts`` those of exposures are in the interval of the sum."""
         level, (n, n_crashes, n_failed) = Level.two_sided(confidence), self.totals
-        limits, (ratio, low, high) = self.limits(level), self.ratio(level)
+        limits = self.limits(level)
         if counts:
             limits = limits._replace(**dict(zip(("low", "high"), self.limits_with_counts(level), strict=True)))
         bound = self.limits(Level.of_bound(confidence, n)).high
         per_km = 1e6 / (3.6 * speed_mps)  # of a million km, per hour
-        reference = self.families[0].seen.design.references
+        names = dict.fromkeys(name for of in self.families for name in of.readings) or [""]
+        beside, *readings = (
+            PerHour([of._replace(reading=name) for of in self.families])._beside(name, level) for name in names
+        )
         return {
             "confidence": confidence, "n_episodes": n, "n_crashes": n_crashes, "n_failed": n_failed,
             "per_hour": {"rate": limits.rate, "ci_low": limits.low, "ci_high": limits.high, "upper_bound": bound,
                          "rhw": limits.rhw},
             "counts_in_interval": counts, "mean_speed_mps": speed_mps, "per_1e6_km": limits.rate * per_km,
-            "beside": {
-                "reference": reference[0].name if reference else "", "rate_per_hour": self.reference_rate,
-                "ratio": ratio, "ratio_low": low, "ratio_high": high, "over_assumed": self.over_assumed(),
-            },
+            "beside": beside, "readings": readings,
             "families": {of.family: found for of, found in zip(self.families, self._families(confidence), strict=True)},
+        }  # fmt: skip
+
+    def _beside(self, reference: str, level: Level) -> dict[str, Any]:
+        ratio, low, high = self.ratio(level)
+        return {
+            "reference": reference, "rate_per_hour": self.reference_rate,
+            "ratio": ratio, "ratio_low": low, "ratio_high": high, "over_assumed": self.over_assumed(),
         }  # fmt: skip
 
     def _families(self, confidence: float) -> Iterator[dict[str, Any]]:

@@ -10,7 +10,7 @@ import numpy as np
 from harness.compiled import compiled, compiled_inline
 from harness.controllers.protocol import BatchObservation
 from harness.loop.cells import NEVER, KernelState
-from harness.vehicles.following import Ahead, follow_on, headway_of, seen_after
+from harness.vehicles.following import Ahead, braking_seen_after, follow_on, headway_of, seen_after
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
 from harness.vehicles.references import Memory, react, reaction_steps, still_cruises
 from harness.vehicles.sideways import lateral_position, perceived_in
@@ -44,7 +44,7 @@ def follow(k: int, kernel: KernelState) -> None:
     late, perceived, reacts = reaction_steps(driver, kernel.seed, cell.episode), 0, NEVER
     lead = revealed = Ahead(speed, math.inf, 0.0)
     if cell.onset_step >= 0:
-        clear, perceived = cell.planned + 1 - cell.onset_step, cell.onset_step + 1
+        clear, perceived = cell.planned + 1 - cell.onset_step, cell.onset_step + braking_seen_after(driver)
         if script.sideways_mps[cell.row] > 0.0:
             perceived = cell.onset_step + seen_after(driver.perceives_lateral_m, script.sideways_mps[cell.row], clear)
         for other in range(kernel.x.shape[1] - 1):

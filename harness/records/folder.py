@@ -221,9 +221,10 @@ def no_episodes(folder: Path) -> RunFolderError:
     return RunFolderError(str(folder), found, "tests on record", "Let `harness run` go on with --resume.")
 
 
-StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "pool_error"]
+StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "pool_error", "sum"]
 """The asked precision, a rate far enough below a reference driver's, a decision about the limit, the budget, the last
-cut-in that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that."""
+event that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that; of one of
+several scenarios that their sum had ended."""
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 TablePath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
 

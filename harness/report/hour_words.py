@@ -17,12 +17,12 @@ def called(family: str) -> str:
     return family_named(family).words.called
 
 
-def hour_lines(content: Mapping[str, Any], report: Path | None = None) -> list[str]:
-    """The answer for a terminal, at most ten lines of 100 columns."""
+def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readings: bool = False) -> list[str]:
+    """The answer for a terminal, at most ten lines of 100 columns; with ``readings`` two more."""
     n, engine = count(content["n_episodes"]), "SUMO" if content["engine"] == "sumo" else "SUMO’s twin"
     scenarios = f"{len(content['families'])} scenarios"
     head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", duration(content["wall_time_s"])]
-    rows = [row for row in (decided(content), *sum_rows(content)) if row]
+    rows = [row for row in (decided(content), *sum_rows(content), *(reading_rows(content) if readings else ())) if row]
     ends = [] if report is None else [f"  report  {report}"]
     parts = columns([(row[1], f"{row[2]} of crashes", *row[3:]) for row in family_rows(content)])
     under = wrapped([*milder(content), exposures(content), scope(content)])
@@ -47,16 +47,25 @@ def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         yield "crashes", f"{number(hour['rate'])} per hour", between(hour["ci_low"], hour["ci_high"]), per_km
     else:
         yield "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen", ""
+    yield beside_row("× competent driver", beside, seen=content["n_crashes"] > 0)
+
+
+def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool) -> tuple[str, ...]:
+    """The rate beside a reading of that driver, where crashes were ``seen`` or none: name, ratio, interval, remark."""
     if beside["ratio"] is None:
-        yield "× competent driver", "no ratio", "", "that driver never crashes here"
-        return
+        return name, "no ratio", "", "such a driver never crashes here"
     low, high = beside["ratio_low"], beside["ratio_high"]
     apart = "not told apart" if high is None or low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
     most = "no limit" if high is None else ratio(high)
     ends = beside["over_assumed"]
     over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed ranges"
-    value = f"{ratio(beside['ratio'])} ({apart})" if content["n_crashes"] else f"< {most}"
-    yield "× competent driver", value, f"{ratio(low)} to {most}", over
+    value = f"{ratio(beside['ratio'])} ({apart})" if seen else f"< {most}"
+    return name, value, f"{ratio(low)} to {most}", over
+
+
+def reading_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """The same beside other readings of the regulation's driver."""
+    return [beside_row(f"× {each['reference']}", each, seen=content["n_crashes"] > 0) for each in content["readings"]]
 
 
 def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -76,8 +85,7 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 
 def milder(content: Mapping[str, Any]) -> Iterator[str]:
     """Warnings of crashes on events too mild to count."""
-    for name, of in content["milder"].items():
-        yield from (f"! {text}" for text in milder_words(name, of))
+    return (f"! {text}" for name, of in content["milder"].items() for text in milder_words(name, of))
 
 
 def exposures(content: Mapping[str, Any]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from harness.report.hour_words import called, decided, exposures, family_rows, milder, scope, sum_rows
+from harness.report.hour_words import called, decided, exposures, family_rows, milder, reading_rows, scope, sum_rows
 from harness.report.templates import write_page
 from harness.runner.families import read_families
 
@@ -24,7 +24,7 @@ def write_hours_of(folder: Path, content: dict[str, Any]) -> Path:
     sizes = [content["families"][row[0]] for row in rows]
     return write_page(
         folder / "report.html", "hours.html.j2",
-        content=content, sums=list(sum_rows(content)), verdict=decided(content),
+        content=content, sums=[*sum_rows(content), *reading_rows(content)], verdict=decided(content),
         rows=list(zip(rows, sizes, strict=True)),
         warnings=list(milder(content)), exposures=exposures(content), scope=scope(content), called=called,
     )  # fmt: skip

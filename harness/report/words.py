@@ -33,6 +33,7 @@ ENDED = {
     "episodes": "budget of tests (stop.episodes) used up",
     "pool": "the pool has no further event that would narrow it",
     "pool_error": "the pool’s own error is too wide",
+    "sum": "the sum of all scenarios, which was asked for",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
 
@@ -161,7 +162,7 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         return elsewhere_words(told.elsewhere)
     best, stopped_by = told.best, told.stopped_by
     ended, target = ENDED.get(stopped_by or "", "interrupted"), campaign.stop.rhw
-    if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept"):
+    if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept", "sum"):
         within = campaign.testing.shells.statement != ASSUMPTION_FREE and best.details.get("within")
         asked = end(within["rhw"]) if within else best.precision
         reached = f", at ± {share(asked)}" if asked <= WIDEST_RHW else f", at over ± {share(WIDEST_RHW)}"

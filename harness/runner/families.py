@@ -140,7 +140,7 @@ def _run(
             raise
         working.close()
         of_all, rule.look = rule.look, replace(rule.look, decision=None)  # which is about the sum
-        results = {name: finish(runs[name], rule, crews[name].cpus(), progress) for name in names}
+        results = {name: finish(runs[name], rule, crews[name].cpus(), progress, of_sum=True) for name in names}
         rule.look = of_all
         return hour, results
 

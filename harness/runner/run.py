@@ -232,14 +232,17 @@ def keep_design(run: Run) -> None:
         write_sealed(run.folder / SHELLS, STORED_DESIGN.dump_python(run.source.design, mode="json"))
 
 
-def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResult:
-    """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left."""
+def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress, *, of_sum: bool = False) -> RunResult:
+    """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left.
+
+    Of one of several scenarios the rule is about their sum.
+    """
     campaign, decision, decided = run.resolved.campaign, rule.look.decision, dict[str, Any]()
-    stopped_by = ended_by(campaign, rule, run.n_episodes)
-    missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference")
+    stopped_by: StoppedBy = "sum" if of_sum else ended_by(campaign, rule, run.n_episodes)
+    missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     if decision is not None:
-        decision = replace(decision, n_milder=crashes_beyond(run))
+        decision = replace(decision, n_milder=run.facts.get("milder", {}).get("n_crashes", 0))
         code = EXIT_OF[decision.verdict]
         decided["decision"] = decision.to_json()
     decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
@@ -259,11 +262,6 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress) -> RunResul
     tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
     shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
     return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
-
-
-def crashes_beyond(run: Run) -> int:
-    """Crashes on events too mild to count."""
-    return int(run.facts["milder"]["n_crashes"]) if "milder" in run.facts else 0
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:

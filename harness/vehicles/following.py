@@ -6,8 +6,9 @@ that the event reveals as soon as it has perceived that, whichever asks for less
 
 The reference driver of UN Regulation No. 157 is careful and competent as in `references`, with the danger of lead
 braking: it has evaluated that ``risk_evaluation_s`` after it has seen the vehicle ahead brake harder than
-``perceives_braking_mps2``, and one revealed as late after it has seen it. The IDM by which it follows waits for its
-reaction time, too: else it would be the better driver for not being one of flesh and blood.
+``perceives_braking_mps2`` (for 0 it knows of the danger at the onset), and one revealed as late after it has seen it.
+The IDM by which it follows waits for its reaction time after the onset, too: else it would be the better driver for not
+being one of flesh and blood.
 """
 
 from __future__ import annotations
@@ -45,6 +46,12 @@ def headway_of(driver: Record, natural_s: float, speed: float) -> float:
 def seen_after(perceives_m: float, lateral_mps: float, clear: int) -> int:
     """Steps from the onset of a lateral motion (m/s) until it has come to so many metres, or is over (``clear``)."""
     return min(math.ceil(perceives_m / (lateral_mps * STEP_S) - _ROUNDING), clear)
+
+
+@compiled_inline
+def braking_seen_after(driver: Record) -> int:
+    """Steps from the onset of braking until a driver can see it; the reference's times count from the onset itself."""
+    return 0 if driver.kind == CAREFUL_COMPETENT_KIND else 1
 
 
 class Ahead(NamedTuple):
@@ -116,17 +123,19 @@ def careful_competent(
     if speed <= minded.speed:
         danger = math.inf
     else:
-        if danger == math.inf and (is_revealed or lead.acceleration < -driver.perceives_braking_mps2):
+        hardest = driver.perceives_braking_mps2
+        if danger == math.inf and (is_revealed or lead.acceleration < -hardest or hardest == 0.0):
             danger = since + driver.risk_evaluation_s / STEP_S
         if minded.gap < driver.critical_ttc_s * (speed - minded.speed):
             danger = min(danger, float(since))
-    coasts = part_after(since, danger, 0.0) if danger < math.inf else 0.0
+    coasts = part_after(since, danger, 0.0)
     idle = changing(coasts, memory.acceleration, max(-driver.coasting_mps2, driver.min_acceleration_mps2))
     from_ = min(idle, 0.0)
     nearest = lead if lead.gap < revealed.gap else revealed
     follows = built_up(driver, memory, from_, behind(driver, headway_s, speed, nearest))
-    a = changing(part_after(since, 0.0, driver.reaction_steps), idle, follows)
-    if danger < math.inf:
-        brakes = built_up(driver, memory, from_, driver.min_acceleration_mps2)
-        a = min(a, changing(part_after(since, danger, driver.reaction_steps), idle, brakes))
-    return a, danger
+    follows_on = part_after(since, 0.0, driver.reaction_steps)
+    if coasts == 0.0:
+        return changing(follows_on, idle, follows), danger
+    brakes = built_up(driver, memory, from_, driver.min_acceleration_mps2)
+    braking = part_after(since, danger, driver.reaction_steps)  # within the other part: no danger is before the onset
+    return (1.0 - follows_on) * idle + (follows_on - braking) * min(idle, follows) + braking * brakes, danger

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,6 +55,29 @@ def test_the_sum_and_its_limits_are_those_of_all_strata_side_by_side():
     for side, limit in ((-1.0, found.low), (1.0, found.high)):
         assert limit == pytest.approx(likelihood_limit(p, crashes, tests, LEVEL, side), rel=1e-9)
     assert PerHour(THREE[::-1]).limits(LEVEL)[:3] == pytest.approx(found[:3], rel=1e-12)
+
+
+def test_another_reading_of_the_competent_driver_has_a_ratio_of_its_own():
+    """Where a library has no driver of that name, its first one stands in; one that is no reading is left out."""
+    lead = THREE[1]
+    names, rates = (*CC, Reference("r157-cc-letter", "a driver"), Reference("r157-fsm", "another")), [1e-4, 0.0101, 0.1]
+    design = replace(
+        lead.seen.design, references=names, reference_rate=np.array(rates), reference_square=np.array(rates) ** 2,
+        cell_references=(7, 6, 4),
+    )  # fmt: skip
+    seen = SeenShells()
+    seen.count(design, lead.tally)
+    hour = PerHour([THREE[0], lead._replace(seen=seen), THREE[2]])
+    told = hour.to_json(0.9, 32.0)
+    (letter,) = told["readings"]
+    reference = math.fsum(of.reference_rate for of in THREE) + 0.1 * (rates[1] - rates[0])
+    assert (letter["reference"], letter["rate_per_hour"]) == ("r157-cc-letter", pytest.approx(reference))
+    ends = [hour.rate / reference, *(end / reference for end in hour.limits(Level.two_sided(0.9))[1:3])]
+    assert [letter["ratio"], letter["ratio_low"], letter["ratio_high"]] == pytest.approx(ends, rel=1e-6)
+    low, high = letter["over_assumed"]
+    assert low < letter["ratio"] < high
+    assert told["beside"] == PerHour(THREE).to_json(0.9, 32.0)["beside"]
+    assert PerHour(THREE).to_json(0.9, 32.0)["readings"] == []
 
 
 def test_it_is_narrower_than_any_sum_of_limits():

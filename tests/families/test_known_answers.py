@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from harness.campaign.drivers import IDMParameters, Reflexes
+from harness.campaign.drivers import CarefulCompetentParameters, IDMParameters, Reflexes
 from harness.families import family_named
 from harness.vehicles.drivers import driver_records
 from harness.vehicles.library import load_library
@@ -122,3 +122,28 @@ def test_behind_one_who_stops_as_hard_as_can_be_who_never_brakes_always_crashes(
     paths = paths_at(SPEEDS)
     assert crashes_of("lead_brakes", traffic, paths, drivers)[0].all()
     assert not crashes_of("lead_brakes", traffic, paths, drivers, above_mps=100.0)[0].any()  # impacts are no harder
+
+
+COASTS, BUILT_UP = -0.4, 1.265
+"""Acceleration (m/s²) of the competent driver off the pedal, and by what it brakes harder in each step."""
+
+
+@pytest.mark.parametrize(
+    ("reading", "danger", "ends"),
+    [
+        # It follows on 7.5 steps after the onset, with 4 m/s² at most; its brakes come 7.5 steps after the danger.
+        ({}, 5, [-1.0325, -2.2975, -3.5625, -4.0, -4.0, -4.6325, -5.8975, -7.1625, -7.59294]),
+        ({"perceives_braking_mps2": 5.0}, 5, [-1.0325, -2.2975, -3.5625, -4.0, -4.0, -4.6325, -5.8975]),
+        ({"perceives_braking_mps2": 0.0, "risk_evaluation_s": 0.0}, 1, [-1.0325, -2.2975, -3.5625, -4.8275, -6.0925]),
+    ],
+)
+def test_the_competent_driver_acts_when_its_times_are_over(reading, danger, ends):
+    """Behind one who stops with 8 m/s²: seen after a step, evaluated after four, and a half step is half a step."""
+    values, family = {**SHORT, "approach__headway_s": 1.5}, family_named("lead_brakes")
+    traffic = traffic_of("lead_brakes", values, [{"peak_mps2": 8.0, "held_s": np.inf, "jerk_mps3": 1000.0}])
+    onset, driver = 10, CarefulCompetentParameters(time_headway_s="natural", **reading)
+    chosen = family.choose(traffic, 1, paths_at([30.0]), np.array([0]))
+    motion = family.drive(traffic, chosen, np.full((1, 2), np.nan), driver_records([driver]), last=True).motion[0]
+    done = np.diff(motion[onset : onset + 7 + len(ends) + 1, 1]) * 10.0
+    assert done == pytest.approx([0.0] * danger + [COASTS] * (7 - danger) + ends, abs=1e-9)
+    assert done[8] - done[7] == pytest.approx(-BUILT_UP)

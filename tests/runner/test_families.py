@@ -47,6 +47,8 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
         assert of["rate_per_hour"] == pytest.approx(per_hour * own["crash_rate"], rel=1e-12)
         assert (of["ci_low"], of["ci_high"]) == pytest.approx([per_hour * own[end] for end in ("ci_low", "ci_high")])
         total += of["rate_per_hour"]
+        assert read_manifest(run.folder / name)["stopped_by"] == "sum"
+        assert "ended by: the sum of all scenarios" in repr(run.runs[name])
     hour = told["per_hour"]
     assert hour["rate"] == pytest.approx(total)
     assert hour["ci_low"] < total < hour["ci_high"]
@@ -56,6 +58,10 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
     assert told["beside"]["ratio"] > 1.0 > told["families"]["cut_in"]["ratio"]
     low, high = told["beside"]["over_assumed"]
     assert low < told["beside"]["ratio"] < high
+    letter, at_once = told["readings"]
+    assert (letter["reference"], at_once["reference"]) == ("r157-cc-letter", "r157-cc-at-once")
+    assert letter["ratio"] < told["beside"]["ratio"] < at_once["ratio"]
+    assert "× r157-cc-letter" in (run.folder / "report.html").read_text()
 
 
 @pytest.mark.slow

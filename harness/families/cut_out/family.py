@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -17,13 +17,16 @@ from harness.campaign.sections import Section
 from harness.families.cut_out.words import CLOSING, TTC, WORDS
 from harness.families.following.approach import NEVER, Following
 from harness.families.following.family import START_FACTS, FollowingFamily
-from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
+from harness.families.following.parameters import FollowingParameters, grid_of
 from harness.families.numbers import Number, Share, ordered, within
 from harness.families.protocol import Column
 from harness.families.words import Shown
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, RecordArray
+
+if TYPE_CHECKING:
+    from harness.fitting.protocol import Fitter
 
 TTC_EDGES_S = np.array([0.5, 0.75, 1, 1.25, 1.5, 1.75, 2, 2.25, 2.5, 2.75, 3, 3.5, 4, 4.5, 5, 6, 7, 8, 10, 12])
 N_DROPS = 12
@@ -95,11 +98,8 @@ class CutOutParameters(FollowingParameters):
         careless = np.diff(np.clip((TTC_EDGES_S - least) / (most - least), 0.0, 1.0))
         share = law.careless_share.value
         of_ttc = (1.0 - share) * careful + share * careless / careless.sum()
-        grid: RecordArray = np.full((N_DROPS + 1, TTC_EDGES_S.size - 1, N_LATERAL), NO_EVENT, EVENT_DTYPE)
-        grid["ratio"], grid["lateral_mps"] = ratio[:, None, None], law.lateral_mps()
-        grid["ttc_s"] = (0.5 * (TTC_EDGES_S[:-1] + TTC_EDGES_S[1:]))[None, :, None]
-        of_all = of_ratio[:, None, None] * of_ttc[None, :, None] * np.full(N_LATERAL, 1.0 / N_LATERAL)
-        return grid.ravel(), of_all.ravel()
+        ttc_s, lateral = 0.5 * (TTC_EDGES_S[:-1] + TTC_EDGES_S[1:]), np.full(N_LATERAL, 1.0 / N_LATERAL)
+        return grid_of(ratio=(ratio, of_ratio), ttc_s=(ttc_s, of_ttc), lateral_mps=(law.lateral_mps(), lateral))
 
 
 class CutOut(FollowingFamily):
@@ -123,6 +123,11 @@ class CutOut(FollowingFamily):
     maps: tuple[tuple[Shown, Shown], ...] = ((CLOSING, TTC._replace(edges=TTC_EDGES_S)),)
     stride = 10
     model = CutOutParameters
+
+    def fitter(self) -> Fitter:
+        from harness.families.cut_out.fitting import CutOutFitter  # noqa: PLC0415 - reads tables
+
+        return CutOutFitter()
 
     def told(self, facts: Mapping[str, Any]) -> str:
         speed = facts["revealed_speed_mps"]

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from harness.families.words import Shown, Words
+import numpy as np
 
-WORDS = Words(
+from harness.families.following.words import words_of
+from harness.families.words import Shown
+
+TTC_EDGES_S = np.array([0.5, 0.75, 1, 1.25, 1.5, 1.75, 2, 2.25, 2.5, 2.75, 3, 3.5, 4, 4.5, 5, 6, 7, 8, 10, 12])
+WORDS = words_of(
     called="cut-out",
     event="cut-out",
-    events="cut-outs",
     since="the lane was clear",
     kicker="How often an automated vehicle (AV) collides with a slower vehicle (SV) that the one ahead (LV) reveals "
     "when it leaves the lane, on a motorway",
     same="vehicles that others reveal",
-    such=" of such following",
     none="Nobody left the lane.",
-    strikes="In every crash the AV strikes SV from behind.",
+    strikes="SV",
     who="LV the one ahead, which leaves the lane, SV the slower one that it reveals",
     shows=("LV", "leaves the lane"),
     happens=("LV", "has left it"),
-    tests=lambda _: (
-        "the vehicle follows another one on a straight road, at the distance that it chooses; after 30 s the one "
-        "ahead leaves the lane and reveals a slower one"
-    ),
-    rests=lambda *_: (
-        "how slow the vehicle is that is revealed, and how late, which is assumed; it is per cut-out, and how many "
-        "there are in an hour of driving is assumed, too"
-    ),
+    then="leaves the lane and reveals a slower one",
+    depend="how slow the vehicle is that is revealed, and how late",
     unlikely="Cut-outs that ask for little braking of anybody are not among them.",
-    milder="leaving.scope_mps2: 0.5",
+    milder="leaving: {scope_mps2: {value: 0.5, source: user}}",
 )
 CLOSING = Shown(
     "closing speed of the one that leaves",

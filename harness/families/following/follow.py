@@ -18,7 +18,7 @@ from harness.families.following.approach import (
 )
 from harness.families.protocol import Events
 from harness.vehicles.drivers import Followers
-from harness.vehicles.following import Ahead, follow_on, headway_of, seen_after
+from harness.vehicles.following import Ahead, braking_seen_after, follow_on, headway_of, seen_after
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, next_position, next_speed
 from harness.vehicles.references import Memory
 from harness.vocabulary import FloatArray, Int8Array, IntArray, Record, RecordArray
@@ -72,7 +72,7 @@ def meet(
     """
     headway_s, memory = headway_of(driver, natural_s, motion.v[0, LEAD]), Memory(acceleration, math.inf, 0.0)
     onset, reveals = numbers.onset, clear < NEVER
-    perceived = onset + 1
+    perceived = onset + braking_seen_after(driver)
     if reveals:  # nobody sees through the one that leaves
         least_m = max(driver.perceives_lateral_m, numbers.visible_from_m)
         perceived = onset + seen_after(least_m, event.lateral_mps, clear - onset)

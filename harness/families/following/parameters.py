@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import AfterValidator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
@@ -44,6 +44,17 @@ EVENT_DTYPE = np.dtype(
 NO_EVENT = np.array((0.0, 0.0, np.inf, np.nan, np.nan, np.nan), EVENT_DTYPE)
 
 
+def grid_of(**laws: tuple[FloatArray, FloatArray]) -> tuple[RecordArray, FloatArray]:
+    """Events (E,) and their probabilities, of fields with ``laws`` of their own: values and probabilities of each."""
+    grid: RecordArray = np.full([values.size for values, _ in laws.values()], NO_EVENT, EVENT_DTYPE)
+    share: FloatArray = np.ones(1)
+    for axis, (name, (values, probabilities)) in enumerate(laws.items()):
+        others = tuple(range(1, len(laws) - axis))
+        grid[name] = np.expand_dims(values, others)
+        share = share * np.expand_dims(probabilities, others)
+    return grid.ravel(), share.ravel()
+
+
 class FreeDriving(Section):
     """How the vehicle ahead drives before the event, each second anew."""
 
@@ -68,9 +79,11 @@ class Approach(Section):
 
 
 class Counted(Section):
-    """How many events there are in an hour of driving."""
+    """How many events there are in an hour of driving: of ``events`` in ``hours``, where they were counted."""
 
     per_hour: Annotated[Number, within(1e-9, 1e6)]
+    events: Annotated[int, Field(ge=1)] | None = None
+    hours: Annotated[float, Field(gt=0.0)] | None = None
 
 
 class FollowingParameters(ParameterFile):
@@ -105,9 +118,10 @@ class FollowingParameters(ParameterFile):
 
     def counted(self) -> Exposure:
         """Events per hour, whether or not they are in scope."""
-        number = self.exposure.per_hour
+        number, events, hours = self.exposure.per_hour, self.exposure.events, self.exposure.hours
         low, high = number.range or (number.value, number.value)
-        return Exposure(number.value, low, high, None, number.note or number.source)
+        counted = None if events is None or hours is None else (events, hours)
+        return Exposure(number.value, low, high, counted, number.note or number.source)
 
     def without_half(self) -> Mapping[int, Mapping[str, float]]:
         """There is no kind of events that data have not."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from types import MappingProxyType
+from typing import Any
 
 from harness.campaign.drivers import Surrogate
+from harness.families.words import Words
 
 STAND_INS = MappingProxyType(
     {
@@ -18,3 +20,22 @@ STAND_INS = MappingProxyType(
         ),
     }
 )
+
+
+def words_of(*, event: str, then: str, depend: str, strikes: str, **own: Any) -> Words:
+    """What pages say of events: what the one ahead does ``then``, and on what assumed numbers rates ``depend``."""
+    return Words(
+        event=event,
+        events=f"{event}s",
+        such=" of such following",
+        strikes=f"In every crash the AV strikes {strikes} from behind.",
+        tests=lambda _: (
+            "the vehicle follows another one on a straight road, at the distance that it chooses; after 30 s the one "
+            "ahead " + then
+        ),
+        rests=lambda *_: (
+            f"{depend}, which is assumed, and it is per {event}: how many there are in an hour of driving is assumed, "
+            "too"
+        ),
+        **own,
+    )

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -15,12 +15,15 @@ from scipy.special import ndtri
 from harness.campaign.sections import Section
 from harness.families.following.approach import Following
 from harness.families.following.family import START_FACTS, FollowingFamily
-from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
+from harness.families.following.parameters import FollowingParameters, grid_of
 from harness.families.lead_brakes.words import HEADWAY, HELD, PEAK, WORDS
 from harness.families.numbers import Number, Share, ordered, within
 from harness.families.protocol import Column
 from harness.families.words import Shown
 from harness.vocabulary import FloatArray, RecordArray
+
+if TYPE_CHECKING:
+    from harness.fitting.protocol import Fitter
 
 PEAK_BIN_MPS2 = 0.2
 N_HELD = 11
@@ -62,17 +65,14 @@ class LeadBrakesParameters(FollowingParameters):
         b = self.braking
         low, high, scale = b.lowest_peak_mps2.value, b.highest_peak_mps2.value, b.peak_scale_mps2.value
         n_bins = max(round((high - low) / PEAK_BIN_MPS2), 1)
-        edges = low + PEAK_BIN_MPS2 * np.arange(n_bins + 1)
+        edges = np.asarray(low + PEAK_BIN_MPS2 * np.arange(n_bins + 1), np.float64)
         beyond = np.append(np.exp(-(edges[:-1] - low) / scale), 0.0)
         peaks, of_peak = edges[:-1] + 0.5 * PEAK_BIN_MPS2, -np.diff(beyond)
         quantiles = (np.arange(N_HELD) + 0.5) / N_HELD
         held = np.append(b.held_median_s.value * np.exp(b.held_log_sd.value * ndtri(quantiles)), math.inf)
         of_held = np.append(np.full(N_HELD, (1.0 - b.stop_share.value) / N_HELD), b.stop_share.value)
         jerks = np.array([b.gentle_jerk_mps3.value, b.abrupt_jerk_mps3.value])
-        grid: RecordArray = np.full((n_bins, N_HELD + 1, 2), NO_EVENT, EVENT_DTYPE)
-        grid["peak_mps2"], grid["held_s"], grid["jerk_mps3"] = peaks[:, None, None], held[None, :, None], jerks
-        share = of_peak[:, None, None] * of_held[None, :, None] * np.full(2, 0.5)
-        return grid.ravel(), share.ravel()
+        return grid_of(peak_mps2=(peaks, of_peak), held_s=(held, of_held), jerk_mps3=(jerks, np.full(2, 0.5)))
 
 
 class LeadBrakes(FollowingFamily):
@@ -94,6 +94,11 @@ class LeadBrakes(FollowingFamily):
     maps: tuple[tuple[Shown, Shown], ...] = ((HEADWAY, PEAK), (HELD, PEAK))
     stride = 37  # of 840 events; each stride that divides them meets one jerk alone
     model = LeadBrakesParameters
+
+    def fitter(self) -> Fitter:
+        from harness.families.lead_brakes.fitting import BrakingFitter  # noqa: PLC0415 - reads tables
+
+        return BrakingFitter()
 
     def told(self, facts: Mapping[str, Any]) -> str:
         held = f"for {facts['held_s']:.1f} s" if facts["held_s"] < math.inf else "to a standstill"

@@ -4,29 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.families.words import Shown, Words
+from harness.families.following.words import words_of
+from harness.families.words import Shown
 
-WORDS = Words(
+WORDS = words_of(
     called="lead brakes",
     event="braking",
-    events="brakings",
     since="the onset",
     kicker="How often an automated vehicle (AV) collides with the vehicle ahead (LV) when that brakes, on a motorway",
     same="vehicles ahead that brake",
-    such=" of such following",
     none="Nobody braked.",
-    strikes="In every crash the AV strikes LV from behind.",
+    strikes="LV",
     who="LV the one ahead, which brakes",
     shows=("LV", "brakes"),
     happens=("LV", "brakes"),
-    tests=lambda _: (
-        "the vehicle follows another one on a straight road, at the distance that it chooses; after 30 s the one "
-        "ahead brakes, for a time or to a standstill"
-    ),
-    rests=lambda *_: (
-        "how hard, how long and how abruptly the vehicle ahead brakes, which is assumed; it is per braking, and how "
-        "many there are in an hour of driving is assumed, too"
-    ),
+    then="brakes, for a time or to a standstill",
+    depend="how hard, how long and how abruptly the vehicle ahead brakes",
     unlikely="These are brakings of 3 m/s² or more, one in each test.",
 )
 HEADWAY = Shown(
