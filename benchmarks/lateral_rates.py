@@ -1,4 +1,4 @@
-"""Crash rates where cut-ins take time, by lead and driver: the table and the picture of docs/lateral.md.
+"""Crash rates where cut-ins take time, by lead and driver: the table and the picture of docs/environment.md.
 
     python -m benchmarks.lateral_rates                          the table, some minutes
     python -m benchmarks.lateral_rates --paths 65536 --plot docs/images/lateral-ratio.png

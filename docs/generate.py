@@ -98,24 +98,37 @@ def _sections(annotation: Any) -> list[type[BaseModel]]:
 
 
 def settings_reference() -> str:
-    """A list for each section of a campaign; the parameters of driver models are told in their own file."""
+    """All settings as a campaign file; those without a default, or in sections of sections, are comments there."""
     fields = Campaign.model_fields
-    top = [_setting(name, field) for name, field in fields.items() if not _sections(field.annotation)]
-    text = [f"\n{_listed(top)}\n"]
+    text = _commented([_setting(name, field) for name, field in fields.items() if not _sections(field.annotation)], "")
     for name, field in fields.items():
         if below := _sections(field.annotation):
-            key = f"{name}.NAME" if get_origin(field.annotation) is dict else name
-            text.append(f"### `{key}`\n\n{_listed(_settings_rows(below[0]))}\n")
-    return "".join(text)
+            by_name = get_origin(field.annotation) is dict
+            text += f"\n{'# ' * by_name}{name}{'.NAME' * by_name}:\n" + _commented(
+                _settings_rows(below[0]), "  ", by_name
+            )
+    return text + "# "
 
 
-def columns_table(name: str) -> str:
-    """A schema's columns; those that episodes have as well are only named."""
-    rows = _column_rows(SCHEMAS[name])
+def _commented(rows: list[tuple[str, ...]], indent: str, always: bool = False) -> str:
+    lines = []
+    for key, text in rows:
+        name, _, value = key.replace("`", "").partition(": ")
+        mark = "# " * (always or not value or "." in name)
+        lines.append(f"{indent}{mark}{f'{name}: {value}' if value else name}  # {' '.join(text.split())}\n")
+    return "".join(lines)
+
+
+def columns_reference() -> str:
+    """The columns of every table; those that episodes have as well are only named."""
     of_tests = {(key, text.removeprefix("initial ")) for key, text in _column_rows(SCHEMAS["episodes"])}
-    known = [row for row in rows if name != "episodes" and (row[0], row[1].removeprefix("initial ")) in of_tests]
-    shared = f"As in `episodes`: {', '.join(row[0] for row in known)}.\n\n" if known else ""
-    return shared + _listed([row for row in rows if row not in known])
+    text = ""
+    for name, schema in SCHEMAS.items():
+        rows = _column_rows(schema)
+        known = [row for row in rows if name != "episodes" and (row[0], row[1].removeprefix("initial ")) in of_tests]
+        shared = f"  # as in episodes: {', '.join(row[0] for row in known)}\n" if known else ""
+        text += f"\n{name}:\n{shared}" + "".join(f"  {row[0]}: {row[1]!r}\n" for row in rows if row not in known)
+    return text + "# "
 
 
 def _column_rows(schema: pa.Schema) -> list[tuple[str, ...]]:
@@ -124,7 +137,7 @@ def _column_rows(schema: pa.Schema) -> list[tuple[str, ...]]:
         words = {key.decode(): value.decode() for key, value in field.metadata.items()}
         unit = words["unit"] if not words["unit"].startswith("m") and words["unit"] not in ("", "1", "s") else ""
         more = ", ".join(filter(None, [unit, "null" if field.nullable else ""]))  # else the unit is in the name
-        rows.append((f"`{field.name}`{more and f' ({more})'}", words["doc"]))
+        rows.append((field.name, f"{words['doc']}{more and f' ({more})'}"))
     return rows
 
 
@@ -389,7 +402,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "settings": settings_reference,
     "validated-methods": methods_table,
     "limits": limits_table,
-    **{f"columns-{name}": partial(columns_table, name) for name in SCHEMAS},
+    "columns": columns_reference,
     **{f"results-{name}": partial(results_table, results) for name, results in RESULTS.items()},
     "validated-acting": validated_ranges,
     "validated-lateral": partial(validated_range, "lateral"),
@@ -407,7 +420,8 @@ def regenerate(text: str) -> str:
 
 def pages() -> Iterator[Path]:
     """Pages that have generated parts."""
-    return (page for page in sorted(FOLDER.rglob("*.md")) if "<!-- generated:" in page.read_text(encoding="utf-8"))
+    files = [*sorted(FOLDER.rglob("*.md")), *sorted(FOLDER.glob("*.yaml"))]
+    return (page for page in files if "<!-- generated:" in page.read_text(encoding="utf-8"))
 
 
 MADE_BY = "\n\nMade by [`python -m studies case`](internals/validation.md#the-papers-case-study).\n\n"

@@ -24,20 +24,20 @@ from harness.signals import interruptible, open_streams
     epilog=examples(
         "harness run my_av.py:MyClass           # how often it crashes, with an interval",
         "harness run my.yaml --out runs/mine    # the same, in a campaign of your own",
-        "harness replay runs/mine 17            # the same episode again, bit for bit",
+        "harness replay runs/mine 17            # test 17 of it again, bit for bit",
     ),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(package_name="harness")
 def cli() -> None:
-    """Crash rates of automated vehicles that one can trust, from few tests in SUMO.
+    """Estimate how often an automated vehicle crashes, from few tests in SUMO.
 
-    A campaign is a YAML file that says which traffic meets which vehicle and when it is enough.
+    A campaign is a YAML file that names the vehicle, the traffic, and when to stop.
 
     Exit codes: 0 done; 2 the campaign or the call is wrong, or the records do not allow what was asked for; 3 too many
-    episodes failed, or SUMO disagreed with the formula; 4 the budget or the pool was spent before the asked precision,
-    or before a decision; 5 the crash rate is above --accept, or the vehicle is worse than the other by more than
-    --margin; 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP: all three keep what is finished.
+    tests failed, or SUMO moved otherwise than it was told; 4 the tests or the pool were used up before the asked
+    precision or a verdict was reached; 5 the crash rate is above --accept, or B is worse than A by more than --margin;
+    130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP: all three keep what is finished.
     """
 
 

@@ -37,15 +37,23 @@ WORLD_SOURCES = (
     "loop/*.py",
     "worlds/twin.py",
 )
-"""All files that decide what happens in a test; pools and tables are made again when one changes."""
+"""Files that decide what happens in a test, but for `NO_SOURCES`; pools and tables are made again when one changes."""
+NO_SOURCES = "words.py", "fitting", "fitting.py"
+"""Files and folders of families that change no test."""
 KERNEL_SOURCES = (*WORLD_SOURCES, "pool/learned.py", "estimators/likelihood.py")
 """All files that compiled code may come from, or take constants from (a test holds this against the imports)."""
+
+
+def source_files(patterns: tuple[str, ...]) -> list[Path]:
+    """Files that patterns name."""
+    found = {path for pattern in patterns for path in _PACKAGE.glob(pattern)}
+    return sorted(path for path in found if not set(NO_SOURCES).intersection(path.relative_to(_PACKAGE).parts))
 
 
 def source_hash(patterns: tuple[str, ...] = KERNEL_SOURCES) -> str:
     """Hash of sources (16 hex digits)."""
     digest = hashlib.sha256()
-    for path in sorted(path for pattern in patterns for path in _PACKAGE.glob(pattern)):
+    for path in source_files(patterns):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""What a pool of cut-ins says in numbers: strata of known probability, and surrogates of known crash rate.
+"""What a pool of events says in numbers: strata of known probability, and surrogates of known crash rate.
 
 The pool makes both; estimators and the planner of a campaign use them, and need nothing else of a pool.
 """
@@ -21,7 +21,7 @@ ASSUMPTION_FREE, LIBRARY_STATEMENT = "assumption_free", "library"
 LEARNED = "learned"
 """Name of the stratum outside on which a surrogate that was learned from the vehicle crashes."""
 FAILED_BASELINE = "failed shadow runs"
-"""Name of a stratum that cannot be tested: cut-ins on paths on which the vehicle failed before one could come."""
+"""Name of a stratum that cannot be tested: events on paths on which the vehicle failed before one could come."""
 
 
 _FLOATS = TypeAdapter(list[FiniteFloat])
@@ -45,8 +45,8 @@ def weight_of_a_test(p: FloatArray, tests: IntArray) -> FloatArray:
 class Reference:
     """A driver that the vehicle is compared with: its name, the driver in plain words, and when it acts.
 
-    ``delay_s`` is the time (s) after the cut-in at which it begins to brake, None if it has no delay of its own, or if
-    cut-ins take time, and it sees them come.
+    ``delay_s`` is the time (s) after the event at which it begins to brake, None if it has no delay of its own, or if
+    events take time, and it sees them come.
     """
 
     name: str
@@ -73,7 +73,7 @@ class ShellDesign:
 
     ``strata`` are named by the surrogate that is the first to crash in each; the last is everything outside. Cells (C,)
     divide them by what the reference drivers (R,) do: ``cell_stratum``, one bit in ``cell_references`` for each that
-    crashes, and ``cell_p``, the probability per test that a cut-in of the cell happens. ``reference_rate`` are crash
+    crashes, and ``cell_p``, the probability per test that an event of the cell happens. ``reference_rate`` are crash
     rates in the pool, ``reference_square`` the mean squares of a path's probability that they crash.
 
     ``boundary`` is the most aggressive surrogate inside the library's boundary, up to which ``n_inside`` strata are
@@ -108,7 +108,7 @@ class ShellDesign:
 
     @cached_property
     def p(self) -> FloatArray:
-        """Probability per test that a cut-in of each stratum happens, shape (S,)."""
+        """Probability per test that an event of each stratum happens, shape (S,)."""
         return np.asarray(np.bincount(self.cell_stratum, self.cell_p, minlength=len(self.strata)), np.float64)
 
     def n_within(self, statement: str) -> int:

@@ -340,9 +340,9 @@ def motorway(folder: Path, *, environments: Sequence[str]) -> None:
     `harness fit --mirror`.
     """
     from harness.campaign.sections import EnvironmentSettings  # noqa: PLC0415 - keeps --help fast
+    from harness.families.cut_in.fitting.laws import Traffic  # noqa: PLC0415
+    from harness.families.cut_in.fitting.observations import Tally, observations  # noqa: PLC0415
     from harness.families.cut_in.loading import load_environment  # noqa: PLC0415
-    from harness.fitting.laws import Traffic  # noqa: PLC0415
-    from harness.fitting.observations import Tally, observations  # noqa: PLC0415
     from harness.fitting.table import load_mapping  # noqa: PLC0415
     from harness.records.folder import write_bytes  # noqa: PLC0415
     from studies.motorway import figures, installed_rows, page, trajectories_of  # noqa: PLC0415

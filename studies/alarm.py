@@ -169,7 +169,7 @@ class Alarm:
         h = np.where(crashes, block.weights()[:, None], 0.0)
         self._drawn = block.drawn
         self._n += len(block)
-        self._n_lost += int(np.count_nonzero(block.failed & ~block.cut_in))
+        self._n_lost += int(np.count_nonzero(block.failed & ~block.happened))
         self._hits += np.count_nonzero(h, axis=0)
         self._sum += h.sum(axis=0)
         self._squares += (h * h).sum(axis=0)

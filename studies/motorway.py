@@ -26,10 +26,10 @@ from scipy.spatial import cKDTree
 
 from harness.errors import HarnessError
 from harness.estimators.limits import clopper_pearson, garwood
+from harness.families.cut_in.fitting.laws import Traffic
+from harness.families.cut_in.fitting.observations import Tally
 from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws
-from harness.fitting.laws import Traffic
-from harness.fitting.observations import Tally
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, BoolArray, FloatArray, IntArray, RecordArray
 

@@ -29,14 +29,14 @@ from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import TrajectoryError
 from harness.estimators.traffic import ONE_LAW
+from harness.families.cut_in.fitting.fit import fit_traffic, replicates
+from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
+from harness.families.cut_in.fitting.laws import Traffic
+from harness.families.cut_in.fitting.observations import KINDS, observations, require_enough
 from harness.families.cut_in.loading import evaluate_laws, load_environment, load_parameters
 from harness.families.cut_in.parameters import FIXED, EnvironmentParameters
 from harness.families.cut_in.sections import REPLACED
 from harness.files import write_atomically
-from harness.fitting.fit import fit_traffic, replicates
-from harness.fitting.hazard import TTC_EDGES_S
-from harness.fitting.laws import Traffic
-from harness.fitting.observations import KINDS, observations, require_enough
 from harness.fitting.table import load_mapping
 from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import take_aim

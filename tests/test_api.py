@@ -72,11 +72,10 @@ def test_load_run_estimate_and_replay_in_a_few_lines(tmp_path):
     assert (
         harness.load_campaign(folder / "campaign.yaml") == resolve(harness.load_campaign(MIXTURE_FILE, SMALL)).campaign
     )
-    replayed = harness.replay(str(folder), 17, fcd=str(tmp_path / "fcd.xml"))
+    replayed = harness.replay(str(folder), 17)
     assert (replayed.bit_equal, replayed.outcome) == (True, replayed.row["outcome"])
     assert replayed.trace.num_rows == 3 * (replayed.row["n_steps"] + 1)
-    assert (tmp_path / "fcd.xml").stat().st_size > 0
-    with pytest.raises(harness.HarnessError, match="no episode 10000"):
+    with pytest.raises(harness.HarnessError, match="no test 10000"):
         harness.replay(folder, 10_000)
     with pytest.raises(harness.HarnessError, match="--resume"):
         harness.run(harness.load_campaign(MIXTURE_FILE, SMALL), folder)
@@ -116,13 +115,16 @@ RUN = "shells-twin"
         (lambda run: harness.replay(run, "1"), "harness.replay(episode=", "a whole number"),
         (lambda run: harness.replay(run, np.int64(-1)), "harness.replay(episode=", "found -1"),
         (lambda run: harness.replay(run, 1, stored=1), "harness.replay(stored=", "true or false"),
-        (lambda run: harness.replay(run, 0, stored=True, gui=True), "--stored", "which SUMO does not simulate"),
         (lambda run: harness.read(run / "no"), "no/manifest.json", "no run folder"),
         (lambda run: harness.read(run).episodes("outcome"), "episodes(columns=", "Write ['outcome']."),
         (lambda run: harness.read(run).episodes(["outcom"]), RUN, "no column 'outcom'"),
         (lambda run: harness.read(run).table("episode"), "table(name=", "Did you mean 'episodes'?"),
         (lambda run: harness.write_report(None), "harness.write_report(folder=", "a path"),
-        (lambda run: harness.write_motion(harness.replay(run, 0), "a.mp4"), "a.mp4", ".html, .csv, .xosc"),
+        (
+            lambda run: harness.write_motion(harness.replay(run, 0), "a.mp4"),
+            "a.mp4",
+            ".html, .csv, .xosc, .xml, .sumocfg",
+        ),
         (lambda run: harness.write_motion({}, "a.html"), "harness.write_motion(result=", "ReplayResult"),
         (lambda _: harness.compare("idm", "fvdm", "out", margin=math.inf), "harness.compare(margin=", "found inf"),
         (lambda _: harness.compare("idm", "fvdm", "out", labels="ab"), "harness.compare(labels=", "a tuple"),
@@ -142,6 +144,16 @@ def test_a_path_is_taken_where_a_campaign_is_and_a_number_of_numpy_s_where_a_num
     harness.run(stored_run(RUN) / "campaign.yaml", tmp_path / "run", workers=np.int64(1))
     assert unlike_columns(stored_run(RUN), tmp_path / "run") == []
     assert harness.replay(tmp_path / "run", np.int16(3)).bit_equal
+
+
+def test_estimates_and_campaigns_show_themselves_in_a_few_lines(stored_run):
+    folder = stored_run("mixture-twin")
+    head, *rows = repr(harness.estimate(folder)).splitlines()
+    assert re.search(r"[1-9]\d* crashes in [\d,]+ tests; crash rate per test \(90 %\)", head)
+    assert {row.split()[0] for row in rows} >= {"nade", "mixture_cv"}
+    shown = repr(harness.load_campaign("idm", ["stop.rhw=0.2"]))
+    assert "rhw=0.2" in shown
+    assert len(shown) < 400
 
 
 EXAMPLES = ("run", "estimate", "read", "replay", "compare")
@@ -192,6 +204,7 @@ def test_in_a_notebook_it_is_the_short_answer_and_the_map(name, stored_run, tmp_
 REFERENCE = json.loads((ROOT / "tests/reference/default.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_the_answer_is_that_of_the_reference(tmp_path, capsys):
     """Fixed seeds on both sides: beyond 2 standard errors with a probability of 5 % once, and none after.
 

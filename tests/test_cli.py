@@ -253,7 +253,7 @@ def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_pat
 @pytest.mark.skipif(sys.platform != "linux", reason="others have no DISPLAY")
 def test_without_a_desktop_a_replay_names_an_option_that_it_has(stored_run, monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.setattr("harness.worlds.sumo.sumo_program", lambda *_: "sumo-gui")
+    monkeypatch.setattr("harness.report.sumo_files.sumo_program", lambda *_: "sumo-gui")
     assert main(["replay", str(stored_run("shells-twin")), "3", "--gui"]) == 2
     options = {name for each in cli.commands["replay"].params for name in each.opts}
     assert re.search(r"(--\w+) FILE", capsys.readouterr().err)[1] in options

@@ -63,6 +63,7 @@ def test_a_new_family_is_a_package_that_is_installed_beside(tmp_path):
     assert set(tests["outcome"][tests["gap_m"] == 8.0]) == {"crash"}
 
 
+@pytest.mark.slow
 def test_a_new_estimator_is_a_class_in_a_file(tmp_path):
     said = ran(laid_out("A new estimator", tmp_path), tmp_path)
     name = "my.py:SelfNormalised"
@@ -74,6 +75,7 @@ def test_a_new_estimator_is_a_class_in_a_file(tmp_path):
     assert name in (tmp_path / "runs/mine/report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_new_surrogate_is_a_driver_by_name_or_by_numbers(tmp_path):
     ran(laid_out("A new surrogate", tmp_path), tmp_path)
     estimates = json.loads((tmp_path / "runs/mine/estimates.json").read_text())
@@ -94,6 +96,7 @@ def test_a_new_criticality_is_a_function_in_a_file(tmp_path):
     assert nade["crash_rate"] == pytest.approx(1.352e-7, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_new_controller_kind_is_three_files(tmp_path):
     recipe = laid_out("A new controller kind", tmp_path)
     own = tmp_path / "own"

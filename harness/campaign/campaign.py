@@ -35,6 +35,7 @@ from harness.campaign.sections import (
     listed,
 )
 from harness.campaign.vehicle import AutomatedVehicle
+from harness.families import DEFAULT_FAMILY
 from harness.vocabulary import SAMPLING, Sampling
 
 
@@ -64,7 +65,9 @@ class Campaign(Section):
     description: str = Field("", description="what this campaign is for, in a sentence")
     seed: Whole = Field(1, ge=0, lt=2**63)
     """random numbers of the tests follow from it; those of the pool from pool.seed"""
-    scenario: str = Field("cut_in", description="kind of events that are tested: cut_in, or one that a package brings")
+    scenario: str = Field(
+        DEFAULT_FAMILY, description="kind of events that are tested: cut_in, or one that a package brings"
+    )
     scenarios: Annotated[list[str], Field(min_length=1)] | None = None
     """several kinds of events in one answer per hour, in place of scenario"""
     exposure: dict[str, Positive] = Field(default_factory=dict, description="events per hour of driving, by scenario")
@@ -95,7 +98,7 @@ class Campaign(Section):
     def of_family(self, name: str) -> Campaign:
         """The campaign of one of its scenarios; ``environment`` is that of cut-ins where others are beside them."""
         given: dict[str, Any] = {}
-        if name != "cut_in":  # where the vehicle drives from the start in any case
+        if name != DEFAULT_FAMILY:  # where the vehicle drives from the start in any case
             given = {"environment": EnvironmentSettings(), "av": self.av.replaced(("before_event",), "hold_speed")}
         stop = self.stop.model_copy(update={"each_family": False})
         return self.model_copy(update={"scenario": name, "scenarios": None, "exposure": {}, "stop": stop, **given})
@@ -146,7 +149,7 @@ class Campaign(Section):
         Cells, workers, estimator, stop rule, trace policy and names are left out, so that a campaign can be continued
         to a smaller RHW or with other resources.
         """
-        others = {} if self.scenario == "cut_in" else {"scenario": self.scenario}
+        others = {} if self.scenario == DEFAULT_FAMILY else {"scenario": self.scenario}
         unused = set() if self.av.acts_before_event else {"shadow_paths", "pilot_tests"}
         content = others | {
             "crash": self.crash.model_dump(),

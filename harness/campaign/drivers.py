@@ -235,5 +235,5 @@ class Reaction(Reflexes):
     """How a built-in AV lags behind its model, now and then by inattention."""
 
     inattention_probability: Probability = 0.0
-    """share of episodes in which it reacts later still [assumed]"""
+    """share of tests in which it reacts later still [assumed]"""
     inattention_delay_s: StepTime = Field(0.0, ge=0.0, le=10.0, description="how much later it then reacts [assumed]")

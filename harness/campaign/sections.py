@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -50,6 +50,13 @@ class Section(BaseModel):
             return validate(data)
         except ValidationError as error:
             raise in_words(error, cls) from None
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """What is not as it would be if nobody had said anything."""
+        for name, value in super().__repr_args__():
+            field = type(self).model_fields[name or ""]
+            if field.is_required() or value != field.get_default(call_default_factory=True):
+                yield name, value
 
     def at(self, path: Sequence[str]) -> Any:
         """Value at a path such as ``("av", "fmu", "file")``; None where a section on the way is left out."""
@@ -178,7 +185,7 @@ class Testing(Section):
         return alpha
 
 
-LEAST_POOL_ERROR, MOST_CUT_INS = 0.001, 1_000_000
+LEAST_POOL_ERROR, MOST_EVENTS = 0.001, 1_000_000
 
 
 class PoolSettings(Section):
@@ -189,7 +196,7 @@ class PoolSettings(Section):
     relative_error: float | None = Field(None, ge=LEAST_POOL_ERROR, le=0.2)
     """relative standard error of the surrogates' crash rates, four times that beyond the boundary; none: the
     scenario's, 0.005 or 0.01"""
-    events_per_shell: Whole = Field(25_000, ge=100, le=MOST_CUT_INS)
+    events_per_shell: Whole = Field(25_000, ge=100, le=MOST_EVENTS)
     """cut-ins kept of each shell: its most tests"""
     shadow_paths: Whole = Field(500, ge=50, le=100_000)
     """baseline runs of a vehicle that acts before the cut-in"""
@@ -200,27 +207,27 @@ class PoolSettings(Section):
 
 
 class World(Section):
-    """Where episodes are simulated."""
+    """Where tests are simulated."""
 
     engine: Literal["sumo", "twin"] = Field("sumo", description="sumo, or twin: the same motion without SUMO")
     cells: Whole = Field(64, ge=1, le=4096)
-    """episodes side by side, in SUMO at most 256; never changes a result"""
+    """tests side by side, in SUMO at most 256; never changes a result"""
 
 
 class Records(Section):
-    """What is kept of every episode."""
+    """What is kept of every test."""
 
     moments: Literal["all", "first_9", "none"] = "first_9"
     """control steps kept: all, first_9 (which scv needs) or none"""
     traces: Literal["all", "crash", "critical", "none"] = "none"
-    """episodes whose motion is kept: all, crash, critical or none"""
-    trace_share: Probability = Field(0.0, description="share of episodes traced whatever their outcome")
+    """tests whose motion is kept: all, crash, critical or none"""
+    trace_share: Probability = Field(0.0, description="share of tests traced whatever their outcome")
 
 
 class Stop(Section):
     """When the campaign is long enough."""
 
-    episodes: Whole = Field(100_000, ge=1, le=10**10, description="most episodes to run")
+    episodes: Whole = Field(100_000, ge=1, le=10**10, description="most tests to run")
     rhw: float | None = Field(None, gt=0.0, lt=10.0)
     """stop at this half-width of the interval over the rate; not for step_mixture"""
     below_reference: float | None = Field(
@@ -293,7 +300,7 @@ class Run(Section):
     """How the work is spread; nothing here changes a result."""
 
     shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = None
-    """episodes per task; none: 5,000, and more in long runs"""
+    """tests per task; none: 5,000, and more in long runs"""
     max_failed_share: Probability = Field(0.01, description="stop with exit code 3 above this share of failures")
     executor: Literal["local", "ray"] = "local"
     """workers run on this machine (local) or on a Ray cluster (ray)"""

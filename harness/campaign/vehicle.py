@@ -45,7 +45,7 @@ def with_another_driver(data: dict[str, Any], source: str, value: Any) -> dict[s
 
 
 class Limits(Section):
-    """What an AV may ask for; beyond it an episode fails instead of being simulated with nonsense."""
+    """What an AV may ask for; beyond it a test fails instead of being simulated with nonsense."""
 
     min_acceleration_mps2: float = Field(-15.0, ge=-50.0, le=0.0, description="hardest braking it may ask for")
     max_acceleration_mps2: Positive = Field(10.0, le=50.0, description="hardest acceleration it may ask for")
@@ -163,7 +163,7 @@ class AutomatedVehicle(Section):
 
     @property
     def reproducible(self) -> bool:
-        """Whether an episode runs again bit for bit: the harness cannot promise it for a program outside of it."""
+        """Whether a test runs again bit for bit: the harness cannot promise it for a program outside of it."""
         return self.traci is None
 
     def identity(self) -> dict[str, Any]:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    short_help="Validate a campaign, and print it resolved.",
+    short_help="Validate a campaign, and print it with all defaults.",
     epilog=examples(
         "harness check scenarios/smoke.yaml",
         "harness check my_av.py:MyClass > my.yaml          # a campaign of one's own to begin with",
@@ -72,7 +72,7 @@ def check(
 
 
 @click.command(
-    short_help="Run a campaign until it is precise enough.",
+    short_help="Test a vehicle until its crash rate is known precisely enough.",
     epilog=examples(
         "harness run my_av.py:MyClass                        # or module:Class, my_av.fmu, sumo:ACC, r157-cc",
         "harness run my_script.py                            # a TraCI script as it is",
@@ -95,15 +95,14 @@ def check(
 @click.option(
     "--accept",
     metavar="RATE|DRIVER",
-    help="Run until it is known whether the crash rate is below so many per test, or below that of a reference driver "
-    "such as r157-cc, instead of to stop.rhw.",
+    help="Run until it is known whether the crash rate is below this limit: crashes per test, or the name of a "
+    "reference driver such as r157-cc. Replaces stop.rhw.",
 )
 @click.option(
     "--independent",
     type=click.IntRange(min=0, max=2**63 - 1),
     metavar="N",
-    help="Repeat it with other random numbers throughout: sets seed and pool.seed. With another seed alone the pool is "
-    "the same.",
+    help="Repeat the run with other random numbers throughout: sets seed and pool.seed to N.",
 )
 @junit_option
 @av_option
@@ -126,18 +125,18 @@ def run(
     overrides: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Run CAMPAIGN until it is precise enough, and print the crash rate; that of VEHICLE is known to 30 %.
+    """Run CAMPAIGN until it is precise enough, or test VEHICLE to ± 30 %, and print the crash rate.
 
     VEHICLE is a Python class or function (my_av.py:MyClass, package.module:MyClass), a TraCI script (my_script.py), an
-    FMU (my_av.fmu), a model of SUMO's (sumo:ACC), of a panel (PANEL.yaml:NAME) or built in (r157-cc). A function is
-    asked step(seen) each 0.1 s.
+    FMU (my_av.fmu), one of SUMO's models (sumo:ACC), an entry of a file (PANEL.yaml:NAME) or a built-in driver
+    (r157-cc). A function is called as step(seen) every 0.1 s and returns the acceleration in m/s².
 
     The same campaign gives the same records, bit for bit, whatever the number of workers, and also when it was
     interrupted and resumed. The run folder holds the resolved campaign, all records (Parquet), estimates.json and
     report.html.
 
-    Exit code 4 says that stop.episodes or the pool was spent before stop.rhw was reached, or --accept decided; the
-    results are there all the same. With --accept 0 means accepted, 5 rejected.
+    Exit code 4: stop.episodes or the pool was used up before stop.rhw was reached or --accept decided; the results are
+    written all the same. With --accept, 0 means accepted and 5 rejected.
     """
     limit = [] if accept is None else accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
@@ -180,7 +179,7 @@ def _told_of_several(found: Hours, junit: Path | None, *, as_json: bool) -> None
 
 @contextmanager
 def named_if_written(folder: Path, *, chosen: bool) -> Iterator[None]:
-    """Say where a run is that was not finished, if its folder was ``chosen`` here and there is something."""
+    """Say where an unfinished run is, if its folder was ``chosen`` here and exists."""
     try:
         yield
     except BaseException:
@@ -191,11 +190,11 @@ def named_if_written(folder: Path, *, chosen: bool) -> Iterator[None]:
 
 @click.command(
     name="av-check",
-    short_help="Look at the AV before a campaign is spent on it.",
+    short_help="Check a vehicle before it is tested: deterministic, within limits, fast?",
     epilog=examples("harness av-check my_av.py:MyClass", "harness av-check my.yaml --set av.parameters.hardest_mps2=8"),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
-@click.option("--episodes", type=click.IntRange(min=2), default=48, show_default=True, help="Episodes to run.")
+@click.option("--tests", "episodes", type=click.IntRange(min=2), default=48, show_default=True, help="Tests to run.")
 @scenario_option
 @av_option
 @set_option
@@ -211,12 +210,12 @@ def av_check(
     overrides: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Run a few dozen cut-ins with VEHICLE, or that of CAMPAIGN, twice, and say what it is like.
+    """Run a few dozen tests of VEHICLE, or of that of CAMPAIGN, twice, and say whether it is ready for a run.
 
-    Shown are whether it gives the same bits in another order and in other cells, whether it stays finite and within
-    limits, how it follows and reacts, and its time per step beside the built-in IDM. Nothing is written.
+    Shown are whether it repeats itself in another order and beside other tests, whether it stays within limits, how it
+    follows and reacts, and its time per step beside the built-in IDM. Nothing is written.
 
-    Exit code 3: episodes failed, were not reproduced, or ended the process; 2: campaign or controller are wrong.
+    Exit code 3: tests failed, were not reproduced, or ended the process; 2: campaign or controller are wrong.
     """
     campaign = harness.load_campaign(campaign_file, [*one_scenario(scenario, "av-check"), *overrides], av=av)
     from harness.report.av_check import rows, verdict  # noqa: PLC0415 - slow to import: only once the campaign is right
@@ -226,13 +225,13 @@ def av_check(
     if as_json:
         print_json(found.to_json())
     else:
-        print_table("What the AV is like", rows(found))
+        print_table("Vehicle under test", rows(found))
         say(verdict(found))
     ctx.exit(found.exit_code)
 
 
 @click.command(
-    short_help="Two AVs on common random numbers: the interval of the difference.",
+    short_help="Which of two vehicles crashes less often, and by how much?",
     epilog=examples(
         "harness compare old_av.py:MyClass new_av.py:MyClass --out runs/old_new",
         "harness compare runs/old new.yaml --margin 0.1 --out runs/old_new       # is the new one 10 % worse?",
@@ -244,12 +243,12 @@ def av_check(
 @click.option("--out", "folder", type=FOLDER, help="Folder of the run folders a and b. Default: runs/A-B.")
 @click.option(
     "--against", multiple=True, metavar="A.B=C",
-    help="Value that B has instead; with it B may be left out. May be given several times.",
+    help="Setting that differs in B; with it B may be left out. May be given several times.",
 )  # fmt: skip
-@click.option("--against-av", metavar="VEHICLE", help="Vehicle that B has instead; with it B may be left out.")
+@click.option("--against-av", metavar="VEHICLE", help="Vehicle of B; with it B may be left out.")
 @click.option(
     "--margin", type=click.FloatRange(min=0.0), metavar="R",
-    help="Run until it is known whether B's crash rate is at most 1 + R times A's, whatever the precision.",
+    help="Run until it is known whether B's crash rate is at most 1 + R times A's. Replaces the precision.",
 )  # fmt: skip
 @workers_option
 @junit_option
@@ -274,19 +273,19 @@ def compare(
     overrides: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Drive the AVs of A and B, campaigns or vehicles, in the same traffic; print the difference.
+    """Test the vehicles of A and B (campaigns or vehicles) in the same traffic, and print the difference.
 
-    Both meet the same events (testing.method: shells), round by round, until it is known who crashes less often, or
-    the half-width of the difference is 0.1 of the larger rate, or both crash less than stop.below_reference says; or
-    until --margin is decided; or, with --set stop.rhw=R, until that half-width is R.
+    Both meet the same events (testing.method: shells), round by round, until it is known which crashes less often, or
+    the half-width of the difference is 0.1 of the larger rate, or both are below stop.below_reference; or until
+    --margin is decided; or, with --set stop.rhw=R, until that half-width is R.
 
-    A may be a run folder: its tests are copied and not driven again. Finished parts of an earlier call with the same
-    --out are used again, too. The folder receives the run folders a and b, compare.json and report.html.
+    A may be a run folder: its tests are copied, not run again. So are finished tests of an earlier call with the same
+    --out. The folder receives the run folders a and b, compare.json and report.html.
 
-    Exit code 5 says that B is worse than A by more than --margin; 4 that budget or pool were spent before it was known.
+    Exit code 5: B is worse than A by more than --margin; 4: tests or pool were used up before that was known.
     """
     if file_b is None and not against and against_av is None:
-        raise click.UsageError("Name a second campaign, or say with --against or --against-av what is different in B.")
+        raise click.UsageError("Name a second campaign, or say with --against or --against-av how B differs.")
     stored = source_a if source_a.is_dir() else None
     file_a = source_a if stored is None else stored / "campaign.yaml"
     overrides = [*one_scenario(scenario, "compare"), *overrides]
@@ -316,7 +315,7 @@ def compare(
 
 
 @click.command(
-    short_help="Build the pool of events, and show its shells.",
+    short_help="Build the pool of events that a run draws from, and show it.",
     epilog=examples("harness pool scenarios/smoke.yaml", "harness pool idm --set environment.cut_in_lead_s=0.5"),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
@@ -324,11 +323,11 @@ def compare(
 @set_option
 @json_option
 def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str], as_json: bool) -> None:
-    """Build the pool that belongs to the environment and surrogate library of CAMPAIGN, and show what is in it.
+    """Build the pool of events for the traffic and the surrogate library of CAMPAIGN, and show it.
 
-    Of a VEHICLE it is the one that `harness run VEHICLE` draws from; the vehicle itself does not matter.
-    Shown are the surrogates from careful to careless with their crash rates, and how probable it is that an event is
-    the first in this order that a surrogate crashes on. A pool is built once and kept; `harness run` builds it, too.
+    With VEHICLE it is the pool that `harness run VEHICLE` draws from; the vehicle itself does not matter. Shown are the
+    surrogates from careful to careless, with their crash rates and the probabilities of their shells: the events on
+    which a surrogate is the most careful to crash. A pool is built once and kept; `harness run` builds it, too.
     """
     campaign = harness.load_campaign(campaign_file, [*one_scenario(scenario, "pool"), *overrides])
     with progress_bar() as bar:
@@ -350,7 +349,7 @@ def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str],
     short_help="Print the JSON schema of a campaign.", epilog=examples("harness schema > campaign.schema.json")
 )
 def schema() -> None:
-    """Print the JSON schema of a campaign, by which an editor completes and checks campaign files.
+    """Print the JSON schema of a campaign, with which an editor completes and checks campaign files.
 
     Let the first line of a campaign name the file: '# yaml-language-server: $schema=campaign.schema.json'.
     """
@@ -360,18 +359,18 @@ def schema() -> None:
 
 
 @click.command(
-    short_help="Install the system libraries that SUMO needs, and compile.",
+    short_help="Set up this machine: SUMO's system libraries, and compiling.",
     epilog=examples(
-        "harness setup             # once per machine and version; asks nothing where nothing is missing",
+        "harness setup             # once per machine and version",
         "harness setup --dry-run   # only print the commands",
     ),
 )
 @click.option("--dry-run", is_flag=True, help="Print the commands that would be run, and run none.")
 def setup(*, dry_run: bool) -> None:
-    """Install the system libraries that SUMO needs, where they are missing, and compile what a first run needs.
+    """Install the system libraries that SUMO needs, if any are missing, and compile what a first run needs.
 
-    pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get, dnf or apk, directly as
-    root and else by sudo, which may ask for your password at a terminal. A campaign with world.engine twin needs none.
+    pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get, dnf or apk, as root or
+    with sudo, which may ask for your password at a terminal. A campaign with world.engine twin needs none.
 
     Exit code 2 says that they could not be installed; the message names the packages.
     """
@@ -390,4 +389,4 @@ def setup(*, dry_run: bool) -> None:
     click.echo("SUMO's system libraries are installed." if missing else "SUMO's system libraries are there.")
     with progress_bar() as bar:
         compiled = compile_kernels(bar)
-    click.echo("Kernels are compiled." if compiled else "Kernels were compiled before.")
+    click.echo("Kernels are compiled." if compiled else "Kernels are compiled already.")

@@ -14,7 +14,7 @@ from harness.commands.printing import print_json, say
 
 
 @click.command(
-    short_help="Fit traffic to trajectories.",
+    short_help="Fit traffic of your own to recorded trajectories.",
     epilog=examples(
         "harness fit trajectories.parquet --out my-traffic.yaml",
         "harness fit 01_tracks.csv 02_tracks.csv --mapping highd --out highway.yaml",
@@ -54,26 +54,11 @@ def fit(
     environments that other trajectories of the same kind would have given: from these `harness estimate --environment`
     computes how uncertain the rate is.
     """
-    from harness.fitting.page import CONFIDENCE  # noqa: PLC0415 - keeps --help fast
-    from harness.report.traffic_words import too_few  # noqa: PLC0415 - keeps --help fast
-
     with progress_bar() as bar:
         given: dict[str, Any] = {"mapping": mapping, "mirror": mirror, "leave_out": leave_out, "force": force}
         found = harness.fit(files, out, n_replicates=replicates, seed=seed, progress=bar, **given)
     written = repr(found).splitlines()
     if as_json:
         print_json({"files": written, **found.facts})
-        return
-    tally, traffic, steps = found.tally, found.fit.traffic, found.fit.acceptance
-    unseen = found.fit.environment.unseen
-    limited = f"! no lane change seen at {unseen}: rates of crashes that begin there have only an upper limit"
-    say(
-        f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h; "
-        f"{tally.used:,} lane changes used of {tally.changes:,}",
-        f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
-        f"{steps.exposure[:-1].sum():.1f} expected if nobody minded it",
-        *(f"kept as in {found.fit.base_name}: {what} ({why})" for what, why in found.fit.kept.items()),
-        *([limited] if unseen else []),
-        *(f"! {words}" for words in too_few(replicates, CONFIDENCE)),
-        *written,
-    )
+    else:
+        say(*found.told, *written)

@@ -55,8 +55,8 @@ def show_error(error: HarnessError) -> None:
 
 _AGAIN = "Nothing finished is lost: then give the same command again (`run` with --resume)."
 _HOW_TO_GO_ON = {
-    "run": " Finished shards are kept: the same command with --resume goes on.",
-    "compare": " Finished shards are kept: the same command goes on.",
+    "run": " Finished tests are kept: the same command with --resume goes on.",
+    "compare": " Finished tests are kept: the same command goes on.",
 }
 
 

@@ -10,20 +10,18 @@ from typing import Any
 import click
 
 import harness
-from harness.commands.options import FILE, RUN_FOLDER, examples, json_option, progress_bar
+from harness.commands.options import FILE, FOLDER, RUN_FOLDER, examples, json_option, progress_bar
 from harness.commands.printing import answer_lines, print_either, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share, words
 from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 
-FCD = ".xml"
-"""Suffix of SUMO's floating car data."""
 LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_ttc_s", "contact")
 """What a replay tells of a cut-in that takes time."""
 
 
 @click.command(
-    short_help="Estimate again from the records of a run.",
+    short_help="Estimate again from a run's tests, also for other traffic.",
     epilog=examples(
         "harness estimate runs/smoke", "harness estimate runs/smoke -e nade -e scv --confidence 0.95 --json"
     ),
@@ -55,7 +53,7 @@ LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_tt
     "--exposure-uncertainty",
     "counts",
     is_flag=True,
-    help="Of several scenarios: counted exposures are in the interval.",
+    help="Of several scenarios: let the interval include the error of counted exposures.",
 )
 @json_option
 @click.pass_context
@@ -71,16 +69,16 @@ def estimate(
     counts: bool,
     as_json: bool,
 ) -> None:
-    """Estimate the crash rate again from the records in DIR, with any estimator.
+    """Estimate the crash rate again from the tests in DIR, with any estimator. Nothing is simulated in SUMO.
 
-    Nothing is simulated in SUMO. Estimators that are asked for are shown in a table; one that the records do not allow
-    with the reason. The exit code is 2 if they allow none of those asked for.
+    Estimators named by -e are shown in a table; one that the records do not allow is listed with the reason. The exit
+    code is 2 if they allow none of those named.
 
-    With --environment the shells' probabilities in other traffic are found in the twin (half a minute), and crash
-    shares within shells are taken to be the same there. Traffic in which they cannot be is refused. Replicates of
-    fitted traffic take a second each, so minutes for 200. What they give is kept: asked again, this run is answered in
-    seconds, and so are most other vehicles tested in the same pool. The answer tells what they leave open, and with
-    --write, in the run's own traffic, so do estimates.json and the page. DIR may be that of a comparison, too.
+    --environment answers for other traffic: the probability of each shell is found anew (half a minute), and the share
+    of crashes in each shell is assumed to be the same. Traffic in which it cannot be is refused. Replicates of fitted
+    traffic take a second each, so minutes for 200; they are kept, so that a second call takes seconds. The answer then
+    says how far the rate may be off because the fit is uncertain; --write puts that into estimates.json and the page.
+    DIR may be the folder of a comparison, too.
     """
     if exposures or counts or (folder / FAMILIES).is_file():
         if estimators or environment is not None:
@@ -185,7 +183,7 @@ def _ranges(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, 
 
 
 @click.command(
-    short_help="Say which numbers of the traffic an answer depends on.",
+    short_help="Which numbers of the traffic does an answer depend on?",
     epilog=examples(
         "harness sensitivity runs/smoke", "harness sensitivity runs/smoke --range cut_in.ignore_share=0.001:0.08"
     ),
@@ -193,14 +191,14 @@ def _ranges(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, 
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 @click.option(
     "--range", "ranges", metavar="SECTION.NAME=LOW:HIGH", multiple=True, callback=_ranges,
-    help="Where a number may lie, beside the ranges that the environment states; may be given several times.",
+    help="Range of a number, in place of the one that the environment states; may be given several times.",
 )  # fmt: skip
 @json_option
 def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json: bool) -> None:
-    """Say by how much the crash rate of the run in DIR, and its ratio to a competent driver, moves with its traffic.
+    """Say by how much each number of the traffic moves the crash rate of the run in DIR, and its ratio to r157-cc.
 
-    Fitted numbers move by their standard errors, or in blocks by replicates, assumed ones over their ranges. Nothing is
-    simulated in SUMO: each move takes a second, once. DIR keeps it as sensitivity.json, and its page shows it.
+    Fitted numbers move by their standard errors, or together by replicates; assumed ones over their ranges. Nothing is
+    simulated in SUMO: each move takes a second, once. The result is kept in DIR/sensitivity.json and shown on the page.
     """
     with progress_bar() as bar:
         content = harness.sensitivity(folder, ranges=ranges, progress=bar)
@@ -210,7 +208,8 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
         return
     print_table(f"What moves the answer: {content['environment']}", list(map(_bar, content["bars"])))
     say(
-        "Crash shares within shells are taken to stay as they were. Off by: what a reference driver shows of that.",
+        "The share of crashes in each shell is assumed to stay the same; 'off by' is the error of that for a reference "
+        "driver.",
         f"report  {page}",
     )
 
@@ -228,11 +227,11 @@ def _bar(bar: dict[str, Any]) -> dict[str, str]:
 
 
 @click.command(
-    short_help="Write report.html of a run or comparison anew.", epilog=examples("harness report runs/smoke")
+    short_help="Write the report of a run or comparison again.", epilog=examples("harness report runs/smoke")
 )
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 def report(folder: Path) -> None:
-    """Write report.html of the run or of the comparison in DIR anew, and print where the page is."""
+    """Write report.html of the run or comparison in DIR again, and print its path."""
     say(harness.write_report(folder))
 
 
@@ -242,66 +241,84 @@ def _motion_files(_ctx: click.Context, _parameter: click.Parameter, files: tuple
         from harness.records.folder import require_place  # noqa: PLC0415 - keeps --help fast
         from harness.report.motion import writer_of  # noqa: PLC0415
 
-        if len(twice := [str(file) for file in files if file.suffix == FCD]) > 1:
-            raise HarnessError("--out", " and ".join(twice), "one file of SUMO's", "Copy it.")
         for file in files:
-            if file.suffix != FCD:
-                writer_of(file)
+            writer_of(file)
             require_place(file.parent)
     return files
 
 
+def _sumo_files(ctx: click.Context, parameter: click.Parameter, folder: Path | None) -> tuple[Path, ...]:
+    return _motion_files(ctx, parameter, () if folder is None else (folder / "test.sumocfg",))
+
+
 @click.command(
-    short_help="Simulate one episode of a run again, bit for bit; watch or write it.",
+    short_help="Simulate one test of a run again, bit for bit; watch or write it.",
     epilog=examples(
         "harness replay runs/smoke 17",
-        "harness replay runs/smoke 17 --out episode_17.html   # or .csv, .xosc, .xml",
-        "harness replay runs/smoke 17 --stored --out episode_17.csv",
-        "harness replay runs/smoke 17 --gui",
+        "harness replay runs/smoke 17 --out test_17.html   # or .csv, .xosc, .xml",
+        "harness replay runs/smoke 17 --stored --out test_17.csv",
+        "harness replay runs/smoke 17 --gui                # halts at the onset",
+        "harness replay runs/smoke 17 --sumo test_17       # then: sumo -c test_17/test.sumocfg",
     ),
 )
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
-@click.argument("episode", type=click.IntRange(min=0))
+@click.argument("episode", metavar="TEST", type=click.IntRange(min=0))
 @click.option(
     "--out", "files", metavar="FILE", type=FILE, multiple=True, callback=_motion_files,
     help="Write the motion. The suffix says how: .html, a page that plays it; .csv, a row for each vehicle and step; "
     ".xosc, OpenSCENARIO XML 1.2 and its road (.xodr; extra 'export'); .xml, SUMO's floating car data. May be given "
     "several times.",
 )  # fmt: skip
-@click.option("--gui", is_flag=True, help="Show it in sumo-gui (extra 'sumo').")
-@click.option("--stored", is_flag=True, help="As the run has traced it: nothing is simulated, nobody's code runs.")
-@click.option("--trust", is_flag=True, help="Run the vehicle's code, though DIR was not made here by you.")
+@click.option("--gui", is_flag=True, help="Show it in sumo-gui, halted at the onset (extra 'sumo').")
+@click.option(
+    "--sumo", "sumo_files", metavar="DIR", type=FOLDER, callback=_sumo_files,
+    help="Write what SUMO needs to repeat it: DIR/test.sumocfg, which sumo and sumo-gui run (-c), and its files.",
+)  # fmt: skip
+@click.option(
+    "--stored", is_flag=True, help="Use the motion that the run has kept: nothing is simulated, no code of others runs."
+)
+@click.option("--trust", is_flag=True, help="Run the vehicle's code even if DIR was not made by you on this machine.")
 @json_option
 def replay(
-    folder: Path, episode: int, *, files: Sequence[Path], gui: bool, stored: bool, trust: bool, as_json: bool
+    folder: Path,
+    episode: int,
+    *,
+    files: Sequence[Path],
+    gui: bool,
+    sumo_files: Sequence[Path],
+    stored: bool,
+    trust: bool,
+    as_json: bool,
 ) -> None:
-    """Simulate episode number EPISODE of the run in DIR again, bit for bit, and say what happens when.
+    """Simulate test number TEST of the run in DIR again, bit for bit, and say what happens when.
 
-    And what would have happened with others in the vehicle's place: the careful and competent driver of UN Regulation
-    No. 157 (r157-cc), and one that brakes at once, at up to 8 m/s2 (brakes-8).
+    It also says how two others would have fared in the vehicle's place: the careful and competent driver of UN
+    Regulation No. 157 (r157-cc), and one that brakes at once, at up to 8 m/s2 (brakes-8).
 
-    Where the run has stored the episode's trace, the replay is compared with it; a difference ends with exit code 3.
+    If the run has kept the test's motion, the replay is compared with it; a difference ends with exit code 3.
 
-    A vehicle of one's own is code that DIR names, and that this runs: it says which. If DIR was not made on this
-    machine by you, --trust is needed for that.
+    A vehicle of your own is code that DIR names; the replay runs it and says which. If DIR was not made by you on this
+    machine, that takes --trust.
     """
     from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
     from harness.records.origin import code_of  # noqa: PLC0415
     from harness.records.reader import read_campaign  # noqa: PLC0415
+    from harness.report.sumo_files import gui_program, watch  # noqa: PLC0415
 
     if not stored and (code := code_of(read_campaign(folder, read_manifest(folder)).av)) is not None:
         say(f"The vehicle is {code}.", err=True)
-    fcd = next((file for file in files if file.suffix == FCD), None)
-    result = harness.replay(folder, episode, gui=gui, fcd=fcd, stored=stored, trust=trust)
-    written = [] if fcd is None else [fcd]
-    written += [each for file in files if file.suffix != FCD for each in harness.write_motion(result, file)]
+    program = gui_program() if gui else None
+    result = harness.replay(folder, episode, stored=stored, trust=trust)
+    written = [each for file in (*files, *sumo_files) for each in harness.write_motion(result, file)]
     content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
     content |= {"files": [str(file) for file in written]}
     content |= {name: result.row[name] for name in LATERAL if name in result.row}
-    compared = {None: "no stored trace to compare with", True: "bit for bit as stored", False: "NOT as stored"}
-    words = "as the run has traced it" if stored else compared[result.bit_equal]
+    compared = {None: "no stored motion to compare with", True: "bit for bit as stored", False: "NOT as stored"}
+    words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
+    if program is not None:
+        watch(result, program)
     if result.bit_equal is False:
-        found = "a replay that differs from the stored trace"
-        raise WorldDisagreementError(f"episode {episode} of {folder}", found, "the same bits", str(result.suspects))
+        found = "a replay that differs from the stored motion"
+        raise WorldDisagreementError(f"test {episode} of {folder}", found, "the same bits", str(result.suspects))

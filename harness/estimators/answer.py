@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import LEAST_POOL_ERROR, MOST_CUT_INS
+from harness.campaign.sections import LEAST_POOL_ERROR, MOST_EVENTS
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Note, Number, Point, Unavailable, finite_json
 from harness.estimators.likelihood import Level
@@ -175,7 +175,7 @@ def pool_remedy(rule: Rule, campaign: Campaign, stopped_by: StoppedBy) -> dict[s
     own = target / math.sqrt(2.0) / Level.two_sided(campaign.stop.confidence).z  # a pool has some paths in any case
     error = min((pool.relative_error or family_named(campaign.scenario).pool_error) / math.sqrt(finer), own)
     kept = two_digits_up(min(pool.events_per_shell * times, 1e9))
-    if error < LEAST_POOL_ERROR or kept > MOST_CUT_INS:
+    if error < LEAST_POOL_ERROR or kept > MOST_EVENTS:
         return {}
     changes: dict[str, float | None] = {"pool.relative_error": math.floor(error * 1e4) / 1e4} if finer > 1.0 else {}
     return changes | ({"pool.events_per_shell": kept} if times > 1.0 else {})

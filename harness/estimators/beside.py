@@ -33,7 +33,7 @@ class BesideReference:
 
     ``crash_rate`` is the reference's, with its standard error. ``ratio`` is the vehicle's crash rate over it, and
     ``preventable`` the share of the vehicle's crashes that the reference would have avoided; NaN where it is not
-    defined. ``delay_s`` (s) is when the reference begins to brake after the cut-in, None if it has no delay of its own.
+    defined. ``delay_s`` (s) is when the reference begins to brake after the event, None if it has no delay of its own.
     """
 
     reference: str
@@ -50,7 +50,7 @@ class BesideReference:
 
 @dataclass(frozen=True)
 class Unavoidable:
-    """The share of a rate, with limits, on whose cut-ins the most careful driver of the library crashes, too."""
+    """The share of a rate, with limits, on whose events the most careful driver of the library crashes, too."""
 
     driver: str
     share: float

@@ -42,12 +42,12 @@ EPISODE_COLUMNS = (
 )  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass")
 BASELINE_COLUMNS = ("shadow", "event_mass")
-"""Of vehicles that act before the cut-in, where `ShellDesign.candidates` says that they are on record."""
+"""Of vehicles that act before the event, where `ShellDesign.candidates` says that they are on record."""
 CUT_OFF_STEPS, DANGER_TTC_S = 40, 4.0
-"""A test whose time was up so soon after a cut-in, and closer to a collision (s), was cut off.
+"""A test whose time was up so soon after an event, and closer to a collision (s), was cut off.
 
 A driver who brakes with 3 m/s² after half a second stays clear from there at closing speeds up to 21 m/s; the fastest
-cut-ins of `ndd-overtaking-1` close with 16."""
+events of `ndd-overtaking-1` close with 16."""
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 Column = NDArray[Any]
 
@@ -78,7 +78,7 @@ class Drawn:
 
     @property
     def forced_share(self) -> float:
-        """Share of forced cut-ins among what the method draws from."""
+        """Share of forced events among what the method draws from."""
         if not self.sampling.forces:
             return 0.0
         return float(self.alpha[0]) if self.sampling.mixes else 1.0  # the defensive component is the first
@@ -90,15 +90,15 @@ class Block:
 
     ``outcome`` (n,) are places in `OUTCOMES`: a failed episode is a row like any other and never a crash.
     ``log_weight`` (n,) is log p(x_c) - log q_sampled(x_c), exactly 0 without control. ``columns``, also as attributes,
-    are what else the method records, a row for each episode: bool (n,) ``cut_in``, ``cut_off`` (`CUT_OFF_STEPS`),
+    are what else the method records, a row for each episode: bool (n,) ``happened``, ``cut_off`` (`CUT_OFF_STEPS`),
     ``took_over_early`` (the AV did something before BV was on its lane) and ``asked_to_speed_up`` (or that in vain);
     ``impact_mps`` (n,), closing speed at contact, NaN without a crash; ``n_control_steps`` (n,). ``log_q`` (n, M) is,
     per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode;
     ``martingale`` (n, J) the D_j of `harness.estimators.doubly_robust`;
     ``first_ratios`` (n, 9, J) q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one;
-    ``log_p_event`` (n,) log P(cut-in | path), where the path is drawn ahead: it bounds Y of that episode alone. Of
-    shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C), its path's probability of a cut-in of each cell, and
-    `BASELINE_COLUMNS`, with ``step`` (n,) of the cut-in, below 0 where a failed test has come to none.
+    ``log_p_event`` (n,) log P(event | path), where the path is drawn ahead: it bounds Y of that episode alone. Of
+    shells ``stratum`` and ``cell`` (n,), ``cell_mass`` (n, C), its path's probability of an event of each cell, and
+    `BASELINE_COLUMNS`, with ``step`` (n,) of the event, below 0 where a failed test has come to none.
     """
 
     first_episode: int
@@ -144,7 +144,7 @@ class Block:
     def log_cap(self) -> float:
         """Log of a bound on Y of these tests, whatever the AV does; inf if none is known.
 
-        Of forced cut-ins it is P(cut-in | path)/share, the largest. The step mixture draws each maneuver with ε times
+        Of forced events it is P(event | path)/share, the largest. The step mixture draws each maneuver with ε times
         its exposure at least: after l control steps, no more than the longest test has steps, W ≤ ε^-l.
         """
         if self.drawn.sampling.mixes_steps and self.drawn.epsilon > 0.0 and "n_steps" in self.columns:
@@ -214,7 +214,7 @@ def block_from_tables(
     close = pc.and_(pc.less(left, CUT_OFF_STEPS), pc.less(episodes["min_ttc_s"], DANGER_TTC_S))
     early = pc.less_equal(episodes["took_over_step"], episodes["event_step"])
     columns: dict[str, Column] = {
-        "cut_in": _known(episodes, "event_step"),
+        "happened": _known(episodes, "event_step"),
         "n_control_steps": n_control_steps,
         "n_steps": _integers(episodes, "n_steps"),
         "impact_mps": np.asarray(episodes["impact_speed_mps"].to_numpy(), dtype=np.float64),
@@ -235,7 +235,7 @@ def block_from_tables(
         if shells.candidates:
             columns |= {name: episodes.column(name).to_numpy() for name in BASELINE_COLUMNS}
             step = pc.fill_null(episodes.column("event_step"), -1).to_numpy()
-            columns["step"] = np.where(columns["cut_in"], step, -1 - index).astype(np.int64)
+            columns["step"] = np.where(columns["happened"], step, -1 - index).astype(np.int64)
     cap, above_mps = None if sampling.controlled else 1.0, campaign.crash.counts_above_mps
     method, names = campaign.testing.method, campaign.importance_names
     drawn = Drawn(method, alpha, cap, shells, above_mps, campaign.testing.epsilon, names)

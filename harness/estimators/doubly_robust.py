@@ -29,6 +29,9 @@ from harness.estimators.weighted import FEW_EFFECTIVE, Nade
 from harness.vocabulary import FloatArray
 
 FOLDS = 5
+WIDER = 1.5
+"""Of residuals than of Y. Less is left of Y than there was, but where a D_j is rarely huge: a path on which crashes of
+large weight are due and none was drawn, so that Y varies more than is seen of it."""
 
 
 class DoublyRobust(Nade):
@@ -64,6 +67,8 @@ class DoublyRobust(Nade):
         if self.n_crashes and y.n_effective < FEW_EFFECTIVE and residual < plain:
             std_error, third_moment = plain, y.third_moment(n)
             warnings.append(note("plain_width", least=FEW_EFFECTIVE))
+        if residual > WIDER * plain:
+            warnings.append(note("due_not_drawn", times=residual / plain))
         details = {"beta": shares.mean(axis=0).tolist(), "residual_std_error": residual}
         details |= {"plain_mean": y.mean(n), "plain_std_error": plain}
         return self.estimate(rate, std_error, third_moment, confidence, warnings=warnings, details=details)

@@ -48,7 +48,7 @@ class Diagnostics:
 
     def __init__(self) -> None:
         self.n, self.counts = 0, Counter[str]()
-        self._weight, self._cut_in, self._contact = Moments(), Moments(), Moments()
+        self._weight, self._event, self._contact = Moments(), Moments(), Moments()
         self._ratios = defaultdict[int, Moments](Moments)
 
     def add(self, block: Block) -> None:
@@ -56,11 +56,11 @@ class Diagnostics:
         weights, contact = block.weights(), block.outcome == CONTACT
         self._drawn = block.drawn
         self.n += len(block)
-        counted = {"n_events": block.cut_in, "n_bv_lv_contacts": contact, "n_failed": block.failed}
+        counted = {"n_events": block.happened, "n_bv_lv_contacts": contact, "n_failed": block.failed}
         counted |= {f"n_{name}": block.columns[name] for name in BEFORE_OVERLAP if name in block.columns}
         self.counts.update({name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
         self._weight += Moments.of(weights)
-        self._cut_in += Moments.of(weights[block.cut_in])
+        self._event += Moments.of(weights[block.happened])
         self._contact += Moments.of(weights[contact])
         for j, ratios in enumerate(block.mixture_ratios().T if block.drawn.sampling.mixes else ()):
             self._ratios[j] += Moments.of(ratios)
@@ -71,7 +71,7 @@ class Diagnostics:
         ratios = {names[j] if names else f"q_{j}": sums for j, sums in self._ratios.items()}
         return {
             "mean_weight": self._mean(self._weight),
-            "mean_weight_event": self._mean(self._cut_in),
+            "mean_weight_event": self._mean(self._event),
             "mean_ratio": {name: self._mean(sums) for name, sums in ratios.items()},
             "bv_lv_contact_share": self._mean(self._contact),
             **self.counts,

@@ -1,4 +1,4 @@
-"""Pairs of tests of two vehicles on the same cut-ins, drawn within shells: counts, and limits of what they say.
+"""Pairs of tests of two vehicles on the same events, drawn within shells: counts, and limits of what they say.
 
 A pair of tests has one of four outcomes: both crash, only A, only B, neither. The rates, their difference and their
 ratio are weighted sums of the shares of these outcomes, and their limits those of the likelihood ratio
@@ -73,7 +73,7 @@ class PairCounts:
     """Pairs of tests of some strata, which are the first of the design's.
 
     ``ends`` (S, 3, 3) is how often A ended in one way (second axis) and B in another (third): no crash, crash, failed.
-    ``mass`` (S, 3, 3, S) is, over the same pairs, the sum of their paths' probability of a cut-in of every stratum.
+    ``mass`` (S, 3, 3, S) is, over the same pairs, the sum of their paths' probability of an event of every stratum.
     Where something is asked with A, or B, the ``worse`` (1, or -1; 0 for neither), its failed tests count as crashes.
     """
 
@@ -157,7 +157,7 @@ class PairCounts:
         return Interval(self.rate(DIFFERENCE), low, high)
 
     def alone(self, side: int, level: Level) -> Interval:
-        """Rate of cut-ins on which A (0), or B (1), crashes and the other one does not."""
+        """Rate of events on which A (0), or B (1), crashes and the other one does not."""
         sign, weights = ((1.0, ONLY_A), (-1.0, ONLY_B))[side]  # `limit` is of what does not fall where A crashes more
         low, high = sorted(sign * self.limit(sign * weights, level, end) for end in (-1.0, 1.0))
         return Interval(self.rate(weights), max(low, 0.0) + 0.0, min(high, 1.0))
@@ -199,7 +199,7 @@ class PairCounts:
 
 
 class PairedShells:
-    """Tests of A and B as they come; the i-th of a stratum with A and the i-th with B are the same cut-in."""
+    """Tests of A and B as they come; the i-th of a stratum with A and the i-th with B are the same event."""
 
     def __init__(self, design: ShellDesign) -> None:
         n = len(design.strata)
@@ -240,7 +240,7 @@ def contrast(pairs: PairCounts, level: Level) -> dict[str, Any]:
     """What lies between A and B in some strata, difference A - B and ratio A/B; rates are crashes per test.
 
     ``rhw`` is the half-width of the difference over the larger of the two rates, ``rhw_from_pool`` what the pool's own
-    error alone would leave of it; ``only_a`` and ``only_b`` are rates of cut-ins on which only one of the two crashes.
+    error alone would leave of it; ``only_a`` and ``only_b`` are rates of events on which only one of the two crashes.
     """
     return {
         **dict(zip(("difference", "ci_low", "ci_high"), pairs.difference(level), strict=True)),

@@ -248,7 +248,7 @@ class SeenShells:
         return times
 
     def events_for(self, times: float) -> float:
-        """How many times the cut-ins that the pool keeps so many times the tests would need; at least 1."""
+        """How many times the events that the pool keeps so many times the tests would need; at least 1."""
         kept = np.array(self.design.available or [math.inf])
         return max(float(np.max(self.tally.tests[kept > 0] * times / kept[kept > 0], initial=1.0)), 1.0)
 

@@ -55,7 +55,7 @@ class Tally(NamedTuple):
     """What tests of strata have come to: ``tests``, ``crashes``, ``failed`` (S,).
 
     ``crash_mass``, ``failed_mass`` (S, S) are, over crashed or failed tests of each stratum, the sum of their paths'
-    probability of a cut-in of every stratum; ``runs`` what is known of runs, of vehicles that act before the cut-in.
+    probability of an event of every stratum; ``runs`` what is known of runs, of vehicles that act before the event.
     """
 
     tests: IntArray
@@ -124,11 +124,11 @@ class CrashedTests(NamedTuple):
 class OnRuns(NamedTuple):
     """Which baseline runs crashed tests repeat, and failed ones: what tells the error of few paths, without a bound.
 
-    The pool of a vehicle that acts before the cut-in knows some hundred paths, of which G_i is each one's weighted
-    probability of a crash. A crashed test is a draw of a cut-in in proportion to its probability m. So Σ y m over these
+    The pool of a vehicle that acts before the event knows some hundred paths, of which G_i is each one's weighted
+    probability of a crash. A crashed test is a draw of an event in proportion to its probability m. So Σ y m over these
     tests, with y = p_s/n_s, estimates the mean over paths of what Σ m² is over their crashes, and Σ y y' over pairs of
     tests of one run in different steps, times the number of runs, that of Σ m m'. Both are the mean of G². Pairs alone
-    would not do: a cut-in is tested once, so that what it adds by itself does not show in them.
+    would not do: an event is tested once, so that what it adds by itself does not show in them.
 
     ``own`` (2 S,) are sums of m, ``pairs`` (2 S, 2 S) numbers of ordered pairs, crashed tests of each stratum before
     failed ones.
@@ -237,7 +237,7 @@ def mean_square(scale: FloatArray, crash_mass: FloatArray) -> float:
 def combined(p: FloatArray, tally: Tally, n_paths: float, level: Level) -> RateLimits:
     """Rate Σ p_s c_s with the two limits of an interval; ``p`` (S,) are known from ``n_paths`` paths of a pool.
 
-    The upper limit may lie above Σ p_s, the rate of a vehicle that crashes on all cut-ins: it is as uncertain as that.
+    The upper limit may lie above Σ p_s, the rate of a vehicle that crashes on all events: it is as uncertain as that.
     """
     worst, variance = tally.failed_as_crashes(), pool_variance(p, tally, n_paths)
     variance_of_worst = variance if worst is tally else pool_variance(p, worst, n_paths)

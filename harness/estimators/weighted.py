@@ -26,7 +26,7 @@ plain mean. Overtaking in the twin, 90 %: `mixture_cv` covers 0.88 at 140 of the
 LARGE_SHARE = 0.1
 OVERTURNS = 1.0
 """One more crash of the largest known weight, over all those seen, above which an interval is not to be trusted: a
-single test could double the rate. Default IDM under forced cut-ins, nominal 0.90: where nearly all campaigns are above
+single test could double the rate. Default IDM under forced events, nominal 0.90: where nearly all campaigns are above
 (500 and 2,000 tests) intervals cover 0.73 and 0.87, where nearly all are below (25,000) 0.91 (docs/estimators.md)."""
 LARGEST_LOG = 700.0
 """Of a number that is still one, and not infinite."""
@@ -121,8 +121,8 @@ class Nade:
         self.y += Moments.of(weights)
         self._largest_y = float(np.max(weights, initial=self._largest_y))
         self._largest_log_weight = float(np.max(block.log_weight, initial=self._largest_log_weight))
-        of_cut_ins = block.log_weight[block.cut_in]
-        self._largest_event_log_weight = float(np.max(of_cut_ins, initial=self._largest_event_log_weight))
+        of_events = block.log_weight[block.happened]
+        self._largest_event_log_weight = float(np.max(of_events, initial=self._largest_event_log_weight))
         self._design_cap = max(self._design_cap, math.inf if (cap := block.drawn.weight_cap) is None else cap)
         self._log_cap = max(self._log_cap, block.log_cap())
 

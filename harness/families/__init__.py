@@ -8,12 +8,19 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.metadata import entry_points
+from typing import TYPE_CHECKING
 
 from harness.campaign.problems import did_you_mean
 from harness.campaign.sections import listed
 from harness.errors import CampaignError
-from harness.families.protocol import Family
 
+if TYPE_CHECKING:
+    from harness.families.protocol import Family
+
+R157 = ("cut_in", "lead_brakes", "cut_out")
+"""Those of UN Regulation No. 157."""
+DEFAULT_FAMILY = R157[0]
+"""Where a campaign names none."""
 GROUP = "harness.families"
 
 

@@ -1,1 +1,1 @@
-"""Traffic fitted to trajectories: the input table, what laws are fitted to, the laws, and what is not known of them."""
+"""Trajectories: the input table, what is read from it, and the fit of each family to it."""

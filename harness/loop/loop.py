@@ -22,7 +22,7 @@ from harness.worlds import AVLostError, World
 
 STRAYED = (
     "the vehicle did something else than in its baseline run, given the same traffic and the same random stream: it "
-    "draws random numbers of its own, remembers earlier episodes, or depends on time"
+    "draws random numbers of its own, remembers earlier tests, or depends on time"
 )
 """Cause of a test that failed because its weight would have been wrong."""
 
@@ -270,5 +270,5 @@ def _disagreement(cell: np.void, contact: bool) -> WorldDisagreementError:
     """SUMO's own collision flag and the crash criterion must name the same cells."""
     found = "a collision that the positions do not show" if contact else "no collision where the positions show one"
     expected = "a collision exactly when bumpers overlap by more than 1 mm"
-    mend = "Please report this episode: its campaign.yaml and index reproduce it."
-    return WorldDisagreementError(f"episode {cell['episode']}, step {cell['step']}", found, expected, mend)
+    mend = "Please report this test: its campaign.yaml and number reproduce it."
+    return WorldDisagreementError(f"test {cell['episode']}, step {cell['step']}", found, expected, mend)

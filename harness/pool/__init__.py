@@ -1,7 +1,7 @@
-"""Pool and shells: all cut-ins of the environment with their probabilities, ordered by who crashes on them.
+"""Pool and shells: all events of the environment with their probabilities, ordered by who crashes on them.
 
-Built once per environment and surrogate library, in the twin: initial states, paths, their cut-in times with exact
-probabilities, and the outcome of every surrogate on each. A shell is the set of cut-ins on which one surrogate is the
+Built once per environment and surrogate library, in the twin: initial states, paths, their event times with exact
+probabilities, and the outcome of every surrogate on each. A shell is the set of events on which one surrogate is the
 most conservative to crash; its probability is known, so that crashes of the AV counted within shells add up to its
 rate.
 

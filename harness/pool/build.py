@@ -163,7 +163,7 @@ def pool_of(
     key: str,
     more: Sequence[str] = (),
 ) -> Pool:
-    """Sort the cut-ins of paths into shells, by surrogates in this order, and cells; keep a sample of each shell.
+    """Sort the events of paths into shells, by surrogates in this order, and cells; keep a sample of each shell.
 
     ``seed`` is that of the paths; without an order surrogates are put into that of their rates. ``more`` are surrogates
     that come after those of the library.
@@ -207,7 +207,7 @@ def pool_of(
 
 
 def _keep(mass: FloatArray, shell: Int8Array, n_shells: int, settings: PoolSettings) -> tuple[IntArray, IntArray]:
-    """Systematic sample of cut-ins of every shell, with probability proportional to mass.
+    """Systematic sample of events of every shell, with probability proportional to mass.
 
     Path and step (row and column in ``mass``), each (n,), sorted by shell and path.
     """

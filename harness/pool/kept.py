@@ -1,6 +1,6 @@
-"""What a pool is: cells with their probabilities, surrogates with their crash rates, and cut-ins to test with.
+"""What a pool is: cells with their probabilities, surrogates with their crash rates, and events to test with.
 
-On disk it is one Parquet file of cut-ins, with all that is known of cells and surrogates in its metadata.
+On disk it is one Parquet file of events, with all that is known of cells and surrogates in its metadata.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ _METADATA = b"harness_pool"
 
 
 def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
-    """Steps of the onset of cut-ins in given steps (n,), with a ``lead`` (n,)."""
+    """Steps of the onset of events in given steps (n,), with a ``lead`` (n,)."""
     return np.asarray(np.maximum(step - lead, 0))
 
 
 @dataclass(frozen=True, eq=False)
 class KeptEvents:
-    """A weighted sample of cut-ins, each with what has to be known to repeat it.
+    """A weighted sample of events, each with what has to be known to repeat it.
 
     Within a shell all have the same probability. ``path``, ``step``, ``cell`` (n,): which path of the pool, which of
     its events, and cell; ``facts``, ``at``, ``lead`` (n,): see `Chosen` of families. ``crashes`` (n, D + R): which
     surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
-    a cut-in of each cell. ``motion`` (n,) are hashes of what the AV did through the step of the cut-in,
+    an event of each cell. ``motion`` (n,) are hashes of what the AV did through the step of the event,
     in the pool of a vehicle that acts before it, or of its onset, and ``mass`` (n,) the probability of those
-    that each stands for; else empty. ``lead`` (n,) is how many steps earlier the onset is: 0 where cut-ins are one
+    that each stands for; else empty. ``lead`` (n,) is how many steps earlier the onset is: 0 where events are one
     step.
     """
 
@@ -79,11 +79,11 @@ class Pool:
     the hash of its environment. ``names`` (D) are
     the surrogates, the most conservative first, ``mu`` (D,) their crash rates per test from ``n_paths`` paths, and
     ``mu_covariance`` (D, D) of their errors. ``p_event`` is the probability that BV cuts in in a test, ``p_event_se``
-    its standard error, and ``p_event_at_crash`` (D,) the mean P(cut-in | path) of the cut-ins on which each surrogate
+    its standard error, and ``p_event_at_crash`` (D,) the mean P(event | path) of the events on which each surrogate
     crashes, three standard errors on top. Cells divide shells by which references crash: ``cell_shell``,
     ``cell_references`` (C,) are the shell of each and one bit per reference, ``cell_p`` (C,) its probability.
     ``reference_rate``, ``reference_square`` (R,) are crash rates of the references, and mean squares of a path's
-    probability that they crash. ``p_after_failure`` is the probability, at most, of cut-ins after a baseline run has
+    probability that they crash. ``p_after_failure`` is the probability, at most, of events after a baseline run has
     failed: nothing is known about them.
     """
 
@@ -108,12 +108,12 @@ class Pool:
 
     @cached_property
     def shell_p(self) -> FloatArray:
-        """Probability of each shell, shape (D + 1,); the last is a cut-in on which no surrogate crashes."""
+        """Probability of each shell, shape (D + 1,); the last is an event on which no surrogate crashes."""
         return np.asarray(np.bincount(self.cell_shell, self.cell_p, minlength=len(self.names) + 1), np.float64)
 
     @cached_property
     def shell(self) -> IntArray:
-        """Shell of each kept cut-in, shape (n,)."""
+        """Shell of each kept event, shape (n,)."""
         return np.asarray(self.cell_shell[self.events.cell])
 
     def to_json(self) -> dict[str, Any]:
@@ -156,7 +156,7 @@ def _table(pool: Pool) -> pa.Table:
         "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
         "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
         "crashes": (rows(c.crashes), "which surrogates crash, as the metadata orders names, and which references"),
-        "path_mass": (rows(c.path_mass), "P of a cut-in of each cell on the path, times the path's weight"),
+        "path_mass": (rows(c.path_mass), "P of an event of each cell on the path, times the path's weight"),
         "lead_steps": (pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"),
     }
     own = family_named(pool.family).columns

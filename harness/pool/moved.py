@@ -31,13 +31,13 @@ N_PATHS = 4096
 FORMAT = 3
 """Raise it when the meaning of what is kept changes."""
 MARGIN = 0.05
-"""Of the range of a sample of cut-ins, by which another may lie beyond it [assumed]."""
+"""Of the range of a sample of events, by which another may lie beyond it [assumed]."""
 
 
 class OnPaths(NamedTuple):
-    """Of some traffic: probability per test of cut-ins of each stratum ``p`` (S,), and rates of reference drivers (R,).
+    """Of some traffic: probability per test of events of each stratum ``p`` (S,), and rates of reference drivers (R,).
 
-    ``beyond`` (S,) is the part of ``p`` in cut-ins whose initial state is beyond all those of the same shell in the
+    ``beyond`` (S,) is the part of ``p`` in events whose initial state is beyond all those of the same shell in the
     tested pool; ``untested`` () the probability of shells that the tested pool does not have.
     """
 
@@ -108,15 +108,15 @@ class FewPaths:
 
 
 def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Where the numbers of the initial states of the pool's cut-ins lie, by shell (D + 1,), with a margin.
+    """Where the numbers of the initial states of the pool's events lie, by shell (D + 1,), with a margin.
 
-    A cut-in a little beyond the outermost of a sample is not unlike those in it.
+    An event a little beyond the outermost of a sample is not unlike those in it.
     """
     shell, n = pool.shell, len(pool.names) + 1
     found = {}
     numbers = [each.name for each in family_named(pool.family).columns if pa.types.is_floating(each.kind)]
     for name in numbers:
-        low, high = np.full(n, -np.inf), np.full(n, np.inf)  # of a shell without cut-ins nothing is known
+        low, high = np.full(n, -np.inf), np.full(n, np.inf)  # of a shell without events nothing is known
         for s in np.unique(shell):
             values = pool.events.facts[name][shell == s]
             low[s], high[s] = values.min(), values.max()

@@ -1,6 +1,6 @@
-"""What a shell is, and shells as strata of a campaign: which cut-ins belong together, and the tests drawn from them.
+"""What a shell is, and shells as strata of a campaign: which events belong together, and the tests drawn from them.
 
-Surrogates are in an order, the most conservative first, by their crash rates. A cut-in belongs to the shell of the
+Surrogates are in an order, the most conservative first, by their crash rates. An event belongs to the shell of the
 first of them that crashes on it, or to the last shell if none does. Cells divide shells by which references crash.
 
 Shells up to the boundary are strata of their own. All beyond it is one stratum, *outside*: what a careful vehicle is
@@ -40,7 +40,7 @@ def conservative_first(rates: FloatArray) -> IntArray:
 
 
 def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:
-    """Shell of cut-ins: the place in the order of the first surrogate that crashes, D if none does.
+    """Shell of events: the place in the order of the first surrogate that crashes, D if none does.
 
     ``crashes``, of any shape, has one bit per surrogate; ``order`` (D,) are the bits as `conservative_first` puts them.
     """
@@ -53,9 +53,9 @@ def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:
 def cells_of(
     mass: FloatArray, shell: Int8Array, references: IntArray, n_references: int
 ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """Cells of cut-ins with ``mass``, of a ``shell``, on which ``references`` crash (one bit each): all (n, steps).
+    """Cells of events with ``mass``, of a ``shell``, on which ``references`` crash (one bit each): all (n, steps).
 
-    Returns the cell of each cut-in (n, steps), shell and references of each cell (C,), and each path's mass in it
+    Returns the cell of each event (n, steps), shell and references of each cell (C,), and each path's mass in it
     (n, C).
     """
     kind = (shell.astype(np.int64) << n_references) | references
@@ -161,9 +161,9 @@ class Draw:
 class PrescribedEpisodes:
     """The tests of a shells campaign.
 
-    Each stratum's cut-ins are taken in a random order that is fixed by the campaign's seed: within a shell without
+    Each stratum's events are taken in a random order that is fixed by the campaign's seed: within a shell without
     replacement. In a stratum of several shells the shell is drawn first, by its probability; the order ends where a
-    shell has no cut-in left.
+    shell has no event left.
     """
 
     def __init__(self, resolved: Resolved, pool: Pool) -> None:
@@ -183,7 +183,7 @@ class PrescribedEpisodes:
         return np.array(self.design.available, np.int64)
 
     def pilot(self, n: int, seed: int) -> Traffic:
-        """Some n cut-ins to learn the vehicle from: half of them inside the boundary, half evenly of shells beyond.
+        """Some n events to learn the vehicle from: half of them inside the boundary, half evenly of shells beyond.
 
         Inside they are drawn by probability.
         """
@@ -196,7 +196,7 @@ class PrescribedEpisodes:
         return self.of_rows(rows, np.zeros(rows.size, np.int64))
 
     def rows(self, draws: tuple[Draw, ...]) -> tuple[IntArray, IntArray]:
-        """Rows of the pool's cut-ins, and their strata, shape (n,) each; IndexError beyond what a stratum allows."""
+        """Rows of the pool's events, and their strata, shape (n,) each; IndexError beyond what a stratum allows."""
         for draw in draws:
             allowed, asked = self.design.available[draw.stratum], draw.first + draw.n
             if asked > allowed:
@@ -205,19 +205,19 @@ class PrescribedEpisodes:
         return np.concatenate(rows), np.repeat([draw.stratum for draw in draws], [draw.n for draw in draws])
 
     def tests(self, draws: tuple[Draw, ...]) -> tuple[Traffic, PrescribedEvents]:
-        """Tests (n,), and which cut-ins they are."""
+        """Tests (n,), and which events they are."""
         rows, stratum = self.rows(draws)
         return self.of_rows(rows, stratum), self.events(rows)
 
     def events(self, rows: IntArray) -> PrescribedEvents:
-        """What records say of given cut-ins of the pool (n,)."""
+        """What records say of given events of the pool (n,)."""
         joined = np.eye(len(self.design.cell_stratum) + 1)[self._cells, :-1]  # the last row is for what is not tested
         c, mass = self._kept, self._kept.path_mass[rows] @ joined
         acts = slice(None) if self.design.shadow_runs else slice(0)
         return PrescribedEvents(rows, self._cells[c.cell[rows]], mass, c.row[rows[acts]], c.mass[rows[acts]])
 
     def of_rows(self, rows: IntArray, stratum: IntArray) -> Traffic:
-        """Tests of given cut-ins of the pool (n,), for given strata (n,)."""
+        """Tests of given events of the pool (n,), for given strata (n,)."""
         c, resolved = self._kept, self._resolved
         chosen = Chosen(c.facts[rows], c.at[rows], c.lead[rows])
         script = resolved.family.script(resolved.environment, chosen)
@@ -229,7 +229,7 @@ class PrescribedEpisodes:
 
 
 def _order(pool: Pool, group: list[int], seed: int, stratum: int) -> IntArray:
-    """Rows of the pool's cut-ins in the order in which a stratum, made of a group of shells, takes them."""
+    """Rows of the pool's events in the order in which a stratum, made of a group of shells, takes them."""
     rng = np.random.Generator(np.random.Philox(key=np.array([seed, stratum], np.uint64)))
     rows = [rng.permutation(np.flatnonzero(pool.shell == s)) for s in group]
     if len(rows) == 1:

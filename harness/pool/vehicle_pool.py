@@ -1,12 +1,12 @@
-"""The pool of one vehicle that acts before the cut-in: paths that it walks itself, and surrogates that take over.
+"""The pool of one vehicle that acts before the event: paths that it walks itself, and surrogates that take over.
 
 LV's and BV's motion does not depend on the AV, and so neither does the choice of paths: a path's weight is known before
 the vehicle has moved. Candidates are aimed paths of the pool, walked in the twin beside an AV that holds its speed;
 paths are drawn from them with replacement, by how much they contribute to the surrogates' crash rates, with a share
 that is drawn evenly and bounds every weight.
 
-Along each path the vehicle is then driven once without a cut-in, its *baseline run*. Where it was says how probable a
-cut-in was in each step. Surrogates take over from it after the step of the cut-in, in which it still does what it did.
+Along each path the vehicle is then driven once without an event, its *baseline run*. Where it was says how probable an
+event was in each step. Surrogates take over from it after the step of the event, in which it still does what it did.
 So shells, their probabilities and their moments are those of this vehicle; allocation and estimates stay what they are.
 """
 
@@ -151,14 +151,14 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded, learn
 
     A surrogate that was ``learned`` from it has a shell beyond the boundary, if a share of its crashes lies there.
 
-    Raises `HarnessError`: no cut-in was found on which even the envelope crashes.
+    Raises `HarnessError`: no event was found on which even the envelope crashes.
     """
     environment, library = resolved.environment, resolved.library
     followers = library.followers(resolved.family.shows(environment))
     found = resolved.family.events(environment, paths.seed, paths.paths, followers, runs)
     if not found.crashes.any():
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""
-        none = f"no cut-in on {len(paths):,} paths{failed} after which even the most careless surrogate would crash"
+        none = f"no event on {len(paths):,} paths{failed} after which even the most careless surrogate would crash"
         mend = (
             "Raise pool.shadow_paths, use testing.method forced, or see whether the vehicle moves (`harness av-check`)."
         )
@@ -183,7 +183,7 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded, learn
     pool = pool_of(resolved.family, enumerated, paths.seed, order, *made_of)
     hashes = motion_hashes(runs.x_m, runs.v_mps)
     row, step, onset = pool.events.row, pool.events.step, pool.events.onset
-    # A kept cut-in stands for its like nearby, too, where these are too improbable to be kept one by one.
+    # A kept event stands for its like nearby, too, where these are too improbable to be kept one by one.
     least = pool.shell_p[pool.shell] * (len(paths) / np.bincount(pool.shell)[pool.shell])
     events = replace(pool.events, motion=hashes[row, onset], mass=np.maximum(mass[row, step], least))
     return replace(pool, events=events, p_after_failure=float((found.after_failure * paths.weight).mean()))

@@ -217,8 +217,8 @@ def damaged(path: Path, error: Exception, mend: str = MEND_PART) -> RunFolderErr
 
 def no_episodes(folder: Path) -> RunFolderError:
     """What to say of a run that was ended before its first shard was finished."""
-    found = "a run that has not finished an episode yet"
-    return RunFolderError(str(folder), found, "episodes on record", "Let `harness run` go on with --resume.")
+    found = "a run that has not finished a test yet"
+    return RunFolderError(str(folder), found, "tests on record", "Let `harness run` go on with --resume.")
 
 
 StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "pool_error", "sum"]

@@ -62,11 +62,11 @@ def episodes_schema(
     ]
     return pa.schema(
         [
-            _field("episode", _I8, "1", "index of the episode in the campaign"),
+            _field("episode", _I8, "1", "number of the test in the campaign"),
             _field("seed", _I8, "1", "campaign seed; with the index it determines every random number"),
             *_facts(columns),
             _field("outcome", _NAME, "", "crash, passed, timeout, bv_lv_contact or failed"),
-            _field("n_steps", _I2, "0.1 s", "steps simulated until the episode ended"),
+            _field("n_steps", _I2, "0.1 s", "steps simulated until the test ended"),
             _or_null("event_step", _I2, "0.1 s", "step in which BV cut in, null without one"),
             _or_null("event_gap_m", _F8, "m", "R2 at the cut-in decision"),
             _or_null("event_rate_mps", _F8, "m/s", "R2dot at the cut-in decision"),
@@ -75,7 +75,7 @@ def episodes_schema(
             _or_null("crash_time_s", _F8, "s", "time of the crash"),
             _or_null("impact_speed_mps", _F8, "m/s", "v_AV - v_BV at the crash"),
             _or_null("min_ttc_s", _F8, "s", "smallest R2/-R2dot after the cut-in while closing"),
-            _field("av_distance_m", _F8, "m", "distance that the AV drove in the episode"),
+            _field("av_distance_m", _F8, "m", "distance that the AV drove in the test"),
             _field("n_control_steps", _I2, "1", "stratum l: steps drawn from an importance function"),
             _field("component", _I1, "1", "importance function drawn (episode mixture), or shell, else -1"),
             _field("log_weight", _F8, "1", "log p(x_c) - log q_sampled(x_c), 0 without control; of shells log p_s"),
@@ -86,7 +86,7 @@ def episodes_schema(
             *(of_shells if n_cells else ()),
             *(of_baseline_runs if acts else ()),
             *(_lateral_fields() if shows else ()),
-            _or_null("failure", pa.string(), "", "cause, for failed episodes"),
+            _or_null("failure", pa.string(), "", "cause, for failed tests"),
         ]
     )
 

@@ -21,7 +21,7 @@ IN_WORDS = {
     "us_per_step": "time per step, µs",
     "episodes_per_s": "tests per second",
     "construction_s": "time that its constructor takes, median, s",
-    "constructions": "times that each worker of a run calls it",
+    "constructions": "calls of its constructor in each worker of a run",
 }
 FOLLOWING = {
     "headway_s": "headway at the onset, median, s",
@@ -30,12 +30,12 @@ FOLLOWING = {
     "n_hit": "tests in which it hit the vehicle ahead before",
 }
 CAUSES: dict[Cause, str] = {
-    "remembers": "It differs after another episode: it remembers the last one. Set all its state in start.",
+    "remembers": "It differs after another test: it remembers the last one. Set all its state in start.",
     "shares": "It differs beside other vehicles: they share something. Keep state in self, not in the class or module.",
-    "random": "It differs also when nothing does: random numbers of its own (random, numpy.random), or a variable of "
-    "its module or class that outlives the object. Draw from episode.random; keep state in self.",
+    "random": "It differs although all else is equal: random numbers of its own (random, numpy.random), or a variable "
+    "of its module or class that outlives the object. Draw from episode.random in start; keep state in self.",
     "process": "It differs from process to process: random numbers of its own (random, numpy.random), the number of "
-    "the process, hash() of a text (the order of a set), or an id(). Draw from episode.random.",
+    "the process, hash() of a text (the order of a set), or an id(). Draw from episode.random in start.",
     "clock": "It depends on the clock ({}): a test may run at any speed. Use time_s of what it sees, or step_s.",
 }
 
@@ -46,7 +46,7 @@ def verdict(found: AvCheck) -> str:
     if found.failures:
         return f"NOT READY: {sum(found.failures.values())} of {n} tests failed: {next(iter(found.failures))}."
     if found.differing:
-        return f"NOT REPRODUCIBLE: {len(found.differing)} of {n} tests came out otherwise. {cause(found)}"
+        return f"NOT REPRODUCIBLE: {len(found.differing)} of {n} tests differed when run again. {cause(found)}"
     if not seen.n_events or not seen.braking_share > 0.0:
         return f"LOOK AGAIN: it braked after none of {seen.n_events} {found.events}. Does it see the other vehicle?"
     if found.follows is not None and found.follows.n_hit:
@@ -66,8 +66,8 @@ def verdict(found: AvCheck) -> str:
         )
     return (
         f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
-        f"{found.events}, {seen.reaction_s:.1f} s after they began (median, also where no need was sooner); "
-        f"a step takes {slower:.1f} times that of IDM.{advice}"
+        f"{found.events}, {seen.reaction_s:.1f} s after they began (median; some leave time to wait); "
+        f"a step takes {slower:.1f} times as long as IDM’s.{advice}"
     )
 
 
@@ -89,12 +89,12 @@ def rows(found: AvCheck) -> list[dict[str, Any]]:
         ("kind of vehicle, engine, method", f"{found.source}, {found.engine}, {found.method}, {kind}", ""),
         ("tests", found.n_episodes, ""),
         *((f"failed: {why}", n, "") for why, n in (told["failures"] or {"none": 0}).items()),
-        ("tests that came out otherwise", told["differing"] or "none", ""),
+        ("tests that differed when run again", told["differing"] or "none", ""),
         ("accelerations allowed, m/s²", [*told["limits_mps2"]], ""),
         *((text.format(events=found.events), own[name], idm[name]) for name, text in IN_WORDS.items()),
         *((text, told["follows"][name], told["idm_follows"][name]) for name, text in of_following.items()),
         *(
-            (f"its first answer with a warm-up of {s:g} s moves by up to, m/s²", moved, "")
+            (f"change of its first answer by a warm-up of {s:g} s, at most, m/s²", moved, "")
             for s, moved in found.moved_mps2.items()
         ),
     ]

@@ -9,7 +9,7 @@ from typing import Any
 from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
-from harness.report.words import ENDED, milder_words
+from harness.report.words import ENDED, milder_words, scope_words
 
 
 def called(family: str) -> str:
@@ -24,7 +24,7 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
     head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", duration(content["wall_time_s"])]
     rows = [row for row in (decided(content), *sum_rows(content), *(reading_rows(content) if readings else ())) if row]
     ends = [] if report is None else [f"  report  {report}"]
-    parts = columns([row[1:] for row in family_rows(content)])
+    parts = columns([(row[1], f"{row[2]} of crashes", *row[3:]) for row in family_rows(content)])
     under = wrapped([*milder(content), exposures(content), scope(content)])
     return [" · ".join(head), *columns(rows), *parts, *under, *ends]
 
@@ -53,12 +53,12 @@ def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool) -> tuple[str, ...]:
     """The rate beside a reading of that driver, where crashes were ``seen`` or none: name, ratio, interval, remark."""
     if beside["ratio"] is None:
-        return name, "no ratio", "", "such a driver never crashes here"
+        return name, "no ratio", "", "that driver never crashes here"
     low, high = beside["ratio_low"], beside["ratio_high"]
     apart = "not told apart" if high is None or low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
     most = "no limit" if high is None else ratio(high)
     ends = beside["over_assumed"]
-    over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed exposures"
+    over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed ranges"
     value = f"{ratio(beside['ratio'])} ({apart})" if seen else f"< {most}"
     return name, value, f"{ratio(low)} to {most}", over
 
@@ -96,7 +96,7 @@ def exposures(content: Mapping[str, Any]) -> str:
         ends = "" if found["low"] == found["high"] else f" ({_short(found['low'])}–{_short(found['high'])})"
         kind = "counted" if found["counted"] else "given" if found["source"] == "given" else "assumed"
         told.setdefault(kind, []).append(f"{called(name)} {_short(found['per_hour'])}{ends}")
-    return "events per hour, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
+    return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
 
 
 def between(low: float, high: float | None) -> str:
@@ -115,7 +115,6 @@ def scope(content: Mapping[str, Any]) -> str:
     ended, target = ENDED.get(content["stopped_by"] or "", "interrupted"), content["asked_rhw"]
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
-        reached = "" if rhw is None else f" ± {share(rhw)}"
-        ended += f"{reached}, asked: ± {share(target)}"
-    counted = ", and counts of exposures," if content["counts_in_interval"] else ""
-    return f"sampling error{counted} in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"
+        ended += f"{'' if rhw is None else f', at ± {share(rhw)}'} (asked: ± {share(target)})"
+    counted = ", and that of counted events," if content["counts_in_interval"] else ""
+    return scope_words(content["confidence"], ended, counted)

@@ -9,7 +9,7 @@ from typing import Any
 
 from harness.numbers import count, duration, interval, number, plain, ratio, share
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
-from harness.report.words import ENDED, ShortAnswer
+from harness.report.words import ENDED, ShortAnswer, scope_words
 
 WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
@@ -33,6 +33,16 @@ def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None 
         head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
     table = columns([row.texts for row in rows])
     return [" · ".join(head), *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+
+
+def estimate_lines(content: Mapping[str, Any]) -> list[str]:
+    """The estimators of ``estimates.json``, a line each; those that its records do not allow are not named."""
+    head = f"{content['campaign']}: {count(content['n_crashes'])} crashes in {count(content['n_episodes'])} tests"
+    found = {name: each for name, each in content["estimates"].items() if each["crash_rate"] is not None}
+    rows = [
+        (name, interval(each.get("ci_low"), each.get("ci_high"), each["crash_rate"])) for name, each in found.items()
+    ]
+    return [f"{head}; crash rate per test ({share(content['confidence'])})", *(columns(rows) if rows else ())]
 
 
 def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -71,14 +81,13 @@ def pair_lines(
     if asked["ratio"] is not None:
         most = "no limit" if asked["ratio_high"] is None else ratio(asked["ratio_high"])
         rows.append(("A / B", ratio(asked["ratio"]), f"{ratio(asked['ratio_low'])} to {most}", ""))
-    alone = f"A alone {count(asked['n_only_a'])}, B alone {count(asked['n_only_b'])}"
+    alone = f"only A crashed in {count(asked['n_only_a'])} pairs, only B in {count(asked['n_only_b'])}"
     rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), alone))
     remarks = [f"! {text}" for text in pair_warnings(content)]
     if asked is not content:
-        given = f"A / B and A − B are given that both crash only where {asked['boundary']} of the library does"
+        given = f"A / B and A − B assume that both crash only where {asked['boundary']} of the library does"
         remarks.insert(0, given)
-    ended = ENDED.get(content.get("ended", ""), "interrupted")
-    scope = f"sampling error in this simulated traffic only ({share(content['confidence'])}); ended by: {ended}"
+    scope = scope_words(content["confidence"], ENDED.get(content.get("ended", ""), "interrupted"))
     counted = f" above {plain(counts_above_mps)} m/s" if counts_above_mps else ""
     pairs = f"{count(content['n_pairs'])} pairs of tests"
     head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per test"

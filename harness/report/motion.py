@@ -13,10 +13,11 @@ from harness.arguments import checked
 from harness.errors import HarnessError
 from harness.files import write_atomically
 from harness.report.player import write_player
+from harness.report.sumo_files import write_floating_car_data, write_sumo
 from harness.runner.stored import ReplayResult
 from harness.vehicles.kinematics import STEP_S
 
-SUFFIXES = ".html", ".csv", ".xosc"
+SUFFIXES = ".html", ".csv", ".xosc", ".xml", ".sumocfg"
 
 
 @checked("harness.write_motion")
@@ -30,21 +31,25 @@ def write_motion(result: ReplayResult, file: str | Path) -> Sequence[Path]:
     file : str or Path
         ``.html`` is a page that plays it; ``.csv`` has a row for each vehicle and step, with units in the columns'
         names; ``.xosc`` is OpenSCENARIO XML 1.2 (extra ``harness[export]``), with its OpenDRIVE road beside it
-        (``.xodr``).
+        (``.xodr``); ``.xml`` is SUMO's floating car data; ``.sumocfg`` runs in SUMO, with the files that it names
+        beside it.
 
     Raises `HarnessError`: the name has another suffix, or the extra is missing.
     """
     file = Path(file)
-    writer_of(file)(result, file)
-    return (file, file.with_suffix(".xodr")) if file.suffix == ".xosc" else (file,)
+    return writer_of(file)(result, file) or [file]
 
 
-def writer_of(file: Path) -> Callable[[ReplayResult, Path], None]:
-    """What writes files of this name; raises as `write_motion` does."""
+def writer_of(file: Path) -> Callable[[ReplayResult, Path], list[Path] | None]:
+    """What writes files of this name, and returns them if they are several; raises as `write_motion` does."""
     if file.suffix == ".html":
         return lambda result, file: write_player(result.scene, file)
     if file.suffix == ".csv":
         return _write_csv
+    if file.suffix == ".xml":
+        return lambda result, file: write_floating_car_data(result.trace, file)
+    if file.suffix == ".sumocfg":
+        return write_sumo
     if file.suffix != ".xosc":
         found = f"a name that ends in '{file.suffix}'" if file.suffix else "a name without a suffix"
         expected, mend = f"one that ends in {', '.join(SUFFIXES)}", f"Write {file.with_suffix('.html')}, say."

@@ -34,7 +34,7 @@ BOUNDS: Mapping[BoundKind, str] = {
 CAPS: Mapping[CapKind, str] = {
     "design": "the weight cap known by design",
     "tests": "the largest weight that the tests driven could have had",
-    "seen_events": "the largest weight seen among episodes with a cut-in (no cap is known)",
+    "seen_events": "the largest weight seen among tests with a cut-in (no cap is known)",
     "seen": "the largest weight seen (no cap is known)",
     "none": "no cap",
 }
@@ -42,7 +42,7 @@ CAPS: Mapping[CapKind, str] = {
 _MAY_BE_ABOVE = "the true rate may lie far above this interval"
 _DRAWN_BY = "; these were drawn by {method}"
 NOTES = {
-    "failed": "{n} of {of} episodes failed; the rate and the lower limit count them as no crash, the upper limits as "
+    "failed": "{n} of {of} tests failed; the rate and the lower limit count them as no crash, the upper limits as "
     "crashes",
     # cautions: why an interval may be wrong
     "contradicts_design": "the records contradict the campaign: a crash weighs {weight:.6g}, more than the design's "
@@ -66,6 +66,9 @@ NOTES = {
     "by {by:.3g}, farther than the interval reaches: only more tests can rule that out",
     "plain_width": "fewer than {least:.0f} effective crashes: the interval is as wide as that of the plain mean of "
     "weighted crashes",
+    "due_not_drawn": "on some paths surrogates predict crashes of large weight that were not drawn: tests vary "
+    "{times:.2g} times as much as their crashes show, and the rate of `nade` is too low, or its interval too narrow. "
+    "Use shells",
     "saturated": "{n} of {of} strata are saturated (l = {levels:first}): with as many independent columns as tests, "
     "less one, any results are fitted. The gain claimed in all is {claimed:.3g}, and {corrected:.3g} with degrees of "
     "freedom",
@@ -87,7 +90,7 @@ NOTES = {
     "needs_tests": "needs {least:,} tests, as with fewer ({n:,}) its intervals miss too often",
     "needs_scv": "is defined for the step mixture ([paper] section III-C)" + _DRAWN_BY,
     "needs_shells": "tests must be drawn from shells (testing.method shells)" + _DRAWN_BY,
-    "needs_moments": "needs the control steps of every episode: set records.moments to first_9 or all",
+    "needs_moments": "needs the control steps of every test: set records.moments to first_9 or all",
     # what a stop rule waits for
     "rhw": "stop.rhw ({target:g})",
     "rhw_of_difference": "stop.rhw ({target:g}, of the difference)",

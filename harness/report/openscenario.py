@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from scenariogeneration import xodr, xosc
 
 from harness.files import write_atomically
-from harness.report.player import LANE_M, share_over
+from harness.report.player import LANE_M, share_over, tracks_of
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 WIDTH_M, HEIGHT_M = 1.9, 1.5
@@ -28,11 +27,10 @@ AHEAD_M = 200.0
 """Road beyond the last position."""
 
 
-def write_openscenario(trace: pa.Table, file: Path) -> None:
+def write_openscenario(trace: pa.Table, file: Path) -> list[Path]:
     """Write the trace of an episode as ``file`` (.xosc), and its road beside it (.xodr)."""
     roads, init, entities = file.with_suffix(".xodr"), xosc.Init(), xosc.Entities()
-    names = dict.fromkeys(trace.column("vehicle").cast(pa.string()).to_pylist())
-    tracks = {name: trace.filter(pc.equal(trace.column("vehicle").cast(pa.string()), name)) for name in names}
+    tracks = tracks_of(trace)
     story = xosc.StoryBoard(init, _at((len(tracks["AV"]) - 1) * STEP_S, "stop"))
     for name, track in tracks.items():
         positions = _positions(track)
@@ -54,6 +52,7 @@ def write_openscenario(trace: pa.Table, file: Path) -> None:
     )  # fmt: skip
     write_atomically(roads, lambda unfinished: network.write_xml(str(unfinished)))
     write_atomically(file, lambda unfinished: scenario.write_xml(str(unfinished)))
+    return [file, roads]
 
 
 def _positions(track: pa.Table) -> list[xosc.WorldPosition]:

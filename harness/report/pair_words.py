@@ -39,13 +39,13 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     if content["decision"]["verdict"] != "open":
         return None
     if (needed := content["to_decide"]) is None:
-        return "no number of pairs is known that would decide: as far as was seen, they are too much alike"
+        return "how many pairs would decide is not known: so far the two are too alike"
     where, done = (" and a new --out", 0) if needed["new_folder"] else ("", content["n_pairs"])
     n = two_digits_up(needed["pairs"] - done)
     cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
     settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
     options = f"--margin {content['decision']['margin']:g}{settings}"
-    return f"to decide, give the same command with {options}{where}: some {count(n)} more pairs{cost}"
+    return f"to decide, repeat the command with {options}{where}: some {count(n)} more pairs{cost}"
 
 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -6,7 +6,7 @@
   const COLOURS = { LV: "green", BV: "vermillion", SV: "vermillion", POV: "vermillion", AV: "blue", "r157-cc": "reference", "brakes-8": "muted" };
   Object.assign(COLOURS, { A: "blue", B: "reference" });
   const SPEEDS = [0.1, 0.25, 0.5, 1], TICKS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200];
-  const COLUMNS = ["", "speed", "acceleration", "gap to", "closing", "time to collision"];
+  const COLUMNS = ["vehicle", "speed, m/s", "acceleration, m/s²", "gap to ", "closing, m/s", "time to collision, s"];
   const STAR = "M0-15 3.5-5 12-10 6-1 15 3 5 5 6 14 0 7-6 14-5 5-15 3-6-1-12-10-3.5-5Z";
   const SVG = document.querySelector(".player svg").namespaceURI;
 
@@ -22,7 +22,7 @@
   const show = (element, shown) => element.classList.toggle("off", !shown);
   const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
   const minus = (text) => text.replace("-", "−");
-  const tenths = (value, unit) => minus(`${(Math.abs(value) < 0.05 ? 0 : value).toFixed(1)} ${unit}`);
+  const tenths = (value) => minus((Math.abs(value) < 0.05 ? 0 : value).toFixed(1));
 
   function play(root) {
     const scenes = JSON.parse(root.querySelector("script").textContent);
@@ -39,6 +39,7 @@
     speed.value = 0.25;
     const [jumps, curves, scroll] = ["jumps", "curves", "scroll"].map((name) => add(root, "div", { class: name }));
     const table = add(scroll, "table", { class: "now" });
+    scroll.tabIndex = 0;
     const facts = add(root, "dl", { class: "told" });
 
     // -- what a scene holds --
@@ -81,7 +82,7 @@
       for (const fact of scene.facts) fact.forEach((text, i) => add(facts, i ? "dd" : "dt", {}, text));
       const head = add(add(table, "thead"), "tr"), body = add(table, "tbody");
       for (const each of COLUMNS) {
-        add(head, "th", { scope: "col" }, each === "gap to" ? `gap to ${main.name}` : each);
+        add(head, "th", { scope: "col" }, each === "gap to " ? `${each}${main.name}, m` : each);
       }
       cells = [tracks.AV, ...others, main, ...ahead].map((track) => {
         const row = add(body, "tr");
@@ -100,8 +101,8 @@
         if (time <= last(tracks.AV)) front = Math.max(front, gap(tracks.AV, time));
         for (const each of others) if (time <= last(each)) behind = Math.max(behind, camera(time) - at(each, time).x);
       }
-      scale = width / clamp(front + behind + 2 * LENGTH + 8, 40, 100);
-      anchor = Math.min((behind + LENGTH + 3) * scale, width / 2);
+      scale = width / clamp(front + behind + 2 * LENGTH + 8, 40, clamp(width / 4.6, 40, 100));
+      anchor = Math.min((behind + LENGTH + 3) * scale, width * (width < 640 ? 0.36 : 0.5));
       const [lane, w, l] = [LANE, WIDTH, LENGTH].map((each) => each * scale);
       const top = 18, low = top + 2 * lane, height = low + 36;
       view.replaceChildren();
@@ -132,13 +133,20 @@
     }
 
     function chart(name, lines, value, least = null) {
-      const w = curves.clientWidth > 700 ? curves.clientWidth / 2 - 12 : curves.clientWidth || 320, h = 190;
-      const left = 34, right = w - 8, top = 40, bottom = h - 22;
+      const w = curves.clientWidth > 700 ? curves.clientWidth / 2 - 12 : curves.clientWidth || 320;
+      const left = 34, right = w - 8;
+      const X = (time) => left + ((time - first) / (end - first)) * (right - left), rows = [];
+      const moments = [...scene.moments].reverse().map(([moment, what]) => {  // each name in the lowest row with room
+        const x = X(moment * STEP), from = clamp(x - 3, left, right - 6 * what.length);
+        const row = [...rows, w].findIndex((taken) => from + 6 * what.length < taken);
+        rows[row] = from;
+        return { x, from, row, what };
+      });
+      const top = 21 + 11 * rows.length, bottom = top + 128, h = bottom + 22;
       const box = add(curves, "svg", { viewBox: `0 0 ${w} ${h}`, height: h, role: "img", "aria-label": name });
       const points = (track) => track.x.map((_, i) => [first + i * STEP, value(track, first + i * STEP)]);
       const values = lines.flatMap(points).map((point) => point[1]), high = Math.max(...values) + 0.5;
       const low = least ?? Math.min(...values) - 0.5;
-      const X = (time) => left + ((time - first) / (end - first)) * (right - left);
       const Y = (v) => bottom - ((v - low) / (high - low)) * (bottom - top);
       const [step, seconds] = [(high - low) / 5, ((end - first) * 55) / w].map((n) => TICKS.find((each) => each >= n));
       add(box, "text", { class: "head", x: left, y: 12 }, name);
@@ -150,11 +158,10 @@
         const unit = s + seconds > end + NEAR ? " s" : "", place = X(s) > right - 12 ? "end" : "middle";
         add(box, "text", { class: "tick", x: X(s), y: h - 6, "text-anchor": place }, +s.toFixed(1) + unit);
       }
-      scene.moments.forEach(([moment, what], i) => {
-        const x = X(moment * STEP);
-        add(box, "line", { class: "moment", x1: x, x2: x, y1: top - 2, y2: bottom });
-        add(box, "text", { class: "tick", x: Math.min(x - 3, right - 30), y: top - 6 - 11 * (i % 2) }, what);
-      });
+      for (const { x, from, row, what } of moments) {
+        add(box, "line", { class: "moment", x1: x, x2: x, y1: top - 2 - 11 * row, y2: bottom });
+        add(box, "text", { class: "tick", x: from, y: top - 6 - 11 * row }, what);
+      }
       const dots = lines.map((track) => {
         const d = points(track).map(([time, v], i) => `${i ? "L" : "M"}${X(time).toFixed(1)} ${Y(v).toFixed(1)}`);
         add(box, "path", { class: `curve${dashed(track)}`, style: colour(track), d: d.join("") });
@@ -181,6 +188,7 @@
       const { lane, top, low, middle, ruler, star } = road, eye = camera(t) - anchor / scale;
       set(middle, { "stroke-dashoffset": (eye % 12) * scale });
       set(ruler, { "stroke-dashoffset": (eye % 10) * scale });
+      let ends = width - 6;
       for (const { track, ghost, group, lights, label } of moving) {
         const now = at(track, t), x = (now.x - eye) * scale, rear = x - LENGTH * scale;
         const y = top + lane * (0.5 + sideways(track));
@@ -193,8 +201,9 @@
         show(label, seen && (ghost >= 0 || beyond));
         const name = `${x < 8 ? "◂ " : ""}${called(track)}${crashed ? " crashed" : ""}`;
         label.textContent = beyond ? `${name} ${far} m ▸` : name;
-        const height = ghost >= 0 ? low + 18 + 14 * ghost : sideways(track) < 0.5 ? top - 5 : y + 11;
-        const from = beyond ? width - 6 : clamp(rear, 4, width - 130);
+        const aside = beyond && ghost < 0, edge = aside ? ends : width - 6, from = beyond ? edge : clamp(rear, 4, width - 130);
+        const height = ghost >= 0 ? low + 18 + 14 * ghost : top - 5;
+        if (aside && seen) ends -= 9 * label.textContent.length;
         set(label, { x: from, y: height, "text-anchor": beyond ? "end" : "start" });
       }
       const hit = `${(at(tracks.AV, t).x - eye) * scale} ${top + 1.5 * lane}`;
@@ -204,9 +213,9 @@
       slider.value = Math.round(t / STEP);
       for (const [track, boxes] of cells) {
         const now = at(track, t), closing = now.v - at(main, t).v, room = gap(track, t), on = there(track);
-        const texts = on ? [tenths(now.v, "m/s"), tenths(now.a, "m/s²")] : [];
-        if (on && (track === tracks.AV || others.includes(track))) texts.push(tenths(room, "m"), tenths(closing, "m/s"));
-        if (texts.length > 2 && closing > 0.05 && room > 0) texts.push(tenths(room / closing, "s"));
+        const texts = on ? [tenths(now.v), tenths(now.a)] : [];
+        if (on && (track === tracks.AV || others.includes(track))) texts.push(tenths(room), tenths(closing));
+        if (texts.length > 2 && closing > 0.05 && room > 0) texts.push(tenths(room / closing));
         boxes.forEach((box, i) => { box.textContent = texts[i] ?? "–"; });
       }
       for (const each of charts) each();
@@ -246,7 +255,7 @@
     };
     button.onclick = keys[" "];
     slider.oninput = () => go(slider.value * STEP, true);
-    add(pick, "span", { class: "small" }, "Crash in episode");
+    add(pick, "span", { class: "small" }, "Crash in test");
     if (scenes.length < 2) pick.remove();
     scenes.forEach((each, i) => { add(pick, "button", { title: each.title }, each.episode).onclick = () => load(i); });
     document.addEventListener("click", ({ target }) => target.dataset.scene && load(+target.dataset.scene));

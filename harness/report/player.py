@@ -95,7 +95,7 @@ class Scenes:
         bv, av = tracks[self._family.principal], tracks[-1]
         last = av["x"].size - 1
         av["crash"] = last if outcome == "crash" else None
-        first, onset, ghosts = 0, None, list[Scene]()
+        first, onset, ghosts, seen = 0, None, list[Scene](), list[tuple[int, str]]()
         if cut is not None and cut < last:
             chosen = chosen_from(row, self._family)
             known = self._environment is not None
@@ -105,6 +105,9 @@ class Scenes:
             first = max(min(onset - BEFORE, last - FEWEST), 0)
             if self._environment is not None:
                 ghosts = self._ghosts(self._environment, row, trace, onset, bv, av)
+                from_step = self._family.script(self._environment, chosen).visible_from[0].tolist()
+                hidden = zip(from_step, self._family.vehicles, strict=False)
+                seen = [(step, f"{name} becomes visible") for step, name in hidden if 0 < step <= last]
         for each in (*tracks, *ghosts):
             each |= {key: each[key][first:] for key in "xv"}
             each["brakes"] = _brakes(each["v"], first)
@@ -113,10 +116,10 @@ class Scenes:
             each["over"] = over if (over != over[0]).any() else over[:1]
         words = self._family.words
         moments = [(cut, " ".join(words.happens)), (av["brakes"], "AV brakes"), (av["crash"], "crash")]
-        moments += [(onset, " ".join(words.shows))] if onset != cut else []
+        moments += [*seen, (onset, " ".join(words.shows))] if onset != cut else seen
         scene = {
             "campaign": self._name, "scenario": self._family.name, "episode": episode,
-            "title": f"Episode {episode:,}: {why or outcome}",
+            "title": f"Test {episode:,}: {why or outcome}",
             "first": first, "onset": onset, "event": cut, "principal": bv["name"],
             "apart": None if onset is None else first if self._family.follows else onset + 1,
             "tracks": tracks, "ghosts": ghosts,
@@ -208,6 +211,11 @@ def share_over(track: pa.Table) -> FloatArray:
         rest = max(over.size - overlap, math.ceil((LANE_M - at) / step) + 1)
         lateral_m = np.append(lateral_m[:overlap], at + step * np.arange(rest))
     return np.minimum(lateral_m / LANE_M, 1.0)
+
+
+def tracks_of(trace: pa.Table) -> dict[str, pa.Table]:
+    """The rows of each vehicle of an episode's trace."""
+    return {name: _of(trace, name) for name in dict.fromkeys(trace.column("vehicle").cast(pa.string()).to_pylist())}
 
 
 def _of(traces: pa.Table, vehicle: str) -> pa.Table:

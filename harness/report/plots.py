@@ -155,8 +155,8 @@ def shells_plot(found: ShownShells) -> Plot:
     orange = " (orange outside the boundary)" if (rate[~inside] > 0.0).any() else ""
     caption = (
         f"From careful (top) to careless. The rate: what each shell adds, with its limits{orange}. {source} The "
-        "uncertainty: probability × half-width of the crash share, and its share of the sum of squares, which makes "
-        f"the interval. {open_question}"
+        "uncertainty: how wide each shell alone would leave the interval; the per cent add up to the whole. "
+        f"{open_question}"
     )
     return Plot("shells", [left, right], alt, caption)
 
@@ -183,7 +183,7 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
     panel.add("line", "muted", [1.0, 1.0], [y.low, y.high], dash=DASHED, width=1.0)
     text = (
         "Fitted numbers move over nine tenths of what their data leave open, assumed ones over the stated range. "
-        f"The rate hangs most on {names[0]}: × {number(rate[0][0], 2)} to × {number(rate[1][0], 2)}; the ratio moves "
+        f"The rate depends most on {names[0]}: × {number(rate[0][0], 2)} to × {number(rate[1][0], 2)}; the ratio moves "
         f"by × {number(ratio[0][0], 3)} to × {number(ratio[1][0], 3)}."
     )
     return Plot("sensitivity", [panel], text, text)
@@ -203,7 +203,7 @@ def _open_question(found: ShownShells, names: tuple[str, ...], half_widths: list
     name, most = names[half_widths.index(widest)], share(found.share_of_uncertainty(widest))
     if name == POOL:
         return f"Most of what is not known is the pool’s own error ({most}): only a pool of more paths would narrow it."
-    return f"Most of what is not known lies in {name} ({most}): further tests do most there."
+    return f"Most of what is not known lies in {name} ({most}): further tests help most there."
 
 
 def where_plot(summary: RunSummary, family: Family, environment: Environment | None) -> Plot | None:

@@ -50,7 +50,7 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) ->
     from_below = wide and (best.is_open_above or (decision is not None and decision["verdict"] == "rejected"))
     unseen = assumed if assumed is not None and assumed.no_lower_limit else None
     less, shown, ends = "", best.crash_rate, interval(best.ci_low, best.ci_high)
-    seen = f"{number(best.crash_rate)} seen" if best.n_crashes else "no crash seen"
+    seen = f"estimate {number(best.crash_rate)}" if best.n_crashes else "no crash seen"
     if unseen is not None:
         less, shown, ends = "< ", unseen.most * high, f"{number(best.crash_rate)} as fitted"
         ends = ends if best.n_crashes else seen
@@ -68,11 +68,11 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) ->
     # Where little else is known of the rate than a limit, what is known comes first: the ratio.
     yield from reversed(rows) if unseen or (wide and beside and end(beside[0]["ratio_high"]) < 1.0) else rows
     if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
-        yield Row("ratio", "× competent driver", "no ratio", "", "such drivers never crash here")
+        yield Row("ratio", "× competent driver", "no ratio", "", "that driver never crashes here")
     if assumed is not None and assumed.highest is not None and assumed.times is not None:
         ends = "" if from_below else f"up to {number(assumed.most * high)}"
-        value = f"at most × {number(assumed.most, 2)} (assumed)"
-        yield Row("assumed", "traffic", value, ends, f"if {share(assumed.highest)} do not look")
+        value = f"up to {number(assumed.most, 2)} times"
+        yield Row("assumed", "in other traffic", value, ends, f"if {share(assumed.highest)} do not look behind")
     if campaign.has_baseline_runs and best.n_crashes:
         yield from width_row(campaign, best, manifest.get("expected"))
     if told.severity is not None:
@@ -89,16 +89,16 @@ def width_row(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | 
     which = "runs" if 2.0 * runs * runs > whole * whole else "tests"
     remark = "" if expected is None else f"try {count(expected['runs'])} runs, {count(expected['tests'])} tests"
     alone = f"{count(campaign.pool.shadow_paths)} baseline runs ± {share(runs)}"
-    yield Row("width", "half-width", f"± {share(whole)}, most by {which}", alone, remark)
+    yield Row("width", "precision", f"± {share(whole)}, mostly by {which}", alone, remark)
 
 
 def _severity(found: Severity, so_far: str) -> Iterator[Row]:
-    above = _share_within(found.share_above_5_mps, found.limits_above_5_mps, f" > {plain(HARD_MPS)} m/s")
-    below = _share_within(found.share_below_1_mps, found.limits_below_1_mps, f" < {plain(TOUCH_MPS)} m/s")
-    yield Row("impact", f"impact{so_far}", f"median {tenths(found.median_mps)} m/s", above, below)
+    above = _share_within(found.share_above_5_mps, found.limits_above_5_mps, f" above {plain(HARD_MPS)} m/s")
+    below = _share_within(found.share_below_1_mps, found.limits_below_1_mps, f" below {plain(TOUCH_MPS)} m/s")
+    yield Row("impact", f"impact speed{so_far}", f"median {tenths(found.median_mps)} m/s", above, below)
     # What a driver who brakes less hard does not avoid another one may.
     if (of := found.unavoidable) is not None and of.driver == _BRAKES_HARDEST:
-        ends, why = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}", "not even 8 m/s² avoids it"
+        ends, why = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}", "even by braking at 8 m/s²"
         yield Row("unavoidable", f"unavoidable{so_far}", f"{share(of.share)} of the rate", ends, why)
 
 
@@ -115,8 +115,8 @@ def _decided(decision: Mapping[str, Any]) -> Row:
     limit = f"{plain(decision['limit'])} × {driver}" if driver else f"{plain(decision['limit'])} per test"
     low, high = (ratio(decision[end]) if driver else number(decision[end]) for end in ("low", "high"))
     value, ends = {
-        "accepted": (f"below {limit}", f"upper limit {high}"),
-        "rejected": (f"above {limit}", f"lower limit {low}"),
+        "accepted": (f"rate below {limit}", f"at most {high}"),
+        "rejected": (f"rate above {limit}", f"at least {low}"),
     }.get(verdict, (f"limit {limit}", f"it may be {low} to {high}"))
     given = "" if decision["statement"] == ASSUMPTION_FREE else f", given {decision['statement']}"
     return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
@@ -124,15 +124,15 @@ def _decided(decision: Mapping[str, Any]) -> Row:
 
 def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: bool) -> Row:
     low, high, seen = found["ratio_low"], end(found["ratio_high"]), found["ratio"]
-    who = {"r157-cc": "beside r157-cc of UN R157"}.get(found["reference"], f"beside {found['reference']}")
+    who = {"r157-cc": "r157-cc, UN R157’s driver"}.get(found["reference"], found["reference"])
     if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
-        who = f"{found['reference']}, same approach"
+        who = f"{found['reference']}, from the same state"
     if not seen:
         value, ends = f"< {ratio(high)}", "no crash seen"
     elif wide and high < 1.0:
-        value, ends = f"< {ratio(high)} (crashes less)", f"{ratio(seen)} seen, ≥ {ratio(low)}"
+        value, ends = f"< {ratio(high)} (crashes less)", f"estimate {ratio(seen)}, ≥ {ratio(low)}"
     elif from_below and low > 1.0:
-        value, ends = f"> {ratio(low)} (crashes more)", f"{ratio(seen)} seen"
+        value, ends = f"> {ratio(low)} (crashes more)", f"estimate {ratio(seen)}"
     else:
         apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
         value = f"{ratio(seen)} ({apart})"
@@ -143,10 +143,10 @@ def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: boo
 def within(found: Mapping[str, Any]) -> Row:
     """What holds if the vehicle crashes only within the library's boundary, and whether it does."""
     n, outside = found["n_crashes_outside"], count(found["n_episodes_outside"])
-    what = f"keeping to {LIBRARY_STATEMENT}"
+    what = f"given the {LIBRARY_STATEMENT}"
     if found["refuted"]:
-        return Row("within", what, "does NOT keep to it", "", f"{count(n)} crashes in {outside} beyond it")
-    beyond = f"no crash in {outside} beyond it" if found["n_episodes_outside"] else "nothing tested beyond it"
+        return Row("within", what, "REFUTED", "", f"{count(n)} crashes in {outside} tests outside it")
+    beyond = f"no crash in {outside} tests outside it" if found["n_episodes_outside"] else "no tests outside it"
     if not found["n_crashes"]:
         return Row("within", what, f"< {number(found['ci_high'])}", "", beyond)
     return Row("within", what, number(found["crash_rate"]), interval(found["ci_low"], found["ci_high"]), beyond)

@@ -24,13 +24,13 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text[-1:] in ".!?" else ".")
 
 
-def templates() -> Environment:
-    """Templates of this package."""
+def templates(package: str = "harness.report") -> Environment:
+    """Templates of a package."""
     place = Path(__file__).parent
     css, more_css, script = (
         (place / name).read_text(encoding="utf-8") for name in ("report.css", "player.css", "player.js")
     )
-    loader = PackageLoader("harness.report", ".")
+    loader = PackageLoader(package, ".")
     found = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     # Our own files, of which the policy of the page lets this one script run, by its hash.

@@ -28,7 +28,7 @@ def with_traffic(rows: list[Row], found: TrafficError | None) -> list[Row]:
         limit, why = f"< {number(found.rate.both[1])} per test", f"none seen at {found.unseen.where}"
         for i, row in enumerate(rows):
             if row.key == "rate":
-                seen = f"{number(found.rate.value)} as fitted" if found.rate.value else row.interval
+                seen = f"as fitted {number(found.rate.value)}" if found.rate.value else row.interval
                 rows[i] = replace(row, value=limit, interval=seen, remark=why)
         rows = sorted(rows, key=lambda row: {"verdict": 0, "ratio": 1}.get(row.key, 2))
     place = 1 + max((i for i, row in enumerate(rows) if row.key in ("verdict", "rate", "ratio")), default=-1)
@@ -43,10 +43,9 @@ def traffic_rows(found: TrafficError) -> Iterator[Row]:
         why = f"{found.n_refused} of {found.n_replicates} replicates unlike what was tested"
     else:
         ends = interval(*both) if found.rate.times[0] > 0.0 else f"< {number(both[1])}"
-    yield Row("traffic", "traffic", f"{_times(found.rate)} (fitted)", ends, why)
+    yield Row("traffic", "error of the fit", _times(found.rate), ends, why)
     for name, each in list(found.ratios.items())[: 0 if found.is_open else 1]:
-        value, remark = f"{_times(each)} (fitted)", f"the ratio to {name}"
-        yield Row("traffic_ratio", "traffic, × driver", value, _of_ratio(each), remark)
+        yield Row("traffic_ratio", "the same, ratio", _times(each), _of_ratio(each), f"the ratio to {name}")
 
 
 def _of_ratio(of: Uncertain) -> str:
@@ -57,11 +56,11 @@ def _of_ratio(of: Uncertain) -> str:
 
 
 def _times(of: Uncertain) -> str:
-    """``× 0.6 … × 2.1``, or ``at most × 27``."""
+    """``0.6 to 2.1 times``, or ``up to 27 times``."""
     low, high = (number(end, 2 if end > 0.0 and abs(math.log(end)) > CLOSE else 3) for end in of.times)
     if of.times[0] > 0.0:
-        return f"× {low} … × {high}"
-    return f"at most × {high}" if math.isfinite(of.times[1]) else "no limit"
+        return f"{low} to {high} times"
+    return f"up to {high} times" if math.isfinite(of.times[1]) else "no limit"
 
 
 def bar_note(bar: Mapping[str, Any]) -> str:
@@ -76,6 +75,5 @@ def too_few(n_replicates: int, confidence: float) -> tuple[str, ...]:
     if n_replicates >= LEAST_REPLICATES:
         return ()
     least = math.ceil(2.0 / (1.0 - confidence) - 1e-9)
-    none = f" (a {share(confidence)} interval needs {least} at least)" if n_replicates < least else ""
-    limits = f"limits of what is not known of the traffic change with their number below {LEAST_REPLICATES}"
-    return (f"{n_replicates} replicates{none}: {limits}",)
+    none = f" (a {share(confidence)} interval needs at least {least})" if n_replicates < least else ""
+    return (f"only {n_replicates} replicates{none}: the error of the fit is rough below {LEAST_REPLICATES}",)

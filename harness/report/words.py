@@ -27,13 +27,13 @@ from harness.strata import ASSUMPTION_FREE
 CUT_OFF_SHARE = 0.2
 """Weight, relative to the rate, from which tests that were cut off are warned of, if the interval leaves them out."""
 ENDED = {
-    "rhw": "precision reached",
-    "below_reference": "far enough below the competent driver",
-    "accept": "decision reached",
-    "episodes": "budget spent",
+    "rhw": "precise enough",
+    "below_reference": "clearly below the competent driver",
+    "accept": "verdict reached",
+    "episodes": "budget of tests used up",
     "pool": "the pool has no further event that would narrow it",
     "pool_error": "the pool’s own error is too wide",
-    "sum": "the sum of all scenarios, which was asked for",
+    "sum": "with the sum of all scenarios",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
 
@@ -123,23 +123,26 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
     yield from map(note_words, best.cautions)
     repeated = manifest.get("repeated") or {}
     if n := len(repeated.get("differing", ())):
-        yield f"NOT REPRODUCIBLE: {count(n)} of {count(repeated['n_episodes'])} tests that ran twice came out otherwise"
+        of = count(repeated["n_episodes"])
+        yield f"NOT REPRODUCIBLE: {count(n)} of {of} tests that ran twice differed: see `harness av-check`"
     if n_failed := best.details["n_failed"]:
         had = number(best.details["crash_rate_if_failed_had_crashed"])
         of = count(best.n_episodes)
         yield f"{count(n_failed)} of {of} tests FAILED; had they all crashed, the rate would be {had}"
     if severity is not None and severity.share_below_1_mps > 0.5:
-        yield f"{share(severity.share_below_1_mps)} of this rate are touches below {plain(TOUCH_MPS)} m/s"
+        left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
+        part = share(severity.share_below_1_mps)
+        yield f"{part} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
     if assumed is not None and assumed.where and assumed.times is None:
         yield unseen_words(assumed.where)
     on_rate = told.decision is not None and not told.decision.get("driver")
     if on_rate and assumed is not None and assumed.no_lower_limit:
-        yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; ask --accept r157-cc"
+        yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; use --accept r157-cc"
     worst = best.crash_rate + (0.0 if severity is None else severity.cut_off)
     if worst > max((1.0 + CUT_OFF_SHARE) * best.crash_rate, best.ci_high):
-        yield f"time was up while it closed in: had all these tests crashed, {number(worst)} per test"
+        yield f"some tests ended while the vehicle was still closing in; had all crashed: {number(worst)} per test"
     if (level := campaign.environment.lane_change_level) != 1.0:
-        yield f"lane-change level {plain(level)}: never compare with rates of other levels"
+        yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
 
 
 def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> Iterator[str]:
@@ -147,11 +150,11 @@ def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Map
     if not manifest.get("events_show") or campaign.av.acts_before_event:
         return
     if campaign.av.source in ("sumo", "traci"):
-        yield "SUMO switches lanes in one step: this vehicle cannot see BV come over, as other drivers do"
+        yield "SUMO changes lanes in one step: this vehicle cannot see the other car (BV) coming over, as drivers can"
     elif counts.get("n_events") and not counts.get("n_took_over_early"):
-        yield "it did nothing until BV was on its lane, though it can see it come over some 2 s before: bv_lateral_m"
+        yield "it reacted only once the other car (BV) was in its lane; bv_lateral_m shows it some 2 s earlier"
     if (n := counts.get("n_asked_to_speed_up")) and campaign.av.model is None:  # of our own it is known
-        yield f"in {count(n)} tests it asked to speed up before BV was on its lane, and was held (av.takes_over)"
+        yield f"in {count(n)} tests it asked to speed up before BV was in its lane; its speed was held (av.takes_over)"
 
 
 def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> str:
@@ -162,13 +165,19 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
     if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept", "sum"):
         within = campaign.testing.shells.statement != ASSUMPTION_FREE and best.details.get("within")
         asked = end(within["rhw"]) if within else best.precision
-        reached = f" ± {share(asked)}" if asked <= WIDEST_RHW else f" at over ± {share(WIDEST_RHW)}"
+        reached = f", at ± {share(asked)}" if asked <= WIDEST_RHW else f", at over ± {share(WIDEST_RHW)}"
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
-        ended += f"{reached}, asked: ± {share(target)}{remedy_words(manifest.get('remedy'))}"
+        ended += f"{reached} (asked: ± {share(target)}){remedy_words(manifest.get('remedy'))}"
     elif stopped_by == "episodes" and campaign.accept is None:
         ended = "all tests done"
-    return f"sampling error in this simulated traffic only ({share(best.confidence)}); ended by: {ended}"
+    return scope_words(best.confidence, ended)
+
+
+def scope_words(confidence: float, ended: str, counted: str = "") -> str:
+    """What intervals cover, and why a run ended."""
+    covered = f"sampling error{counted} in this simulated traffic only"
+    return f"{share(confidence)} intervals cover {covered}; stopped: {ended}"
 
 
 def remedy_words(changes: Mapping[str, float | None] | None) -> str:
@@ -176,7 +185,7 @@ def remedy_words(changes: Mapping[str, float | None] | None) -> str:
     if changes is None:
         return ""
     if not changes:
-        return "; no pool gives as much: ask for a wider stop.rhw"
+        return "; no pool is large enough for that: raise stop.rhw"
     told = []
     for key, value in changes.items():
         way = "lower" if key == "pool.relative_error" else "raise"
@@ -188,5 +197,5 @@ def elsewhere_words(found: Elsewhere) -> str:
     """On what an answer for other traffic rests."""
     drivers = " and ".join(found.drivers)
     known = f" (off by {share(found.off, least=0.001)} for {drivers})" if drivers else ""
-    rests = f"holds if as large a share of each shell crashes as there{known}"
-    return f"tests of {found.tested_in}, answered for {found.answered_for}: {rests}"
+    rests = f"assumes that the same share of each shell crashes in both{known}"
+    return f"tested in {found.tested_in}, answered for {found.answered_for}: {rests}"

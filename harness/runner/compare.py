@@ -1,6 +1,6 @@
-"""Compare two AVs on the same cut-ins drawn from shells: both are driven round by round, to where they differ.
+"""Compare two AVs on the same events drawn from shells: both are driven round by round, to where they differ.
 
-The i-th cut-in of a stratum is the same for both, as it follows from the campaign's seed and the pool. What either
+The i-th event of a stratum is the same for both, as it follows from the campaign's seed and the pool. What either
 folder holds already, from an earlier call or because it is the copy of a stored run, is not driven again.
 """
 
@@ -22,7 +22,7 @@ from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.files import campaign_of
-from harness.campaign.sections import MOST_CUT_INS
+from harness.campaign.sections import MOST_EVENTS
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
 from harness.estimators.answer import ended_by
 from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
@@ -95,7 +95,7 @@ def compare_campaigns(
     margin: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None,
     rhw: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None,
 ) -> Comparison:
-    """Drive two vehicles on the same cut-ins until it is known who crashes less often, or to half-width 0.1.
+    """Drive two vehicles on the same events until it is known who crashes less often, or to half-width 0.1.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def _compared(
             counts = pairs.first(n_pairs)
             while (added := rounds.next_round(counts)).any():
                 n_pairs = n_pairs + added
-                for side, run in enumerate(runs):  # what is missing of the first cut-ins of each stratum
+                for side, run in enumerate(runs):  # what is missing of the first events of each stratum
                     tested = pairs.tests(side)
                     if (missing := np.maximum(n_pairs - tested, 0)).any():
                         places = len(run.blocks), run.n_episodes, campaign.run.smallest_shard
@@ -235,7 +235,7 @@ def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: PairCounts) -> dic
     settings = {"stop.episodes": needed} if needed > campaign.stop.episodes else {}
     if new_folder := (more := rounds.used_of_pool(pairs) * times) > 1.0:
         kept = two_digits_up(campaign.pool.events_per_shell * more)
-        if kept > MOST_CUT_INS:
+        if kept > MOST_EVENTS:
             return None
         settings["pool.events_per_shell"] = kept
     return {"pairs": needed, "settings": settings, "new_folder": new_folder}
@@ -286,13 +286,13 @@ def require_comparable(a: Campaign, b: Campaign) -> None:
     if apart := [key for key in of_a | of_b if of_a.get(key) != of_b.get(key)]:
         where = apart[0]
         more = f"; also {', '.join(apart[1:])}" if len(apart) > 1 else ""
-        expected = f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of episodes need equal settings"
+        expected = f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of tests need equal settings"
         mend = f"Make them equal, e.g. with --set {where}=…, which holds for both."
         raise CampaignError(where, f"{of_a.get(where)} in A and {of_b.get(where)} in B{more}", expected, mend)
 
 
 def require_same_shells(sides: Both, stored: str | Path | None = None) -> None:
-    """Refuse vehicles that would not have the same strata of cut-ins."""
+    """Refuse vehicles that would not have the same strata of events."""
     limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
     envelope = sides[0].library.envelope_mps2
     if (limits[0] > envelope) != (limits[1] > envelope):

@@ -139,7 +139,7 @@ class Run:
         return self.n_episodes < self.earlier.n_episodes
 
     def known(self, request: ShardRequest) -> ShardResult | None:
-        """A shard that needs not be run again, or None: as many tests and, of shells, the cut-ins that are drawn now.
+        """A shard that needs not be run again, or None: as many tests and, of shells, the events that are drawn now.
 
         Raises `RunFolderError`: one of its files is damaged.
         """
@@ -292,7 +292,7 @@ def cpu_name() -> str:
 
 
 def require_few_failed(
-    causes: Counter[str], n: int, campaign: Campaign, what: str = "episodes", where: str = "the episodes table"
+    causes: Counter[str], n: int, campaign: Campaign, what: str = "tests", where: str = "the table `episodes`"
 ) -> None:
     """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
     if causes.total() > (most := campaign.run.max_failed_share) * n:
@@ -352,7 +352,7 @@ def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> 
 
 
 def require_same_pool(folder: Path, source: Source) -> None:
-    """Refuse (`RunFolderError`) to go on with a run whose cut-ins came from another pool.
+    """Refuse (`RunFolderError`) to go on with a run whose events came from another pool.
 
     Its library, or the harness itself, has changed since.
     """
@@ -363,4 +363,4 @@ def require_same_pool(folder: Path, source: Source) -> None:
     if found != design.pool:
         expected = f"those of pool {design.pool}, which this campaign now has"
         mend = "Restore the surrogate library, or the version of the harness (manifest.json), or use a new folder."
-        raise RunFolderError(str(path), f"cut-ins of pool {found}", expected, mend)
+        raise RunFolderError(str(path), f"events of pool {found}", expected, mend)

@@ -275,7 +275,7 @@ def _wrong_environment(error: Exception) -> CampaignError:
         "run.ray.runtime_env",
         f"an environment that Ray cannot set up: {error}",
         "what ray.init takes as runtime_env",
-        "Correct it; docs/ray.md has an example.",
+        "Correct it; docs/installation.md has an example.",
     )
 
 

@@ -139,7 +139,7 @@ def run_campaign(
             stop = resolved.campaign.stop
             # Until a precision or a decision nobody knows how many.
             most = stop.episodes if resolved.campaign.accept is None and stop.rhw is None else None
-            progress.stage(f"episodes{crew.where}", most, done=run.earlier.n_episodes)
+            progress.stage(f"tests{crew.where}", most, done=run.earlier.n_episodes)
             rounds = run.source.rounds(run.earlier.n_episodes)
             run = tested(run, rounds, crew, progress)
         require_no_fewer(out, earlier, run.n_episodes)

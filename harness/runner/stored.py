@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from shutil import copyfile
 from typing import Annotated, Any
 
 import pyarrow as pa
@@ -16,15 +15,14 @@ from pydantic import Field
 from harness.arguments import Confidence, Episode, checked
 from harness.campaign.campaign import Campaign
 from harness.controllers.find import has_foreign_code, require_controller, run_apart
-from harness.errors import CampaignError, HarnessError, RunFolderError
+from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables, joined
 from harness.estimators.one_pass import SPACING
 from harness.estimators.own import asked_for
 from harness.families import family_named
 from harness.families.protocol import Environment
-from harness.files import write_atomically
-from harness.processes import SharedFile, made_ahead
+from harness.processes import made_ahead
 from harness.records.folder import CAMPAIGN, Part, no_episodes, read_kept, read_manifest
 from harness.records.origin import code_of, require_trust
 from harness.records.reader import N_READERS, read_campaign, require_campaign, traffic_of
@@ -35,11 +33,19 @@ from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
 from harness.vocabulary import ESTIMATORS
 from harness.worlds import build_world
-from harness.worlds.system_libraries import require_libraries
 
 FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
 """Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
+
+
+class Estimates(dict[str, Any]):
+    """Content of ``estimates.json``; shown, a line an estimator."""
+
+    def __repr__(self) -> str:
+        from harness.report.lines import estimate_lines  # noqa: PLC0415 - draws
+
+        return "\n".join(estimate_lines(self))
 
 
 @checked("harness.estimate")
@@ -48,8 +54,8 @@ def estimate_run(
     *,
     estimators: Annotated[Sequence[str | Any], Field(min_length=1)] | None = None,
     confidence: Confidence | None = None,
-) -> dict[str, Any]:
-    """Estimate a stored run from its records; returns the content of ``estimates.json``.
+) -> Estimates:
+    """Estimate a stored run from its records; returns the content of ``estimates.json``, a dict.
 
     Parameters
     ----------
@@ -67,9 +73,12 @@ def estimate_run(
     Of the run that `harness.run` shows:
 
     >>> import harness
-    >>> found = harness.estimate("runs/idm", estimators=["nade"], confidence=0.5)["estimates"]["nade"]
-    >>> f"{found['crash_rate']:.2e}, {found['ci_low']:.2e} to {found['ci_high']:.2e}"
-    '1.95e-07, 1.45e-07 to 2.69e-07'
+    >>> found = harness.estimate("runs/idm", estimators=["nade"], confidence=0.5)
+    >>> print(found)
+    idm: 95 crashes in 1,000 tests; crash rate per test (50 %)
+      nade  1.95 (1.45 to 2.69) × 10⁻⁷
+    >>> round(found["estimates"]["nade"]["n_effective"], 2)
+    6.82
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -77,7 +86,7 @@ def estimate_run(
     require_trust(folder, manifest, campaign.testing.estimator, "Read that code, and run campaign.yaml yourself.")
     asked = asked_for(estimators or ESTIMATORS, "harness.estimate(estimators=…)")
     blocks = stored_blocks(folder, moments=not {*asked} < {*ESTIMATORS} - {"scv"})
-    return estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence)
+    return Estimates(estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence))
 
 
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
@@ -106,14 +115,14 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     n = 0
     for block in made_ahead(read, manifest["parts"], N_READERS):
         if block.first_episode != n:
-            raise _incomplete(folder, f"a part that begins at episode {block.first_episode}", f"episode {n}")
+            raise _incomplete(folder, f"a part that begins at test {block.first_episode}", f"test {n}")
         counted = block.take(slice(0, n_counted - n))
         n += len(counted)
         if len(counted):
             yield counted
         if n == n_counted:
             return
-    raise _incomplete(folder, f"{n} episodes on record", f"{n_counted} (manifest.json)")
+    raise _incomplete(folder, f"{n} tests on record", f"{n_counted} (manifest.json)")
 
 
 def even(blocks: Iterable[Block]) -> Iterator[Block]:
@@ -158,20 +167,12 @@ class ReplayResult:
     suspects: str | None = None
 
     def __repr__(self) -> str:
-        facts = [f"  {name:<13} {fact}" for name, fact in self.scene["facts"]]
-        return "\n".join([f"episode {self.row['episode']}: {self.outcome}", *facts])
+        facts = [f"  {name:<18} {fact}" for name, fact in self.scene["facts"]]
+        return "\n".join([f"test {self.row['episode']}: {self.outcome}", *facts])
 
 
 @checked("harness.replay")
-def replay_episode(
-    folder: str | Path,
-    episode: Episode,
-    *,
-    gui: bool = False,
-    fcd: str | Path | None = None,
-    stored: bool = False,
-    trust: bool = False,
-) -> ReplayResult:
+def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False, trust: bool = False) -> ReplayResult:
     """Replay an episode of a run; a user's own code in a process of its own.
 
     Parameters
@@ -180,10 +181,6 @@ def replay_episode(
         Run folder.
     episode : int
         Index of the test in the campaign, from 0.
-    gui : bool
-        Whether to show it in sumo-gui (extra ``harness[sumo]``).
-    fcd : str or Path, optional
-        File for SUMO's floating-car data.
     stored : bool
         Whether to give it as the run has traced it: nothing is simulated.
     trust : bool
@@ -206,7 +203,7 @@ def replay_episode(
       r157-cc       a careful and competent driver: avoids it, 9.1 m at the closest
       brakes-8      braking at once, at up to 8 m/s²: avoids it, 18.7 m at the closest
     """
-    folder, fcd = Path(folder), None if fcd is None else Path(fcd)
+    folder = Path(folder)
     manifest = read_manifest(folder)
     tables = _stored(folder, manifest, episode)
     campaign = read_campaign(folder, manifest, check_files=not stored)
@@ -215,13 +212,10 @@ def replay_episode(
         if not trust:
             for code in (code_of(campaign.av), campaign.testing.own_challenge):
                 require_trust(folder, manifest, code, _TRUST)
-        return _simulated(folder, manifest, campaign, tables, episode, gui, fcd)
-    if gui or fcd is not None:
-        found, expected = "stored motion, which SUMO does not simulate", "a simulation, for sumo-gui and its data"
-        raise HarnessError("--stored", found, expected, "Leave one of the two out.")
+        return _simulated(folder, manifest, campaign, tables, episode)
     if "traces" not in tables or not tables["traces"].num_rows:
         mend = "Simulate it again (without --stored), or run with --set records.traces=all, say."
-        raise RunFolderError(str(folder), f"no stored motion of episode {episode}", "an episode that is traced", mend)
+        raise RunFolderError(str(folder), f"no stored motion of test {episode}", "a test that is traced", mend)
     return _result(campaign, traffic_of(campaign, manifest), tables, None, ())
 
 
@@ -242,42 +236,27 @@ def _result(
 
 
 def _simulated(
-    folder: Path,
-    manifest: dict[str, Any],
-    campaign: Campaign,
-    stored: Mapping[str, pa.Table],
-    episode: int,
-    gui: bool,
-    fcd: Path | None,
+    folder: Path, manifest: dict[str, Any], campaign: Campaign, stored: Mapping[str, pa.Table], episode: int
 ) -> ReplayResult:
     """The episode run again, and compared with what is stored."""
     resolved = resolve(campaign)
     require_campaign(folder / CAMPAIGN, resolved.content_hash, manifest)
-    if gui or fcd is not None:
-        require_libraries()
-    else:
-        require_world(campaign)
+    require_world(campaign)
     replay = partial(run_apart, campaign.av, _replay) if has_foreign_code(campaign.av) else _replay
-    written = None if fcd is None else SharedFile()  # SUMO takes no other path as it is
-    again = replay(resolved, folder, episode, stored["episodes"], gui, None if written is None else written.path)
-    if fcd is not None and written is not None:
-        write_atomically(fcd, partial(copyfile, written.path))
+    again = replay(resolved, folder, episode, stored["episodes"])
     compared = tuple(name for name in again if name in stored and stored[name].num_rows)
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
     why = None if bit_equal is not False else suspects(manifest, campaign)
     return _result(campaign, resolved.environment, again, bit_equal, compared, why)
 
 
-def _replay(
-    resolved: Resolved, folder: Path, episode: int, stored: pa.Table, gui: bool, fcd: Path | None
-) -> dict[str, pa.Table]:
+def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) -> dict[str, pa.Table]:
     """Row and trace of the episode, run again."""
     source = prepare(resolved)
     if source.baseline_paths is not None:
         begin(source, partial(read_stored, folder, source.baseline_paths, read_manifest(folder)["before"]))
     require_same_pool(folder, source)
-    options = () if fcd is None else ("--fcd-output", str(fcd), "--precision", "9")
-    world = build_world(resolved.campaign, 1, in_sumo=gui or fcd is not None, gui=gui, options=options)
+    world = build_world(resolved.campaign, 1)
     try:
         shard = source.run_again(source.loop(world, traces="all"), episode, stored)
     finally:
@@ -297,8 +276,8 @@ def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
     elif campaign.av.model is None:
         same = "Versions, CPU and the controller's source file are the run's. " if not other else ""
         found.append(
-            f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier episodes, "
-            "or a file that it reads. `harness av-check` looks at that."
+            f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier tests, "
+            "or a file that it reads. `harness av-check` looks for that."
         )
     return " ".join(found) or "Versions and CPU are the run's: the records have been changed, or it is a defect."
 
@@ -310,11 +289,11 @@ def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:
     if repeated:
         raise CampaignError(
             "av",
-            f"a run that is not reproducible: {len(repeated['differing'])} of {repeated['n_episodes']} tests "
-            "that it repeated itself came out otherwise",
+            f"a run that is not reproducible: {len(repeated['differing'])} of the {repeated['n_episodes']} tests "
+            "that it ran twice differed",
             "an AV that does the same again, given the same observations and the same random stream",
-            "Draw only from the generator handed over in start, ask no clock, and keep nothing across episodes "
-            "(`harness av-check` tells whether that is so). The kept traces (--stored) are what happened.",
+            "Draw only from the generator handed over in start, ask no clock, and keep nothing from one test to the "
+            "next (`harness av-check` finds the cause). The kept traces (--stored) are what happened.",
         )
     found = "a run that is not reproducible: a program outside of the harness drove the AV"
     mend = "Look at the traces that the run has kept (--stored; records.traces: crash), or let the program write a log."
@@ -329,8 +308,8 @@ def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, p
             return {name: table.filter(pc.equal(table["episode"], episode)) for name, table in tables.items()}
     if not manifest["n_episodes"]:
         raise no_episodes(folder)
-    mend = "The report and the episodes table list the episodes of interest."
-    raise RunFolderError(str(folder), f"no episode {episode}", f"an index from 0 to {manifest['n_episodes'] - 1}", mend)
+    mend = "The report lists the tests of interest, the table `episodes` all."
+    raise RunFolderError(str(folder), f"no test {episode}", f"a number from 0 to {manifest['n_episodes'] - 1}", mend)
 
 
 def _equal(again: pa.Table, stored: pa.Table) -> bool:

@@ -1,10 +1,10 @@
 """A stored run of shells in other traffic: the shells' probabilities there, and crash shares as they were.
 
-Traffic decides how probable a cut-in is; what a vehicle makes of one, only through what LV and BV do afterwards, and
-through which cut-ins of a shell there are. Crash shares within shells are taken to be the same. The reference drivers,
+Traffic decides how probable an event is; what a vehicle makes of one, only through what LV and BV do afterwards, and
+through which events of a shell there are. Crash shares within shells are taken to be the same. The reference drivers,
 of which no shell is made, tell how far that holds: their rates follow by the same rule, and are known besides. Of a
-vehicle that crashes on few of the cut-ins of its shells they do not: which these are may change. Of such a vehicle
-there are upper limits alone, in traffic close by; of traffic with cut-ins that no test stands for nothing is said.
+vehicle that crashes on few of the events of its shells they do not: which these are may change. Of such a vehicle
+there are upper limits alone, in traffic close by; of traffic with events that no test stands for nothing is said.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from harness.strata import ShellDesign
 from harness.vocabulary import FloatArray
 
 MOST_BEYOND = 0.01
-"""Share of the probability in a shell, as it crashes, that may lie where no cut-in of the old pool does [assumed]."""
+"""Share of the probability in a shell, as it crashes, that may lie where no event of the old pool does [assumed]."""
 SAME_POOL = 0.05
 """How far a pool that another version has built may differ [assumed]."""
 MOST_OFF = 0.05
 """How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
 LEAST_SHARE = 0.5
-"""Of the cut-ins that crash, in the mean over a rate, from which on shares are taken to stay the same. Where cut-ins
+"""Of the events that crash, in the mean over a rate, from which on shares are taken to stay the same. Where events
 take time, rates of drivers with 0.58 or more came out wrong by at most 6 %, with 0.33 by 16 %, with 0.1 by 28 %,
 with 0.02 by more than a factor of 3 (`python -m benchmarks.other_traffic`)."""
 FAR_OFF = 0.5
@@ -72,9 +72,9 @@ class StoredShells:
         manifest = read_manifest(folder)
         campaign = read_campaign(folder, manifest, check_files=True)
         if not campaign.sampling.strata or campaign.has_baseline_runs:
-            acts = "a vehicle that acts before the cut-in: its cut-ins follow from its own runs"
+            acts = "a vehicle that acts before the event: its events follow from its own runs"
             found = acts if campaign.sampling.strata else f"tests by {campaign.testing.method}"
-            expected = "tests of shells, of a vehicle that holds its speed until the cut-in"
+            expected = "tests of shells, of a vehicle that holds its speed until the event"
             raise CampaignError(option, found, expected, ELSEWHERE)
         here = resolve(campaign)
         design, pool = Shells.stored_design(folder), campaign_pool(here, progress)
@@ -123,7 +123,7 @@ class StoredShells:
         return float(p @ tally.share) if tally.crashes.any() else self.limit(p)
 
     def limit(self, p: FloatArray, *, at_worst: bool = False) -> float:
-        """Upper limit of it; ``at_worst`` every cut-in may crash of strata of which a few did."""
+        """Upper limit of it; ``at_worst`` every event may crash of strata of which a few did."""
         worst = self.seen.tally.failed_as_crashes()
         few = at_worst & (worst.crashes > 0) & (worst.crashes < LEAST_SHARE * worst.tests)
         crashes = np.where(few, worst.tests, worst.crashes)
@@ -135,7 +135,7 @@ class Nearby:
     """Some traffic beside another: probabilities of the strata ``p`` (S,), and by what rates move from there to here.
 
     ``rate`` is the vehicle's factor, ``references`` (R,) are those of the drivers, which are known, ``off`` by how much
-    one of these comes out too high or too low at most, and ``beyond`` the share of the crashes in cut-ins unlike any
+    one of these comes out too high or too low at most, and ``beyond`` the share of the crashes in events unlike any
     tested.
     """
 
@@ -170,7 +170,7 @@ class Elsewhere:
         return self.design is self.tested.design
 
     def block(self, block: Block) -> Block:
-        """Tests as they count there: a path's probability of cut-ins is taken to change as that of all paths."""
+        """Tests as they count there: a path's probability of events is taken to change as that of all paths."""
         if self.is_same:
             return block
         old, new = self.tested.design.cell_p, self.design.cell_p
@@ -222,14 +222,14 @@ def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progres
     was, now = ("take time" if each.scenario.shows else "are one step" for each in (tested.here, there))
     if was != now:  # nobody sees those of one step beforehand: shells mean something else there
         expected = f"traffic as that of the tests, in which they {was}"
-        raise CampaignError(OPTION, f"{name}, in which cut-ins {now}", expected, ELSEWHERE)
+        raise CampaignError(OPTION, f"{name}, in which events {now}", expected, ELSEWHERE)
     require_shares(tested)
     progress.stage("pool of the other traffic", None)
     elsewhere = campaign_pool(there, progress, order=tested.pool.names)
     moved = Elsewhere(tested, there, moved_design(tested.design, design_shells(elsewhere, tested.limit_mps2), name))
     off, beyond = moved.reference_error(), _share_beyond(tested, elsewhere)
     if beyond > MOST_BEYOND or off > MOST_OFF:
-        found = f"traffic where {share(beyond)} of the crashes are in cut-ins unlike any that was tested"
+        found = f"traffic where {share(beyond)} of the crashes are in events unlike any that was tested"
         if beyond <= MOST_BEYOND:
             found = f"traffic for which the rate of a reference driver would come out wrong by {share(off)}"
         expected = f"at most {share(MOST_BEYOND)} and {share(MOST_OFF)}: crash shares within shells must stay the same"
@@ -245,7 +245,7 @@ def require_shares(tested: StoredShells) -> None:
     """Raise a `CampaignError` where shares may not be taken to stay the same."""
     if tested.holds:
         return
-    found = f"a vehicle that crashes on {share(tested.mean_share)} of the cut-ins of the shells that it crashes in"
+    found = f"a vehicle that crashes on {share(tested.mean_share)} of the events of the shells that it crashes in"
     expected = f"at least {share(LEAST_SHARE)}: else which these are may change with the traffic"
     mend = "Run it in that environment, or here with a surrogate close to it in the library (pool.library)."
     raise CampaignError(str(tested.folder), found, expected, mend)
@@ -289,7 +289,7 @@ def reference_shares(design: ShellDesign) -> FloatArray:
 
 
 def _share_beyond(tested: StoredShells, new: Pool) -> float:
-    """Share of crashes in cut-ins whose initial state is beyond all those of the same shell that were there."""
+    """Share of crashes in events whose initial state is beyond all those of the same shell that were there."""
     design, old, weight = tested.design, tested.pool, tested.design.p * tested.seen.tally.share
     outside = np.zeros(new.shell.size, np.bool_)
     for name, (low, high) in ranges(old).items():

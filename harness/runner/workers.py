@@ -287,7 +287,7 @@ class Workers:
             how = f"because {death_cause(exit_code, self._campaign.av.limits)}"
             mend = "Fix the controller: look for os._exit or a crash of compiled code (`harness av-check`)."
         raise WorkerLostError(
-            f"shard {job.request.index} (from episode {job.request.first_episode})",
+            f"shard {job.request.index} (from test {job.request.first_episode})",
             f"{ATTEMPTS} worker processes that died, the last {how}",
             "a worker that finishes the shard",
             mend,
@@ -301,8 +301,8 @@ class Workers:
         if float(bdtrc(len(fatal) - 1, n_begun, share)) < SURELY_TOO_MANY:
             raise TooManyFailedError(
                 "run.max_failed_share",
-                f"{len(fatal)} of the first {n_begun} episodes of shard {job.request.index} ended their worker "
-                f"process, the last of them episode {episode}: {cause}",
+                f"{len(fatal)} of the first {n_begun} tests of shard {job.request.index} ended their worker "
+                f"process, the last of them test {episode}: {cause}",
                 f"a share of at most {share:g}",
                 "Fix the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
             )

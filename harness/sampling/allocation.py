@@ -116,7 +116,7 @@ class Allocation:
         return np.asarray(np.diff(np.minimum(np.cumsum(wanted), max(budget, 0)), prepend=0))  # cut from the last one on
 
     def _used_up(self, tally: Tally) -> bool:
-        """Whether nearly all that is left to know lies in strata without further cut-ins."""
+        """Whether nearly all that is left to know lies in strata without further events."""
         tests, (low, high) = tally.tests, clopper_pearson(tally.crashes, tally.tests, _TAIL, tally.failed)
         relevant = np.arange(tests.size) < self.n_asked
         squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)

@@ -1,9 +1,9 @@
 """Before tests that count: baseline runs, pilot tests that a surrogate is learned from, and tests of milder events.
 
-A vehicle that acts before the cut-in is driven along each path without one, to know where it is.
+A vehicle that acts before the event is driven along each path without one, to know where it is.
 
-A test repeats the path with a cut-in, and tells the vehicle the index of the baseline run, so that both see the same
-random stream. What the vehicle did through the step of the cut-in must be the same to the last bit, or the test fails.
+A test repeats the path with an event, and tells the vehicle the index of the baseline run, so that both see the same
+random stream. What the vehicle did through the step of the event must be the same to the last bit, or the test fails.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Cut-ins of the pool, drawn within shells, in rounds: each decides what the next one tests.
+"""Events of the pool, drawn within shells, in rounds: each decides what the next one tests.
 
 A round is run to its end before the next begins, whatever the number of workers, and the result is looked at. Rounds
 grow geometrically, to where they narrow the interval most (`harness.sampling.allocation`). That depends on counts
@@ -47,7 +47,7 @@ _FINISH = "Run `harness run` with --resume, which makes what is missing."
 
 
 class Shells(Source):
-    """Tests of strata of the pool's cut-ins; a vehicle that acts before the cut-in makes the pool itself."""
+    """Tests of strata of the pool's events; a vehicle that acts before the event makes the pool itself."""
 
     columns = (*EPISODE_COLUMNS, *SHELL_COLUMNS)
 
@@ -178,7 +178,7 @@ class PairRounds:
         return added
 
     def used_of_pool(self, pairs: PairCounts) -> float:
-        """Largest share of the pool's cut-ins of a stratum that these pairs have used."""
+        """Largest share of the pool's events of a stratum that these pairs have used."""
         return float(np.max(pairs.tests / np.maximum(self._allocation.available, 1)))
 
 

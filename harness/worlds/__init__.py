@@ -68,24 +68,17 @@ class AVLostError(Exception):
     """What drives the AVs is gone: all running episodes fail with this cause; ``x``, ``v`` are as before the step."""
 
 
-def build_world(
-    campaign: Campaign,
-    n_cells: int | None = None,
-    *,
-    in_sumo: bool = False,
-    gui: bool = False,
-    options: Sequence[str] = (),
-) -> World:
-    """The world that a campaign names, or SUMO's, with its number of cells or another.
+def build_world(campaign: Campaign, n_cells: int | None = None) -> World:
+    """The world that a campaign names, with its number of cells or another.
 
-    An AV whose SUMO model keeps hidden state gets one cell in any case; ``gui`` and ``options``: see `SumoWorld`.
+    An AV whose SUMO model keeps hidden state gets one cell in any case.
     """
     # A run needs one of them, and not what the others import.
     from harness.families import family_named  # noqa: PLC0415 - families read what worlds are asked
 
     av, cells, family = campaign.av, n_cells or campaign.world.cells, family_named(campaign.scenario)
     vehicles = family.vehicles
-    if campaign.world.engine == "twin" and not in_sumo:
+    if campaign.world.engine == "twin":
         from harness.worlds.twin import TwinWorld  # noqa: PLC0415
 
         return TwinWorld(cells, vehicles)
@@ -98,7 +91,7 @@ def build_world(
     from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld, recyclable  # noqa: PLC0415
 
     if av.sumo is None:
-        return SumoWorld(cells, vehicles, gui=gui, options=options)
+        return SumoWorld(cells, vehicles)
     if recyclable(av.sumo) and not early:  # one that is released at the start remembers the last episode's cut-in
-        return SumoAvWorld(cells, av.sumo, vehicles, gui=gui, options=options)
-    return FreshWorld(av.sumo, campaign.seed, vehicles, acts_before_event=early, gui=gui, options=options)
+        return SumoAvWorld(cells, av.sumo, vehicles)
+    return FreshWorld(av.sumo, campaign.seed, vehicles, acts_before_event=early)

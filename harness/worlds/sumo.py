@@ -11,9 +11,7 @@ Roads are the committed networks', whose ``vehicles.add.xml`` holds the vehicle 
 from __future__ import annotations
 
 import atexit
-import os
 import struct
-import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -177,23 +175,15 @@ SPEED_CHECK_STEPS = 10
 class SumoWorld(SumoCells):
     """World in SUMO, one in a process: libsumo holds no more; see `harness.worlds.World`.
 
-    ``vanilla`` lets SUMO plan in every step (action step 0.1 s), as a reference for tests; ``gui`` shows it; ``shim``
-    uses the compiled shim where it is installed, with the same bits; ``options`` are further ones of SUMO, for instance
-    ``--fcd-output``.
+    ``vanilla`` lets SUMO plan in every step (action step 0.1 s), as a reference for tests; ``shim`` uses the compiled
+    shim where it is installed, with the same bits.
     """
 
     _open: ClassVar[bool] = False
     _shim: Shim | None = None
 
     def __init__(
-        self,
-        n_cells: int,
-        vehicles: Sequence[str] = VEHICLES,
-        *,
-        vanilla: bool = False,
-        gui: bool = False,
-        shim: bool = True,
-        options: Sequence[str] = (),
+        self, n_cells: int, vehicles: Sequence[str] = VEHICLES, *, vanilla: bool = False, shim: bool = True
     ) -> None:
         if SumoWorld._open:
             mend = "Close the other world first, or use another process."
@@ -202,8 +192,8 @@ class SumoWorld(SumoCells):
         self._vanilla = vanilla
         self._told: FloatArray = np.zeros_like(self.x)
         self._n_steps = 0
-        self._running, self._options = False, options
-        self._api: Any = start_gui(self._arguments()) if gui else start_libsumo(self._arguments())
+        self._running = False
+        self._api: Any = start_libsumo(self._arguments())
         self._running = SumoWorld._open = True
         atexit.register(self.close)
         self._populate(self._api)
@@ -213,14 +203,11 @@ class SumoWorld(SumoCells):
         self._get_speed = self._function("vehicle", "getSpeed")
         self._get_collisions = self._function("simulation", "getCollisions")
         self._simulation_step = self._function("simulation", "step")
-        self._shim = open_shim(self._flat, self._told, self.x, self.v) if shim and not gui else None
+        self._shim = open_shim(self._flat, self._told, self.x, self.v) if shim else None
 
     def _function(self, domain: str, name: str) -> Any:
         inner = getattr(self._api, "_libsumo", None)
         return getattr(inner, f"{domain}_{name}", None) or getattr(getattr(self._api, domain), name)
-
-    def _arguments(self) -> list[str]:
-        return [*super()._arguments(), *self._options]
 
     def _type_of(self, vehicle: int) -> str:
         return "vanilla" if self._vanilla else super()._type_of(vehicle)
@@ -315,23 +302,3 @@ def start_libsumo(arguments: Sequence[str]) -> Any:
         raise not_importable(str(error)) from error
     libsumo.start(["sumo", *arguments])
     return libsumo
-
-
-def start_gui(arguments: Sequence[str]) -> Any:
-    """Start sumo-gui and connect to it; returns traci, which has libsumo's functions."""
-    import traci  # noqa: PLC0415 - comes with libsumo, wanted only here
-
-    program = sumo_program("sumo-gui", "--gui")
-    display = os.environ.get("DISPLAY")
-    if sys.platform.startswith("linux") and not display:
-        raise _no_window("no screen (the environment variable DISPLAY is not set)")
-    try:
-        traci.start([str(program), "--start", "--delay", "100", *arguments])
-    except (traci.TraCIException, traci.FatalTraCIError) as error:
-        raise _no_window(f"a sumo-gui that cannot be reached ({error}; DISPLAY is {display})") from error
-    return traci
-
-
-def _no_window(found: str) -> CampaignError:
-    mend = "Start it from a desktop session (or with ssh -X), or write the motion to a file: --out FILE.csv."
-    return CampaignError("--gui", found, "a desktop that sumo-gui can open its window on", mend)

@@ -129,7 +129,7 @@ class SmallWorld:
             steps[running] += critical
             crash[running], cut_in[running] = cut & (self.crash[here] > 0.0), cut
             running = running[~cut]
-        columns = {"cut_in": cut_in, "log_q": log_q, "n_control_steps": steps, "first_ratios": ratios}
+        columns = {"happened": cut_in, "log_q": log_q, "n_control_steps": steps, "first_ratios": ratios}
         drawn = Drawn("step_mixture", np.full(j, 1.0 / j))
         return Block(0, np.where(crash, CRASH, TIMEOUT).astype(np.int8), log_weight, columns, drawn)
 

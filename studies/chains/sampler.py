@@ -81,7 +81,7 @@ class Sampler:
         if self.method != "step_mixture":
             forced = np.where(self.cut_in, -self.log_p_cut, -np.inf)
             log_q = np.column_stack([forced, log_q])[:, : len(self.alpha)]
-        columns = {"cut_in": self.cut_in, "log_q": log_q, "n_control_steps": self.n_control}
+        columns = {"happened": self.cut_in, "log_q": log_q, "n_control_steps": self.n_control}
         columns["martingale"] = self.martingale
         if self.method == "step_mixture":
             columns["first_ratios"] = self.ratios
@@ -193,7 +193,7 @@ class SingleChoice:
         log_weight = np.log(self.p / (self.alpha @ self.q))[maneuver]
         ratios = np.ones((n, 9, len(self.alpha)))
         ratios[:, 0] = np.exp(log_q + log_weight[:, None])
-        columns = {"cut_in": np.ones(n, np.bool_), "log_q": log_q, "n_control_steps": np.ones(n, np.int64)}
+        columns = {"happened": np.ones(n, np.bool_), "log_q": log_q, "n_control_steps": np.ones(n, np.int64)}
         outcome = np.where(self.crash[maneuver], CRASH, TIMEOUT).astype(np.int8)
         return Block(0, outcome, log_weight, {**columns, "first_ratios": ratios}, Drawn(method, self.alpha))
 

@@ -72,6 +72,7 @@ def test_scenario_is_valid(file):
 # -- written out, and the editor's schema --
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(
     file=st.sampled_from(SCENARIOS),

@@ -140,3 +140,12 @@ def test_it_is_refused_below_the_tests_from_which_on_it_covers():
     assert isinstance(few, Unavailable)
     assert (few.why.key, few.why.numbers) == ("needs_tests", {"n": least - 1, "least": least})
     assert enough.n_episodes == least
+
+
+def test_a_crash_that_is_due_and_was_not_drawn_is_said():
+    """One path on which the surrogate predicts a crash as heavy as all that were drawn together, and none came."""
+    (some,) = blocks(DECISIVE[0], "step_mixture", [3_000], SEED)
+    assert "due_not_drawn" not in [each.key for each in fed(DoublyRobust(), [some]).result(0.9).warnings]
+    quiet = int(np.flatnonzero(some.weighted_crashes() == 0.0)[0])
+    some.martingale[quiet] = -some.weighted_crashes().sum()
+    assert "due_not_drawn" in [each.key for each in fed(DoublyRobust(), [some]).result(0.9).warnings]

@@ -133,6 +133,7 @@ def test_known_means_cover_and_sample_means_do_not(tilt):
     assert not covers(found["wrong"]["covered"])
 
 
+@pytest.mark.slow
 def test_known_mean_control_variates_cover_on_a_chain():
     chain = DECISIVE[0]
     one = {"mixture_cv": MixtureCv}

@@ -90,7 +90,7 @@ def test_the_vehicle_that_makes_room_is_asked_from_the_first_step_on(tmp_path, m
     (command,) = re.findall(r"^harness run (room.py:.*?)  ", page, re.MULTILINE)
     asked = {}
     for options in (command.split(), command.split()[:1]):
-        assert main(["av-check", *options, "--episodes", "20", "--json"]) == 0
+        assert main(["av-check", *options, "--tests", "20", "--json"]) == 0
         asked[len(options)] = json.loads(capsys.readouterr().out)
     assert len({json.dumps(each["behaviour"]) for each in asked.values()}) == 2
 

@@ -163,6 +163,7 @@ def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undist
     assert noted is None or note.read_text().count("closed") >= noted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("episodes", "n", "share"), quick(1, [(400, 200, 0.005), (40, 40, 0.04)]))
 def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
     """They end a campaign halfway; one with fewer tests than that takes has no answer either."""
@@ -171,7 +172,7 @@ def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
     assert _run(tmp_path, av, *sizes) == EXIT_TOO_MANY_FAILED
     err = capsys.readouterr().err
     assert "run.max_failed_share" in err
-    assert f"2 of {n} episodes failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
+    assert f"2 of {n} tests failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
     assert not (tmp_path / "run/estimates.json").exists()
 
 
@@ -287,7 +288,8 @@ def test_one_that_always_ends_its_process_is_named_after_a_few_workers(how, wher
     assert "run.max_failed_share" in err
 
 
-@pytest.mark.parametrize("command", quick(1, ["run", "check", "av-check --episodes 4"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("command", quick(1, ["run", "check", "av-check --tests 4"]))
 def test_what_a_controller_starts_does_not_outlive_the_command(command, tmp_path):
     assert _main(command, tmp_path, _of("StartsPrograms", note=f"{tmp_path}/started")) == EXIT_DONE
     started = (tmp_path / "started").read_text().split()
@@ -295,7 +297,7 @@ def test_what_a_controller_starts_does_not_outlive_the_command(command, tmp_path
     assert orphans(list(map(int, started)), 5.0) == []
 
 
-@pytest.mark.parametrize("command", quick(1, ["run --json", "check --json", "av-check --json --episodes 4"]))
+@pytest.mark.parametrize("command", quick(1, ["run --json", "check --json", "av-check --json --tests 4"]))
 def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd):
     assert _main(command, tmp_path, _of("Prints")) == EXIT_DONE
     printed = capfd.readouterr()
@@ -310,7 +312,7 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["run", "av-check --episodes 20"])
+@pytest.mark.parametrize("command", ["run", "av-check --tests 20"])
 def test_of_much_that_is_printed_the_first_and_the_last_are_passed_on(command, tmp_path, capfd):
     assert _main(command, tmp_path, _of("PrintsMuch"), "stop.episodes=100") == EXIT_DONE
     printed = capfd.readouterr().err

@@ -47,6 +47,7 @@ def test_an_fmu_gives_the_same_motion_and_gets_its_start_values_in_every_episode
     assert braking[0] == -1.5 > braking[1]
 
 
+@pytest.mark.slow
 def test_one_that_sees_bv_come_over_is_the_built_in_model_and_one_that_waits_for_the_overlap_is_not():
     """To the last bit; the sibling is the built-in model that is blind until then."""
     yields = "controller: 'examples.sees_lateral:Yields'"
@@ -76,6 +77,7 @@ class ACCScript(TraciStyleController):
         traci.vehicle.setAcceleration(veh_id, ahead, 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["ACC", "ACCBatch", "ACCScript"])
 def test_one_that_sees_nobody_keeps_its_speed_until_bv_is_on_its_lane_however_it_is_written(form):
     """It crashed three times as often as one that waits: it had sped up for 2 s. With ``onset`` it still does."""
@@ -135,6 +137,7 @@ class Faster(IDM):
         return -3.0 if ahead else 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["nde", "step_mixture"])
 def test_a_controller_acts_from_the_first_step(method):
     shard = drive(EARLY, f"testing={{method: {method}}}", "environment.lane_change_level=350", n=300)

@@ -68,6 +68,7 @@ def test_a_script_leaves_the_bits_of_the_hook(name, of_the_hook):
     assert motion(script(name)) == of_the_hook
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["main_guard.py", "with_main.py:main", "several/several.py"])
 def test_so_it_does_in_sumo(name, of_the_hook):
     with closing(SumoWorld(7)) as world:
@@ -239,8 +240,9 @@ def test_from_the_command_line_with_workers_of_its_own_resumed_and_repeated(name
     assert manifest["repeated"]["differing"] == []
 
 
+@pytest.mark.slow
 def test_av_check_finds_nothing(capsys):
-    assert main(["av-check", str(SCRIPTS / "remembers.py"), "--episodes", "20", "--json"]) == 0
+    assert main(["av-check", str(SCRIPTS / "remembers.py"), "--tests", "20", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["deterministic"]
     assert found["failures"] == {}

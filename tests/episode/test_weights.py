@@ -114,6 +114,7 @@ def test_martingale_sums_are_those_of_moments():
     assert (np.abs(found - done.summed(terms)) <= 1e-8 * scale).all()
 
 
+@pytest.mark.slow
 def test_without_control_the_weight_is_exactly_one():
     assert (plain().log_weight == 0.0).all()
     published = run("step_mixture", "immediate", n=4_000, moments="all", surrogates="two")
@@ -139,7 +140,7 @@ RAISED_RUNS = [
     ("episode_mixture", {"n": 20_000}),
     *((method, {"n": 20_000, "av": "never_brakes"}) for method in ("forced", "episode_mixture")),
     *(pytest.param(*each, marks=pytest.mark.slow) for each in HARDLY_BRAKES),
-    *((method, EVERY_STEP) for method in ("forced", "step_mixture", "episode_mixture")),
+    *(pytest.param(each, EVERY_STEP, marks=pytest.mark.slow) for each in ("forced", "step_mixture", "episode_mixture")),
     ("step_mixture", PUBLISHED),  # ε = 0.1, with a surrogate that is critical for a step or two
 ]
 
@@ -151,6 +152,7 @@ def plain(n=50_000, **settings):
     return done
 
 
+@pytest.mark.slow
 def test_methods_agree_at_the_default_level():
     found = [run("forced", n=50_000), run("step_mixture", n=30_000), run("episode_mixture", n=30_000)]
     for i, one in enumerate(found):

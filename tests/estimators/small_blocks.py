@@ -43,7 +43,7 @@ def block(
     outcome = np.select(
         [np.array([False] * n if failed is None else failed, bool), crashed], [FAILED, CRASH], TIMEOUT
     ).astype(np.int8)
-    columns = {"cut_in": crashed, "log_q": np.zeros((n, 2)), "n_control_steps": np.ones(n, dtype=np.int64)}
+    columns = {"happened": crashed, "log_q": np.zeros((n, 2)), "n_control_steps": np.ones(n, dtype=np.int64)}
     columns |= {"martingale": np.zeros((n, 2)), **more}
     drawn = Drawn(method, np.full(2, 0.5) if alpha is None else alpha, weight_cap, epsilon=epsilon)
     return Block(
@@ -55,7 +55,7 @@ def in_shells(strata: list[int], crash: list[bool], failed: list[bool] | None = 
     """Tests drawn from `SHELLS`."""
     n, stratum = len(strata), np.array(strata, np.int64)
     some = block(crash, failed=failed)
-    columns = {"cut_in": np.ones(n, np.bool_), "stratum": stratum, "cell": stratum}
+    columns = {"happened": np.ones(n, np.bool_), "stratum": stratum, "cell": stratum}
     columns["cell_mass"] = np.tile(SHELLS.p, (n, 1))
     return Block(first, some.outcome, np.log(SHELLS.p)[strata], columns, Drawn("shells", shells=SHELLS))
 

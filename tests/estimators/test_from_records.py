@@ -41,7 +41,7 @@ def test_a_block_holds_what_the_rows_say(name, stored_run):
     rows, found = episodes.to_pandas(), read(episodes, name=name)
     assert found.first_episode == 40
     assert [OUTCOMES[k] for k in found.outcome] == rows.outcome.tolist()
-    np.testing.assert_array_equal(found.cut_in, rows.event_step.notna())
+    np.testing.assert_array_equal(found.happened, rows.event_step.notna())
     if name in (NAME, "mixture-twin"):
         np.testing.assert_array_equal(found.log_q, np.stack(rows.log_q))
     for column in ("log_weight", "n_control_steps"):

@@ -116,7 +116,7 @@ def campaign_of(source, crashed, impact, rows, rng):
         chosen = np.concatenate([rng.choice(rows[s], k) for s, k in enumerate(added.tolist()) if k])
         n, crash = stratum.size, crashed[chosen]
         columns = {
-            "cut_in": np.ones(n, bool), "stratum": stratum, "cell": stratum, "impact_mps": impact[chosen],
+            "happened": np.ones(n, bool), "stratum": stratum, "cell": stratum, "impact_mps": impact[chosen],
             "cell_mass": np.zeros((n, design.p.size)),
         }  # fmt: skip
         outcome = np.where(crash, CRASH, TIMEOUT).astype(np.int8)
@@ -133,6 +133,7 @@ def harder():
     return prepare(resolve(golden("shells-twin", "crash.counts_above_mps=5")))
 
 
+@pytest.mark.slow
 def test_drivers_of_the_pool_are_judged_by_the_speed_that_counts(harder, source):
     """But the envelope: of it every crash counts."""
     crashed, impact = driven(harder, "brakes-8")
@@ -180,6 +181,7 @@ def held(source, name, n_campaigns):
     return np.mean(found, axis=0).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["idm", "touches"])
 def test_bands_and_bounds_hold_at_each_speed(name, source):
     """At 90 %, where each campaign stops by its own rate; the pool's own error is not in it."""

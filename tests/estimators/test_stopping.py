@@ -133,6 +133,7 @@ def wrong() -> tuple[int, int]:
     return found.count("accepted"), found.count("rejected")
 
 
+@pytest.mark.slow
 def test_either_verdict_is_wrong_in_at_most_one_of_twenty():
     assert all(binomtest(n, REPLICATIONS, 0.05, alternative="greater").pvalue > 1e-4 for n in wrong())
 

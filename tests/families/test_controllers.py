@@ -31,7 +31,9 @@ def drive(name: str, controller: str, traffic, cells=16):
             return loop.run(0, traffic)
 
 
-@pytest.mark.parametrize("name", LADDERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "cut_out")) for name in LADDERS]
+)
 def test_the_same_model_has_the_same_bits_in_every_form(name):
     """Where the vehicle ahead brakes they are those of the built-in one; before a cut-out that looks ahead of it."""
     traffic, resolved = traffic_from(name, 40), resolved_of(name)

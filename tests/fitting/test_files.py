@@ -11,13 +11,13 @@ import pytest
 from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.errors import HarnessError, TrajectoryError
+from harness.families.cut_in.fitting.hazard import FREE_TTC_S
+from harness.families.cut_in.fitting.laws import LAWS, FittedLaw
+from harness.families.cut_in.fitting.maximum import Maximum
 from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.families.replicates import read_replicates
 from harness.fitting.files import fit_files
-from harness.fitting.hazard import FREE_TTC_S
-from harness.fitting.laws import LAWS, FittedLaw
-from harness.fitting.maximum import Maximum
 from tests.fitting.trajectories import overtaking
 
 
@@ -29,7 +29,7 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
     told = json.loads(capsys.readouterr().out)
     assert told["recordings"] == told["lane_changes"] == 24
     assert main(["fit", "rows.parquet", "--out", "other.yaml", "--replicates", "5", "--quiet"]) == 0
-    assert "! 5 replicates (a 90 % interval needs 20 at least)" in capsys.readouterr().out
+    assert "! only 5 replicates (a 90 % interval needs at least 20)" in capsys.readouterr().out
     parameters = load_parameters(EnvironmentSettings(parameters="./a #1: b.yaml"))
     assert len(read_replicates("./a #1: b.yaml", parameters, SHIPPED_FOLDER)) == 5
     page = (tmp_path / "a #1: b.html").read_text()
@@ -43,14 +43,14 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
     assert all(each.se > abs(each.value) for each in numbers)
     assert len(grey) < len(re.findall(r'<tr><th scope="row"><code>', page))
     again = fit_files(["rows.parquet"], tmp_path / "again" / "a #1: b.yaml", n_replicates=5)
-    for file in (again.environment, again.replicates, again.page):
+    for file in again.files:
         assert file.read_bytes() == (tmp_path / file.name).read_bytes()
 
 
 def test_a_hazard_above_what_a_second_allows_is_fitted(tmp_path):
     """Where BV nearly always cuts in within a second, the likelihood once had a bend, at which no maximum was found."""
     overtaking(2.0).assign(length_m=4.5).to_parquet(tmp_path / "rows.parquet", index=False)
-    found = fit_files([tmp_path / "rows.parquet"], tmp_path / "mine.yaml", n_replicates=2).fit
+    found = fit_files([tmp_path / "rows.parquet"], tmp_path / "mine.yaml", n_replicates=2).families["cut_in"].fit
     risk = found.traffic.at_risk[found.traffic.at_risk["ttc_s"] > FREE_TTC_S]
     wished = float(found.hazard.rate(risk) @ risk["duration_s"])
     assert wished == pytest.approx(risk["changes"].sum(), rel=0.1)
@@ -111,25 +111,27 @@ def test_what_no_fit_has_written_stays_unless_forced(tmp_path, monkeypatch, caps
 def test_replicates_belong_to_one_environment(tmp_path):
     """Neither those of another fit, nor those of other numbers."""
     overtaking(2.0).to_parquet(tmp_path / "rows.parquet", index=False)
-    mine, other = (
-        fit_files([tmp_path / "rows.parquet"], tmp_path / f"{i}.yaml", n_replicates=2, seed=i) for i in (1, 2)
+    for i in (1, 2):
+        fit_files([tmp_path / "rows.parquet"], tmp_path / f"{i}.yaml", n_replicates=2, seed=i)
+    mine, replicated, other = (
+        tmp_path / f"{name}" for name in ("1.yaml", "1.replicates.parquet", "2.replicates.parquet")
     )
-    text, own = mine.environment.read_text(), mine.replicates.read_bytes()
+    text, own = mine.read_text(), replicated.read_bytes()
 
     def read() -> int:
-        name = str(mine.environment)
+        name = str(mine)
         return len(read_replicates(name, load_parameters(EnvironmentSettings(parameters=name)), SHIPPED_FOLDER))
 
     assert read() == 2
-    mine.replicates.write_bytes(other.replicates.read_bytes())
+    replicated.write_bytes(other.read_bytes())
     with pytest.raises(HarnessError, match=r"1\.replicates\.parquet: found replicates of another fit, or changed ones"):
         read()
-    mine.replicates.write_bytes(own)
-    mine.environment.write_text(re.sub(r"v_location_mps: {value: [\d.]+", r"\g<0>1", text))
+    replicated.write_bytes(own)
+    mine.write_text(re.sub(r"v_location_mps: {value: [\d.]+", r"\g<0>1", text))
     with pytest.raises(HarnessError, match=r"replicates of other numbers than those of 1\.yaml"):
         read()
     for wrong in (r"\ud800", r"a\0"):
-        mine.environment.write_text(text.replace("1.replicates.parquet", wrong))
+        mine.write_text(text.replace("1.replicates.parquet", wrong))
         with pytest.raises(HarnessError, match=r"replicates\.file"):
             read()
 

@@ -5,7 +5,13 @@ import pandas as pd
 import pytest
 
 from harness.errors import TrajectoryError
-from harness.fitting.observations import Observations, Tally, observations, require_distinct, require_enough
+from harness.families.cut_in.fitting.observations import (
+    Observations,
+    Tally,
+    observations,
+    require_distinct,
+    require_enough,
+)
 from harness.fitting.table import load_mapping
 from tests.fitting.trajectories import overtaking
 

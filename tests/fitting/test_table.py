@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from harness.errors import EXIT_BAD_INPUT, HarnessError, TrajectoryError
-from harness.fitting.observations import Tally, observations, require_distinct, require_enough
+from harness.families.cut_in.fitting.observations import Tally, observations, require_distinct, require_enough
 from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
 
@@ -252,6 +252,7 @@ def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):
     assert shares[-1] == 1.0
 
 
+@pytest.mark.slow
 def test_ngsim(tmp_path):
     """Feet, milliseconds, front bumpers, lanes from the left, and ramps; also the original text without a header."""
     lane = np.where(ROWS.recording_id == 3, 7, 6 - ROWS.lane)

@@ -74,6 +74,7 @@ def require_identities(proposals, epsilon):
     assert (v <= 1.0 + 1e-6).all()
 
 
+@pytest.mark.slow
 @settings
 @given(st.lists(st.tuples(states, maneuvers, steps), min_size=1, max_size=20))
 def test_identities_anywhere(challenge, epsilon, situations):

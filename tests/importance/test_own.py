@@ -76,6 +76,7 @@ def test_its_file_s_content_is_part_of_the_hash_and_its_place_is_not(tmp_path):
     assert first.content_hash != other.content_hash
 
 
+@pytest.mark.slow
 def test_a_folder_from_elsewhere_runs_it_only_if_trusted(tmp_path):
     name = own(tmp_path)
     harness.run(campaign(name), tmp_path / "run", workers=1)

@@ -53,6 +53,7 @@ def test_kept_cut_ins_stand_for_their_shell(pool):
         assert abs(pool.shell_p @ share - pool.mu[k]) <= 4.0 * error + 1e-12 * pool.mu[k]
 
 
+@pytest.mark.slow
 def test_tables_that_say_what_the_formulas_do_give_their_rates(campaign, environment):
     """The same paths are enumerated; a logistic of a thousandth of a second is a step."""
     library = load_library(campaign.pool.library)
@@ -110,6 +111,7 @@ def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside
         prescribed.rows((Draw(0, within.size, 1),))
 
 
+@pytest.mark.slow
 def test_how_many_paths_a_pool_has_does_not_depend_on_them(environment, monkeypatch):
     """One that ends where its paths look alike has the rates of paths that look alike, which are too low."""
     settings, run = PoolSettings(relative_error=0.015, events_per_shell=100), Enumerator.run

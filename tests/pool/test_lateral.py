@@ -87,6 +87,7 @@ def test_leads_are_kept_with_the_pool(lateral_pool, pool):
     assert not pool_from(pool_content(pool)).events.lead.any()
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow():
     """Surrogates take over at the onset; a test repeats its baseline run until then, and ends inside the envelope."""
     acts = of("environment.parameters=ndd-overtaking-1-lateral", f"av={ACTING.format('Speeds')}", "world.engine=twin")

@@ -70,6 +70,7 @@ def test_probabilities_are_those_of_the_states_that_were_driven(speeds):
         assert np.all(probability[row, len(trace) - 1 :] == 0.0)
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one_does(speeds):
     """The loop drives what the pool has worked out: script, motion and hash agree, and every outcome."""
     ready, _, _ = speeds
@@ -99,6 +100,7 @@ def test_weights_of_the_chosen_paths_keep_every_mean():
     np.testing.assert_allclose(chances(np.zeros((10, 2)), np.ones(2)), 0.1)
 
 
+@pytest.mark.slow
 def test_shells_of_a_holder_on_few_chosen_paths_are_those_of_the_large_pool(campaign, pool):
     """Each within four standard errors (false alarm for 9 numbers below 1e-3), which are 13 % at most, mostly 3 %."""
     ready, _, runs = prepared_after(acting("HoldsBatch", "pool.shadow_paths=1000"))

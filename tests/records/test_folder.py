@@ -176,6 +176,7 @@ def flips_unnoticed(folder: Path, n: int, seed: int) -> Iterator[str]:
                 yield f"bit {bit} of {path}"
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_changes_no_number_silently(stored):
     assert list(flips_unnoticed(stored, FLIPS, seed=1)) == []
 

@@ -60,6 +60,7 @@ def test_a_run_of_ones_own_is_run_again_wherever_it_was_moved_to(made, tmp_path,
     assert err.startswith(f"The vehicle is {made.parent}/av.py:Av.")
 
 
+@pytest.mark.slow
 def test_of_somebody_else_it_takes_trust(made, elsewhere, capsys, tmp_path):
     traced, untraced = crashed(elsewhere)
     for episode in (traced, untraced):
@@ -68,7 +69,7 @@ def test_of_somebody_else_it_takes_trust(made, elsewhere, capsys, tmp_path):
         assert f"{made.parent}/av.py:Av" in said
     for kind in ("csv", "html", "xosc"):
         assert main(["replay", str(elsewhere), str(traced), "--stored", "--out", str(tmp_path / f"y.{kind}")]) == 0
-    assert capsys.readouterr().out.startswith(f"episode {traced}: crash; as the run has traced it")
+    assert capsys.readouterr().out.startswith(f"test {traced}: crash; the motion that the run has kept")
     assert main(["replay", str(elsewhere), str(untraced), "--stored"]) == 2
     for command in ("estimate", "report"):
         assert main([command, str(elsewhere)]) == 0

@@ -6,11 +6,12 @@ from typing import Any
 import pytest
 
 import harness
+from harness.campaign.files import load_campaign
 from harness.report.page import write_report
 from harness.report.summary import RunFolder, read_run_folder
 from tests.golden.campaigns import SHELLS
 from tests.golden.record import load
-from tests.in_process import controllers_here, one_process, without_page
+from tests.in_process import controllers_here, one_process, run_here, without_page
 from tests.report.page_text import write_run
 
 
@@ -52,6 +53,18 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with one_process(), controllers_here(), without_page():
         harness.compare(load(*shared), load(*shared, late), out, workers=1)
     return out
+
+
+@pytest.fixture(scope="session")
+def crashing(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A run of each scenario, by its name, of a pool that is small: idm crashes in all; tests must not change them."""
+
+    def make(scenario: str) -> Path:
+        small = "pool.relative_error=0.2", "pool.events_per_shell=200", "stop.episodes=200", "stop.rhw=0.9"
+        campaign = load_campaign("idm", [f"scenario={scenario}", "world.engine=twin", "records.traces=crash", *small])
+        return run_here(campaign, tmp_path_factory.mktemp(scenario) / "run").folder
+
+    return OnDemand(make)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import pytest
 
 import harness
 from harness.report.compare_page import write_comparison
+from harness.report.hours_page import write_hours_of
 from harness.report.page import write_report
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of
@@ -114,9 +115,9 @@ def test_the_slider_shows_each_step_as_it_was_and_to_scale(opened, replayed):
         page.fill(".bar input", str(step))
         i, place = step - scene["first"], {}
         assert seconds(page) == pytest.approx(STEP_S * step)
-        assert cell(page, "AV", "speed") == f"{av['v'][i]:.1f} m/s"
+        assert cell(page, "AV", "speed, m/s") == f"{av['v'][i]:.1f}"
         gap = bv["x"][i] - LENGTH_M - av["x"][i]
-        assert cell(page, "AV", "gap to BV") == f"{gap if abs(gap) >= 0.05 else 0.0:.1f} m".replace("-", "−")
+        assert cell(page, "AV", "gap to BV, m") == f"{gap if abs(gap) >= 0.05 else 0.0:.1f}".replace("-", "−")
         assert page.locator(".star").is_visible() == (step == av["crash"])
         body = page.locator(".car:not(.dashed) .body").first
         pixels = float(body.get_attribute("width")) / LENGTH_M
@@ -126,7 +127,7 @@ def test_the_slider_shows_each_step_as_it_was_and_to_scale(opened, replayed):
             place[car.locator("text").text_content()] = float(x), float(y)
         for track in scene["tracks"][:2]:
             ahead_m, (x, y) = track["x"][i] - av["x"][i], place[track["name"]]
-            over = scene["over"][i] if track is bv else 0.0
+            over = track["over"][min(i, len(track["over"]) - 1)]
             assert x - place["AV"][0] == pytest.approx(ahead_m * pixels, abs=0.02)
             assert place["AV"][1] - y == pytest.approx((1.0 - over) * 3.6 * pixels, abs=0.02)
 
@@ -152,7 +153,7 @@ def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
     for step, hit in ((scene["event"], False), (scene["tracks"][2]["crash"], True)):
         page.fill(".bar input", str(step))
         for name, track in (("B", scene["tracks"][2]), ("A", scene["ghosts"][0])):
-            assert cell(page, name, "speed") == f"{track['v'][step - scene['first']]:.1f} m/s"
+            assert cell(page, name, "speed, m/s") == f"{track['v'][step - scene['first']]:.1f}"
         assert page.locator(".star").is_visible() == hit
     begin = seconds(page)
     assert page.locator(".car.dashed").is_visible()
@@ -161,6 +162,76 @@ def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
     assert seconds(page) > begin
     page.locator(".pick button").last.click()
     assert "Only A crashes" in page.inner_text(".player h3")
+
+
+@pytest.fixture(scope="module")
+def pages(report, replayed, crashing, compared, tmp_path_factory) -> list[Path]:
+    """One of each kind: a run's in each scenario, of their sum, of a comparison, of one test."""
+    place = tmp_path_factory.mktemp("pages")
+    runs = [write_report(copy_of(crashing[name], place / name)) for name in ("lead_brakes", "cut_out")]
+    return [report, replayed, *runs, write_comparison(copy_of(compared, place / "compared")), hours_page(place)]
+
+
+def hours_page(place: Path) -> Path:
+    """The page of a sum, of figures made up."""
+    exposure = {"per_hour": 0.1, "low": 0.02, "high": 0.5, "counted": None, "source": "assumed: no primary rate"}
+    part = {
+        "rate_per_hour": 1.26e-3, "ci_low": 1.19e-3, "ci_high": 1.89e-3, "upper_bound": None, "share": 0.5,
+        "ratio": 34.0, "n_episodes": 100, "n_crashes": 10, "median_impact_mps": 7.0, "exposure": exposure,
+    }  # fmt: skip
+    beside = {"ratio": 15.0, "ratio_low": 14.0, "ratio_high": 22.0, "over_assumed": [4.4, 27.0], "reference": "r157-cc"}
+    content = {
+        "vehicle": "idm", "name": "r157", "n_episodes": 300, "n_crashes": 30, "seed": 1, "confidence": 0.9,
+        "per_hour": {"rate": 1.27e-3, "ci_low": 1.2e-3, "ci_high": 1.9e-3, "upper_bound": None, "rhw": 0.3},
+        "per_1e6_km": 11.3, "beside": beside, "decision": None, "stopped_by": "rhw", "asked_rhw": 0.3,
+        "counts_in_interval": False, "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
+    }  # fmt: skip
+    return write_hours_of(place, content)
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark"), (390, "light")])
+def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(width, scheme, browser, pages):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="it brings axe-core").Axe()
+    context = browser.new_context(
+        viewport={"width": width, "height": 844}, color_scheme=scheme, bypass_csp=True, offline=True
+    )
+    for file in pages:
+        page = context.new_page()
+        page.goto(file.as_uri())
+        page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+        page.add_style_tag(content=".scroll { background: none }")  # contrast on a gradient is not judged
+        found = axe.run(page).response["violations"]
+        assert [(file, each["id"], [node["target"] for node in each["nodes"]]) for each in found] == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        page.close()
+    context.close()
+
+
+def test_a_phone_shows_all_columns_of_the_player_and_cars_that_can_be_seen(opened, pages):
+    for file in pages[:-1]:
+        page = opened(file, 390)
+        table = page.locator(".now").first
+        assert table.locator("thead th:visible").count() == 6
+        assert table.evaluate("(e) => e.scrollWidth <= e.parentElement.clientWidth")
+        assert float(page.locator(".car .body").first.get_attribute("width")) >= 20.0
+
+
+def test_on_paper_it_is_light_and_without_what_only_a_screen_can_do(opened, pages):
+    for file in pages:
+        page = opened(file, 1280, "dark")
+        page.emulate_media(media="print", color_scheme="dark")
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+        for name in (".bar", ".jumps", "details:not([open]) summary"):
+            assert page.locator(f"{name}:visible").count() == 0
+
+
+def test_a_cut_out_shows_when_the_revealed_vehicle_becomes_visible(opened, crashing):
+    file = write_report(copy_of(crashing["cut_out"], crashing["cut_out"].parent / "shown"))
+    page, scene = opened(file), scenes_in(file.read_text())[0]
+    [step] = [step for step, name in scene["moments"] if name == "SV becomes visible"]
+    assert scene["onset"] <= step <= scene["event"]
+    page.get_by_role("button", name="SV becomes visible", exact=True).click()
+    assert seconds(page) == pytest.approx(STEP_S * step)
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])

@@ -26,8 +26,8 @@ SEEN = {
     "no_crash": (set(), ["No crash was seen."]),
     "nde": ({"severity"}, []),
     "failed": ({"severity"}, ["9 of 300 tests FAILED", "step: returned nan, expected"]),
-    "shells": ({"severity", "shells"}, ["not even 8 m/s² avoids it"]),
-    "shells_refuted": ({"severity", "shells"}, ["refuted by these tests; by episode", "outermost no. 1"]),
+    "shells": ({"severity", "shells"}, ["even by braking at 8 m/s²"]),
+    "shells_refuted": ({"severity", "shells"}, ["refuted by these tests; by test", "outermost no. 1"]),
     "shells_inside_only": ({"severity", "shells"}, ["not put to the test"]),
 }
 """Plots, and words that no other kind of run has."""
@@ -186,7 +186,7 @@ def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     assert (suite.name, suite.tests, suite.skipped) == ("smoke", 1, 0)
     assert (suite.failures, suite.errors) == (int(kind == "Failure"), int(kind == "Error"))
     (asked,) = suite
-    assert (asked.name, "no crash in 9 beyond it" in asked.system_out) == ("assumption_free", True)
+    assert (asked.name, "no crash in 9 tests outside it" in asked.system_out) == ("assumption_free", True)
     assert [type(each).__name__ for each in asked.result] == ([] if kind is None else [kind])
     assert all("REJECTED  <above> & beyond\\u001b[31m" in each.message for each in asked.result)
     assert f"[[ATTACHMENT|{report}]]" in asked.system_out

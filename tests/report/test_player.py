@@ -178,14 +178,14 @@ def test_replay_says_what_happens_and_writes_the_page(stored_run, tmp_path, caps
     episode = crashed(folder)[0]
     assert main(["replay", str(folder), str(episode), "--out", str(file)]) == 0
     first, *lines, last = capsys.readouterr().out.splitlines()
-    assert first == f"episode {episode}: crash; bit for bit as stored"
+    assert first == f"test {episode}: crash; bit for bit as stored"
     assert last == str(file)
-    told = {line[2:15].strip(): line[16:] for line in lines}
-    assert set(told) == {"BV comes over", "BV cuts in", "AV brakes", "AV", *STAND_INS}
+    told = {line[2:20].strip(): line[21:] for line in lines}
+    assert set(told) == {"BV comes over", "BV enters the lane", "AV brakes", "AV", *STAND_INS}
     row = harness.replay(folder, episode).row
     assert f"crashes at {row['crash_time_s']:.1f} s" in told["AV"]
     assert f"impact {row['impact_speed_mps']:.1f} m/s" in told["AV"]
-    assert f"{row['event_gap_m']:.1f} m ahead and {-row['event_rate_mps']:.1f} m/s slower" in told["BV cuts in"]
+    assert f"{row['event_gap_m']:.1f} m ahead and {-row['event_rate_mps']:.1f} m/s slower" in told["BV enters the lane"]
     assert f"{row['onset_gap_m']:.1f} m ahead" in told["BV comes over"]
     assert scenes_in(file.read_text(encoding="utf-8"))[0]["episode"] == episode
 

@@ -20,14 +20,14 @@ from tests.golden.campaigns import BASE, RUNS
 from tests.stored_runs import answer_in, estimates, golden
 
 SAID = {
-    "nde-twin": ["lane-change level 3,000,000: never compare", "impact "],
+    "nde-twin": ["lane_change_level is 3,000,000: compare only with", "impact speed "],
     "step-immediate-twin": ["the true rate may lie far above this interval: a crash may weigh 1.00 × 10²⁰⁰, and all"],
     "forced-failing-twin": [" of 240 tests FAILED; had they all crashed, the rate would be "],
-    "shells-twin": ["crash rate  ", "× competent driver  ", "r157-cc of UN R157", "not even 8 m/s² avoids it"],
-    "shells-accepted": ["ACCEPTED ", "below 4 × 10⁻⁷ per test", "confidence 0.95", "ended by: decision reached"],
-    "shells-refuted": ["138 (crashes more)", "ended by: all tests done"],
-    "shells-inside": ["keeping to library ", "nothing tested beyond it", "crash rate so far", "unavoidable so far"],
-    "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc, same approach"],
+    "shells-twin": ["crash rate  ", "× competent driver  ", "r157-cc, UN R157’s driver", "even by braking at 8 m/s²"],
+    "shells-accepted": ["ACCEPTED ", "rate below 4 × 10⁻⁷ per test", "confidence 0.95", "stopped: verdict reached"],
+    "shells-refuted": ["138 (crashes more)", "stopped: all tests done"],
+    "shells-inside": ["given the library ", "no tests outside it", "crash rate so far", "unavoidable so far"],
+    "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc, from the same state"],
     "forced-inattentive": ["fvdm (reaction.delay_s 0.2, "],
     "forced-krauss": ["SUMO’s Krauss · 240 tests in SUMO"],
     "shells-lateral-twin": ["idm · 240 tests"],
@@ -43,7 +43,7 @@ def test_it_is_short_and_says_what_changes_the_meaning(name, stored_run):
     assert "…" not in "".join(text[1:])
     assert " · 3.2 s" in text[0]
     assert text[-1] == f"  report  {run.path}/report.html"
-    assert "\n  sampling error in this simulated traffic only (90 %)" in "\n".join(text)
+    assert "\n  90 % intervals cover sampling error in this simulated traffic only; stopped: " in "\n".join(text)
     assert [each for each in SAID.get(name, ()) if each not in re.sub(r"\n    ", " ", "\n".join(text))] == []
 
 
@@ -66,11 +66,12 @@ def said(run, best=None, campaign=None, manifest=None, **changes):
 
 def test_a_vehicle_that_is_not_reproducible_and_a_precision_that_was_not_reached(stored_run):
     answer = answered(stored_run, repeated={"n_episodes": 16, "differing": [3, 4, 5]})
-    assert list(answer.warnings) == ["NOT REPRODUCIBLE: 3 of 16 tests that ran twice came out otherwise"]
-    assert re.search(r"ended by: budget spent ± \d+ %, asked: ± 10 %$", answer.scope)
+    told = "NOT REPRODUCIBLE: 3 of 16 tests that ran twice differed: see `harness av-check`"
+    assert list(answer.warnings) == [told]
+    assert re.search(r"stopped: budget of tests used up, at ± \d+ % \(asked: ± 10 %\)$", answer.scope)
 
 
-@pytest.mark.parametrize(("verdict", "value"), [("rejected", "above"), ("undecided", "limit")])
+@pytest.mark.parametrize(("verdict", "value"), [("rejected", "rate above"), ("undecided", "limit")])
 def test_a_limit_that_is_rejected_or_open(verdict, value, stored_run):
     decision = {**read_manifest(stored_run("shells-accepted"))["decision"], "verdict": verdict}
     answer = answered(stored_run, decision=decision)
@@ -95,9 +96,10 @@ def test_a_vehicle_that_only_touches_is_said_so(stored_run):
         replace(each, columns={**each.columns, "impact_mps": 0.02 * each.impact_mps}) for each in blocks_of(folder)
     ]
     answer = answered(stored_run, "shells-refuted", blocks, ())
-    text, row = lines(answer, 1.0), r"  impact +median 0.1 m/s +0 % \(0–\d+ %\) > 5 m/s +100 % \(\d+–100 %\) < 1 m/s"
+    above, below = r"0 % \(0–\d+ %\) above 5 m/s", r"100 % \(\d+–100 %\) below 1 m/s"
+    text, row = lines(answer, 1.0), rf"  impact speed +median 0.1 m/s +{above} +{below}"
     assert any(re.match(row, line) for line in text)
-    assert "  ! 100 % of this rate are touches below 1 m/s" in text
+    assert "  ! 100 % of these crashes are touches below 1 m/s: crash.counts_above_mps=1 leaves them out" in text
     assert asdict(answer.rows[0]) == answer_in(folder)["rows"][0]
 
 
@@ -128,8 +130,8 @@ def test_vehicles_are_named_with_what_is_not_a_default(av, name, parameters):
 @pytest.mark.parametrize(
     ("alone", "expected", "row"),
     [
-        (0.4, {"runs": 1300, "tests": 240}, ("± 50 %, most by runs", "± 40 %", "try 1,300 runs, 240 tests")),
-        (0.1, None, ("± 50 %, most by tests", "± 10 %", "")),
+        (0.4, {"runs": 1300, "tests": 240}, ("± 50 %, mostly by runs", "± 40 %", "try 1,300 runs, 240 tests")),
+        (0.1, None, ("± 50 %, mostly by tests", "± 10 %", "")),
     ],
 )
 def test_of_a_vehicle_that_acts_it_says_whether_runs_or_tests_are_missing(alone, expected, row):
@@ -147,8 +149,8 @@ def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what
     manifest = {"remedy": {"pool.events_per_shell": 3200}}
     answer = said(run, best, campaign, severity=None, stopped_by="pool", manifest=manifest)
     [row] = [row for row in answer.rows if row.key == "ratio"]
-    assert (row.value, row.remark) == ("no ratio", "such drivers never crash here")
-    assert answer.scope.endswith("would narrow it, no crash seen, asked: ± 30 %; raise pool.events_per_shell to 3,200")
+    assert (row.value, row.remark) == ("no ratio", "that driver never crashes here")
+    assert answer.scope.endswith("would narrow it, no crash seen (asked: ± 30 %); raise pool.events_per_shell to 3,200")
     run = read_run_folder(stored_run("forced-acting-twin"))
     answer = said(run, replace(run.estimates.best, cautions=()))  # asks no other driver
     assert "ratio" not in {row.key for row in answer.rows}
@@ -167,7 +169,7 @@ def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(nam
     run = read_run_folder(stored_run(name))
     asked = {**run.estimates.diagnostics, "n_asked_to_speed_up": 1234 * (name != "forced-krauss")}
     warnings = "".join(said(run, manifest={"events_show": shows}, diagnostics=asked).warnings)
-    assert ("cannot see BV come over" in warnings) == blind
+    assert ("cannot see the other car (BV)" in warnings) == blind
     assert ("1,234 tests it asked to speed up" in warnings) == held
 
 
@@ -175,8 +177,8 @@ def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(nam
     ("seen", "high", "first", "value", "ends"),
     [
         (0.0, 0.2, "ratio", "< 0.20", "no crash seen"),
-        (0.08, 0.2, "ratio", "< 0.20 (crashes less)", "0.080 seen, ≥ 0.050"),
-        (0.08, 3.0, "rate", "< 3.00 × 10⁻⁸ per test", "1.00 × 10⁻⁹ seen"),
+        (0.08, 0.2, "ratio", "< 0.20 (crashes less)", "estimate 0.080, ≥ 0.050"),
+        (0.08, 3.0, "rate", "< 3.00 × 10⁻⁸ per test", "estimate 1.00 × 10⁻⁹"),
     ],
 )
 def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, value, ends, stored_run):
@@ -206,9 +208,9 @@ def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     severity = replace(run.estimates.severity, **limits, share_below_1_mps=0.0)
     rows = said(run, best, severity=severity, decision=decision).rows
     found = {row.key: row.texts[1:] for row in rows}
-    assert found["rate"][:2] == ("> 1.00 × 10⁻⁷ per test", "2.00 × 10⁻⁷ seen")
-    assert found["ratio"][:2] == ("> 2.00 (crashes more)", "3.98 seen")
-    assert found["impact"][1:] == ("", "0 % (0–41 %) < 1 m/s")
+    assert found["rate"][:2] == ("> 1.00 × 10⁻⁷ per test", "estimate 2.00 × 10⁻⁷")
+    assert found["ratio"][:2] == ("> 2.00 (crashes more)", "estimate 3.98")
+    assert found["impact"][1:] == ("", "0 % (0–41 %) below 1 m/s")
 
 
 def severe(stored_run, cut_off=0.0, driver="brakes-8", **of_rate):
@@ -222,7 +224,7 @@ def severe(stored_run, cut_off=0.0, driver="brakes-8", **of_rate):
 @pytest.mark.parametrize(("cut_off", "high", "warned"), [(0.19, 1.1, False), (0.3, 1.2, True), (0.3, 1.4, False)])
 def test_tests_whose_time_was_up_are_warned_of_where_the_interval_leaves_them_out(cut_off, high, warned, stored_run):
     """They are many, and had they crashed the rate would be above its upper end."""
-    assert any("time was up" in each for each in severe(stored_run, cut_off, ci_high=high).warnings) == warned
+    assert any("still closing in" in each for each in severe(stored_run, cut_off, ci_high=high).warnings) == warned
 
 
 @pytest.mark.parametrize(("driver", "told"), [("brakes-8", True), ("brakes-6", False)])
@@ -253,8 +255,9 @@ def test_a_comparison_is_as_short():
     shown = "\n".join(text)
     assert "1.00 × 10⁻¹⁰ to 2.00 × 10⁻⁷" in shown
     for said in (
-        "0.10 to no limit", "no crash seen", "only where brakes-2-late-1s of", "by: precision reached",
-        "A alone 31, B alone 1,000", "with --margin 0.1 --set stop.episodes=7000: some 5,800 more pairs, 58.0 s",
+        "0.10 to no limit", "no crash seen", "only where brakes-2-late-1s of", "stopped: precise enough",
+        "only A crashed in 31 pairs, only B in 1,000",
+        "with --margin 0.1 --set stop.episodes=7000: some 5,800 more pairs, 58.0 s",
     ):  # fmt: skip
         assert said in " ".join(shown.split())
 
@@ -266,7 +269,7 @@ NEW_FOLDER = {"pairs": 1000, "settings": {}, "new_folder": True}
     ("verdict", "needed", "said"),
     [
         ("proven", None, None),
-        ("open", None, "too much alike"),
+        ("open", None, "too alike"),
         ("open", NEW_FOLDER, "--margin 0 and a new --out: some 1,000"),
     ],
 )
@@ -306,4 +309,4 @@ def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time
         ("forced-krauss", True, True), ("forced-krauss", False, False), ("forced-twin", True, False)
     ):  # fmt: skip
         answer = said(read_run_folder(stored_run(name)), manifest={"events_show": shows})
-        assert any("cannot see BV come over" in each for each in answer.warnings) == warned
+        assert any("cannot see the other car (BV)" in each for each in answer.warnings) == warned

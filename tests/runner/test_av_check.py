@@ -177,6 +177,7 @@ def test_a_controller_that_is_not_reproduced_is_found_out(name, why):
         assert (did.reaction_s, did.braking_share, did.share_at_min) == (0.0, 1.0, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "moves"),
     [
@@ -215,7 +216,7 @@ def test_failures_that_differ_in_digits_are_one_and_name_line_and_what_was_meant
 
 
 def test_the_command_line(capfd):
-    call = ["av-check", MIXTURE_FILE, "--episodes", "6"]
+    call = ["av-check", MIXTURE_FILE, "--tests", "6"]
     assert main(call) == 0
     out = capfd.readouterr().out
     assert re.search(r"built-in IDM +[│┃]\n", out)
@@ -281,6 +282,7 @@ def test_a_vehicle_that_does_the_same_again_is_said_to(name, stored_run):
     assert manifest["repeated"]["n_episodes"] > 5
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, run, tmp_path):
     folders = [run_av(GLOBAL, name="1"), run_av(GLOBAL, name="2", run=run, workers=2)]
     one, two = (read_manifest(folder) for folder in folders)
@@ -289,7 +291,7 @@ def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_afte
     assert (one["reproducible"], two["reproducible"]) == (False, False)
     warnings = answer_in(folders[0])["warnings"]
     assert any(told.startswith("NOT REPRODUCIBLE: 10 of 10 tests") for told in warnings)
-    with pytest.raises(CampaignError, match="10 of 10 tests that it repeated itself came out otherwise"):
+    with pytest.raises(CampaignError, match="10 of the 10 tests that it ran twice differed"):
         replay_episode(folders[0], 3)
     copied = copy_of(folders[0], tmp_path / "copy")
     run_av(GLOBAL, "stop.episodes=500", name=copied.name, resume=True)

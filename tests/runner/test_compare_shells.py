@@ -94,6 +94,7 @@ def test_a_stored_run_of_a_is_taken_over(done, campaigns, run_here, campaign, tm
         compare_campaigns(*campaigns, tmp_path / "other", stored=done.folder / "b")
 
 
+@pytest.mark.slow
 def test_an_interrupted_comparison_goes_on(done, campaigns, tmp_path, monkeypatch, driven):
     run, calls = Workers.run, []
 

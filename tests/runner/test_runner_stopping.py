@@ -36,7 +36,7 @@ class Bar(Progress):
     """Where the bar of tests begins and ends."""
 
     def stage(self, name, total, *, done=0):
-        if name == "episodes":
+        if name == "tests":
             self.begin = self.end = done
 
     def advance(self, n):
@@ -113,7 +113,7 @@ def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(campaign, run_h
     far = run_here(asked("stop.below_reference=2"), tmp_path / "far")
     assert (far.exit_code, far.stopped_by, far.estimates["decision"]) == (0, "below_reference", None)
     assert far.estimates["unmet"] == [{"key": "below_reference", "numbers": {"limit": 2.0}}]
-    assert answer_in(far.folder)["scope"].endswith("ended by: far enough below the competent driver")
+    assert answer_in(far.folder)["scope"].endswith("stopped: clearly below the competent driver")
     n = far.estimates["n_episodes"]
     others = run_here(asked("stop.below_reference=0.3"), tmp_path / "other")
     assert (others.exit_code, others.estimates["n_episodes"]) == (4, 2000)

@@ -97,6 +97,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 def test_killed_while_it_writes_then_resumed(stored_run, tmp_path):
     out, temporary = tmp_path / "run", tmp_path / ("t" * 100)  # longer than the path of a socket may be
     temporary.mkdir()

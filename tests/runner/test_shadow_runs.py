@@ -49,6 +49,7 @@ ACTS = "shells-acting-twin"
 """Sixty shadow runs, in two tasks."""
 
 
+@pytest.mark.slow
 def test_a_run_that_was_interrupted_goes_on_where_it_was(stored_run, tmp_path):
     """Ended in the middle of the shadow runs, and again among the tests: the end is that of a run in one go."""
     out = copy_of(stored_run(ACTS), tmp_path / "run")

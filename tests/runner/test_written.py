@@ -90,6 +90,7 @@ def test_a_pool_is_read_once_by_the_run_and_once_by_each_worker(stored_run, tmp_
     assert list(pools.values()) == [2]
 
 
+@pytest.mark.slow
 def test_what_an_earlier_run_has_left_is_read_once(tmp_path):
     name = "shells-acting-twin"
     run_here(golden(name, "stop.episodes=200"), tmp_path / "run")

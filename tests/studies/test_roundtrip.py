@@ -7,11 +7,11 @@ import pandas as pd
 import pytest
 from scipy.stats import gamma
 
+from harness.families.cut_in.fitting.fit import HEAVIEST_TAILS, fit_traffic
+from harness.families.cut_in.fitting.hazard import Acceptance
+from harness.families.cut_in.fitting.laws import Traffic
+from harness.families.cut_in.fitting.observations import observations
 from harness.families.cut_in.loading import load_environment, load_parameters
-from harness.fitting.fit import HEAVIEST_TAILS, fit_traffic
-from harness.fitting.hazard import Acceptance
-from harness.fitting.laws import Traffic
-from harness.fitting.observations import observations
 from harness.fitting.table import load_mapping
 from harness.progress import Progress
 from harness.vocabulary import FloatArray

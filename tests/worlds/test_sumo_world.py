@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import libsumo
 import numpy as np
@@ -58,19 +56,6 @@ def test_a_second_simulation_is_refused_and_closing_twice_leaves_the_next_one_al
     second = driving(2)
     first.close()
     drive(second)
-
-
-def test_without_its_extra_or_a_screen_the_gui_is_refused_in_words(open_world, monkeypatch):
-    monkeypatch.setitem(sys.modules, "sumo", None)
-    with pytest.raises(
-        CampaignError, match=r"found no sumo-gui; expected the extra .* -c requirements.lock -e '\.\[sumo\]'"
-    ):
-        open_world(1, gui=True)
-    monkeypatch.setattr("harness.worlds.sumo.sumo_program", Path)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    with pytest.raises(CampaignError, match="DISPLAY is not set"):
-        open_world(1, gui=True)
-    assert open_world(1).n_cells == 1
 
 
 # -- a world that disobeys --
@@ -144,11 +129,11 @@ def run_in(world) -> Shard:
 
 def test_a_flag_that_the_positions_do_not_show_or_lack_stops_the_run_and_names_the_episode():
     run = run_in(TwinWorld(16)).episode
-    crashes = {f"episode {500 + row}, step {run['n_steps'][row]}" for row in np.flatnonzero(run["outcome"] == CRASH)}
+    crashes = {f"test {500 + row}, step {run['n_steps'][row]}" for row in np.flatnonzero(run["outcome"] == CRASH)}
     with pytest.raises(WorldDisagreementError, match="found no collision where the positions show one") as raised:
         run_in(LyingTwin(16, nervous=False))
     assert raised.value.where in crashes
-    with pytest.raises(WorldDisagreementError, match="episode 503, step 20: found a collision that the positions do"):
+    with pytest.raises(WorldDisagreementError, match="test 503, step 20: found a collision that the positions do"):
         run_in(LyingTwin(16, nervous=True))
 
 

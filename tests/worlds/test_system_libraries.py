@@ -100,7 +100,7 @@ def test_a_stored_episode_is_not_replayed_there_and_the_twin_needs_none(stored_r
     request.getfixturevalue("bare_machine")
     assert main(["replay", run, "17"]) == EXIT_BAD_INPUT
     assert "libnowhere7" in capsys.readouterr().err
-    assert main(["av-check", SMOKE, "--episodes", "2"]) == 0  # it drives a built-in model in the twin
+    assert main(["av-check", SMOKE, "--tests", "2"]) == 0  # it drives a built-in model in the twin
 
 
 def test_a_libsumo_that_does_not_load_for_another_reason_is_told_too(monkeypatch, open_world):

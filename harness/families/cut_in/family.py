@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -28,6 +28,9 @@ from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
 from harness.families.protocol import Chosen, Column, Exposure, Paths
 from harness.families.words import Shown
 from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
+
+if TYPE_CHECKING:
+    from harness.fitting.protocol import Fitter
 
 _STATE_DOCS = (
     "speed of BV",
@@ -122,6 +125,11 @@ class CutIn:
 
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:  # noqa: ARG002 - counted, whatever the laws
         return EXPOSURE
+
+    def fitter(self) -> Fitter:
+        from harness.families.cut_in.fitting.fitter import CutInFitter  # noqa: PLC0415 - reads tables, draws pages
+
+        return CutInFitter()
 
     def milder(self, traffic: Environment) -> None:
         """There are none: all cut-ins count."""

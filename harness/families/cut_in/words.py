@@ -18,9 +18,9 @@ def _tests(shows: bool) -> str:
 
 def _rests(traffic: Environment | None, level: str) -> str:
     often = (
-        "how often drivers cut in on vehicles that close in, which this traffic has from data"
+        "how often drivers cut in ahead of vehicles that are closing in, which this traffic has from data"
         if traffic is not None and len(traffic.accepted)
-        else "the share of drivers who cut in without looking, which is assumed"
+        else "the share of drivers who cut in without looking behind, which is assumed"
     )
     return f"the level of lane changing ({level} here) and with {often}"
 
@@ -29,7 +29,7 @@ WORDS = Words(
     called="cut-in",
     event="cut-in",
     events="cut-ins",
-    since="the cut-in",
+    since="BV entered the lane",
     kicker="How often an automated vehicle (AV) collides with a car that cuts in (BV, the background vehicle) behind a "
     "leading one (LV), on a motorway",
     same="cars that cut in",
@@ -38,14 +38,14 @@ WORDS = Words(
     strikes="In every crash the AV strikes BV from behind.",
     who="BV the one that cuts in, LV the one ahead of it",
     shows=("BV", "comes over"),
-    happens=("BV", "cuts in"),
+    happens=("BV", "enters the lane"),
     unlikely="It is small because most naturalistic tests end without a cut-in, and so without a crash.",
     tests=_tests,
     rests=_rests,
     limits=" Left of its line the competent driver (r157-cc), or the best of brakes (8 m/s² at once), crashes in the "
     "vehicle’s place, too, if the car that cuts in keeps its speed.",
 )
-GAP = Shown("gap at the cut-in", "m", ("Gap at", "cut-in"), lambda of: of["event_gap_m"], beyond=1.4, cell=1.0)
+GAP = Shown("gap at the overlap", "m", ("Gap at", "overlap"), lambda of: of["event_gap_m"], beyond=1.4, cell=1.0)
 CLOSING = Shown(
     "closing speed", "m/s", ("Closing", "speed"), lambda of: np.asarray(-of["event_rate_mps"]), beyond=1.15, cell=0.5
 )

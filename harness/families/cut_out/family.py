@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
-from harness.families.cut_out.words import CLOSING, TTC, TTC_EDGES_S, WORDS
+from harness.families.cut_out.words import CLOSING, TTC, WORDS
 from harness.families.following.approach import NEVER, Following
 from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import FollowingParameters, grid_of
@@ -25,6 +25,7 @@ from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, RecordArray
 
+TTC_EDGES_S = np.array([0.5, 0.75, 1, 1.25, 1.5, 1.75, 2, 2.25, 2.5, 2.75, 3, 3.5, 4, 4.5, 5, 6, 7, 8, 10, 12])
 N_DROPS = 12
 N_LATERAL = 7
 _Ttc = Annotated[Number, within(0.1, 60.0)]
@@ -116,7 +117,7 @@ class CutOut(FollowingFamily):
     ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-cut-out-1"})
     default_parameters = "cut-out-1"
     crosses, words = 0, WORDS
-    maps: tuple[tuple[Shown, Shown], ...] = ((CLOSING, TTC),)
+    maps: tuple[tuple[Shown, Shown], ...] = ((CLOSING, TTC._replace(edges=TTC_EDGES_S)),)
     stride = 10
     model = CutOutParameters
 

@@ -17,18 +17,17 @@ import numpy as np
 from harness.campaign.files import Places, validated
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
+from harness.families.cut_in.fitting.hazard import FREE_TTC_S, HAZARD_OF, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
+from harness.families.cut_in.fitting.laws import LAWS, FittedLaw, Traffic, fit_rate
 from harness.families.cut_in.loading import load_environment, require_sound_laws
 from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.families.cut_in.sections import REPLACED
-from harness.fitting.hazard import FREE_TTC_S, HAZARD_OF, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
-from harness.fitting.laws import LAWS, FittedLaw, Traffic, fit_rate
 from harness.progress import Progress
 from harness.vocabulary import FloatArray
 
 HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)
 """Degrees of freedom of R1dot: fitted (None), then tried until LV's speed is one that SUMO's lanes allow."""
 DIGITS = 6
-REPLICATES = 200
 MOST_DRAWS = 5
 """At most this many times the replicates asked for are drawn, as tests cannot be drawn from some."""
 

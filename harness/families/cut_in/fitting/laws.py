@@ -16,8 +16,8 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse, special
 
-from harness.fitting.maximum import LogLikelihood, Maximum, Prior, maximise
-from harness.fitting.observations import KINDS, Observations
+from harness.families.cut_in.fitting.maximum import LogLikelihood, Maximum, Prior, maximise
+from harness.families.cut_in.fitting.observations import KINDS, Observations
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, BoolArray, FloatArray, IntArray, RecordArray
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
+from harness.families.cut_in.fitting.laws import FittedLaw, Traffic
+from harness.families.cut_in.fitting.maximum import Prior, maximise
 from harness.families.cut_in.sections import SMALLEST_SHARE
-from harness.fitting.laws import FittedLaw, Traffic
-from harness.fitting.maximum import Prior, maximise
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 FREE_TTC_S = 8.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from inspect import getmembers, isfunction
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,13 @@ from harness.campaign.files import read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import printable
 from harness.estimators.limits import garwood
+from harness.families.cut_in.fitting.fit import Fit
+from harness.families.cut_in.fitting.hazard import HAZARD_OF, TTC_EDGES_S
+from harness.families.cut_in.fitting.laws import bins
+from harness.families.cut_in.fitting.observations import Tally
 from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
-from harness.fitting.fit import Fit
-from harness.fitting.hazard import HAZARD_OF, TTC_EDGES_S
-from harness.fitting.laws import bins
-from harness.fitting.observations import Tally
 from harness.numbers import number
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.templates import templates
@@ -39,24 +38,34 @@ _SEED = 1
 
 
 def page(
-    fit: Fit, tally: Tally, noise_mps2: float, rows: Mapping[str, FloatArray], name: str, files: Sequence[Path]
+    fit: Fit,
+    tally: Tally,
+    noise_mps2: float,
+    rows: Mapping[str, FloatArray],
+    name: str,
+    files: Sequence[Path],
+    others: Sequence[str],
 ) -> str:
     """The page, self-contained; ``rows`` are the replicates, ``name`` is that of the environment's file.
 
-    ``noise_mps2`` is the standard deviation of accelerations by measurement noise.
+    ``noise_mps2`` is the standard deviation of accelerations by measurement noise; ``others`` say what was found for
+    other families.
     """
-    environment = templates()
-    environment.filters.update(getmembers(numbers, isfunction))
-    shown = environment.get_template("fit.html.j2").render(
-        fit=fit,
-        tally=tally,
-        name=name,
-        files=[file.name for file in files],
-        n_replicates=len(next(iter(rows.values()))),
-        plots=list(_plots(fit)),
-        bins=list(_bins(fit)),
-        numbers=list(_numbers(fit)),
-        noise_mps2=noise_mps2,
+    shown = (
+        templates(__package__)
+        .get_template("fit.html.j2")
+        .render(
+            fit=fit,
+            tally=tally,
+            name=name,
+            files=[file.name for file in files],
+            n_replicates=len(next(iter(rows.values()))),
+            plots=list(_plots(fit)),
+            bins=list(_bins(fit)),
+            numbers=list(_numbers(fit)),
+            noise_mps2=noise_mps2,
+            others=others,
+        )
     )
     return printable(shown)
 
