@@ -341,9 +341,9 @@ def motorway(folder: Path, *, environments: Sequence[str]) -> None:
     """
     from harness.campaign.sections import EnvironmentSettings  # noqa: PLC0415 - keeps --help fast
     from harness.families.cut_in.fitting.laws import Traffic  # noqa: PLC0415
-    from harness.families.cut_in.fitting.observations import Tally, observations  # noqa: PLC0415
+    from harness.families.cut_in.fitting.observations import Tally, observe  # noqa: PLC0415
     from harness.families.cut_in.loading import load_environment  # noqa: PLC0415
-    from harness.fitting.table import load_mapping  # noqa: PLC0415
+    from harness.fitting.table import load_mapping, recordings  # noqa: PLC0415
     from harness.records.folder import write_bytes  # noqa: PLC0415
     from studies.motorway import figures, installed_rows, page, trajectories_of  # noqa: PLC0415
     from studies.trajectories import write  # noqa: PLC0415
@@ -354,7 +354,7 @@ def motorway(folder: Path, *, environments: Sequence[str]) -> None:
     write(trajectories_of(rows), table := folder / "trajectories.parquet")
     sides = {}
     for side in ("left", "right"):
-        seen = [each for each, _ in observations([table], load_mapping(mirror=side == "left"))]
+        seen = list(map(observe, recordings([table], load_mapping(mirror=side == "left"))))
         tally = Tally.of(seen)
         sides[side] = tally, figures(Traffic.of(seen), laws)
     written = page(sides)

@@ -32,12 +32,12 @@ from harness.estimators.traffic import ONE_LAW
 from harness.families.cut_in.fitting.fit import fit_traffic, replicates
 from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
 from harness.families.cut_in.fitting.laws import Traffic
-from harness.families.cut_in.fitting.observations import KINDS, observations, require_enough
+from harness.families.cut_in.fitting.observations import KINDS, observe, require_enough
 from harness.families.cut_in.loading import evaluate_laws, load_environment, load_parameters
 from harness.families.cut_in.parameters import FIXED, EnvironmentParameters
 from harness.families.cut_in.sections import REPLACED
 from harness.files import write_atomically
-from harness.fitting.table import load_mapping
+from harness.fitting.table import load_mapping, recordings
 from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import take_aim
 from harness.progress import Progress
@@ -95,7 +95,7 @@ def _observe(part: int, path: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         file = Path(name, "trajectories.parquet")
         write(simulate(load_environment(TRAFFIC, truth()), PART_H, SEED + part, Differences()), file)
-        traffic = Traffic.of(each for each, _ in observations([file], load_mapping()))
+        traffic = Traffic.of(map(observe, recordings([file], load_mapping())))
     with path.open("wb") as out:
         np.savez(out, recording=traffic.recording, **{kind: getattr(traffic, kind) for kind in KINDS})
 
@@ -449,7 +449,7 @@ def misread() -> dict[str, str]:
             path = Path(folder, "trajectories.parquet")
             write(wrong(table), path)
             try:
-                found_in = [each for each, _ in observations([path], load_mapping())]
+                found_in = list(map(observe, recordings([path], load_mapping())))
                 require_enough(found_in, path.name, load_mapping())
                 found[name] = "not noticed"
             except TrajectoryError as error:

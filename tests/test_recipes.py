@@ -101,7 +101,7 @@ def test_a_new_controller_kind_is_three_files(tmp_path):
     recipe = laid_out("A new controller kind", tmp_path)
     own = tmp_path / "own"
     shutil.copytree(ROOT / "harness", own / "harness", symlinks=False, ignore=shutil.ignore_patterns("__pycache__"))
-    (diff,) = blocks(recipe, "diff")
+    diff = (ROOT / "examples/new_controller_kind.diff").read_text(encoding="utf-8")
     assert diff.count("\n+++ ") == 3
     subprocess.run(["git", "apply", "--unidiff-zero", "-"], cwd=own, input=diff, text=True, check=True)
     assert "profile · 500 tests" in ran(recipe, tmp_path, own)

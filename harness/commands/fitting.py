@@ -20,6 +20,7 @@ from harness.commands.printing import print_json, say
         "harness fit 01_tracks.csv 02_tracks.csv --mapping highd --out highway.yaml",
         "harness run my_av.py:MyAV --set environment.parameters=my-traffic.yaml",
         "harness estimate runs/mine --environment my-traffic.yaml",
+        "harness run my_av.py:MyAV --scenario lead_brakes --set environment.parameters=my-traffic.lead_brakes.yaml",
     ),
 )
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -52,7 +53,7 @@ def fit(
 
     Beside the environment file are written a page that shows data and fit, and FILE.replicates.parquet with
     environments that other trajectories of the same kind would have given: from these `harness estimate --environment`
-    computes how uncertain the rate is.
+    computes how uncertain the rate is; and FILE.lead_brakes.yaml and FILE.cut_out.yaml, by what drivers met who follow.
     """
     with progress_bar() as bar:
         given: dict[str, Any] = {"mapping": mapping, "mirror": mirror, "leave_out": leave_out, "force": force}

@@ -47,10 +47,10 @@ def show_error(error: HarnessError) -> None:
         say(f" {error.where}: {error.found}", err=True)
     for part in error.problems or (error,):
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
-        told = {
-            shown: getattr(part, of).replace("`", "'") for shown, of in _PARTS.items()
-        }  # commands in docs have these
-        say(f" {part.where}", *(f"  {shown + ':':<9} {text}" for shown, text in told.items()), err=True)
+        told = (
+            (shown, getattr(part, of).replace("`", "'")) for shown, of in _PARTS.items()
+        )  # ` is of commands in docs
+        say(f" {part.where}", *(f"  {shown + ':':<9} {text}" for shown, text in told), err=True)
 
 
 _AGAIN = "Nothing finished is lost: then give the same command again (`run` with --resume)."

@@ -14,7 +14,7 @@ import yaml
 from harness.arguments import checked
 from harness.errors import HarnessError, printable
 from harness.families import families
-from harness.fitting.protocol import Asked, Fits, Fitted
+from harness.fitting.protocol import Asked, Fitted, Fitter
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
 from harness.records.folder import require_place, write_together
@@ -62,7 +62,7 @@ def fit_files(
     force: bool = False,
     progress: Progress | None = None,
 ) -> FittedFiles:
-    """Fit traffic to trajectories and write it: ``out`` (YAML), and beside it its replicates and a page.
+    """Fit traffic to trajectories and write it: ``out`` (YAML), its replicates, a page, and files of other families.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def fit_files(
     progress, out = progress or Progress(), Path(out)
     paths = [Path(file) for file in files]
     read = load_mapping(mapping, mirror=mirror, leave_out=leave_out)
-    fitters = {name: family.fitter() for name, family in families().items() if isinstance(family, Fits)}
+    fitters: dict[str, Fitter] = {name: of.fitter() for name, of in families().items() if hasattr(of, "fitter")}
     marks = {path: mark for each in fitters.values() for path, mark in each.marks(out).items()}
     _require_ours(out, marks, [*paths, Path(mapping or ".")], force=force)
     require_place(out.parent)

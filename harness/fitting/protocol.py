@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol
 
 from harness.families.replicates import content_hash
 from harness.fitting.recording import Recording
@@ -48,7 +48,7 @@ class Fitted(NamedTuple):
 
 
 class Fitter(Protocol):
-    """A fit that is under way."""
+    """A fit that is under way; `fitter` of a family makes one, if its traffic can be fitted."""
 
     def marks(self, out: Path) -> Mapping[Path, bytes]:
         """Files that it will write beside ``out``, each with what marks one that a fit has written."""
@@ -61,11 +61,3 @@ class Fitter(Protocol):
 
         Raises `TrajectoryError`: nothing can be.
         """
-
-
-@runtime_checkable
-class Fits(Protocol):
-    """A family whose traffic can be fitted."""
-
-    def fitter(self) -> Fitter:
-        """A fit that has not seen anything."""

@@ -24,20 +24,13 @@ NO_LENGTH = "Gaps need lengths: correct them, or give one for all in a mapping (
 ONE_CLOCK = "Do several recordings share a name, or do times begin anew with each vehicle? Use one clock for all."
 CORRECT = "Correct the value, or delete the row."
 SLOWEST_HZ = 9.5
-FASTEST_MEDIAN_MPS = 70.0
-USUAL_LENGTH_M = (2.5, 10.0)
-"""Range of the median length of vehicles, which in feet is about 15."""
+MEDIANS = (
+    ("speed_mps", -0.5, 70.0, "Give units in a mapping (units: {s_m: ft, speed_mps: ft/s}); forward is positive."),
+    ("length_m", 2.5, 10.0, "Give units in a mapping (units: {length_m: ft}); or is it the width of vehicles?"),
+)
+"""What medians lie between; in feet they do not."""
 OF_STEP = 0.05
 """Largest relative difference between speeds and the change of positions."""
-_PAIRS: list[tuple[Unit, Unit]] = [
-    (speed, way) for speed in ("m/s", "ft/s", "km/h", "mph") for way in ("m", "ft", "km")
-]
-SLIPS = {UNITS[way] / UNITS[speed]: f"speeds in {speed} beside positions in {way}" for speed, way in _PAIRS} | {
-    UNITS["km/h"] / UNITS["ft/s"]: "speeds in ft/s read as km/h",
-    -1.0: "positions that fall where vehicles drive forward",
-}
-"""Cause of a ratio of speeds to the change of positions, in units that are taken for m/s and m."""
-LEAST_LAG_S = 0.3
 ANOTHER_VEHICLE_S = 60.0
 """An identifier that reappears after so long is another vehicle's (as in NGSIM)."""
 OFF_IN_STEP_M = 3.0
@@ -238,20 +231,15 @@ def _check_motion(recording: Recording, rows: pd.DataFrame) -> None:
     way_m, of_speeds_m = s[begin + n] - s[begin], driven_m[begin + n] - driven_m[begin]
     ratio = _ratio(way_m, of_speeds_m)
     if abs(ratio - 1.0) > OF_STEP:
-        slip = min(SLIPS, key=lambda each: abs(ratio / each - 1.0))
-        words = f": {SLIPS[slip]}" if abs(ratio / slip - 1.0) < OF_STEP else ""
-        found = f"speeds {ratio:.3g} times the change of positions{words}"
+        found = f"speeds {ratio:.3g} times the change of positions"
         mend = "Correct the units of speed_mps or s_m in a mapping (units: {speed_mps: km/h, s_m: ft})."
         if ratio < 0.0:
             mend = "s_m must rise in driving direction, and speeds be positive."
         raise TrajectoryError(recording.place, found, "positions in m and speeds in m/s that agree", mend)
-    _check_sizes(recording, float(np.median(v)), float(np.median(recording.length)))
-    few = slice(None, None, max(n // 2, 1))
-    lag_s = _lag(begin[few], frame, vehicle, way_m[few], driven_m, n) / rate
-    if abs(lag_s) >= LEAST_LAG_S:
-        found = f"speeds that belong to positions of {abs(lag_s):.1f} s {'earlier' if lag_s > 0 else 'later'}"
-        mend = "Shift one of the columns."
-        raise TrajectoryError(recording.place, found, "speeds and positions of the same time", mend)
+    for column, low, high, mend in MEDIANS:
+        if not low < (median := float(rows[column].median())) < high:
+            found = f"a median of {median:.4g} in {column}"
+            raise TrajectoryError(recording.place, found, f"{low:g} to {high:g}", mend)
     for rule in NEAR:
         require(rule, rows, recording.where)
     step = np.flatnonzero(np.diff(vehicle) == 0)
@@ -285,40 +273,6 @@ def _require_agreement(
         found += f"; {off.size:,} such pairs of rows"
     mend = f"{CORRECT} If they are many, positions or speeds stand still, or are of different vehicles."
     raise TrajectoryError(recording.where(first), found, "positions and speeds of one motion in all rows", mend)
-
-
-def _check_sizes(recording: Recording, speed: float, length: float) -> None:
-    """Refuse medians of speeds (m/s) and lengths (m) that no road has."""
-    place, feet = recording.place, length > USUAL_LENGTH_M[1]
-    if not -0.5 < speed < FASTEST_MEDIAN_MPS:
-        found = f"a median speed of {speed:.4g} m/s" + (f" and a median length of {length:.3g} m: feet" if feet else "")
-        mend = "Give units in a mapping (units: {s_m: ft, speed_mps: ft/s, length_m: ft}); forward is positive."
-        raise TrajectoryError(place, found, "0 to 70 m/s", mend)
-    if feet or length < USUAL_LENGTH_M[0]:
-        mend = "Use a mapping: units: {length_m: ft}." if feet else "Is this the width of vehicles?"
-        found = f"a median length of {length:.3g} m{': feet' if feet else ''}"
-        raise TrajectoryError(place, found, "2.5 to 10 m", mend)
-
-
-def _lag(begin: IntArray, frame: IntArray, vehicle: IntArray, way_m: FloatArray, driven_m: FloatArray, n: int) -> int:
-    """Frames by which speeds lag behind positions; 0 unless a shift explains them better beyond doubt.
-
-    ``way_m`` is that of the ``n`` frames from each of ``begin``; ``driven_m`` is the way by speeds since the first row.
-    """
-    reach = 2 * n
-    inside = (begin >= reach) & (begin + n + reach < driven_m.size)
-    begin, way_m = begin[inside], way_m[inside]
-    first, last = begin - reach, begin + n + reach
-    inside = (vehicle[first] == vehicle[last]) & (frame[last] - frame[first] == n + 2 * reach)
-    begin, way_m = begin[inside], way_m[inside]
-    if begin.size < 50:
-        return 0
-    lags = np.arange(-reach, reach + 1, max(n // 10, 1))
-    error = np.array([np.abs(driven_m[begin + lag + n] - driven_m[begin + lag] - way_m) for lag in lags])
-    best = int(np.argmin(error.mean(axis=1)))
-    gain = error[lags.size // 2] - error[best]
-    sure = gain.mean() > 6.0 * gain.std() / np.sqrt(gain.size) and gain.mean() > 0.2 * error[best].mean()
-    return int(lags[best]) if sure else 0
 
 
 def _numbers(breaks: BoolArray) -> IntArray:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import re
-import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet as pq
 from pydantic import Field
@@ -37,7 +35,6 @@ from harness.fitting.recording import (
     recording_of,
     require,
 )
-from harness.vocabulary import FloatArray
 
 Needed = Literal["vehicle_id", "time_s", "s_m", "speed_mps", "lane", "length_m"]
 Measured = Literal["time_s", "s_m", "speed_mps", "length_m", "lateral_m"]
@@ -46,19 +43,7 @@ NEEDED: tuple[Needed, ...] = get_args(Needed)
 OPTIONAL: tuple[Optional, ...] = get_args(Optional)
 NO_COLUMN = ("Rename the column, or give its name in a mapping (--mapping FILE.yaml).", NO_LENGTH)
 SAMPLE = 1 << 16
-"""Bytes of a file by which its kind and its decimal signs are known."""
-COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\x28\xb5\x2f\xfd": "zstd"}
-"""Compressions that are read, by the first bytes of a file."""
-UTF_16 = (b"\xff\xfe", b"\xfe\xff")
-FOREIGN = {
-    b"PK\x03\x04": "a ZIP archive, or an Excel workbook",
-    b"\xd0\xcf\x11\xe0": "an Excel workbook",
-    b"7z\xbc\xaf": "a 7-Zip archive",
-    b"\xfd7zXZ": "an xz archive",
-    b"\x89HDF": "an HDF5 file",
-    b"<": "a page or XML",
-}
-"""What else a file may be, by its first bytes."""
+"""Bytes of a file by which its separators and decimal signs are known."""
 
 
 class Mapping(Section):
@@ -70,7 +55,7 @@ class Mapping(Section):
     units: dict[Measured, Unit | Annotated[float, Field(gt=0.0)]] = Field(
         default={}, description="unit in the file, or the factor to multiply by"
     )
-    lanes: Literal["from_right", "from_left"] | list[int | str] = Field(
+    lanes: Literal["from_right", "from_left"] | list[int] = Field(
         default="from_right",
         description="how lanes are numbered, or a list of lanes from right to left, without others",
     )
@@ -80,12 +65,6 @@ class Mapping(Section):
     leave_out: list[str] = Field(default=[], description="recordings that are not fitted")
     header: list[str] = Field(default=[], description="names of the columns of a text file without a header")
     layout: Literal["table", "highd"] = Field(default="table", description="whether files are highD's")
-
-    @property
-    def lane_names(self) -> list[str]:
-        """Lanes from right to left if some have names; else none."""
-        names = self.lanes if isinstance(self.lanes, list) else []
-        return list(map(str, names)) if any(isinstance(each, str) for each in names) else []
 
 
 SHIPPED_FOLDER = Path(__file__).parent
@@ -145,12 +124,8 @@ def _reading(path: Path) -> Iterator[None]:
     """Say what is wrong with a file that cannot be read."""
     expected = "a CSV or Parquet file"
     try:
-        mode = path.stat().st_mode
-        if stat.S_ISDIR(mode):
+        if path.is_dir():
             raise TrajectoryError(str(path), "a folder", expected, "Name the files in it.")
-        if not stat.S_ISREG(mode):
-            mend = "Write its content into a file first: it is read more than once."
-            raise TrajectoryError(str(path), "a pipe or a device", expected, mend)
         yield
     except FileNotFoundError:
         meant = did_you_mean(path.name, [each.name for each in path.parent.glob("*")])
@@ -168,65 +143,42 @@ def _reading(path: Path) -> Iterator[None]:
 def _read(path: Path, mapping: Mapping) -> pd.DataFrame:
     """Rows of a file with the columns of the input table that it has, and ``row``."""
     with _reading(path):
-        if path.suffix in (".parquet", ".pq") or _unpacked(path).read(4) == b"PAR1":
+        if path.suffix in (".parquet", ".pq"):
             with pq.ParquetFile(path, page_checksum_verification=True) as file:
                 columns, text = _columns(path, file.schema_arrow.names, mapping), None
                 table = file.read(list(columns.values()))
         else:
             text = _Text.of(path, mapping)
             columns = _columns(path, text.names, mapping)
-            types = dict.fromkeys(columns.values(), pa.string())
+            types = {name: pa.string() if column in NAMES else pa.float64() for column, name in columns.items()}
             table = pa.csv.read_csv(
                 text.content,
                 pa.csv.ReadOptions(column_names=text.names, skip_rows=text.row - 1, block_size=1 << 22),
                 pa.csv.ParseOptions(delimiter=text.delimiter),
-                pa.csv.ConvertOptions(column_types=types, include_columns=list(types)),
+                pa.csv.ConvertOptions(
+                    column_types=types, include_columns=list(types), decimal_point=text.decimal_point
+                ),
             )
-    if not len(table):
-        raise TrajectoryError(str(path), "no rows", "one row per vehicle and time", "Is it the right file?")
-    return _renamed(table, columns, path, mapping, first=text.row if text else 1, commas=bool(text and text.commas))
-
-
-def _unpacked(path: Path) -> Any:
-    """Content of a file, unpacked as it is read."""
-    raw = pa.OSFile(str(path))  # after an error pyarrow's threads read on: from a file of Python they abort its exit
-    first = raw.read(4)
-    raw.seek(0)
-    kind = next((kind for magic, kind in COMPRESSED.items() if first.startswith(magic)), None)
-    return raw if kind is None else pa.CompressedInputStream(raw, kind)
+        if not len(table):
+            raise TrajectoryError(str(path), "no rows", "one row per vehicle and time", "Is it the right file?")
+        return _renamed(table, columns, path, mapping, text.row if text else 1)
 
 
 class _Text(NamedTuple):
-    """A text file: its ``content`` in UTF-8; ``row`` is that of its first values.
-
-    Decimal signs are ``commas`` where those are more, and do not separate columns.
-    """
+    """A text file: its ``content`` in UTF-8; ``row`` is that of its first values."""
 
     content: Any
     names: list[str]
     delimiter: str
-    commas: bool
+    decimal_point: str
     row: int
 
     @classmethod
     def of(cls, path: Path, mapping: Mapping) -> _Text:
-        """Find out how a file is written; what is no text is refused by its kind (`TrajectoryError`)."""
-        sample = _unpacked(path).read(SAMPLE)
-        for magic, kind in FOREIGN.items():
-            if sample.startswith(magic):
-                raise TrajectoryError(str(path), kind, "a CSV or Parquet file", "Unpack or convert it.")
-        content = _unpacked(path)
-        if isinstance(content, pa.OSFile) and sample:
-            content.seek(max(content.size() - 2, 0))  # of a character in UTF-16, too
-            last = content.read()
-            content.seek(0)
-            if not last.rstrip(b"\0").endswith((b"\n", b"\r")):
-                mend = "Copy it again; or, if it is complete, end it with a newline."
-                raise TrajectoryError(str(path), "a last row that does not end: a part of a file", "whole rows", mend)
-        if sample.startswith(UTF_16):
-            sample = content.read().decode("utf-16").encode()
-            content = pa.BufferReader(sample)
-        text = sample[:SAMPLE].decode("utf-8-sig", errors="replace")
+        """Find out how a file is written; what is packed is unpacked as it is read."""
+        sample = pa.input_stream(str(path)).read(SAMPLE)
+        content = pa.input_stream(str(path))
+        text = sample.decode("utf-8-sig", errors="replace")
         head = text.lstrip("\r\n").partition("\n")[0].strip()
         if not head:
             raise TrajectoryError(str(path), "an empty file", "a header and rows", "Is it the right file?")
@@ -242,8 +194,8 @@ class _Text(NamedTuple):
             found = f"numbers in place of a header: {len(names)} columns"
             mend = "Add a header; or list the names in a mapping (header: [vehicle_id, time_s, …])."
             raise TrajectoryError(str(path), found, "names of columns in the first row", mend)
-        commas = delimiter != "," and marks[0] > marks[1]
-        return cls(content, names if headed else mapping.header, delimiter, commas, 1 + headed)
+        decimal_point = "," if delimiter != "," and marks[0] > marks[1] else "."
+        return cls(content, names if headed else mapping.header, delimiter, decimal_point, 1 + headed)
 
 
 def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, str]:
@@ -271,9 +223,7 @@ def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, st
     return found
 
 
-def _renamed(
-    table: Any, columns: dict[str, str], path: Path, mapping: Mapping, *, first: int, commas: bool
-) -> pd.DataFrame:
+def _renamed(table: Any, columns: dict[str, str], path: Path, mapping: Mapping, first: int) -> pd.DataFrame:
     """Rows of a table by the names of the input table, constants filled in."""
     data: dict[str, Any] = {}
     for column, name in columns.items():
@@ -284,43 +234,14 @@ def _renamed(
                 where, mend = f"{path}, row {first + i}, {name}", "Fill it in, or delete the row."
                 raise TrajectoryError(where, "nothing", "an identifier in every row", mend)
             data[column] = pd.arrays.ArrowExtensionArray(text)
-        elif column == "lane" and mapping.lane_names:
-            order = {lane: i for i, lane in enumerate(mapping.lane_names)}
-            data[column] = values.cast(pa.string()).to_pandas().map(order).fillna(-1)  # others are left out
         else:
-            data[column] = _numbers(values, name, first, path, commas=commas)
+            data[column] = values.cast(pa.float64(), safe=False).to_numpy()
     rows = pd.DataFrame(data)
     for column, value in mapping.columns.items():
         if isinstance(value, float):
             rows[column] = value
     rows["row"] = np.arange(first, first + len(rows))
     return rows if "recording_id" in rows else rows.assign(recording_id=path.stem)
-
-
-def _numbers(values: Any, name: str, first: int, path: Path, *, commas: bool) -> FloatArray:
-    """Values of a column as numbers (n,); a text that is none is refused by its row."""
-    text = values
-    if is_text := pa.types.is_string(values.type) or pa.types.is_large_string(values.type):
-        text = pc.utf8_trim_whitespace(values)
-        if commas:  # points beside them may be those of thousands
-            text = pc.replace_substring(pc.replace_substring(text, ".", "?"), ",", ".")
-    try:
-        return np.asarray(text.cast(pa.float64(), safe=False).to_numpy())
-    except pa.ArrowException:
-        if not is_text:
-            found, mend = f"values of type {values.type}", "Write the column as numbers."
-            raise TrajectoryError(f"{path}, column {name}", found, "numbers", mend) from None
-    numbers = pd.to_numeric(text.to_pandas(), errors="coerce")
-    if (odd := numbers.isna() & text.to_pandas().notna()).any():
-        i = int(np.argmax(odd))
-        found, mend = f"'{values[i]}'", "Correct it, or give another column in a mapping (--mapping FILE.yaml)."
-        if re.fullmatch(r"[-+]?\d+[.,]\d+", str(values[i])):
-            found += ", beside decimal commas" if commas else ", a decimal comma"
-            mend = "Write all numbers with a decimal point."
-        elif name.lower().startswith("lane"):
-            mend = "Lanes with names need a mapping that lists them from right to left (lanes: [R, L])."
-        raise TrajectoryError(f"{path}, row {first + i}, column {name}", found, "a number", mend)
-    return np.asarray(numbers, np.float64)
 
 
 # -- rows by the mapping --
@@ -336,8 +257,7 @@ def _standard(rows: pd.DataFrame, path: Path, mapping: Mapping) -> pd.DataFrame:
     for rule in (*NUMBERS, WHOLE_LANE):
         require(rule, rows, lambda i, of=rule.column: f"{path}, row {rows.row.iloc[i]}, {of}")  # type: ignore[misc]
     if isinstance(mapping.lanes, list):
-        lanes = range(len(mapping.lanes)) if mapping.lane_names else mapping.lanes
-        order = {float(lane): i for i, lane in enumerate(lanes)}
+        order = {float(lane): i for i, lane in enumerate(mapping.lanes)}
         rows = rows[rows.lane.isin(list(order))].copy()
         if rows.empty:
             found = f"no vehicle in the lanes {', '.join(map(str, mapping.lanes))}"
@@ -381,8 +301,6 @@ def _highd_meta(path: Path, columns: list[str]) -> pd.DataFrame:
     """Columns of one of highD's two files about a recording, as text."""
     try:
         return pd.read_csv(path, usecols=columns, dtype=str)
-    except FileNotFoundError:
-        found, mend = "no such file", "highD needs it beside the tracks: copy it there."
     except (ValueError, OSError) as error:
-        found, mend = str(error), "Use the file as published."
-    raise TrajectoryError(str(path), found, f"a CSV file with {', '.join(columns)}", mend)
+        mend = "highD has it beside the tracks: use the file as published."
+        raise TrajectoryError(str(path), str(error), f"a CSV file with {', '.join(columns)}", mend) from None

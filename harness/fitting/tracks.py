@@ -52,9 +52,9 @@ class Scene:
             np.where((i > 0) & (self._spot[behind] == spot), behind, -1),
         )
 
-    def states(self, rows: IntArray, side: int, fit_range: FitRange) -> States:
+    def states(self, rows: IntArray, side: int) -> States:
         """States of some rows (m,) towards the lane ``side``."""
-        track, fit = self._track, fit_range
+        track, fit = self._track, USUAL_RANGE
         v = track.v[rows]
         leader, _ = self.neighbours(rows, 0)
         r1 = track.gap(leader, rows)
@@ -105,19 +105,23 @@ def durations_s(track: Recording, rows: IntArray) -> FloatArray:
     return np.asarray(end - begin) / track.rate_hz
 
 
+def slope_weights(track: Recording, window_s: float = 1.0) -> FloatArray:
+    """Weights of the values of some time that give the slope (1/s) of a line through them."""
+    frames = round(window_s * track.rate_hz)
+    since = np.arange(frames + 1) - frames / 2
+    return np.asarray(since / (since @ since) * track.rate_hz)
+
+
 def slopes(track: Recording, rows: IntArray) -> FloatArray:
     """Slope (m/s²) of a line through the speeds of the second that begins at each of some rows (m,)."""
-    since = np.arange(track.second + 1) - track.second / 2
-    weights = since / (since @ since) * track.rate_hz
     slopes = np.zeros(rows.size)
-    for i, weight in enumerate(weights):
+    for i, weight in enumerate(slope_weights(track)):
         slopes += weight * track.v[rows + i]
     return slopes
 
 
-def noise_of(track: Recording) -> float:
+def noise_of(track: Recording, window_s: float = 1.0) -> float:
     """Standard deviation (m/s²) of slopes by white noise, from third differences, to which motion adds little."""
     same = track.piece[3:] == track.piece[:-3]
     third = np.diff(track.v, 3)[same]
-    since = np.arange(track.second + 1) - track.second / 2
-    return float(np.sqrt(third @ third / max(third.size, 1) / 20.0 / (since @ since)) * track.rate_hz)
+    return float(np.sqrt(third @ third / max(third.size, 1) / 20.0) * np.linalg.norm(slope_weights(track, window_s)))

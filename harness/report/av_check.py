@@ -20,8 +20,6 @@ IN_WORDS = {
     "n_crashes": "crashes (no rate: {events} are forced)",
     "us_per_step": "time per step, µs",
     "episodes_per_s": "tests per second",
-    "construction_s": "time that its constructor takes, median, s",
-    "constructions": "calls of its constructor in each worker of a run",
 }
 FOLLOWING = {
     "headway_s": "headway at the onset, median, s",

@@ -53,7 +53,7 @@ def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool) -> tuple[str, ...]:
     """The rate beside a reading of that driver, where crashes were ``seen`` or none: name, ratio, interval, remark."""
     if beside["ratio"] is None:
-        return name, "no ratio", "", "that driver never crashes here"
+        return name, "no ratio", "", "such a driver never crashes here"
     low, high = beside["ratio_low"], beside["ratio_high"]
     apart = "not told apart" if high is None or low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
     most = "no limit" if high is None else ratio(high)

@@ -30,7 +30,7 @@ ENDED = {
     "rhw": "precise enough",
     "below_reference": "clearly below the competent driver",
     "accept": "verdict reached",
-    "episodes": "budget of tests used up",
+    "episodes": "budget of tests (stop.episodes) used up",
     "pool": "the pool has no further event that would narrow it",
     "pool_error": "the pool’s own error is too wide",
     "sum": "with the sum of all scenarios",
@@ -102,7 +102,7 @@ def vehicle_words(av: AutomatedVehicle) -> tuple[str, list[tuple[str, str]]]:
 
 
 def unseen_words(where: str) -> str:
-    """The same where it is not known by what the rate may rise."""
+    """What a rate has only an upper limit for: no lane change was seen there."""
     return f"no lane change was seen at {where} in the data of this traffic: rates have only an upper limit"
 
 
@@ -111,8 +111,8 @@ def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[st
     if milder is not None and milder["n_crashes"]:
         words, n, of = family_named(scenario).words, count(milder["n_crashes"]), count(milder["n_tests"])
         yield (
-            f"{n} of {of} MILDER {words.events} crash, too, {number(milder['per_hour'])} an hour, not in this rate: "
-            f"run it alone with environment.parameters that say {words.milder}"
+            f"{n} of {of} MILDER {words.events} end in a crash, too: {number(milder['per_hour'])} per hour, which this "
+            f"rate leaves out; to count them, set {words.milder} in a file of environment.parameters"
         )
 
 

@@ -5,21 +5,15 @@ import pandas as pd
 import pytest
 
 from harness.errors import TrajectoryError
-from harness.families.cut_in.fitting.observations import (
-    Observations,
-    Tally,
-    observations,
-    require_distinct,
-    require_enough,
-)
-from harness.fitting.table import load_mapping
+from harness.families.cut_in.fitting.observations import Observations, Tally, observe, require_distinct, require_enough
+from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
 
 
 def observed(rows: pd.DataFrame, tmp_path, **mapping) -> tuple[list[Observations], Tally]:
     file = tmp_path / "rows.parquet"
     rows.to_parquet(file, index=False)
-    found = [each for each, _ in observations([file], load_mapping().model_copy(update=mapping))]
+    found = list(map(observe, recordings([file], load_mapping().model_copy(update=mapping))))
     return found, Tally.of(found)
 
 

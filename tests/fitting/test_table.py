@@ -1,7 +1,6 @@
 """Files and mappings: what is read, and what is refused, by name."""
 
 import gzip
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ import pandas as pd
 import pytest
 
 from harness.errors import EXIT_BAD_INPUT, HarnessError, TrajectoryError
-from harness.families.cut_in.fitting.observations import Tally, observations, require_distinct, require_enough
+from harness.families.cut_in.fitting.observations import Tally, observe, require_distinct, require_enough
 from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
 
@@ -22,7 +21,7 @@ ROWS = overtaking(2.5)
 def judged(file: Path, mapping: str | None = None, *others: Path, leave_out: tuple[str, ...] = ()) -> Tally:
     """What `harness fit` does with files before it fits."""
     read = load_mapping(mapping, leave_out=leave_out)
-    found = [each for each, _ in observations([file, *others], read)]
+    found = list(map(observe, recordings([file, *others], read)))
     require_distinct(found)
     return require_enough(found, file.name, read)
 
@@ -66,12 +65,6 @@ def long_followers() -> pd.DataFrame:
     return rows
 
 
-def shifted() -> pd.DataFrame:
-    """Speeds a second late."""
-    late = ROWS.groupby(["recording_id", "vehicle_id"]).speed_mps.shift(10)
-    return ROWS.assign(speed_mps=late).dropna()
-
-
 def late_lanes() -> pd.DataFrame:
     """Lanes a second late."""
     late = ROWS.groupby(["recording_id", "vehicle_id"]).lane.shift(9)
@@ -88,30 +81,27 @@ def flickering() -> pd.DataFrame:
 
 
 REFUSED = {
-    "feet beside m/s": (changed(s_m=ROWS.s_m * FEET), "speeds in m/s beside positions in ft"),
-    "km/h": (changed(speed_mps=ROWS.speed_mps * 3.6), "speeds in km/h"),
+    "feet beside m/s": (changed(s_m=ROWS.s_m * FEET), "speeds 0.305 times the change"),
+    "km/h": (changed(speed_mps=ROWS.speed_mps * 3.6), "speeds 3.6 times"),
     "feet throughout": (
         lambda: ROWS.assign(**{each: ROWS[each] * FEET for each in ("s_m", "speed_mps", "length_m")}),
-        "a median speed of .* and a median length of .*: feet",
+        "found a median of .* in speed_mps.*feet|a median of .* in speed_mps.*ft",
     ),
-    "lengths in feet": (changed(length_m=ROWS.length_m * FEET), r"median length of 15\.\d m: feet"),
+    "lengths in feet": (changed(length_m=ROWS.length_m * FEET), r"a median of 15\.\d+ in length_m.*ft"),
     "milliseconds": (changed(time_s=ROWS.time_s * 1000), "units: {time_s: ms}"),
     "widths": (changed(length_m=1.9), "the width"),
-    "backwards": (changed(s_m=-ROWS.s_m), "positions that fall where vehicles drive forward.*must rise"),
-    "backwards throughout": (changed(s_m=-ROWS.s_m, speed_mps=-ROWS.speed_mps), "median speed of -"),
-    "mirrored": (fast_lanes, "mirror: true"),
-    "shifted": (shifted, r"speeds that belong to positions of 1\.0 s earlier"),
+    "backwards": (changed(s_m=-ROWS.s_m), "speeds -1 times the change.*must rise"),
+    "backwards throughout": (changed(s_m=-ROWS.s_m, speed_mps=-ROWS.speed_mps), "a median of -"),
+    "mirrored": (fast_lanes, "--mirror"),
     "front bumpers": (long_followers, "origin: front"),
     "own clocks": (own_clocks, "one clock"),
-    "one vehicle": (lambda: ROWS[(ROWS.vehicle_id == 1) & (ROWS.recording_id == 0)], "found only one vehicle;"),
-    "one vehicle each": (lambda: ROWS[ROWS.vehicle_id == 1], "only one vehicle in each recording"),
+    "one vehicle each": (lambda: ROWS[ROWS.vehicle_id == 1], "vehicles that close in from behind"),
     "two recordings of one name": (
         lambda: pd.concat([ROWS, ROWS.assign(vehicle_id=ROWS.vehicle_id + 5, s_m=ROWS.s_m + 2)]).sort_values(
             "recording_id"
         ),
         "Do several recordings share a name",
     ),
-    "ft/s as km/h": (changed(speed_mps=ROWS.speed_mps * FEET / 3.6), r"speeds in ft/s read as km/h.*speed_mps: km/h"),
     "one lane": (changed(lane=0), "no vehicle with another lane beside it"),
     "half a lane": (with_value(7, "lane", 0.5), r"row 8, lane: found 0\.5"),
     "5 Hz": (lambda: ROWS[(ROWS.time_s * 10).round() % 2 == 0], "a row every 0.2 s"),
@@ -124,9 +114,9 @@ REFUSED = {
     ),
     "congested": (congested, "outside the fit range"),
     "nobody closes in": (lambda: ROWS[ROWS.vehicle_id != 2].query("vehicle_id < 2"), "beside it|closes? in"),
-    "straight": (changed(lateral_m=first("lateral_m")), "without lateral motion"),
-    "lanes' middles": (changed(lateral_m=3.5 * ROWS.lane), "in one jump"),
-    "late lanes": (late_lanes, r"more than 0\.8 s from the lane's marking"),
+    "straight": (changed(lateral_m=first("lateral_m")), "or without lateral motion"),
+    "lanes' middles": (changed(lateral_m=3.5 * ROWS.lane), "in a jump"),
+    "late lanes": (late_lanes, "off the marking"),
     "no length": (with_value(3, "length_m", 0.0), r"row 4 \(vehicle 0 of recording 0, t = 0\.3 s\): found no length"),
     "NaN": (with_value(9, "speed_mps", np.nan), "row 10, speed_mps: found no finite number"),
     "a lone row each": (lambda: ROWS[ROWS.time_s == 0], "one row per vehicle"),
@@ -134,8 +124,8 @@ REFUSED = {
     "without lengths": (lambda: ROWS.drop(columns="length_m"), "Gaps need lengths"),
     "of highD": (lambda: ROWS.rename(columns={"speed_mps": "xVelocity"}), "--mapping highd"),
     "of NGSIM": (lambda: ROWS.rename(columns={"s_m": "Local_Y"}), "--mapping ngsim"),
-    "text": (changed(lane="left"), r"row 1, column lane: found 'left'.*lanes: \[R, L\]"),
-    "dates": (changed(time_s=pd.Timestamp(0)), "values of type timestamp"),
+    "text": (changed(lane="left"), "invalid value .left|cannot be read"),
+    "dates": (changed(time_s=pd.Timestamp(0)), "cannot be read .*timestamp"),
     "nobody's row": (with_value(7, "vehicle_id", None), "row 8, vehicle_id: found nothing"),
     "the end of time": (with_value(7, "time_s", 1e12), r"row 8 .*found time_s 1e\+12"),
     "far away": (with_value(7, "s_m", 1e12), r"row 8 .*found s_m 1e\+12"),
@@ -175,19 +165,14 @@ FILES = {
     "empty.csv": (b"", "an empty file"),
     "header.csv": (HEAD, "no rows"),
     "ragged.csv": (HEAD + b"1,0,0,30,0,5\n1,0.1,3\n", "as many values as"),
-    "words.csv": (HEAD + b"1,0,0,fast,0,5\n", "row 2, column speed_mps: found 'fast'; expected a number"),
+    "words.csv": (HEAD + b"1,0,0,fast,0,5\n", "invalid value .fast"),
     "comma.csv": (HEAD + b"1,0,0,30,5,0,5\n", "got 7.*Decimal commas"),
-    "both.csv": (
-        b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n",
-        r"row 2, column s_m: found '996\.58', beside decimal commas.*with a decimal point",
-    ),
+    "both.csv": (b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n", r"invalid value .996\.58"),
     "twice.csv": (HEAD[:-1] + b",Lane\n1,0,0,30,0,5,1\n", "more than one column lane"),
     "cut.parquet": (b"PAR1 and no more", "cannot be read"),
     "binary.csv": (b"\xff\xfe\x00\x01\x80\n\x80\n", "cannot be read|columns"),
     "latin.csv": (HEAD + b"\xfcber,0,0,30,0,5\n", "text in UTF-8"),
-    "book.csv": (b"PK\x03\x04\x14\x00", "found a ZIP archive, or an Excel workbook"),
-    "cut.csv": (gzip.compress(ROWS.to_csv(index=False).encode())[:-2000], "cannot be read"),
-    "part.csv": (HEAD + b"1,0,0,30,0,4.", "a last row that does not end"),
+    "cut.csv.gz": (gzip.compress(ROWS.to_csv(index=False).encode())[:-2000], "cannot be read"),
     "headless.csv": (b"1,0,0,30,0,5\n1,0.1,3,30,0,5\n", r"numbers in place of a header: 6 columns.*header: \["),
 }
 
@@ -218,15 +203,10 @@ def test_missing_and_truncated_files(tmp_path):
     whole.write_bytes(whole.read_bytes()[:-1000])
     with pytest.raises(TrajectoryError, match="cannot be read"):
         judged(whole)
-    os.mkfifo(tmp_path / "pipe.csv")
-    (tmp_path / "loop.csv").symlink_to("loop.csv")
-    for name, words in (("pipe", "a pipe"), ("loop", "cannot be read .*symbolic links")):
-        with pytest.raises(TrajectoryError, match=words):
-            judged(tmp_path / f"{name}.csv")
 
 
 def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):
-    """Also with semicolons and decimal commas, compressed, in UTF-16, in two files, and with lengths of the mapping."""
+    """Also with semicolons and decimal commas, compressed, in two files, and with lengths of the mapping."""
     rows = ROWS.assign(length_m=4.6, vehicle_id="car " + ROWS.vehicle_id.astype(str))
     rows.to_parquet(tmp_path / "all.parquet", index=False, row_group_size=5000)
     rows.to_csv(tmp_path / "all.csv", index=False)
@@ -237,17 +217,16 @@ def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):
     whole = judged(tmp_path / "all.parquet")
     text = (tmp_path / "all.csv").read_text()
     (tmp_path / "all.csv.gz").write_bytes(gzip.compress(text.encode()))
-    (tmp_path / "wide.csv").write_bytes(text.encode("utf-16"))
-    for name in ("all.csv", "all.csv.gz", "wide.csv"):
+    for name in ("all.csv", "all.csv.gz"):
         assert judged(tmp_path / name) == whole
     assert judged(tmp_path / "german.csv", str(tmp_path / "own.yaml")) == whole
     parts = [tmp_path / "first.csv", tmp_path / "second.csv"]
     first = rows.recording_id < 13
     rows[first].to_csv(parts[0], index=False)
     rows[~first].to_csv(parts[1], index=False)
-    found = list(observations(parts, load_mapping()))
-    assert sum(each.tally.changes for each, _ in found) == whole.changes
-    shares = [share for _, share in found]
+    found = list(recordings(parts, load_mapping()))
+    assert sum(observe(each).tally.changes for each in found) == whole.changes
+    shares = [each.share_read for each in found]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
 
@@ -347,8 +326,7 @@ def highd(folder: Path) -> Path:
 
 def test_highd(tmp_path):
     tracks = highd(tmp_path)
-    found = list(observations(sorted(tmp_path.glob("*.csv")), load_mapping("highd")))
-    ((each, _),) = found
+    (each,) = map(observe, recordings(sorted(tmp_path.glob("*.csv")), load_mapping("highd")))
     # Both carriageways say the same: the vehicle behind another in the right lane, and who comes on the left.
     for number in (1, 4):
         following = each.following[each.following["vehicle"] == number]
@@ -391,8 +369,8 @@ def test_a_mapping_is_checked(tmp_path):
 
 MAPPED = {
     "classes": ("classes: [car]", "found no class car; there are PKW, van"),
-    "from_left": ("lanes: from_left", "or lanes: from_right"),
-    "list": ("lanes: [1, 0]", "Turn `lanes` of the mapping round"),
+    "from_left": ("lanes: from_left", "Give --mirror"),
+    "list": ("lanes: [1, 0]", "from the other side"),
     "column": ("columns: {speed_mps: speed_ft, s_m: s_m}", r"found the columns .*speed_mps.*speed_ft for speed_mps\."),
 }
 
@@ -406,23 +384,13 @@ def test_a_mapping_that_does_not_suit_the_file(case, tmp_path):
         judged(tmp_path / "rows.parquet", str(tmp_path / "own.yaml"))
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_lanes_with_names(suffix, tmp_path):
-    file = tmp_path / f"rows.{suffix}"
-    rows = ROWS.assign(lane=np.where(ROWS.vehicle_id == 4, "ramp", np.where(ROWS.lane == 0, "R", "L")))
-    rows.to_csv(file, index=False) if suffix == "csv" else rows.to_parquet(file)
-    (tmp_path / "own.yaml").write_text("lanes: [R, L]\n")
-    ROWS[ROWS.vehicle_id != 4].to_parquet(tmp_path / "numbers.parquet")
-    assert judged(file, str(tmp_path / "own.yaml")) == judged(tmp_path / "numbers.parquet")
-
-
 def test_classes_and_mirror(tmp_path):
     """Only named classes are fitted, others are neighbours still; a mirror's picture in a mirror is the road."""
     rows = ROWS.assign(**{"class": np.where(ROWS.recording_id % 2 == 0, "car", "truck")})
     rows.to_csv(tmp_path / "rows.csv", index=False)
     (tmp_path / "cars.yaml").write_text("classes: [car]\n")
-    found = observations([tmp_path / "rows.csv"], load_mapping(str(tmp_path / "cars.yaml")))
-    driven_s, whole = sum(each.tally.driven_s for each, _ in found), judged(tmp_path / "rows.csv")
+    found = recordings([tmp_path / "rows.csv"], load_mapping(str(tmp_path / "cars.yaml")))
+    driven_s, whole = sum(observe(each).tally.driven_s for each in found), judged(tmp_path / "rows.csv")
     assert 0.4 * whole.driven_s < driven_s < 0.6 * whole.driven_s
     fast_lanes().to_csv(tmp_path / "mirrored.csv", index=False)
     (tmp_path / "mirror.yaml").write_text("mirror: true\n")

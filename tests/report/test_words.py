@@ -68,7 +68,7 @@ def test_a_vehicle_that_is_not_reproducible_and_a_precision_that_was_not_reached
     answer = answered(stored_run, repeated={"n_episodes": 16, "differing": [3, 4, 5]})
     told = "NOT REPRODUCIBLE: 3 of 16 tests that ran twice differed: see `harness av-check`"
     assert list(answer.warnings) == [told]
-    assert re.search(r"stopped: budget of tests used up, at ± \d+ % \(asked: ± 10 %\)$", answer.scope)
+    assert re.search(r"stopped: budget of tests \(stop.episodes\) used up, at ± \d+ % \(asked: ± 10 %\)$", answer.scope)
 
 
 @pytest.mark.parametrize(("verdict", "value"), [("rejected", "rate above"), ("undecided", "limit")])

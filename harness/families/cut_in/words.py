@@ -13,7 +13,7 @@ from harness.families.words import Shown, Words
 
 def _tests(shows: bool) -> str:
     takes = "takes time" if shows else "takes no time"
-    return f"the vehicle is cut in on while it overtakes on a straight road, by a lane change that {takes}, and"
+    return f"a car cuts in ahead of the vehicle that overtakes it on a straight road, by a lane change that {takes}"
 
 
 def _rests(traffic: Environment | None, level: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -24,6 +24,9 @@ from harness.families.words import Shown
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, RecordArray
+
+if TYPE_CHECKING:
+    from harness.fitting.protocol import Fitter
 
 TTC_EDGES_S = np.array([0.5, 0.75, 1, 1.25, 1.5, 1.75, 2, 2.25, 2.5, 2.75, 3, 3.5, 4, 4.5, 5, 6, 7, 8, 10, 12])
 N_DROPS = 12
@@ -120,6 +123,11 @@ class CutOut(FollowingFamily):
     maps: tuple[tuple[Shown, Shown], ...] = ((CLOSING, TTC._replace(edges=TTC_EDGES_S)),)
     stride = 10
     model = CutOutParameters
+
+    def fitter(self) -> Fitter:
+        from harness.families.cut_out.fitting import CutOutFitter  # noqa: PLC0415 - reads tables
+
+        return CutOutFitter()
 
     def told(self, facts: Mapping[str, Any]) -> str:
         speed = facts["revealed_speed_mps"]

@@ -137,7 +137,8 @@ class FollowingFamily:
 
     def exposure(self, traffic: Following, parameters: FollowingParameters) -> Exposure:
         given, share = parameters.counted(), self.share_in_scope(traffic)
-        return given._replace(per_hour=given.per_hour * share, low=given.low * share, high=given.high * share)
+        counted = given.counted and (given.counted[0], given.counted[1] / share)
+        return Exposure(given.per_hour * share, given.low * share, given.high * share, counted, given.source)
 
     def milder(self, traffic: Following) -> Following | None:
         if (scope := float(traffic.numbers["scope_mps2"])) <= MILDEST_MPS2:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import AfterValidator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
@@ -79,9 +79,11 @@ class Approach(Section):
 
 
 class Counted(Section):
-    """How many events there are in an hour of driving."""
+    """How many events there are in an hour of driving: of ``events`` in ``hours``, where they were counted."""
 
     per_hour: Annotated[Number, within(1e-9, 1e6)]
+    events: Annotated[int, Field(ge=1)] | None = None
+    hours: Annotated[float, Field(gt=0.0)] | None = None
 
 
 class FollowingParameters(ParameterFile):
@@ -116,9 +118,10 @@ class FollowingParameters(ParameterFile):
 
     def counted(self) -> Exposure:
         """Events per hour, whether or not they are in scope."""
-        number = self.exposure.per_hour
+        number, events, hours = self.exposure.per_hour, self.exposure.events, self.exposure.hours
         low, high = number.range or (number.value, number.value)
-        return Exposure(number.value, low, high, None, number.note or number.source)
+        counted = None if events is None or hours is None else (events, hours)
+        return Exposure(number.value, low, high, counted, number.note or number.source)
 
     def without_half(self) -> Mapping[int, Mapping[str, float]]:
         """There is no kind of events that data have not."""

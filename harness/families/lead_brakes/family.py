@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +21,9 @@ from harness.families.numbers import Number, Share, ordered, within
 from harness.families.protocol import Column
 from harness.families.words import Shown
 from harness.vocabulary import FloatArray, RecordArray
+
+if TYPE_CHECKING:
+    from harness.fitting.protocol import Fitter
 
 PEAK_BIN_MPS2 = 0.2
 N_HELD = 11
@@ -91,6 +94,11 @@ class LeadBrakes(FollowingFamily):
     maps: tuple[tuple[Shown, Shown], ...] = ((HEADWAY, PEAK), (HELD, PEAK))
     stride = 37  # of 840 events; each stride that divides them meets one jerk alone
     model = LeadBrakesParameters
+
+    def fitter(self) -> Fitter:
+        from harness.families.lead_brakes.fitting import BrakingFitter  # noqa: PLC0415 - reads tables
+
+        return BrakingFitter()
 
     def told(self, facts: Mapping[str, Any]) -> str:
         held = f"for {facts['held_s']:.1f} s" if facts["held_s"] < math.inf else "to a standstill"

@@ -18,7 +18,7 @@ WORDS = words_of(
     who="LV the one ahead, which brakes",
     shows=("LV", "brakes"),
     happens=("LV", "brakes"),
-    then="brakes, and releases or stands",
+    then="brakes, for a time or to a standstill",
     depend="how hard, how long and how abruptly the vehicle ahead brakes",
     unlikely="These are brakings of 3 m/s² or more, one in each test.",
 )

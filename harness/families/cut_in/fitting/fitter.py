@@ -20,7 +20,6 @@ from harness.fitting.files import OF_YAML, environment_text
 from harness.fitting.protocol import Asked, Fitted
 from harness.fitting.recording import Recording
 from harness.fitting.table import places
-from harness.fitting.tracks import FitRange
 from harness.records.folder import parquet
 from harness.report.traffic_words import too_few
 
@@ -34,8 +33,6 @@ class CutInFitter:
 
     def __init__(self) -> None:
         self._base = read_model(SHIPPED_FOLDER / f"{BASE}.yaml", EnvironmentParameters)
-        numbers = self._base.values()
-        self._range = FitRange(*(numbers[f"fit_range__{name}"] for name in FitRange._fields))
         self._seen = list[Observations]()
 
     def marks(self, out: Path) -> dict[Path, bytes]:
@@ -43,7 +40,7 @@ class CutInFitter:
         return {out: OF_YAML, out.with_suffix(".html"): OF_PAGE, replicated: OF_REPLICATES}
 
     def observe(self, recording: Recording) -> None:
-        self._seen.append(observe(recording, self._range))
+        self._seen.append(observe(recording))
 
     def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:
         require_distinct(self._seen)
@@ -54,15 +51,12 @@ class CutInFitter:
         noise_mps2 = math.sqrt(math.fsum(each.noise_mps2**2 for each in self._seen) / len(self._seen))
         out, shown, beside = self.marks(asked.out)
         drawn = parquet(pa.table(rows, metadata={OF_REPLICATES: fit.environment.content_hash()}))
-        text = _text(fit, tally, asked) + f"\n{yaml_text({'replicates': _tied(beside, drawn)})}"
+        tied = {"replicates": {"file": beside.name, "sha256": content_hash(drawn)}}
+        text = f"{_text(fit, tally, asked)}\n{yaml_text(tied)}"
         told = [line for each in others.values() for line in each.told]
         shows = page(fit, tally, noise_mps2, rows, out.name, asked.files, told)
         files = {out: text.encode(), shown: shows.encode(), beside: drawn}
         return Fitted(files, _told(fit, tally, asked.n_replicates), _facts(fit, tally), fit)
-
-
-def _tied(file: Path, content: bytes) -> dict[str, str]:
-    return {"file": file.name, "sha256": content_hash(content)}
 
 
 def _text(fit: Fit, tally: Tally, asked: Asked) -> str:

@@ -11,9 +11,8 @@ row stands for the time nearest to it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,8 +20,8 @@ import pandas as pd
 
 from harness.errors import TrajectoryError
 from harness.fitting.recording import ONE_CLOCK, Recording
-from harness.fitting.table import Mapping, recordings
-from harness.fitting.tracks import USUAL_RANGE, FitRange, Scene, States, durations_s, noise_of, slopes
+from harness.fitting.table import Mapping
+from harness.fitting.tracks import USUAL_RANGE, Scene, durations_s, noise_of, slopes
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 
@@ -69,9 +68,6 @@ OTHER_SIDE = 10.0
 class Tally(NamedTuple):
     """Counts of vehicles beside the target lane, by which all recordings are judged together."""
 
-    recordings: int = 0
-    recorded: int = 0
-    """Vehicles in any lane."""
     vehicles: int = 0
     driven_s: float = 0.0
     """At any speed."""
@@ -80,20 +76,13 @@ class Tally(NamedTuple):
     followed_s: float = 0.0
     overlapping_s: float = 0.0
     """Of that, behind a leader that overlaps."""
-    overlapping_fronts_s: float = 0.0
-    overlapping_rears_s: float = 0.0
-    """The same, if positions were those of front or rear bumpers."""
     flickers: int = 0
     changes: int = 0
     """Lane changes to the target lane."""
     used: int = 0
     """Of those, behind a leader within the fit range and beside nobody."""
-    straight: int = 0
-    """Lane changes without lateral motion, where lateral positions are known."""
-    shifted: int = 0
-    """The same, more than 0.8 s from the middle between both lanes."""
-    jumping: int = 0
-    """The same, within one frame."""
+    odd: int = 0
+    """Lane changes without lateral motion, within one frame, or beside the middle between both lanes."""
     closing_s: float = 0.0
     """Whole seconds at risk with a time to collision below 8 s."""
     closing_other_s: float = 0.0
@@ -132,24 +121,11 @@ class Observations:
     noise_mps2: float
     """Standard deviation of ``acceleration_mps2`` by white measurement noise."""
     tally: Tally
-    overlap: str
-    """The first two vehicles that overlap, in words; empty if none do."""
     marks: IntArray
     """Hashes (m,) of a part of the rows, the same ones in a copy of them."""
 
 
-def observations(
-    files: Sequence[str | Path], mapping: Mapping, fit_range: FitRange = USUAL_RANGE
-) -> Iterator[tuple[Observations, float]]:
-    """Observations of each recording, and the share of the files that is read by then.
-
-    Raises `TrajectoryError`: a file cannot be read, or its rows are wrong.
-    """
-    for recording in recordings(files, mapping):
-        yield observe(recording, fit_range), recording.share_read
-
-
-def observe(track: Recording, fit_range: FitRange = USUAL_RANGE) -> Observations:
+def observe(track: Recording) -> Observations:
     """Observations of one recording, not yet judged (`require_enough`)."""
     n = track.second
     changes = np.flatnonzero(track.crosses(-1) & track.fitted)
@@ -159,37 +135,30 @@ def observe(track: Recording, fit_range: FitRange = USUAL_RANGE) -> Observations
     rows = np.flatnonzero(chosen & track.has_lane(-1))
     whole = track.frame[rows] % n == 0
     scene = Scene(track, chosen)
-    state, other = scene.states(rows, -1, fit_range), scene.states(other_rows, 1, fit_range)
+    state, other = scene.states(rows, -1), scene.states(other_rows, 1)
     duration_s = durations_s(track, rows)
 
     second = whole & track.same_run(rows, n)
     acceleration = np.full(rows.size, np.nan)
     acceleration[second] = slopes(track, rows[second])
-    seen = (state.leader >= 0) | (track.s[rows] + fit_range.r1_max_m <= track.view[1, track.road[rows]])
+    seen = (state.leader >= 0) | (track.s[rows] + USUAL_RANGE.r1_max_m <= track.view[1, track.road[rows]])
     since = track.frame[rows] - track.frame[np.searchsorted(track.vehicle, track.vehicle[rows])]
     crosses = np.isin(rows, changes)
     columns: dict[str, Any] = {"vehicle": track.vehicle[rows], "duration_s": duration_s, "v_mps": track.v[rows]}
     columns |= {"r1_m": state.r1, "r1dot_mps": state.r1dot, "r2_m": state.r2, "r2dot_mps": state.r2dot}
     columns |= {"ttc_s": state.ttc_s, "acceleration_mps2": acceleration, "changes": crosses}
-    leads, straight, shifted, jumping = _leads(track, rows[crosses & state.fits])
+    leads, odd = _leads(track, rows[crosses & state.fits])
     overlaps = state.follows & (state.r1 < OVERLAP_M)
-    longer = 0.5 * (track.length[rows] - track.length[state.leader])
     tally = Tally(
-        recordings=1,
-        recorded=len(track.vehicles),
         vehicles=np.unique(track.vehicle[rows]).size,
         driven_s=float(duration_s.sum()),
         outside_s=float(duration_s[~state.fits].sum()),
         followed_s=float(duration_s[state.follows].sum()),
         overlapping_s=float(duration_s[overlaps].sum()),
-        overlapping_fronts_s=float(duration_s[state.follows & (state.r1 + longer < OVERLAP_M)].sum()),
-        overlapping_rears_s=float(duration_s[state.follows & (state.r1 - longer < OVERLAP_M)].sum()),
         flickers=track.flickers,
         changes=changes.size,
         used=int((state.at_risk & crosses).sum()),
-        straight=straight,
-        shifted=shifted,
-        jumping=jumping,
+        odd=odd,
         closing_s=float((whole & state.at_risk & (state.ttc_s < CLOSING_TTC_S)).sum()),
         closing_other_s=float((other.at_risk & (other.ttc_s < CLOSING_TTC_S)).sum()),
     )
@@ -203,7 +172,6 @@ def observe(track: Recording, fit_range: FitRange = USUAL_RANGE) -> Observations
         leads,
         noise_of(track),
         tally,
-        _overlap(track, rows, state, overlaps),
         _marks(track),
     )
 
@@ -242,14 +210,14 @@ def _records(kind: str, columns: dict[str, RecordArray], inside: BoolArray) -> R
 # -- lateral motion --
 
 
-def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int, int, int]:
-    """Leads of some crossings (rows before them); how many have no lateral motion, at another time, or in one frame.
+def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int]:
+    """Leads of some crossings (rows before them), and how many are `Tally.odd`.
 
     The onset is the bend of a line, level before and straight from there to the crossing, fitted to the lateral
     positions: the law's motion at constant lateral speed. Where none is seen, the lead is the time that was searched,
     at least `SEEN_BEFORE_S`.
     """
-    found, straight, shifted, jumping = [], 0, 0, 0
+    found, odd = [], 0
     moves = (np.diff(track.lane) != 0) & (np.diff(track.vehicle) == 0)
     steady = ~np.isin(track.vehicle, track.vehicle[1:][moves]) & np.isfinite(track.lateral)
     middle: dict[tuple[int, int], float] = {}
@@ -268,14 +236,13 @@ def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int, int
             on = [track.lateral[steady & (track.road == road) & (track.lane == each)] for each in (lane, lane - 1)]
             middle[where] = float(np.mean([np.median(each) if each.size else np.nan for each in on]))
         off_m = abs(track.lateral[reach[-1]] - middle[where])
-        straight += int(abs(speed) < STRAIGHT_MPS)
-        shifted += int(STRAIGHT_MPS <= abs(speed) < off_m / SHIFTED_S)
-        jumping += int(np.abs(np.diff(track.lateral[near])).max() > JUMP_M)
+        jumps = np.abs(np.diff(track.lateral[near])).max() > JUMP_M
+        odd += int(jumps or abs(speed) < max(STRAIGHT_MPS, off_m / SHIFTED_S))
         if before_s[0] <= -SEEN_BEFORE_S:
             onset = _onset(before_s, track.lateral[reach])
             lead_s = -onset if onset - before_s[0] >= LEVEL_S else -before_s[0]
             found.append((track.vehicle[row], lead_s, abs(speed)))
-    return np.array(found, KINDS["leads"]), straight, shifted, jumping
+    return np.array(found, KINDS["leads"]), odd
 
 
 def _onset(time_s: FloatArray, lateral: FloatArray) -> float:
@@ -294,25 +261,6 @@ def _slope(x: FloatArray, y: FloatArray) -> float:
 # -- is it enough? --
 
 
-def _overlap(recording: Recording, rows: IntArray, state: States, overlaps: BoolArray) -> str:
-    """The first two vehicles that overlap, in words; empty if none do."""
-    if not overlaps.any():
-        return ""
-    i = int(np.argmax(overlaps))
-    ahead = recording.vehicles[recording.vehicle[state.leader[i]]]
-    return f"{recording.where(rows[i])}: a gap of {state.r1[i]:.1f} m to vehicle {ahead}"
-
-
-def _other_side(mapping: Mapping) -> str:
-    """How to mend lanes or a mirror that are the wrong way round."""
-    if mapping.mirror:
-        return "Give --no-mirror (in a mapping, mirror: false)."
-    if isinstance(mapping.lanes, list):
-        return "Turn `lanes` of the mapping round: they go from right to left. If they do, set mirror: true (--mirror)."
-    other = "from_left" if mapping.lanes == "from_right" else "from_right"
-    return f"Set mirror: true in a mapping (or --mirror); or lanes: {other}, if they are numbered so."
-
-
 def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) -> Tally:
     """Refuse recordings that are too few, or that were read wrongly by the ``mapping``; the sum of their counts.
 
@@ -327,56 +275,36 @@ def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) 
             words, mend = f"{words}; most of it in recording {name}", f"{mend} Or leave it out: --leave-out '{name}'."
         return TrajectoryError(f"{where}, {column}" if column else where, words, expected, mend)
 
-    if total.recorded <= total.recordings:
-        words = "only one vehicle" + (" in each recording" if total.recordings > 1 else "")
-        raise refuse(words, "the vehicles around it as well", "Check the columns vehicle_id and recording_id.")
-    side = _other_side(mapping)
-    if total.driven_s == 0.0:
-        words = "no vehicle with another lane beside it, on the side where vehicles close in"
-        raise refuse(words, "lanes 0, 1, …", f"Check the column of lanes. {side}", "lane")
-    if total.overlapping_s > MOST_OVERLAPPING * total.followed_s:
-        share, first = total.overlapping_s / total.followed_s, next(each.overlap for each in found if each.overlap)
-        words = f"vehicles that overlap in {share:.1%} of the time; first {first}"
-        raise refuse(words, f"at most {MOST_OVERLAPPING:.1%}", _how_they_overlap(total), most="overlapping_s")
-    if total.flickers > max(total.changes, FEWEST_CHANGES):
-        words = f"lanes that come back within a second {total.flickers:,} times, against {total.changes:,} lane changes"
-        raise refuse(words, "fewer", "Smooth lanes, or take them from lateral positions.", "lane", "flickers")
-    how = {
-        "straight": "without lateral motion",
-        "shifted": "more than 0.8 s from the lane's marking",
-        "jumping": "in one jump of lateral_m, as of a lane's middle",
-    }
-    odd = max(how, key=lambda each: int(getattr(total, each)))
-    if (n := getattr(total, odd)) > 0.5 * total.changes:
-        words = f"{n:,} of {total.changes:,} lane changes {how[odd]}"
-        mend = "Correct the shift between lanes and lateral positions, or leave out lateral_m."
-        raise refuse(words, "lane and lateral_m of the same time", mend, "lane", odd)
-    if total.outside_s > MOST_OUTSIDE * total.driven_s:
-        words = f"{total.outside_s / total.driven_s:.0%} of the time at speeds outside the fit range"
-        mend = "Use recordings of flowing traffic: laws are fitted at 20 to 40 m/s."
-        raise refuse(words, f"at most {MOST_OUTSIDE:.0%}", mend, "speed_mps", "outside_s")
-    if total.closing_s < max(LEAST_CLOSING_S, total.closing_other_s / OTHER_SIDE):
-        words = (
-            f"vehicles that close in from behind in the target lane (TTC < 8 s) for {total.closing_s:.0f} s, "
-            f"and for {total.closing_other_s:.0f} s in the lane on the other side"
-        )
-        mend = side if total.closing_other_s > total.closing_s else "Use recordings in which vehicles overtake."
-        raise refuse(words, "most of it in the target lane", mend, "lane")
-    if total.used < FEWEST_CHANGES:
-        hours = total.driven_s / 3600.0
-        words = (
-            f"{total.used} lane changes to the target lane behind a leader within the fit range (of {total.changes} in "
-            f"all), in {hours:.1f} vehicle-hours beside the target lane"
-        )
-        needed = hours * FEWEST_CHANGES / max(total.used, 1)
-        more = f"some {needed:.2g} such hours are needed" if total.used else "they are rare"
-        raise refuse(words, f"at least {FEWEST_CHANGES}", f"Add recordings: {more}.")
+    side = f"Give {'--no-mirror' if mapping.mirror else '--mirror'}, or number `lanes` from the other side."
+    overlapping, outside = total.overlapping_s / (total.followed_s or 1.0), total.outside_s / (total.driven_s or 1.0)
+    hours = total.driven_s / 3600.0
+    needed = f"some {hours * FEWEST_CHANGES / total.used:.2g} such hours are needed" if total.used else "they are rare"
+    closing = f"for {total.closing_s:.0f} s, and for {total.closing_other_s:.0f} s in the lane on the other side"
+    rules: list[tuple[bool, str, str, str, str, str]] = [
+        (total.driven_s == 0.0, "no vehicle with another lane beside it, on the side where vehicles close in",
+         "lanes 0, 1, …", f"Check the columns of lanes and vehicles. {side}", "lane", ""),
+        (overlapping > MOST_OVERLAPPING, f"vehicles that overlap in {overlapping:.1%} of the time",
+         f"at most {MOST_OVERLAPPING:.1%}",
+         f"Set origin: front (or rear) in a mapping, or check lengths. {ONE_CLOCK}", "", "overlapping_s"),
+        (total.flickers > max(total.changes, FEWEST_CHANGES),
+         f"lanes that come back within a second {total.flickers:,} times, against {total.changes:,} lane changes",
+         "fewer", "Smooth lanes, or take them from lateral positions.", "lane", "flickers"),
+        (total.odd > 0.5 * total.changes,
+         f"{total.odd:,} of {total.changes:,} lane changes off the marking, in a jump or without lateral motion",
+         "lane and lateral_m of the same time", "Shift one of them, or leave out lateral_m.", "lane", "odd"),
+        (outside > MOST_OUTSIDE, f"{outside:.0%} of the time at speeds outside the fit range",
+         f"at most {MOST_OUTSIDE:.0%}", "Use recordings of flowing traffic: laws are fitted at 20 to 40 m/s.",
+         "speed_mps", "outside_s"),
+        (total.closing_s < max(LEAST_CLOSING_S, total.closing_other_s / OTHER_SIDE),
+         f"vehicles that close in from behind in the target lane (TTC < {CLOSING_TTC_S:g} s) {closing}",
+         "most of it in the target lane",
+         side if total.closing_other_s > total.closing_s else "Use recordings in which vehicles overtake.", "lane", ""),
+        (total.used < FEWEST_CHANGES,
+         f"{total.used} lane changes to the target lane behind a leader within the fit range (of {total.changes} in "
+         f"all), in {hours:.1f} vehicle-hours beside the target lane",
+         f"at least {FEWEST_CHANGES}", f"Add recordings: {needed}.", "", ""),
+    ]  # fmt: skip
+    for broken, *told in rules:
+        if broken:
+            raise refuse(*told)
     return total
-
-
-def _how_they_overlap(total: Tally) -> str:
-    if total.overlapping_fronts_s < 0.2 * total.overlapping_s:
-        return "Positions seem to be front bumpers': set origin: front in a mapping (or centre, if it says rear)."
-    if total.overlapping_rears_s < 0.2 * total.overlapping_s:
-        return "Positions seem to be rear bumpers': set origin: rear in a mapping (or centre, if it says front)."
-    return f"Check lengths, and that lanes and positions are of the same time. {ONE_CLOCK}"

@@ -31,9 +31,6 @@ SHIPPED = {"ndd-overtaking-1": "muted", "ndd-overtaking-2": "vermillion"}
 """Environments drawn for comparison, and their colours."""
 BIN_NAMES = ("0–1", "1–2", "2–3", "3–5", "5–8", "> 8")
 MOST_ROWS = 20_000
-OVER_S = 5
-SAME_MPS = 0.3
-"""A row follows another if its speed is the other's plus acceleration, within this."""
 _SEED = 1
 
 
@@ -105,14 +102,10 @@ def _plots(fit: Fit) -> Iterator[Plot]:
     if fit.traffic.initial.size:
         yield _initial_plot(fit, traffic)
     both = [(fit.traffic.free, "Free driving"), (fit.traffic.following, "Behind a leader")]
-    panels = [panel for rows, title in both if rows.size for panel in _acceleration_panels(rows, title, traffic)]
+    panels = [_acceleration_panel(rows, title, traffic) for rows, title in both if rows.size]
     if panels:
-        alt = "Accelerations seen and by the law, their autocorrelation, and changes of speed in 5 s."
-        caption = (
-            f"The law draws every second independently; real drivers persist. Where observed changes of speed in "
-            f"{OVER_S} s spread more than the law's, simulated LV and BV are steadier than real ones."
-        )
-        yield Plot("accelerations", panels, alt, caption)
+        caption = "The law draws every second independently; real drivers persist, so that simulated ones are steadier."
+        yield Plot("accelerations", panels, "Accelerations seen and by the law.", caption)
     if (lead := fit.laws.get("lead")) is not None:
         yield _lead_plot(fit, lead.estimate["lateral__speed_log_sd"])
 
@@ -212,7 +205,7 @@ def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
     return Plot("initial", panels, alt, "States behind a leader, one per vehicle and 20 s.")
 
 
-def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) -> Iterator[Panel]:
+def _acceleration_panel(rows: RecordArray, title: str, traffic: Environment) -> Panel:
     step = -(-rows.size // MOST_ROWS)
     some = rows[::step]
     names = rows.dtype.names or ()
@@ -221,43 +214,7 @@ def _acceleration_panels(rows: RecordArray, title: str, traffic: Environment) ->
     law, seen = pmf.mean(axis=0), np.bincount(bins(rows["acceleration_mps2"]), minlength=N_ACCELERATIONS) / rows.size
     y = Axis("share", 10.0 ** math.floor(math.log10(min(1.0 / rows.size, 0.1))), 1.0, log=True)
     edges = np.append(ACCELERATIONS_MPS2 - 0.1, ACCELERATIONS_MPS2[-1] + 0.1)
-    line = ACCELERATIONS_MPS2, law
-    yield _beside(title, "acceleration of one second, m/s²", y, edges, seen, line)
-
-    first = _followed(rows, OVER_S)
-    panel = Panel(
-        f"{title}, from second to second", Axis("seconds later", 0.0, float(OVER_S)), Axis("autocorrelation", -0.2, 1.0)
-    )
-    acceleration = rows["acceleration_mps2"]
-    lags = np.arange(OVER_S)
-    if first.size > 1:
-        seen = np.array([np.corrcoef(acceleration[first], acceleration[first + lag])[0, 1] for lag in lags])
-        panel.add("line", "blue", lags, seen, label="seen")
-        panel.add("dots", "blue", lags, seen, 3.0)
-    panel.add("line", "vermillion", [0.0, 1.0, OVER_S], [1.0, 0.0, 0.0], label="law, around its mean")
-    yield panel
-
-    random = np.random.default_rng(_SEED)
-    drawn = np.zeros(some.size)
-    below = np.cumsum(pmf, axis=1)[:, :-1]
-    for _ in range(OVER_S):
-        drawn += ACCELERATIONS_MPS2[(random.random((some.size, 1)) > below).sum(axis=1)]
-    changes = sum(acceleration[first + lag] for lag in lags) if first.size else np.empty(0)
-    ends = np.linspace(-8.0, 8.0, 33)
-    seen, law = (_histogram(np.clip(each, -8.0, 8.0), ends) for each in (np.asarray(changes), drawn))
-    y = Axis("density", 1e-4, 2.0 * max(float(seen.max()), float(law.max())), log=True)
-    line, label = (0.5 * (ends[1:] + ends[:-1]), law), f"change of speed in {OVER_S} s, m/s"
-    yield _beside(f"{title}, over {OVER_S} s", label, y, ends, seen, line, ("seen", "law, second by second"))
-
-
-def _followed(rows: RecordArray, n: int) -> IntArray:
-    """Rows that are followed by n - 1 more seconds of the same vehicle."""
-    v, a, vehicle = rows["v_mps"], rows["acceleration_mps2"], rows["vehicle"]
-    if rows.size < n:
-        return np.empty(0, np.int64)
-    goes_on = (vehicle[1:] == vehicle[:-1]) & (np.abs(v[1:] - v[:-1] - a[:-1]) < SAME_MPS)
-    length = np.lib.stride_tricks.sliding_window_view(goes_on, n - 1).all(axis=1)
-    return np.flatnonzero(length).astype(np.int64)
+    return _beside(title, "acceleration of one second, m/s²", y, edges, seen, (ACCELERATIONS_MPS2, law))
 
 
 def _lead_plot(fit: Fit, log_sd: float) -> Plot:

@@ -1,0 +1,90 @@
+"""Cut-outs in trajectories: how often the vehicle ahead leaves the lane and reveals a slower one, and how late.
+
+A cut-out is a lasting change of the lane, to either side, by a vehicle that somebody follows, where the next one ahead
+on the lane that it leaves is slower, and as near as the law has it: at most 12 s of time to collision away. States are
+those of the last row on that lane. Following counts where 100 m of the road ahead of the leader are in view.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import optimize, special
+
+from harness.campaign.sections import EnvironmentSettings
+from harness.families.cut_out.family import CUT_OUT, TTC_EDGES_S
+from harness.families.following.fitting import FEWEST_OF_LAW, FollowingFitter, Numbers, Seen, fitted_number, followed
+from harness.fitting.recording import Recording
+from harness.fitting.tracks import IN_VIEW_M, slope_weights
+from harness.vocabulary import FloatArray, IntArray, RecordArray
+
+STANDS_MPS = 0.5
+LEAST_LATERAL_MPS = 0.1
+"""Slower ones are wrong lateral positions, or a drift."""
+EVENT = np.dtype([("drop", np.float64), ("ttc_s", np.float64), ("lateral_mps", np.float64)])
+
+
+class CutOutFitter(FollowingFitter):
+    """See `FollowingFitter`."""
+
+    family, events = CUT_OUT, f"cut-outs that reveal a slower vehicle within {TTC_EDGES_S[-1]:g} s"
+
+    def seen(self, track: Recording) -> Seen:
+        of = followed(track)
+        ends = track.view[1, track.road]
+        leader = of.ahead[of.follows]
+        hours = float((track.s[leader] + IN_VIEW_M <= ends[leader]).sum()) / track.rate_hz / 3600.0
+        left = track.crosses(-1) | track.crosses(1)
+        row = np.flatnonzero(left & (of.behind >= 0) & (of.ahead >= 0) & (track.s + IN_VIEW_M <= ends))
+        closing, gap = -track.rate(of.ahead[row], row), track.gap(of.ahead[row], row)
+        events: RecordArray = np.empty(row.size, EVENT)
+        events["drop"], events["ttc_s"] = closing / track.v[row], gap / np.maximum(closing, 1e-9)
+        events["lateral_mps"] = np.abs(lateral_speeds(track, row))
+        return Seen(hours, events[(closing > 0.0) & (gap > 0.0) & (events["ttc_s"] <= TTC_EDGES_S[-1])])
+
+    def numbers(self, events: RecordArray) -> Numbers:
+        base = CUT_OUT.parameters(EnvironmentSettings()).values()
+        drops = events["drop"][events["drop"] < 1.0 - STANDS_MPS / 30.0]
+        careless = [base[f"leaving__careless_{name}"] for name in ("share", "least_s", "most_s")]
+        (median, log_sd), errors = time_law(events["ttc_s"], *careless)
+        found = {"drop_mean": fitted_number(drops.mean(), drops.mean() / math.sqrt(drops.size))}
+        found |= {"ttc_median_s": fitted_number(median, errors[0]), "ttc_log_sd": fitted_number(log_sd, errors[1])}
+        logs = np.log(events["lateral_mps"][events["lateral_mps"] >= LEAST_LATERAL_MPS])
+        if logs.size >= FEWEST_OF_LAW:
+            at, sd = math.exp(logs.mean()), float(logs.std(ddof=1))
+            found["lateral_median_mps"] = fitted_number(at, at * sd / math.sqrt(logs.size))
+            found["lateral_log_sd"] = fitted_number(sd, sd / math.sqrt(2.0 * logs.size))
+        return {"leaving": found}
+
+
+def lateral_speeds(track: Recording, rows: IntArray) -> FloatArray:
+    """Lateral speed (m/s) around the ends of some rows (m,), NaN where it is not known."""
+    weights = slope_weights(track)
+    around = rows[:, None] + np.arange(weights.size) - weights.size // 2
+    inside = np.clip(around, 0, track.v.size - 1)
+    known = (around == inside).all(axis=1) & (track.piece[inside[:, 0]] == track.piece[inside[:, -1]])
+    return np.where(known, track.lateral[inside] @ weights, np.nan)
+
+
+def time_law(ttc_s: FloatArray, share: float, least_s: float, most_s: float) -> tuple[FloatArray, FloatArray]:
+    """Median and log-sd of times to collision (k,) up to the law's last edge, and their standard errors.
+
+    Log-normal, but for a ``share`` of careless drivers between two times, who are too few to be fitted.
+    """
+    log_t, last = np.log(ttc_s), math.log(TTC_EDGES_S[-1])
+    careless = share / (most_s - least_s) * ((ttc_s >= least_s) & (ttc_s <= most_s))
+
+    def loss(theta: FloatArray) -> float:
+        log_sd = math.exp(theta[1])
+        z = (log_t - theta[0]) / log_sd
+        density = np.exp(-0.5 * z * z - log_t) / (log_sd * math.sqrt(2.0 * math.pi))
+        seen = special.ndtr((last - theta[0]) / log_sd)
+        return -float(np.log((1.0 - share) * density / seen + careless + 1e-300).sum())
+
+    found = optimize.minimize(loss, [log_t.mean(), math.log(log_t.std() + 1e-3)], method="Nelder-Mead").x
+    steps = 1e-3 * np.eye(2)
+    bend = [[sum(a * b * loss(found + a * i + b * j) for a in (-1, 1) for b in (-1, 1)) for j in steps] for i in steps]
+    errors = np.sqrt(np.diag(np.linalg.inv(np.array(bend) / 4e-6)))
+    values = np.exp(found)
+    return values, values * errors

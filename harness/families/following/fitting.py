@@ -1,0 +1,129 @@
+"""Events that following drivers met, counted in trajectories, and the environment file that they give.
+
+An exposure is events per hour of following: driving in the fit range behind a vehicle on the same lane, whoever drives
+and on whichever lane. What a vehicle does is one event to the one driver who follows it then, to nobody if none does.
+Limits are exact for a Poisson count; events that have one cause, such as a wave of braking, make them too narrow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from harness.campaign.sections import EnvironmentSettings
+from harness.estimators.limits import garwood
+from harness.families.following.family import FollowingFamily
+from harness.fitting.files import OF_YAML, environment_text
+from harness.fitting.protocol import Asked, Fitted
+from harness.fitting.recording import Recording
+from harness.fitting.tracks import USUAL_RANGE, Scene
+from harness.numbers import number
+from harness.vocabulary import BoolArray, IntArray, RecordArray
+
+FEWEST_COUNTED, FEWEST_OF_LAW = 5, 20
+"""Fewest events from which a rate is taken, and a law [assumed]."""
+TAIL = 0.05
+"""At each end of the limits of a rate."""
+Numbers = dict[str, dict[str, Any]]
+
+
+class Followed(NamedTuple):
+    """Who follows whom in a recording: by row (n,), the row of the vehicle ahead on the lane, -1 without one.
+
+    ``follows`` (n,) are rows of drivers whose following counts, ``behind`` (n,) the row of such a driver who follows.
+    """
+
+    ahead: IntArray
+    follows: BoolArray
+    behind: IntArray
+
+
+@lru_cache(maxsize=1)  # several families ask for the same recording
+def followed(track: Recording) -> Followed:
+    """Find the vehicle ahead in every row."""
+    rows = np.arange(track.v.size)
+    ahead, _ = Scene(track, np.ones(rows.size, np.bool_)).neighbours(rows, 0)
+    gap, fit = track.gap(ahead, rows), USUAL_RANGE
+    follows = track.fitted & (ahead >= 0) & (gap > fit.r1_min_m) & (gap <= fit.r1_max_m)
+    follows &= (track.v >= fit.v_min_mps) & (track.v <= fit.v_max_mps)
+    behind = np.full(rows.size, -1)
+    behind[ahead[follows]] = rows[follows]
+    return Followed(ahead, follows, behind)
+
+
+class Seen(NamedTuple):
+    """Hours of following in which events would have been seen, and the events; ``why`` a recording says nothing."""
+
+    hours: float
+    events: RecordArray
+    why: str = ""
+
+
+def fitted_number(value: float, se: float) -> dict[str, Any]:
+    """A number of an environment file."""
+    return {"value": float(f"{value:.4g}"), "source": "fitted", "se": float(f"{se:.2g}")}
+
+
+class FollowingFitter:
+    """See `harness.fitting.protocol.Fitter`; ``events`` are what a family's are called, in the plural."""
+
+    family: FollowingFamily
+    events: str
+
+    def __init__(self) -> None:
+        self._seen = list[Seen]()
+
+    def seen(self, track: Recording) -> Seen:
+        """Events in a recording."""
+        raise NotImplementedError
+
+    def numbers(self, events: RecordArray) -> Numbers:
+        """Fitted numbers by section and name, from at least `FEWEST_OF_LAW` events."""
+        raise NotImplementedError
+
+    def marks(self, out: Path) -> dict[Path, bytes]:
+        return {out.with_name(f"{out.stem}.{self.family.name}.yaml"): OF_YAML}
+
+    def observe(self, recording: Recording) -> None:
+        self._seen.append(self.seen(recording))
+
+    def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:  # noqa: ARG002 - it has no page
+        base = self.family.default_parameters
+        hours = math.fsum(each.hours for each in self._seen)
+        events = np.concatenate([each.events for each in self._seen])
+        content, told = self._exposure(events.size, hours)
+        if events.size >= FEWEST_OF_LAW:
+            law = self.numbers(events)
+            content |= law
+            of = [(name, each) for own in law.values() for name, each in own.items()]
+            told += "; " + ", ".join(f"{name} {number(each['value'])} ± {number(each['se'], 2)}" for name, each in of)
+        elif content:
+            told += f"; a law takes {FEWEST_OF_LAW}: kept is that of {base}"
+        silent, n = [each.why for each in self._seen if each.why], len(self._seen)
+        more = [f"! {self.family.name}: {len(silent)} of {n} recordings are not counted: {silent[0]}"] if silent else []
+        head = [f"{n - len(silent)} recordings.", told, f"The rest is as in {base}.", *asked.provenance()]
+        [file] = self.marks(asked.out)
+        text = environment_text(head, {"like": base, **content})
+        facts = {self.family.name: {"events": events.size, "hours": hours, **content}}
+        return Fitted({file: text.encode()}, (told, *more), facts, content)
+
+    def _exposure(self, n: int, hours: float) -> tuple[Numbers, str]:
+        """The rate of n events, where they are enough, and in words."""
+        kept = self.family.parameters(EnvironmentSettings()).exposure.per_hour
+        told = f"{self.family.name}: {n:,} {self.events} in {number(hours)} h of following"
+        low, high = (float(f"{end / max(hours, 1e-9):.4g}") for end in garwood(n, TAIL))
+        limits = f"{number(low, 2)} to {number(high, 2)} per hour" if hours else "which says nothing"
+        if n >= FEWEST_COUNTED:
+            note = f"{n} in {hours:.4g} h of following"
+            rate = {**fitted_number(n / hours, math.sqrt(n) / hours), "range": [low, high], "note": note}
+            counted = {"exposure": {"per_hour": rate, "events": n, "hours": round(hours, 6)}}
+            return counted, f"{told}, {number(n / hours)} per hour ({limits})"
+        needed = f", some {number(hours * FEWEST_COUNTED / n, 2)} h" if n else ""
+        excluded = "" if low <= kept.value <= high else ", which these data exclude"
+        told += f" ({limits}); at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)} per hour"
+        return {}, f"{told} [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
