@@ -184,7 +184,8 @@ def hours_page(place: Path) -> Path:
         "vehicle": "idm", "name": "r157", "n_episodes": 300, "n_crashes": 30, "seed": 1, "confidence": 0.9,
         "per_hour": {"rate": 1.27e-3, "ci_low": 1.2e-3, "ci_high": 1.9e-3, "upper_bound": None, "rhw": 0.3},
         "per_1e6_km": 11.3, "beside": beside, "decision": None, "stopped_by": "rhw", "asked_rhw": 0.3,
-        "counts_in_interval": False, "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
+        "counts_in_interval": False, "readings": [beside], "milder": {},
+        "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
     }  # fmt: skip
     return write_hours_of(place, content)
 
