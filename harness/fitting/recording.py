@@ -221,7 +221,7 @@ def _rate_hz(recording: Recording, steps_s: FloatArray) -> float:
 
 
 def _check_motion(recording: Recording, rows: pd.DataFrame) -> None:
-    """Refuse wrong units, columns that are shifted in time, and rows whose positions and speeds disagree."""
+    """Refuse wrong units, and rows whose positions and speeds disagree."""
     require(SOME_LENGTH, rows, recording.where)
     frame, vehicle, s, v = recording.frame, recording.vehicle, recording.s, recording.v
     rate, n = recording.rate_hz, recording.second

@@ -24,8 +24,8 @@ from harness.runner.stored import ReplayResult
 from harness.vehicles.kinematics import STEP_S
 from harness.worlds.sumo import network_file, sumo_program
 
-LANE_M, INSIDE_M = 3.2, 0.01
-"""Lanes of the committed network; SUMO takes a vehicle to be on the lane that its middle is on."""
+ROAD_M, LANE_M, INSIDE_M = 4000.0, 3.2, 0.01
+"""Of the committed network; SUMO takes a vehicle to be on the lane that its middle is on, which it is by so much."""
 COLOURS, OTHERS = {"LV": "#00795a", "AV": "#0067a8"}, "#c94f0a"
 MARGIN_M, NARROWEST_M, WIDEST_M = 15.0, 80.0, 400.0
 """Of the road that the window shows."""
@@ -58,7 +58,6 @@ def write_sumo(result: ReplayResult, file: Path) -> list[Path]:
     scene, tracks = result.scene, tracks_of(result.trace)
     first, last = scene["first"], max(map(len, tracks.values())) - 1
     onset = first if scene["onset"] is None else scene["onset"]
-    # One step beyond the last: where its time is up, sumo-gui asks whether to close, in front of the crash.
     write_bytes(files[0], network_file(1).read_bytes())
     # The device lets vehicles begin as fast as their type may be; what they are told later may be more.
     types = [
@@ -75,9 +74,10 @@ def write_sumo(result: ReplayResult, file: Path) -> list[Path]:
     names = '<vehicles vehicleQuality="2" vehicleName_show="1" vehicleName_size="70" vehicleName_color="white"/>'
     looks = [
         f'<scheme name="harness">{names}</scheme>', f'<delay value="{1000 * STEP_S:g}"/>',
-        f'<viewport x="{left + width / 2:.1f}" y="0" zoom="{100 * 4000 / width:.0f}"/>',
+        f'<viewport x="{left + width / 2:.1f}" y="0" zoom="{100 * ROAD_M / width:.0f}"/>',
     ]  # fmt: skip
     _write(files[3], "viewsettings", looks)
+    # It may go one step beyond the last: where its time is up, sumo-gui asks whether to close, in front of the crash.
     halts = ",".join(f"{step * STEP_S:.1f}" for step in (onset, last))
     settings = {
         "input": f"<net-file value={network}/><additional-files value={vehicles}/>",
@@ -119,7 +119,7 @@ def watch(result: ReplayResult, program: Path) -> None:
     with TemporaryDirectory() as folder:
         file = write_sumo(result, Path(folder) / "test.sumocfg")[0]
         ended = subprocess.run([program, "-c", file.name], cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - SUMO's own program
-    if ended.returncode:
+    if ended.returncode > 0:  # and not by a signal, which is how one may close it, too
         raise _no_window(f"a sumo-gui that ends with {ended.returncode}: {ended.stderr.strip()[-200:]}")
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from harness import numbers
@@ -25,12 +25,12 @@ def sentence(text: str) -> str:
 
 
 def templates(package: str = "harness.report") -> Environment:
-    """Templates of a package."""
+    """Templates of a package, which may include those of this one."""
     place = Path(__file__).parent
     css, more_css, script = (
         (place / name).read_text(encoding="utf-8") for name in ("report.css", "player.css", "player.js")
     )
-    loader = PackageLoader(package, ".")
+    loader = ChoiceLoader([PackageLoader(each, ".") for each in (package, "harness.report")])
     found = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     # Our own files, of which the policy of the page lets this one script run, by its hash.

@@ -33,7 +33,7 @@ ENDED = {
     "episodes": "budget of tests (stop.episodes) used up",
     "pool": "the pool has no further event that would narrow it",
     "pool_error": "the pool’s own error is too wide",
-    "sum": "the sum of all scenarios, which was asked for",
+    "sum": "with the sum of all scenarios",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
 

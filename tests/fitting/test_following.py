@@ -176,10 +176,12 @@ def test_what_a_fit_writes_is_what_a_campaign_reads(tmp_path, monkeypatch, capsy
         file = f"./mine.{name}.yaml"
         return family_named(name).parameters(EnvironmentSettings(parameters=file))
 
-    leads, shipped = parameters("lead_brakes"), family_named("lead_brakes").parameters(EnvironmentSettings())
-    given = leads.counted()
+    family, leads = family_named("lead_brakes"), parameters("lead_brakes")
+    shipped = family.parameters(EnvironmentSettings())
+    given = family.exposure(family.traffic(EnvironmentSettings(), leads), leads)
     assert given.counted is not None
     assert given.counted[0] > 20
+    assert given.counted[0] / given.counted[1] == pytest.approx(given.per_hour, rel=1e-3)
     assert given.low < 30.0 * 1.5 / given.counted[1] < given.high
     assert leads.braking.peak_scale_mps2.source == "fitted"
     same = {name for name, value in leads.values().items() if value == shipped.values()[name]}

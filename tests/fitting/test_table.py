@@ -65,12 +65,6 @@ def long_followers() -> pd.DataFrame:
     return rows
 
 
-def late_lanes() -> pd.DataFrame:
-    """Lanes a second late."""
-    late = ROWS.groupby(["recording_id", "vehicle_id"]).lane.shift(9)
-    return ROWS.assign(lane=late).dropna()
-
-
 def congested() -> pd.DataFrame:
     return ROWS.assign(speed_mps=ROWS.speed_mps - 15, s_m=ROWS.s_m - 15 * ROWS.time_s)
 
@@ -116,7 +110,6 @@ REFUSED = {
     "nobody closes in": (lambda: ROWS[ROWS.vehicle_id != 2].query("vehicle_id < 2"), "beside it|closes? in"),
     "straight": (changed(lateral_m=first("lateral_m")), "or without lateral motion"),
     "lanes' middles": (changed(lateral_m=3.5 * ROWS.lane), "in a jump"),
-    "late lanes": (late_lanes, "off the marking"),
     "no length": (with_value(3, "length_m", 0.0), r"row 4 \(vehicle 0 of recording 0, t = 0\.3 s\): found no length"),
     "NaN": (with_value(9, "speed_mps", np.nan), "row 10, speed_mps: found no finite number"),
     "a lone row each": (lambda: ROWS[ROWS.time_s == 0], "one row per vehicle"),

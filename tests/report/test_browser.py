@@ -223,6 +223,10 @@ def test_on_paper_it_is_light_and_without_what_only_a_screen_can_do(opened, page
         assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
         for name in (".bar", ".jumps", "details:not([open]) summary"):
             assert page.locator(f"{name}:visible").count() == 0
+        page.set_viewport_size({"width": 688, "height": 900})  # A4 within its margins
+        page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+        wide = "[...document.querySelectorAll('table, svg, pre')].map((e) => [e.scrollWidth, e.textContent])"
+        assert [each for each in page.evaluate(wide) if each[0] > 688] == []
 
 
 def test_a_cut_out_shows_when_the_revealed_vehicle_becomes_visible(opened, crashing):

@@ -48,7 +48,7 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
         assert (of["ci_low"], of["ci_high"]) == pytest.approx([per_hour * own[end] for end in ("ci_low", "ci_high")])
         total += of["rate_per_hour"]
         assert read_manifest(run.folder / name)["stopped_by"] == "sum"
-        assert "ended by: the sum of all scenarios" in repr(run.runs[name])
+        assert "stopped: with the sum of all scenarios" in " ".join(repr(run.runs[name]).split())
     hour = told["per_hour"]
     assert hour["rate"] == pytest.approx(total)
     assert hour["ci_low"] < total < hour["ci_high"]

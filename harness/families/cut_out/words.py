@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from harness.families.following.words import words_of
 from harness.families.words import Shown
 
-TTC_EDGES_S = np.array([0.5, 0.75, 1, 1.25, 1.5, 1.75, 2, 2.25, 2.5, 2.75, 3, 3.5, 4, 4.5, 5, 6, 7, 8, 10, 12])
 WORDS = words_of(
     called="cut-out",
     event="cut-out",

@@ -117,7 +117,7 @@ class FollowingFitter:
         kept = self.family.parameters(EnvironmentSettings()).exposure.per_hour
         told = f"{self.family.name}: {n:,} {self.events} in {number(hours)} h of following"
         low, high = (float(f"{end / max(hours, 1e-9):.4g}") for end in garwood(n, TAIL))
-        limits = f"{number(low, 2)} to {number(high, 2)} per hour" if hours else "which says nothing"
+        limits = f"{number(low, 2)} to {number(high, 2)}"
         if n >= FEWEST_COUNTED:
             note = f"{n} in {hours:.4g} h of following"
             rate = {**fitted_number(n / hours, math.sqrt(n) / hours), "range": [low, high], "note": note}
@@ -125,5 +125,7 @@ class FollowingFitter:
             return counted, f"{told}, {number(n / hours)} per hour ({limits})"
         needed = f", some {number(hours * FEWEST_COUNTED / n, 2)} h" if n else ""
         excluded = "" if low <= kept.value <= high else ", which these data exclude"
-        told += f" ({limits}); at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)} per hour"
+        told += (
+            f" ({limits} per hour); at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)} per hour"
+        )
         return {}, f"{told} [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"

@@ -51,7 +51,6 @@ LATERAL_WINDOW_S = 0.5
 STRAIGHT_MPS = 0.1
 JUMP_M = 1.5
 """Between two frames nobody drives so far across [assumed]."""
-SHIFTED_S = 0.8
 OVERLAP_M = -0.5
 """Gaps below are more than measurement error."""
 MOST_OVERLAPPING = 0.005
@@ -82,7 +81,7 @@ class Tally(NamedTuple):
     used: int = 0
     """Of those, behind a leader within the fit range and beside nobody."""
     odd: int = 0
-    """Lane changes without lateral motion, within one frame, or beside the middle between both lanes."""
+    """Lane changes without lateral motion, or within one frame."""
     closing_s: float = 0.0
     """Whole seconds at risk with a time to collision below 8 s."""
     closing_other_s: float = 0.0
@@ -218,9 +217,6 @@ def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int]:
     at least `SEEN_BEFORE_S`.
     """
     found, odd = [], 0
-    moves = (np.diff(track.lane) != 0) & (np.diff(track.vehicle) == 0)
-    steady = ~np.isin(track.vehicle, track.vehicle[1:][moves]) & np.isfinite(track.lateral)
-    middle: dict[tuple[int, int], float] = {}
     for row in crossings:
         window = round(LATERAL_WINDOW_S * track.rate_hz)
         near = np.arange(max(row - window + 1, 0), min(row + window + 1, track.run.size))
@@ -231,13 +227,8 @@ def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int]:
             continue
         before_s = (reach - row - 0.5) / track.rate_hz
         speed = _slope(near / track.rate_hz, track.lateral[near])
-        road, lane = where = int(track.road[row]), int(track.lane[row])
-        if where not in middle:
-            on = [track.lateral[steady & (track.road == road) & (track.lane == each)] for each in (lane, lane - 1)]
-            middle[where] = float(np.mean([np.median(each) if each.size else np.nan for each in on]))
-        off_m = abs(track.lateral[reach[-1]] - middle[where])
         jumps = np.abs(np.diff(track.lateral[near])).max() > JUMP_M
-        odd += int(jumps or abs(speed) < max(STRAIGHT_MPS, off_m / SHIFTED_S))
+        odd += int(jumps or abs(speed) < STRAIGHT_MPS)
         if before_s[0] <= -SEEN_BEFORE_S:
             onset = _onset(before_s, track.lateral[reach])
             lead_s = -onset if onset - before_s[0] >= LEVEL_S else -before_s[0]
@@ -290,7 +281,7 @@ def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) 
          f"lanes that come back within a second {total.flickers:,} times, against {total.changes:,} lane changes",
          "fewer", "Smooth lanes, or take them from lateral positions.", "lane", "flickers"),
         (total.odd > 0.5 * total.changes,
-         f"{total.odd:,} of {total.changes:,} lane changes off the marking, in a jump or without lateral motion",
+         f"{total.odd:,} of {total.changes:,} lane changes in a jump, or without lateral motion",
          "lane and lateral_m of the same time", "Shift one of them, or leave out lateral_m.", "lane", "odd"),
         (outside > MOST_OUTSIDE, f"{outside:.0%} of the time at speeds outside the fit range",
          f"at most {MOST_OUTSIDE:.0%}", "Use recordings of flowing traffic: laws are fitted at 20 to 40 m/s.",
