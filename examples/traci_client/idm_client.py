@@ -3,8 +3,8 @@
     python idm_client.py --port 8813 --cells 64
 
 It needs nothing but the package ``traci``. SUMO has two clients: this program (order 1) and the harness (order 2). In
-cell k stand the vehicles LVk, BVk and AVk; only AVk is ours. It is on lane 0. Once BVk is on lane 0 too, it has cut in.
-Until then the harness holds our speed, whatever we command.
+cell k stand AVk, which is ours, on lane 0, and the others of the scenario: LVk, and BVk, SVk or nobody. Once a BVk
+is on lane 0 it has cut in; until then the harness holds our speed, whatever we command.
 """
 
 from __future__ import annotations
@@ -52,18 +52,20 @@ def drive(sumo: traci.connection.Connection, cells: int) -> None:
     """Step until the harness ends the simulation."""
     sumo.setOrder(1)
     sumo.simulationStep()  # the harness has put the vehicles on the road
-    for k in range(cells):
-        sumo.vehicle.subscribe(f"AV{k}", [tc.VAR_LANEPOSITION, tc.VAR_SPEED])
-        sumo.vehicle.subscribe(f"BV{k}", [tc.VAR_LANEPOSITION, tc.VAR_SPEED, tc.VAR_LANE_INDEX])
+    others: list[list[str]] = [[] for _ in range(cells)]
+    for name in sumo.vehicle.getIDList():
+        sumo.vehicle.subscribe(name, [tc.VAR_LANEPOSITION, tc.VAR_SPEED, tc.VAR_LANE_INDEX])
+        if not name.startswith("AV"):
+            others[int(name[2:])].append(name)
     while True:
         sumo.simulationStep()
         seen = sumo.vehicle.getAllSubscriptionResults()
         for k in range(cells):
-            bv = seen[f"BV{k}"]
-            if bv[tc.VAR_LANE_INDEX] == 0:
-                av = seen[f"AV{k}"]
-                speed, gap = av[tc.VAR_SPEED], bv[tc.VAR_LANEPOSITION] - LENGTH_M - av[tc.VAR_LANEPOSITION]
-                sumo.vehicle.setSpeed(f"AV{k}", max(speed + idm(speed, bv[tc.VAR_SPEED], gap) * STEP_S, 0.0))
+            ahead = [seen[name] for name in others[k] if seen[name][tc.VAR_LANE_INDEX] == 0]
+            if ahead:
+                av, lead = seen[f"AV{k}"], min(ahead, key=lambda of: of[tc.VAR_LANEPOSITION])
+                speed, gap = av[tc.VAR_SPEED], lead[tc.VAR_LANEPOSITION] - LENGTH_M - av[tc.VAR_LANEPOSITION]
+                sumo.vehicle.setSpeed(f"AV{k}", max(speed + idm(speed, lead[tc.VAR_SPEED], gap) * STEP_S, 0.0))
 
 
 def main() -> None:

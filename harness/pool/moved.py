@@ -96,8 +96,8 @@ class FewPaths:
         flat = np.arange(N_PATHS)[:, None] * n_shells + shell
         by_path = np.bincount(flat.ravel(), mass.ravel(), N_PATHS * n_shells).reshape(N_PATHS, n_shells)
         outside = np.zeros((N_PATHS, n_shells), np.bool_)
-        for name, (low, high) in self._range.items():
-            state = paths.start[name][:, None]
+        for name in {*self._range} & {*(paths.start.dtype.names or ())}:  # a fact may be of the event alone
+            (low, high), state = self._range[name], paths.start[name][:, None]
             outside |= (state < low) | (state > high)
         rate = [np.where((paths.crashes >> bit) & 1 == 1, mass, 0.0).sum() for bit in self._references]
         in_stratum = self._stratum[:, None] == np.arange(self._n_strata)

@@ -107,11 +107,12 @@ def unseen_words(where: str) -> str:
 
 
 def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[str]:
-    """That a vehicle crashes on events too mild to count, if it does."""
-    if milder is not None and milder["n_crashes"]:
-        words, n, of = family_named(scenario).words, count(milder["n_crashes"]), count(milder["n_tests"])
+    """That a vehicle crashes on events too mild to count, or fails, if it does."""
+    if milder is not None and (found := milder["n_crashes"] + milder["n_failed"]):
+        words, n, of = family_named(scenario).words, count(found), count(milder["n_tests"])
+        ends = "end in a crash or FAIL" if milder["n_failed"] else "end in a crash"
         yield (
-            f"{n} of {of} MILDER {words.events} end in a crash, too: {number(milder['per_hour'])} per hour, which this "
+            f"{n} of {of} MILDER {words.events} {ends}, too: {number(milder['per_hour'])} per hour, which this "
             f"rate leaves out; to count them, set {words.milder} in a file of environment.parameters"
         )
 

@@ -32,6 +32,7 @@ from harness.runner.kept import Run, require_no_fewer, require_own_folder
 from harness.runner.run import ESTIMATES, EXIT_OF, RunResult, begun, finish, show, with_baseline, workers_of
 from harness.runner.stored import stored_blocks
 from harness.sampling.hours import HourRounds
+from harness.sampling.milder import beyond_scope
 from harness.sampling.shells import Shells, round_requests
 from harness.vocabulary import FAMILIES
 
@@ -77,7 +78,7 @@ def run_families(
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     milder = {name: of for name, each in results.items() if (of := each.estimates.get("milder"))}
-    beyond = sum(of["n_crashes"] for of in milder.values())
+    beyond = sum(map(beyond_scope, milder.values()))
     if (decision := rule.look.decision) is not None:
         decision = replace(decision, n_milder=beyond)
         code = EXIT_OF[decision.verdict]

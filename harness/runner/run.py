@@ -38,7 +38,7 @@ from harness.runner.stored import even
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
 from harness.sampling.baseline import IN_WORDS, begin, prescribed_requests, stored_baseline, stored_table
-from harness.sampling.milder import milder_of, milder_tests
+from harness.sampling.milder import beyond_scope, milder_of, milder_tests
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
 
@@ -206,7 +206,8 @@ def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
             run = run.with_baseline(name, result)
             causes += result.failures
             progress.advance(result.request.n_episodes)
-        require_few_failed(causes, n, run.resolved.campaign, what, f"the run folder's {name}/ table")
+        if name != MILDER:  # one of few that fails is told, as if it had crashed
+            require_few_failed(causes, n, run.resolved.campaign, what, f"the run folder's {name}/ table")
         return pa.concat_tables(run.before[name])
 
     try:
@@ -242,7 +243,7 @@ def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress, *, of_sum: 
     missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     if decision is not None:
-        decision = replace(decision, n_milder=run.facts.get("milder", {}).get("n_crashes", 0))
+        decision = replace(decision, n_milder=beyond_scope(run.facts.get("milder")))
         code = EXIT_OF[decision.verdict]
         decided["decision"] = decision.to_json()
     decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None

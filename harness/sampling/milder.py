@@ -5,7 +5,9 @@ They enter no rate, and a vehicle that crashes on them is not accepted.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -26,7 +28,7 @@ def milder_tests(resolved: Resolved) -> Traffic | None:
     return Forced(replace(resolved, environment=environment), Progress()).tests(0, N_TESTS)
 
 
-def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, float]:
+def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, Any]:
     """Tests, crashes and failures, by their table of episodes, and how many such events an hour of driving has."""
     family, crashes = resolved.family, pc.equal(table.column("outcome").cast(pa.string()), "crash")
     if above := resolved.campaign.crash.counts_above_mps:
@@ -34,3 +36,8 @@ def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, float]:
     exposure = family.exposure(family.milder(resolved.environment), resolved.parameters)
     counts = {"n_tests": len(table), "n_crashes": pc.sum(crashes).as_py()}
     return {**counts, "n_failed": len(table) - table.column("failure").null_count, "per_hour": exposure.per_hour}
+
+
+def beyond_scope(milder: Mapping[str, Any] | None) -> int:
+    """How many of the milder tests speak against a vehicle: one that has failed may have hidden a crash."""
+    return 0 if milder is None else milder["n_crashes"] + milder["n_failed"]

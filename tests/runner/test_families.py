@@ -10,6 +10,7 @@ import pytest
 import harness
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
+from harness.pool import moved
 from harness.records.folder import read_manifest
 from harness.runner.families import estimate_families
 
@@ -130,3 +131,13 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
     with pytest.raises(RunFolderError, match=r"mine\.txt"):
         harness.run(campaign(), tmp_path)
     assert [each.name for each in Path(tmp_path).iterdir()] == ["mine.txt"]
+
+
+def test_what_the_answer_of_one_scenario_depends_on(run, monkeypatch):
+    """Harder peaks, or longer ones: twice, or three times as many crashes; per event, however many there are."""
+    monkeypatch.setattr(moved, "N_PATHS", 256)  # of some ends these few do not tell
+    found = harness.sensitivity(run.folder / "lead_brakes")
+    rates = {bar["what"]: bar["rate"] for bar in found["bars"]}
+    assert 1.5 < rates["braking.peak_scale_mps2"][1] < 3.0
+    assert 1.2 < rates["braking.held_log_sd"][1] < 3.0
+    assert rates["exposure.per_hour"] == [1.0, 1.0]
