@@ -24,7 +24,7 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
     head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", duration(content["wall_time_s"])]
     rows = [row for row in (decided(content), *sum_rows(content), *(reading_rows(content) if readings else ())) if row]
     ends = [] if report is None else [f"  report  {report}"]
-    parts = columns([(row[1], f"{row[2]} of crashes", *row[3:]) for row in family_rows(content)])
+    parts = columns([(row[1], f"{row[2]} of all", *row[3:]) for row in family_rows(content)])
     under = wrapped([*milder(content), exposures(content), scope(content)])
     return [" · ".join(head), *columns(rows), *parts, *under, *ends]
 
