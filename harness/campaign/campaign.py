@@ -19,6 +19,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from harness.campaign.drivers import NATURAL, Surrogate, default_surrogates
 from harness.campaign.problems import NAME_PATTERN, broken_rule, did_you_mean
 from harness.campaign.sections import (
+    DEFAULT,
     Accept,
     CrashSettings,
     EnvironmentSettings,
@@ -72,6 +73,8 @@ class Campaign(Section):
     """several kinds of events in one answer per hour, in place of scenario"""
     exposure: dict[str, Positive] = Field(default_factory=dict, description="events per hour of driving, by scenario")
     environment: EnvironmentSettings = EnvironmentSettings()
+    environments: dict[str, str] = Field(default_factory=dict)
+    """parameter files of the other scenarios, beside cut_in's environment: {lead_brakes: mine.lead_brakes.yaml}"""
     av: AutomatedVehicle = AutomatedVehicle()
     crash: CrashSettings = CrashSettings()
     surrogates: dict[SurrogateName, Annotated[Surrogate, _Shipped]] = Field(default_factory=default_surrogates)
@@ -99,9 +102,12 @@ class Campaign(Section):
         """The campaign of one of its scenarios; ``environment`` is that of cut-ins where others are beside them."""
         given: dict[str, Any] = {}
         if name != DEFAULT_FAMILY:  # where the vehicle drives from the start in any case
-            given = {"environment": EnvironmentSettings(), "av": self.av.replaced(("before_event",), "hold_speed")}
+            own = EnvironmentSettings(parameters=self.environments.get(name, DEFAULT))
+            given = {"environment": own, "av": self.av.replaced(("before_event",), "hold_speed")}
         stop = self.stop.model_copy(update={"each_family": False})
-        return self.model_copy(update={"scenario": name, "scenarios": None, "exposure": {}, "stop": stop, **given})
+        return self.model_copy(
+            update={"scenario": name, "scenarios": None, "exposure": {}, "environments": {}, "stop": stop, **given}
+        )
 
     @property
     def sampling(self) -> Sampling:
@@ -256,6 +262,13 @@ REFUSED = (
         "of a scenario that is not among scenarios",
         "events per hour of those that are tested",
         "Name it among scenarios, or delete it: one scenario alone has no rate per hour.",
+    ),
+    Combination(
+        "environments",
+        lambda c, _: bool(set(c.environments) - set(c.scenarios or ()) | {DEFAULT_FAMILY} & set(c.environments)),
+        "a file of a scenario that is not among scenarios, or of cut_in",
+        "files of the others that are tested",
+        "Name it among scenarios; that of cut_in, or of one scenario alone, is environment.parameters.",
     ),
     # -- vehicles that act before the cut-in --
     Combination(

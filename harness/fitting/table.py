@@ -44,6 +44,15 @@ OPTIONAL: tuple[Optional, ...] = get_args(Optional)
 NO_COLUMN = ("Rename the column, or give its name in a mapping (--mapping FILE.yaml).", NO_LENGTH)
 SAMPLE = 1 << 16
 """Bytes of a file by which its separators and decimal signs are known."""
+FOREIGN = {
+    b"\xff\xfe": "text in UTF-16",
+    b"\xfe\xff": "text in UTF-16",
+    b"PK\x03\x04": "a ZIP archive, or an Excel workbook",
+    b"\xd0\xcf\x11\xe0": "an Excel workbook",
+    b"\x1f\x8b": "a file packed by gzip whose name does not end in .gz",
+    b"PAR1": "a Parquet file whose name does not end in .parquet",
+}
+"""What else a file may be, by its first bytes."""
 
 
 class Mapping(Section):
@@ -126,6 +135,8 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         if path.is_dir():
             raise TrajectoryError(str(path), "a folder", expected, "Name the files in it.")
+        if path.exists() and not path.is_file():
+            raise TrajectoryError(str(path), "a pipe or a device", expected, "Write its content into a file first.")
         yield
     except FileNotFoundError:
         meant = did_you_mean(path.name, [each.name for each in path.parent.glob("*")])
@@ -177,6 +188,10 @@ class _Text(NamedTuple):
     def of(cls, path: Path, mapping: Mapping) -> _Text:
         """Find out how a file is written; what is packed is unpacked as it is read."""
         sample = pa.input_stream(str(path)).read(SAMPLE)
+        for first, kind in FOREIGN.items():
+            if sample.startswith(first):
+                mend = "Write it as CSV in UTF-8 (packed by gzip: .csv.gz), or as Parquet."
+                raise TrajectoryError(str(path), kind, "a CSV or Parquet file", mend)
         content = pa.input_stream(str(path))
         text = sample.decode("utf-8-sig", errors="replace")
         head = text.lstrip("\r\n").partition("\n")[0].strip()

@@ -1,6 +1,7 @@
 """Files and mappings: what is read, and what is refused, by name."""
 
 import gzip
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -163,7 +164,7 @@ FILES = {
     "both.csv": (b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n", r"invalid value .996\.58"),
     "twice.csv": (HEAD[:-1] + b",Lane\n1,0,0,30,0,5,1\n", "more than one column lane"),
     "cut.parquet": (b"PAR1 and no more", "cannot be read"),
-    "binary.csv": (b"\xff\xfe\x00\x01\x80\n\x80\n", "cannot be read|columns"),
+    "binary.csv": (b"\xff\xfe\x00\x01\x80\n\x80\n", "text in UTF-16"),
     "latin.csv": (HEAD + b"\xfcber,0,0,30,0,5\n", "text in UTF-8"),
     "cut.csv.gz": (gzip.compress(ROWS.to_csv(index=False).encode())[:-2000], "cannot be read"),
     "headless.csv": (b"1,0,0,30,0,5\n1,0.1,3,30,0,5\n", r"numbers in place of a header: 6 columns.*header: \["),
@@ -196,6 +197,27 @@ def test_missing_and_truncated_files(tmp_path):
     whole.write_bytes(whole.read_bytes()[:-1000])
     with pytest.raises(TrajectoryError, match="cannot be read"):
         judged(whole)
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        ("vehicle_id,time_s\n1,0.1\n".encode("utf-16"), "text in UTF-16"),
+        (b"PK\x03\x04" + bytes(40), "an Excel workbook"),
+        (gzip.compress(b"vehicle_id,time_s\n1,0.1\n"), "does not end in .gz"),
+        (b"PAR1" + bytes(40), "does not end in .parquet"),
+    ],
+)
+def test_what_is_no_text_is_called_by_its_kind(content, kind, tmp_path):
+    (tmp_path / "rows.csv").write_bytes(content)
+    with pytest.raises(TrajectoryError, match=kind):
+        judged(tmp_path / "rows.csv")
+
+
+def test_a_pipe_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "rows.csv")
+    with pytest.raises(TrajectoryError, match="a pipe"):
+        judged(tmp_path / "rows.csv")
 
 
 def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):

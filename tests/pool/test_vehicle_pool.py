@@ -147,5 +147,5 @@ def test_hashes_tell_motions_apart_from_the_first_step_that_differs_on():
 def test_a_vehicle_that_never_moves_is_refused(speeds):
     ready, _, runs = speeds
     parked = runs._replace(n_steps=np.zeros_like(runs.n_steps), failed=np.ones_like(runs.failed))
-    with pytest.raises(HarnessError, match="no cut-in on 120 paths"):
+    with pytest.raises(HarnessError, match="no event on 120 paths"):
         vehicle_pool(ready.resolved, ready.baseline_paths, parked)

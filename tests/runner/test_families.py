@@ -12,6 +12,7 @@ from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.pool import moved
 from harness.records.folder import read_manifest
+from harness.resolved import resolve
 from harness.runner.families import estimate_families
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
@@ -115,6 +116,7 @@ def test_other_exposures_need_no_new_tests(run, capsys):
         (["testing.shells.statement=library"], "testing.shells.statement"),
         (["accept={times_reference: {driver: r157-fsm}}", "stop.rhw=null"], "accept.times_reference.driver"),
         (["exposure.cut_inn=1"], "exposure"),
+        (["environments.cut_in=ndd-overtaking-1"], "environments"),
         (["scenarios=[cut_in, cut_in]"], "scenarios"),
         (["scenarios=[cut_in, lead_breaks]"], "scenario"),
     ],
@@ -124,6 +126,17 @@ def test_what_does_not_go_together_is_refused(overrides, where, tmp_path):
         harness.run(campaign(*overrides), tmp_path / "run")
     assert where in str(refused.value.where)
     assert not (tmp_path / "run").exists()
+
+
+def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
+    (tmp_path / "mine.yaml").write_text("like: lead-brakes-1\nexposure: {per_hour: {value: 0.3, source: user}}\n")
+    found = campaign(f"environments={{lead_brakes: {tmp_path / 'mine.yaml'}}}")
+    exposures = {name: resolve(found.of_family(name)).parameters.exposure.per_hour.value for name in NAMES[1:]}
+    assert exposures == {"lead_brakes": 0.3, "cut_out": 1.0}
+    with pytest.raises(CampaignError, match="no file"):
+        campaign("environments={lead_brakes: ./none.yaml}")
+    with pytest.raises(CampaignError, match="cut-out-1"):
+        campaign("environments={cut_out: cut-out-7}")
 
 
 def test_a_folder_with_something_else_is_left_alone(tmp_path):

@@ -51,7 +51,9 @@ def test_the_rate_is_proportional_to_the_share_that_does_not_look(stored_run, tm
     assert told["crash_rate"] == pytest.approx(2.0 * stored["crash_rate"], rel=0.05)
     ratios = [each["details"]["references"][0]["ratio"] for each in (told, stored)]
     assert ratios[0] == pytest.approx(ratios[1], rel=0.02)
-    assert "as there" in words(estimate_in_other_traffic(folder, mine), golden("shells-twin"))["scope"]
+    assert (
+        "the same share of each shell" in words(estimate_in_other_traffic(folder, mine), golden("shells-twin"))["scope"]
+    )
 
 
 def test_cut_ins_that_no_test_stands_for_are_refused(stored_run, tmp_path):
@@ -71,7 +73,7 @@ def test_a_vehicle_that_crashes_on_few_cut_ins_of_its_shells_is_refused(stored_r
     further = float(p @ ((share > 0.0) * (1.0 - share)))
     assert further > 0.0
     assert tested.limit(p, at_worst=True) == pytest.approx(tested.limit(p) + further, rel=0.05)
-    with pytest.raises(CampaignError, match="of the cut-ins of the shells that it crashes in"):
+    with pytest.raises(CampaignError, match="of the events of the shells that it crashes in"):
         answer(folder, mine)
 
 
@@ -90,9 +92,9 @@ def test_a_reference_driver_told_too_low_is_as_far_off_as_one_told_too_high(stor
 @pytest.mark.parametrize(
     ("name", "where", "found"),
     [
-        ("shells-twin", "ndd-overtaking-1-lateral", "in which cut-ins take time"),
+        ("shells-twin", "ndd-overtaking-1-lateral", "in which events take time"),
         ("forced-twin", "ndd-overtaking-1", "tests by forced"),
-        ("shells-acting-twin", "ndd-overtaking-1", "acts before the cut-in"),
+        ("shells-acting-twin", "ndd-overtaking-1", "acts before the event"),
         ("shells-twin", "nowhere", "which is not shipped"),
     ],
 )

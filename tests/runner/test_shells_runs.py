@@ -72,7 +72,7 @@ def test_shells_of_another_pool_or_that_are_none_are_refused(stored_run, tmp_pat
     folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
     edit(folder, "shells.json", pool="f" * 24)
     for act in (lambda: replay(folder, 3), lambda: run_golden(golden("shells-twin"), folder, resume=True)):
-        with pytest.raises(RunFolderError, match="cut-ins of pool ffff"):
+        with pytest.raises(RunFolderError, match="events of pool ffff"):
             act()
     for key, wrong in (("cell_p", [0.1]), ("n_inside", 9), ("strata", {})):
         kept = json.loads((folder / "shells.json").read_text())[key]
