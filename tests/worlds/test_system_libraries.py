@@ -153,7 +153,7 @@ def test_setup_does_nothing_where_nothing_is_missing(programs, capsys):
     programs.user(1000)
     assert main(["setup"]) == 0
     assert main(["setup", "--dry-run"]) == 0
-    told = ["SUMO's system libraries are there.", "Kernels were compiled before.", "Nothing to install."]
+    told = ["SUMO's system libraries are there.", "Kernels are compiled already.", "Nothing to install."]
     assert capsys.readouterr().out.splitlines() == told
     assert programs.calls() == []
 
