@@ -185,7 +185,7 @@ def test_every_function_says_what_each_parameter_is():
             assert {one for head in heads for one in head.split(", ")} == {*inspect.signature(function).parameters}
 
 
-@pytest.mark.parametrize("name", ["run", "compare"])
+@pytest.mark.parametrize("name", ["run", pytest.param("compare", marks=pytest.mark.slow)])
 def test_in_a_notebook_it_is_the_short_answer_and_the_map(name, stored_run, tmp_path):
     campaign = stored_run(RUN) / "campaign.yaml"
     given = {"run": (campaign,), "compare": (campaign, harness.load_campaign(campaign, av="r157-cc"))}[name]

@@ -155,7 +155,7 @@ NO_FAULT = {
 }
 
 
-@pytest.mark.parametrize(("av", "noted"), quick(2, NO_FAULT.values()), ids=NO_FAULT)
+@pytest.mark.parametrize(("av", "noted"), quick(1, NO_FAULT.values()), ids=NO_FAULT)
 def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undisturbed):
     note = tmp_path / "note"
     assert _run(tmp_path, av.replace("NOTE", str(note))) == EXIT_DONE
@@ -297,7 +297,7 @@ def test_what_a_controller_starts_does_not_outlive_the_command(command, tmp_path
     assert orphans(list(map(int, started)), 5.0) == []
 
 
-@pytest.mark.parametrize("command", quick(1, ["run --json", "check --json", "av-check --json --tests 4"]))
+@pytest.mark.parametrize("command", quick(1, ["check --json", "run --json", "av-check --json --tests 4"]))
 def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd):
     assert _main(command, tmp_path, _of("Prints")) == EXIT_DONE
     printed = capfd.readouterr()

@@ -173,6 +173,7 @@ def test_each_test_is_left_out_in_turn():
     assert sum(row["leave_one_out"] is not None for row in gain["strata"]) >= 2
 
 
+@pytest.mark.slow
 def test_results_that_columns_do_not_explain_have_no_gain_once_corrected():
     """512 columns of noise fit half of 1,000 results of noise: a claimed gain of 2."""
     rng, stratum = np.random.default_rng(SEED), Stratum(9)

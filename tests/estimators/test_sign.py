@@ -75,6 +75,7 @@ def signs(name, seed):
     return allowed, first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EQUAL if N >= 500 else [pytest.param(QUICK[0], marks=pytest.mark.slow), QUICK[1]])
 def test_where_both_crash_as_often_a_sign_is_rare(name):
     """Either sign is wrong; a look after every round, until the budget or the pool is spent."""

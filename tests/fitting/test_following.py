@@ -36,7 +36,7 @@ def one_braking(peak: float = 5.0, at: int = 200, n: int = 600) -> np.ndarray:
     return v
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.0])
+@pytest.mark.parametrize("scale", [pytest.param(0.5, marks=pytest.mark.slow), 1.0])
 def test_brakings_of_a_known_law_are_found_again(scale):
     found = seen(BrakingFitter(), braking(12.0, 30.0, 5, scale=scale))
     low, high = (end / found.hours for end in garwood(found.events.size, TAIL))

@@ -195,6 +195,7 @@ def test_what_winds_up_in_a_longer_warm_up_is_seen(overrides, moves):
     assert all(moved < 0.5 for seconds, moved in found.moved_mps2.items() if not moves or seconds == 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "n"),
     [

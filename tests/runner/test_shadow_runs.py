@@ -103,6 +103,7 @@ def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_
 NOISY = "parameters: {noise_mps2: 0.2}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [pytest.param(SHELLS, id="shells", marks=pytest.mark.slow), pytest.param(FORCED, id="forced")]
 )

@@ -34,6 +34,7 @@ class RaisesBeforeContact(IDM):
         return super().step(seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [pytest.param(each, marks=[pytest.mark.slow] * (each != "shells")) for each in METHODS]
 )

@@ -328,6 +328,7 @@ def test_models_that_are_recycled_otherwise_remember_the_last_cut_in():
     assert len(shard.failures) > 5
 
 
+@pytest.mark.slow
 def test_an_fmu_in_both_worlds(fmu):
     av = fmu_av(fmu, EARLY[:-1])
     failures, shard, runs = driven(av)
