@@ -23,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened
 from harness.files import write_atomically
+from harness.vocabulary import FAMILIES
 
 T = TypeVar("T")
 Tables = Mapping[str, pa.Table | None]
@@ -292,6 +293,9 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     path = folder / MANIFEST
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
+        if (folder / FAMILIES).is_file():
+            one = f"Name one of its scenarios, such as {next(folder.glob('*/' + MANIFEST)).parent}."
+            raise RunFolderError(str(folder), "a run of several scenarios", "the run folder of one", one)
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     found = read_as(StoredManifest, path, mend=mend)
     return {**found.model_dump(exclude_unset=True), "parts": found.parts, "before": found.before}

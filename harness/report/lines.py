@@ -81,7 +81,7 @@ def pair_lines(
     if asked["ratio"] is not None:
         most = "no limit" if asked["ratio_high"] is None else ratio(asked["ratio_high"])
         rows.append(("A / B", ratio(asked["ratio"]), f"{ratio(asked['ratio_low'])} to {most}", ""))
-    alone = f"only A crashed in {count(asked['n_only_a'])} pairs, only B in {count(asked['n_only_b'])}"
+    alone = f"crashes of A alone {count(asked['n_only_a'])}, B {count(asked['n_only_b'])}"
     rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), alone))
     remarks = [f"! {text}" for text in pair_warnings(content)]
     if asked is not content:

@@ -273,9 +273,10 @@ def _ending(track: Scene, bv: Scene, scene: Scene, family: Family) -> str:
         return f"avoids it, {gap} at the closest"
     v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
     from_the_side = family.crosses == family.principal and scene["onset"] < cut and crash == cut + 1
-    who = f"{name} strikes it from the side" if from_the_side else f"strikes {name} from behind"
+    who = f"{name} strikes its side" if from_the_side else f"strikes {name} from behind"
     impact = tenths(_closing(track, bv, crash - first))
-    return f"crashes at {_when(crash, cut, family.words.since)}: {who}, {v} m/s into {v_bv} m/s, impact {impact} m/s"
+    speeds = f"it drives {v} m/s, {name} {v_bv} m/s"
+    return f"crashes at {_when(crash, cut, family.words.since)}: {who}; {speeds}: impact {impact} m/s"
 
 
 def _gap(track: Scene, bv: Scene, place: int) -> float:

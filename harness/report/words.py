@@ -111,9 +111,11 @@ def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[st
     if milder is not None and (found := milder["n_crashes"] + milder["n_failed"]):
         words, n, of = family_named(scenario).words, count(found), count(milder["n_tests"])
         ends = "end in a crash or FAIL" if milder["n_failed"] else "end in a crash"
+        rate = number(milder["per_hour"] * found / milder["n_tests"], 2)
         yield (
-            f"{n} of {of} MILDER {words.events} {ends}, too: {number(milder['per_hour'])} per hour, which this "
-            f"rate leaves out; to count them, set {words.milder} in a file of environment.parameters"
+            f"{n} of {of} MILDER {words.events} {ends}, too: some {rate} an hour, which this rate leaves out; to count "
+            f"them, say {words.milder} in a file, and name that as environment.parameters, or of several scenarios as "
+            f"environments.{scenario}"
         )
 
 

@@ -297,11 +297,13 @@ def require_few_failed(
     """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
     if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in causes.most_common(1))
+        unbound = "Add --set av.traci_style.decel_mps2=4.5 --set av.traci_style.accel_mps2=2.6 (SUMO's own). "
         raise TooManyFailedError(
             "run.max_failed_share",
             f"{causes.total()} of {n} {what} failed{cause}",
             f"a share of at most {most:g}",
-            "Fix the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
+            (unbound if "av.traci_style.decel_mps2" in cause else "")
+            + "Fix the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
             f"are in the column 'failure' of {where}.",
         )
 

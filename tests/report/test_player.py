@@ -58,7 +58,7 @@ def test_a_page_holds_the_motion_to_the_last_bit(name, stored_run, tmp_path):
         assert scene["event"] == cut_in
         assert scene["onset"] == result.row.get("onset_step", cut_in)
         assert len(scene["ghosts"]) == (0 if cut_in is None else 2)
-        touched = [fact for name, fact in scene["facts"] if name == "AV" and "BV strikes it from the side" in fact]
+        touched = [fact for name, fact in scene["facts"] if name == "AV" and "BV strikes its side" in fact]
         assert bool(touched) == (result.row.get("contact") == "side" and scene["onset"] < cut_in)
 
 

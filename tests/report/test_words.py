@@ -256,7 +256,7 @@ def test_a_comparison_is_as_short():
     assert "1.00 × 10⁻¹⁰ to 2.00 × 10⁻⁷" in shown
     for said in (
         "0.10 to no limit", "no crash seen", "only where brakes-2-late-1s of", "stopped: precise enough",
-        "only A crashed in 31 pairs, only B in 1,000",
+        "crashes of A alone 31, B 1,000",
         "with --margin 0.1 --set stop.episodes=7000: some 5,800 more pairs, 58.0 s",
     ):  # fmt: skip
         assert said in " ".join(shown.split())
