@@ -279,6 +279,8 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     known = list(dict.fromkeys((*models, *sorted(panel))))
     files = [] if colon else [str(file) for file in Path().glob("*.y*ml")]
     found = f"no vehicle '{name}' in {place}" if colon else f"no {'' if option else 'campaign file, and no '}vehicle"
+    if text.endswith(".py") and not Path(text).exists():
+        found, files = "no such file", [str(file) for file in Path().glob("*.py")]
     few = difflib.get_close_matches(name, known, FEW_NAMES, cutoff=0.3) or known[:FEW_NAMES]
     more = f" … ({len(known)} names)" if len(few) < len(known) else ""
     expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(few)}{more}"

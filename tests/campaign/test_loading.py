@@ -295,6 +295,7 @@ def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, ow
         ("my_av.py", "Name its class or function: my_av.py:MyAV or my_av.py:step"),
         ("my_aw.py:MyAV", r"^av\.controller \(my_aw.py:MyAV\): found no file \S*my_aw.py;.* Did you mean 'my_av.py'"),
         ("mine", "no campaign file, and no vehicle.* Did you mean 'mine.yaml'"),
+        ("gone.py", "no such file"),
         ("mime.yaml", "no such file.* Did you mean 'mine.yaml'"),
         ("late-60ms", r"or one of late-600ms, [^;]{9,99} … \(\d+ names\).* Did you mean 'late-600ms'"),
         ("mine.yaml:idm", "format"),  # which is no panel
