@@ -19,6 +19,8 @@ from harness.worlds.sumo import SumoWorld
 from tests.stored_runs import ROOT
 from tests.worlds.running import LATERAL, drive, motion
 
+pytestmark = pytest.mark.slow  # at night
+
 HERE = "tests.controllers.test_warm_up"
 SHOWN = 300
 DELAY_STEPS = 5

@@ -16,6 +16,8 @@ from tests.chains.seed import SEED
 from tests.episode.twin_runs import Mean, prepared, run
 from tests.kernels import tabulated
 
+pytestmark = pytest.mark.slow  # at night
+
 BRAKES = np.linspace(-4.0, -1.0, 16)
 BRAKE_SHARES = np.exp(0.18 * BRAKES) / np.exp(0.18 * BRAKES).sum()
 SURROGATES = "SM-I", "SM-II", "SM-III"
