@@ -68,8 +68,13 @@ def load_campaign(
         for each in filter(_asks_for_precision, typed):
             found, expected = "a precision, in a campaign with a limit", "one of the two: a limit ends it at a decision"
             raise CampaignError(each.option, found, expected, "Add --set accept=null.")
-
-    def located(name: str, where: tuple[str, ...], expected: str) -> str:
+    files = _FILES | {("environments", each): _FILES["environment", "parameters"] for each in campaign.environments}
+    for where, expected in files.items():
+        name, end = campaign.at(where), ""
+        if where[-1] in ("controller", "estimator", "challenge") and name is not None and ".py:" in name:
+            name, _, end = name.rpartition(":")
+        elif name is None or (where[-1] != "file" and not names_a_file(name)):
+            continue
         file = _absolute(name, folder if of_file else Path.cwd())
         if not Path(file).exists() and place(where).startswith("--set"):  # typed in another folder than the campaign's
             file = _absolute(name, Path.cwd())
@@ -78,21 +83,7 @@ def load_campaign(
             meant = did_you_mean(Path(name).name, [each.name for each in beside])
             mend = meant or "Correct the path; it is relative to the folder of the campaign file."
             raise CampaignError(place(where), f"no file {file}", expected, mend)
-        return str(file)
-
-    for where, expected in _FILES.items():
-        name, end = campaign.at(where), ""
-        if where[-1] in ("controller", "estimator", "challenge") and name is not None and ".py:" in name:
-            name, _, end = name.rpartition(":")
-        elif name is None or (where[-1] != "file" and not names_a_file(name)):
-            continue
-        file = located(name, where, expected)
         campaign = campaign.replaced(where, f"{file}:{end}" if end else file)
-    others = {
-        name: located(file, ("environments", name), _FILES["environment", "parameters"]) if names_a_file(file) else file
-        for name, file in campaign.environments.items()
-    }
-    campaign = campaign.replaced(("environments",), others)
     if check_files:
         from harness.families import family_named  # noqa: PLC0415 - families read campaigns' sections
 

@@ -62,12 +62,17 @@ class Section(BaseModel):
         """Value at a path such as ``("av", "fmu", "file")``; None where a section on the way is left out."""
         key, *rest = path
         value = getattr(self, key)
+        if rest and isinstance(value, dict):
+            return value.get(rest[0])
         return value.at(rest) if rest and value is not None else value
 
     def replaced(self, path: Sequence[str], value: Any) -> Self:
         """A copy with another value at a path such as ``("av", "fmu", "file")``, not validated."""
         key, *rest = path
-        return self.model_copy(update={key: getattr(self, key).replaced(rest, value) if rest else value})
+        own = getattr(self, key)
+        if rest:
+            value = own | {rest[0]: value} if isinstance(own, dict) else own.replaced(rest, value)
+        return self.model_copy(update={key: value})
 
 
 def _whole_steps(seconds: float) -> float:
