@@ -30,8 +30,8 @@ def words_of(*, event: str, then: str, depend: str, strikes: str, **own: Any) ->
         such=" of such following",
         strikes=f"In every crash the AV strikes {strikes} from behind.",
         tests=lambda _: (
-            "the vehicle follows another one on a straight road, at the distance that it chooses; after 30 s the one "
-            "ahead " + then
+            "the vehicle follows another one on a straight road, at the distance that it chooses; then the one ahead "
+            + then
         ),
         rests=lambda *_: (
             f"{depend}, which is assumed, and it is per {event}: how many there are in an hour of driving is assumed, "
