@@ -30,8 +30,8 @@ from harness.vocabulary import FloatArray
 
 FOLDS = 5
 WIDER = 1.5
-"""Of residuals than of Y [assumed]. Less is left of Y than there was, but where a D_j is rarely huge: a path on which crashes of
-large weight are due and none was drawn, so that Y varies more than is seen of it."""
+"""Of residuals than of Y [assumed]. Less is left of Y than there was, but where a D_j is rarely huge: a path on which
+crashes of large weight are due and none was drawn, so that Y varies more than is seen of it."""
 
 
 class DoublyRobust(Nade):
