@@ -207,6 +207,7 @@ def test_missing_and_truncated_files(tmp_path):
         (gzip.compress(b"vehicle_id,time_s\n1,0.1\n"), "does not end in .gz"),
         (b"PAR1" + bytes(40), "does not end in .parquet"),
     ],
+    ids=["utf-16", "excel", "gzip", "parquet"],  # gzip's bytes hold the time of day
 )
 def test_what_is_no_text_is_called_by_its_kind(content, kind, tmp_path):
     (tmp_path / "rows.csv").write_bytes(content)
