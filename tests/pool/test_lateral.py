@@ -83,8 +83,10 @@ def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name)
 
 def test_leads_are_kept_with_the_pool(lateral_pool, pool):
     assert np.unique(lateral_pool.events.lead).size > 15
-    assert np.array_equal(pool_from(pool_content(lateral_pool)).events.lead, lateral_pool.events.lead)
-    assert not pool_from(pool_content(pool)).events.lead.any()
+    assert np.array_equal(
+        pool_from(pool_content(lateral_pool), lateral_pool.library).events.lead, lateral_pool.events.lead
+    )
+    assert not pool_from(pool_content(pool), pool.library).events.lead.any()
 
 
 @pytest.mark.slow
@@ -92,8 +94,7 @@ def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow(
     """Surrogates take over at the onset; a test repeats its baseline run until then, and ends inside the envelope."""
     acts = of("environment.parameters=ndd-overtaking-1-lateral", f"av={ACTING.format('Speeds')}", "world.engine=twin")
     resolved = resolve(acts)
-    environment, library = resolved.environment, resolved.library
-    paths = walk_candidates(resolved.family, environment, library, acts.pool, "test", candidates=1024).draw(60)
+    paths = walk_candidates(resolved, "test", candidates=1024).draw(60)
     loop = EpisodeLoop(
         TwinWorld(32), resolved.scenario, RecordPolicy("none", 0.0), build_host(acts.av, n_cells=32, seed=1)
     )
@@ -105,7 +106,7 @@ def test_a_vehicle_that_acts_before_has_a_pool_of_its_own_that_its_tests_follow(
     episode = shard.episode
     assert np.unique(episode["lead_steps"]).size > 10
     crashed = episode["outcome"] == CRASH
-    enclosed = pool.events.crashes[rows, pool.names.index(library.envelope)]
+    enclosed = pool.events.crashes[rows, pool.names.index(resolved.library.envelope)]
     assert 50 < crashed.sum() < rows.size - 50
     assert np.all(enclosed[crashed])
     script = traffic.script
