@@ -6,20 +6,23 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import click
 
 from harness.errors import HarnessError, printable
-from harness.numbers import half_width, interval, share, words
+from harness.numbers import count, half_width, interval, share, words
+from harness.processes import Kept, Printed
 
 if TYPE_CHECKING:
     from harness.campaign.campaign import Campaign
 
 _WIDTH_OF_FILES = 140
+PRINTED = "printed.txt"
+"""Of a run folder: what its vehicle has printed."""
 _PARTS = {"found": "found", "expected": "expected", "fix": "mend"}
 """Parts of an error, by what they are called on the screen."""
 
@@ -33,6 +36,24 @@ def say(*lines: object, err: bool = False) -> None:
         click.echo(printable("\n".join(map(str, lines))), err=err)
     except BrokenPipeError:
         go_on_unread(sys.stderr if err else sys.stdout)
+
+
+@contextmanager
+def prints_kept_in(folder: Path) -> Iterator[None]:
+    """Let what is printed in workers be a file of the run folder, and say so; to stderr where there is no folder."""
+    before, Printed.kept = Printed.kept, (kept := Kept())
+    try:
+        yield
+    finally:
+        Printed.kept = before
+        with suppress(OSError):  # what ends the command is told first of all
+            if not folder.is_dir():
+                os.write(2, kept.text)
+            elif first := kept.text.strip().partition(b"\n")[0].decode(errors="replace"):
+                with (folder / PRINTED).open("ab") as file:
+                    file.write(kept.text)
+                by = f"{count(kept.n_lines)} lines printed by the vehicle (or SUMO)"
+                say(f"{by}: {folder / PRINTED}", f"  the first: {first[:80]}", err=True)
 
 
 def go_on_unread(stream: TextIO) -> None:
