@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 CLOSED_PIPE_EXIT_CODE = 76
 """Exit code of a process whose controller has closed its pipe."""
+PRINTED = "printed.txt"
+"""What processes have printed, in a run folder."""
 PRINTED_BYTES = 65_536
 """Of what a process prints first, and of what it prints last, that is passed on."""
 _ATTEMPTS = 3

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,14 +16,12 @@ import click
 
 from harness.errors import HarnessError, printable
 from harness.numbers import count, half_width, interval, share, words
-from harness.processes import Kept, Printed
+from harness.processes import PRINTED, Kept, Printed
 
 if TYPE_CHECKING:
     from harness.campaign.campaign import Campaign
 
 _WIDTH_OF_FILES = 140
-PRINTED = "printed.txt"
-"""Of a run folder: what its vehicle has printed."""
 _PARTS = {"found": "found", "expected": "expected", "fix": "mend"}
 """Parts of an error, by what they are called on the screen."""
 
@@ -40,14 +39,15 @@ def say(*lines: object, err: bool = False) -> None:
 
 @contextmanager
 def prints_kept_in(folder: Path) -> Iterator[None]:
-    """Let what is printed in workers be a file of the run folder, and say so; to stderr where there is no folder."""
-    before, Printed.kept = Printed.kept, (kept := Kept())
+    """Let what is printed in workers be a file of the run folder, and say so; to stderr where nothing was run there."""
+    began, before, Printed.kept = time.time(), Printed.kept, (kept := Kept())
     try:
         yield
     finally:
         Printed.kept = before
         with suppress(OSError):  # what ends the command is told first of all
-            if not folder.is_dir():
+            manifests = *folder.glob("manifest.json"), *folder.glob("*/manifest.json")
+            if not any(each.stat().st_mtime >= began for each in manifests):
                 os.write(2, kept.text)
             elif first := kept.text.strip().partition(b"\n")[0].decode(errors="replace"):
                 with (folder / PRINTED).open("ab") as file:

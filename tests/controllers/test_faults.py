@@ -9,9 +9,9 @@ import pytest
 
 from benchmarks.kills import orphans
 from harness.cli import main
-from harness.commands.printing import PRINTED
 from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.processes import PRINTED
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
 from tests.stored_runs import sets, stored_table
@@ -308,6 +308,9 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
         text, told = (tmp_path / "run" / PRINTED).read_text(), printed.err.splitlines()[-2:]
         assert told[0].startswith(f"{len(text.splitlines()):,} lines printed by the vehicle")
         assert told[1] == f"  the first: {text.splitlines()[0]}"
+        assert _main(command, tmp_path, _of("Prints")) == EXIT_BAD_INPUT  # nothing is run into a folder that is there
+        assert "made, in Python" in capfd.readouterr().err
+        assert (tmp_path / "run" / PRINTED).read_text() == text
     assert "made, in Python" in text
     assert "made, below Python" in text
     if command.startswith("run"):

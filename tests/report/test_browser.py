@@ -10,8 +10,7 @@ import pytest
 import harness
 from harness.fitting.files import fit_files
 from harness.report.compare_page import write_comparison
-from harness.report.hours_page import write_hours_of
-from harness.report.page import write_report
+from harness.report.page import write_hours, write_report
 from tests.fitting.trajectories import overtaking
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of
@@ -192,7 +191,7 @@ def hours_page(place: Path) -> Path:
         "counts_in_interval": False, "readings": [beside], "milder": {},
         "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
     }  # fmt: skip
-    return write_hours_of(place, content)
+    return write_hours(place, content)
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark"), (390, "light")])
