@@ -11,6 +11,7 @@ from benchmarks.kills import orphans
 from harness.cli import main
 from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.processes import PRINTED
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
 from tests.stored_runs import sets, stored_table
@@ -302,8 +303,16 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
     assert _main(command, tmp_path, _of("Prints")) == EXIT_DONE
     printed = capfd.readouterr()
     json.loads(printed.out)
-    assert "made, in Python" in printed.err
-    assert "made, below Python" in printed.err
+    text = printed.err
+    if command.startswith("run"):  # of some hundred lines the terminal shows one
+        text, told = (tmp_path / "run" / PRINTED).read_text(), printed.err.splitlines()[-2:]
+        assert told[0].startswith(f"{len(text.splitlines()):,} lines printed by the vehicle")
+        assert told[1] == f"  the first: {text.splitlines()[0]}"
+        assert _main(command, tmp_path, _of("Prints")) == EXIT_BAD_INPUT  # nothing is run into a folder that is there
+        assert "made, in Python" in capfd.readouterr().err
+        assert (tmp_path / "run" / PRINTED).read_text() == text
+    assert "made, in Python" in text
+    assert "made, below Python" in text
     if command.startswith("run"):
         assert main(["replay", str(tmp_path / "run"), "3", "--json"]) == EXIT_DONE
         printed = capfd.readouterr()
@@ -316,6 +325,9 @@ def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd
 def test_of_much_that_is_printed_the_first_and_the_last_are_passed_on(command, tmp_path, capfd):
     assert _main(command, tmp_path, _of("PrintsMuch"), "stop.episodes=100") == EXIT_DONE
     printed = capfd.readouterr().err
+    if command == "run":
+        assert len(printed) < 1_000
+        printed = (tmp_path / "run" / PRINTED).read_text()
     assert re.search(r"^\[\d\d[\d,]+ bytes more that a worker has printed\]$", printed, re.MULTILINE)
     assert 2 * 65_536 < len(printed) < 9 * 65_536
     assert re.match(r"[-\d.]+ s x", printed)
