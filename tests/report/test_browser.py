@@ -9,7 +9,6 @@ import pytest
 
 import harness
 from harness.report.compare_page import write_comparison
-from harness.report.hours_page import write_hours_of
 from harness.report.page import write_report
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of
@@ -164,39 +163,17 @@ def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
     assert "Only A crashes" in page.inner_text(".player h3")
 
 
-@pytest.fixture(scope="module")
-def pages(report, replayed, crashing, compared, tmp_path_factory) -> list[Path]:
-    """One of each kind: a run's in each scenario, of their sum, of a comparison, of one test."""
-    place = tmp_path_factory.mktemp("pages")
-    runs = [write_report(copy_of(crashing[name], place / name)) for name in ("lead_brakes", "cut_out")]
-    return [report, replayed, *runs, write_comparison(copy_of(compared, place / "compared")), hours_page(place)]
-
-
-def hours_page(place: Path) -> Path:
-    """The page of a sum, of figures made up."""
-    exposure = {"per_hour": 0.1, "low": 0.02, "high": 0.5, "counted": None, "source": "assumed: no primary rate"}
-    part = {
-        "rate_per_hour": 1.26e-3, "ci_low": 1.19e-3, "ci_high": 1.89e-3, "upper_bound": None, "share": 0.5,
-        "ratio": 34.0, "n_episodes": 100, "n_crashes": 10, "median_impact_mps": 7.0, "exposure": exposure,
-    }  # fmt: skip
-    beside = {"ratio": 15.0, "ratio_low": 14.0, "ratio_high": 22.0, "over_assumed": [4.4, 27.0], "reference": "r157-cc"}
-    content = {
-        "vehicle": "idm", "name": "r157", "n_episodes": 300, "n_crashes": 30, "seed": 1, "confidence": 0.9,
-        "per_hour": {"rate": 1.27e-3, "ci_low": 1.2e-3, "ci_high": 1.9e-3, "upper_bound": None, "rhw": 0.3},
-        "per_1e6_km": 11.3, "beside": beside, "decision": None, "stopped_by": "rhw", "asked_rhw": 0.3,
-        "counts_in_interval": False, "readings": [beside], "milder": {},
-        "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
-    }  # fmt: skip
-    return write_hours_of(place, content)
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark"), (390, "light")])
-def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(width, scheme, browser, pages):
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
+def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(
+    width, scheme, browser, report, replayed, crashing, compared, tmp_path
+):
+    """Of one page of each kind: of runs, of a comparison, of one test."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="it brings axe-core").Axe()
     context = browser.new_context(
         viewport={"width": width, "height": 844}, color_scheme=scheme, bypass_csp=True, offline=True
     )
-    for file in pages:
+    other, pair = copy_of(crashing["cut_out"], tmp_path / "run"), copy_of(compared, tmp_path / "pair")
+    for file in (report, replayed, write_report(other), write_comparison(pair)):
         page = context.new_page()
         page.goto(file.as_uri())
         page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
@@ -206,55 +183,6 @@ def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(width, scheme, b
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         page.close()
     context.close()
-
-
-def test_a_phone_shows_all_columns_of_the_player_and_cars_that_can_be_seen(opened, pages):
-    for file in pages[:-1]:
-        page = opened(file, 390)
-        table = page.locator(".now").first
-        assert table.locator("thead th:visible").count() == 6
-        assert table.evaluate("(e) => e.scrollWidth <= e.parentElement.clientWidth")
-        assert float(page.locator(".car .body").first.get_attribute("width")) >= 20.0
-
-
-def test_on_paper_it_is_light_and_without_what_only_a_screen_can_do(opened, pages):
-    for file in pages:
-        page = opened(file, 1280, "dark")
-        page.emulate_media(media="print", color_scheme="dark")
-        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-        for name in (".bar", ".jumps", "details:not([open]) summary"):
-            assert page.locator(f"{name}:visible").count() == 0
-        page.set_viewport_size({"width": 688, "height": 900})  # A4 within its margins
-        page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
-        wide = "[...document.querySelectorAll('table, svg, pre')].map((e) => [e.scrollWidth, e.textContent])"
-        assert [each for each in page.evaluate(wide) if each[0] > 688] == []
-
-
-def test_a_cut_out_shows_when_the_revealed_vehicle_becomes_visible(opened, crashing):
-    file = write_report(copy_of(crashing["cut_out"], crashing["cut_out"].parent / "shown"))
-    page, scene = opened(file), scenes_in(file.read_text())[0]
-    [step] = [step for step, name in scene["moments"] if name == "SV becomes visible"]
-    assert scene["onset"] <= step <= scene["event"]
-    page.get_by_role("button", name="SV becomes visible", exact=True).click()
-    assert seconds(page) == pytest.approx(STEP_S * step)
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])
-def test_it_is_readable_wide_and_narrow_in_light_and_in_the_dark(width, scheme, opened, report, replayed):
-    for file in (report, replayed):
-        page = opened(file, width, scheme)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        ink, paper = page.evaluate("[getComputedStyle(document.body)].flatMap((s) => [s.color, s.backgroundColor])")
-        light = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
-        assert (light[0] < light[1]) == (scheme == "light")
-        sizes = page.evaluate(
-            "[...document.querySelectorAll('.player text, .player td')].map((e) => getComputedStyle(e).fontSize)"
-        )
-        assert min(float(size.removesuffix("px")) for size in sizes) >= 8
-        page.set_viewport_size({"width": 700, "height": 900})  # what was drawn for one width is drawn for the next
-        road = page.locator(".road").first  # waiting for a function would be `eval`, which the page's policy forbids
-        width = road.evaluate("(e) => e.clientWidth")
-        api.expect(road).to_have_attribute("viewBox", re.compile(rf"^0 0 {width} "))
 
 
 def test_the_policy_lets_no_other_script_run(browser, report):
