@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 import harness
+from harness.fitting.files import fit_files
 from harness.report.compare_page import write_comparison
-from harness.report.hours_page import write_hours_of
-from harness.report.page import write_report
+from harness.report.page import write_hours, write_report
+from tests.fitting.trajectories import overtaking
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of
 
@@ -166,10 +167,13 @@ def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
 
 @pytest.fixture(scope="module")
 def pages(report, replayed, crashing, compared, tmp_path_factory) -> list[Path]:
-    """One of each kind: a run's in each scenario, of their sum, of a comparison, of one test."""
+    """One of each kind: a run's in each scenario, of a comparison, of one test; without a player of a sum, of a fit."""
     place = tmp_path_factory.mktemp("pages")
     runs = [write_report(copy_of(crashing[name], place / name)) for name in ("lead_brakes", "cut_out")]
-    return [report, replayed, *runs, write_comparison(copy_of(compared, place / "compared")), hours_page(place)]
+    with_player = [report, replayed, *runs, write_comparison(copy_of(compared, place / "compared"))]
+    overtaking(2.0).to_parquet(place / "rows.parquet", index=False)
+    fit_files([place / "rows.parquet"], place / "mine.yaml", n_replicates=2)
+    return [*with_player, hours_page(place), place / "mine.html"]
 
 
 def hours_page(place: Path) -> Path:
@@ -187,7 +191,7 @@ def hours_page(place: Path) -> Path:
         "counts_in_interval": False, "readings": [beside], "milder": {},
         "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
     }  # fmt: skip
-    return write_hours_of(place, content)
+    return write_hours(place, content)
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark"), (390, "light")])
@@ -209,7 +213,7 @@ def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(width, scheme, b
 
 
 def test_a_phone_shows_all_columns_of_the_player_and_cars_that_can_be_seen(opened, pages):
-    for file in pages[:-1]:
+    for file in pages[:-2]:
         page = opened(file, 390)
         table = page.locator(".now").first
         assert table.locator("thead th:visible").count() == 6
