@@ -65,6 +65,12 @@ class Tally(NamedTuple):
     failed_mass: FloatArray
     runs: OnRuns | None = None
 
+    @classmethod
+    def counted(cls, tests: IntArray, crashes: Counts, failed: Counts) -> Tally:
+        """Counts (S,) alone, of tests whose paths nobody has looked at."""
+        no_mass = np.zeros((tests.size, tests.size))
+        return cls(tests, crashes, failed, no_mass, no_mass)
+
     def part(self, strata: slice) -> Tally:
         """That of some strata."""
         return self.joined(np.eye(self.tests.size)[:, strata])
@@ -108,8 +114,7 @@ class Tally(NamedTuple):
 
 def empty_tally(n_strata: int) -> Tally:
     """That of no tests."""
-    none, no_mass = np.zeros((3, n_strata), np.int64), np.zeros((2, n_strata, n_strata))
-    return Tally(*none, *no_mass)
+    return Tally.counted(*np.zeros((3, n_strata), np.int64))
 
 
 class CrashedTests(NamedTuple):

@@ -129,23 +129,17 @@ def environment_with(there: Resolved, values: Mapping[str, float]) -> Environmen
     return there.family.traffic_with(there.campaign.environment, there.parameters, values)
 
 
-def assumed_in(
-    resolved: Resolved, pool: Pool | None, design: ShellDesign | None, progress: Progress
+def assumed(
+    traffic: Resolved, pool: Pool | None, design: ShellDesign | None, progress: Progress
 ) -> dict[str, Any] | None:
-    """Fields of `Assumed` for a campaign; without strata of this traffic there are no factors."""
-    if pool is not None and design is not None:
-        found = assumed(resolved, pool, design, progress)
-    else:
-        found = Assumed(resolved.parameters.unseen) if resolved.parameters.unseen else None
-    return None if found is None else asdict(found)
-
-
-def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progress) -> Assumed | None:
-    """By what the strata's probabilities move over what data leave open of who cuts in closely; None without that.
+    """Fields of `Assumed`: by what the strata's probabilities move over what data leave open; None without that.
 
     That is the range that is stated for who does not look, or shares of lane changes at times to collision where none
-    was seen, which are anything up to what that many vehicles without one refuse.
+    was seen, which are anything up to what that many vehicles without one refuse. Without strata of this traffic there
+    are no factors.
     """
+    if pool is None or design is None:
+        return asdict(Assumed(traffic.parameters.unseen)) if traffic.parameters.unseen else None
     if (left := traffic.family.left_open(traffic.parameters)) is None:
         return None
     ends = [environment_with(traffic, each) for each in left.ends]
@@ -154,7 +148,7 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
     paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)
     base, *moved = paths.of([traffic.environment, *filter(None, ends)])
     low, high = (tuple(ratio_of(each.p, base.p).tolist()) for each in moved)
-    return Assumed(left.where, left.highest, (low, high))
+    return asdict(Assumed(left.where, left.highest, (low, high)))
 
 
 def ratio_of(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +73,7 @@ def estimate_in_other_traffic(
     if there.parameters.replicates is not None and there.parameters.unseen:
         told.pop("assumed", None)  # replicates say it better
     elif not moved.is_same:
-        found = assumed(there, tested.pool, tested.design, progress)
-        told["assumed"] = found and asdict(found)
+        told["assumed"] = assumed(there, tested.pool, tested.design, progress)
     asked: list[EstimatorName] | None = None if moved.is_same else ["shells"]
     blocks = map(moved.block, tested.blocks)
     content = estimate_blocks(blocks, there.campaign, told, estimators=asked, confidence=confidence)

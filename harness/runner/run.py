@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -20,7 +20,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import ended_by, estimate_blocks, expected_for, pool_remedy
 from harness.estimators.stopping import Rule, Verdict
 from harness.files import remove_unfinished
-from harness.pool.moved import assumed_in
+from harness.pool.moved import assumed
 from harness.progress import Progress
 from harness.records.folder import MILDER, SHELLS, StoppedBy, parquet, sole_use, write_sealed
 from harness.records.shown import ShownTests
@@ -37,9 +37,9 @@ from harness.runner.kept import (
 from harness.runner.stored import even
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
-from harness.sampling.baseline import IN_WORDS, begin, milder_requests, stored_baseline, stored_table
-from harness.sampling.milder import beyond_scope, milder_of, milder_tests
-from harness.sampling.protocol import Rounds, ShardRequest
+from harness.sampling.baseline import IN_WORDS, begin, requests_before, stored_baseline, stored_table
+from harness.sampling.milder import N_TESTS, beyond_scope, milder_of
+from harness.sampling.protocol import Rounds
 from harness.strata import STORED_DESIGN
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def begun(out: Path, resolved: Resolved, earlier: dict[str, Any], crew: Workers,
     run = take_over(out, resolved, source, earlier, began, **facts)
     try:
         keep_design(run)
-        return run.noting(assumed=assumed_in(resolved, source.pool, source.design, progress))
+        return run.noting(assumed=assumed(resolved, source.pool, source.design, progress))
     except BaseException:
         run.written("interrupted")
         raise
@@ -194,15 +194,15 @@ def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
 
     Where there are events too mild to count, it meets a few of them.
     """
-    paths, mild = run.source.baseline_paths, milder_tests(run.resolved)
+    paths, resolved = run.source.baseline_paths, run.resolved
 
-    def drive(name: str, requests: Sequence[ShardRequest]) -> pa.Table:
+    def drive(name: str, n: int) -> pa.Table:
         """What comes before tests that count, but for what an earlier run has done of it."""
         nonlocal run
-        n, what, causes = sum(each.n_episodes for each in requests), IN_WORDS[name], Counter[str]()
+        what, causes = IN_WORDS[name], Counter[str]()
         progress.stage(f"{what}{crew.where}", n)
         known = partial(stored_baseline, stored_table(run.folder, run.parts_before, name), paths)
-        for result in crew.run(iter(requests), known):
+        for result in crew.run(requests_before(name, n), known):
             run = run.with_baseline(name, result)
             causes += result.failures
             progress.advance(result.request.n_episodes)
@@ -211,9 +211,9 @@ def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
         return pa.concat_tables(run.before[name])
 
     try:
-        if mild is not None:
-            driven = drive(MILDER, list(milder_requests(mild)))
-            run = run.noting(milder=milder_of(run.resolved, driven))
+        if resolved.family.milder(resolved.environment) is not None:
+            driven = drive(MILDER, N_TESTS)  # which writes what it drives into the run
+            run = run.noting(milder=milder_of(resolved, driven))
         if paths is None:
             return run
         table, runs = begin(run.source, drive)

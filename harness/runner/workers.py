@@ -26,12 +26,13 @@ from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.loop.loop import EpisodeLoop
 from harness.processes import Began, Child, SharedFile, WorkerDeath, first_to_answer, start_server, tell, usable_cpus
-from harness.records.folder import Repeated, read_table
+from harness.records.folder import MILDER, Repeated, read_table
 from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.runner.again import repeat
 from harness.sampling import prepare
 from harness.sampling.baseline import BaselineResult, as_recorded, run_baseline
+from harness.sampling.milder import run_milder
 from harness.sampling.protocol import ShardRequest
 from harness.worlds import build_world
 
@@ -124,7 +125,9 @@ class ShardRunner:
         """Run a shard; tests that are known to be ``fatal`` fail before they begin, with these causes."""
         self._fatal = dict(fatal or {})
         source, paths = self._source, self._source.baseline_paths
-        if request.before:
+        if request.before == MILDER:
+            return run_milder(self._loop, source.resolved, request)
+        if request.before and paths is not None:
             return run_baseline(self._loop, paths, source.resolved, request)
         if paths is not None and not self._begun:
             self._begun = True

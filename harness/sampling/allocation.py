@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +14,7 @@ from harness.estimators.likelihood import Level, spread
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.tally import Tally, combined
 from harness.strata import ASSUMPTION_FREE, ShellDesign
-from harness.vocabulary import IntArray
+from harness.vocabulary import FloatArray, IntArray
 
 GROWTH = 1.1
 """Tests after a round over tests before it; also the distance of the looks at the result."""
@@ -53,22 +54,25 @@ def first_tests(design: ShellDesign, asked: int | None = None) -> IntArray:
 class Allocation:
     """How many tests each shell gets next.
 
-    A stratum gets ``first_tests`` before anything is decided about it, and at most those ``available``, shape (S,).
-    With the ``statement`` `library` what lies outside the boundary is never tested. A round has at least
-    ``smallest_round`` tests, where there are as many.
+    Strata have the probabilities ``p`` (S,), known from ``n_paths``; ``n_inside`` are inside the boundary. One gets
+    ``first_tests`` before anything is decided about it, and at most those ``available``, (S,) each. With the
+    ``statement`` `library` what lies outside the boundary is never tested. A round has at least ``smallest_round``
+    tests, where there are as many.
     """
 
-    design: ShellDesign
+    p: FloatArray
+    n_inside: int
     first_tests: IntArray
     available: IntArray
     statement: str = ASSUMPTION_FREE
     smallest_round: int = 1
+    n_paths: float = math.inf
 
     @classmethod
     def of(cls, shells: ShellSettings, design: ShellDesign, available: IntArray) -> Allocation:
         """That of a campaign's ``testing.shells``."""
-        first = first_tests(design, shells.first_tests)
-        return cls(design, first, available, shells.statement, shells.smallest_round)
+        first, asked = first_tests(design, shells.first_tests), (shells.statement, shells.smallest_round)
+        return cls(design.p, design.n_inside, first, available, *asked, design.n_independent)
 
     def is_first(self, tests: IntArray, added: IntArray) -> bool:
         """Whether a round after so many tests per stratum, (S,) each, brings some that a stratum gets in any case."""
@@ -77,7 +81,7 @@ class Allocation:
     @property
     def n_asked(self) -> int:
         """Strata that may be tested, which come first."""
-        return self.design.n_within(self.statement)
+        return self.p.size if self.statement == ASSUMPTION_FREE else self.n_inside
 
     def next_round(
         self,
@@ -98,14 +102,14 @@ class Allocation:
             return np.zeros_like(tests)
 
         def of_crashes(n: int) -> float:
-            return combined(self.design.p[:n], tally.part(slice(0, n)), self.design.n_independent, _LEVEL).rhw
+            return combined(self.p[:n], tally.part(slice(0, n)), self.n_paths, _LEVEL).rhw
 
         begun = np.arange(tests.size) < self._n_begun(tests, inner_rhw or of_crashes)
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if wanted.any():
             # Further first tests by the probability of strata, while that is all that is known of them.
-            missing, p = max(self.smallest_round - int(wanted.sum()), 0), np.where(active, self.design.p, 0.0)
+            missing, p = max(self.smallest_round - int(wanted.sum()), 0), np.where(active, self.p, 0.0)
             if p.any():
                 wanted = wanted + np.ceil(missing * p / p.sum()).astype(np.int64)
         elif active.any():
@@ -119,12 +123,12 @@ class Allocation:
         """Whether nearly all that is left to know lies in strata without further events."""
         tests, (low, high) = tally.tests, clopper_pearson(tally.crashes, tally.tests, _TAIL, tally.failed)
         relevant = np.arange(tests.size) < self.n_asked
-        squares = np.where(relevant, (self.design.p * (high - low)) ** 2, 0.0)
+        squares = np.where(relevant, (self.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
     def _n_begun(self, tests: IntArray, inner_rhw: Callable[[int], float]) -> int:
         """Of how many strata it is time: of those inside the boundary while they leave much open."""
-        n = min(self.design.n_inside, self.n_asked)
+        n = min(self.n_inside, self.n_asked)
         return self.n_asked if n == self.n_asked or self._enough_inside(n, tests, inner_rhw) else n
 
     def _enough_inside(self, n: int, tests: IntArray, inner_rhw: Callable[[int], float]) -> bool:
@@ -138,7 +142,7 @@ class Allocation:
         return inner_rhw(n) <= INNER_RHW
 
     def _spread(self, tally: Tally, size: int, most: IntArray) -> IntArray:
-        weights, room = np.column_stack([self.design.p, np.zeros_like(self.design.p)]), ADDED * (tally.tests > 0)
+        weights, room = np.column_stack([self.p, np.zeros_like(self.p)]), ADDED * (tally.tests > 0)
         lower, upper = (
             np.column_stack([crashes + room, tally.tests - crashes + room])
             for crashes in (tally.crashes, tally.crashes + tally.failed)

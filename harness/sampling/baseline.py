@@ -9,7 +9,7 @@ random stream. What the vehicle did through the step of the event must be the sa
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.records.folder import MILDER, SHADOW, Part, read_kept
-from harness.records.schemas import baseline_table, episodes_table, padded
+from harness.records.schemas import baseline_table, padded
 from harness.resolved import Resolved
 from harness.sampling.protocol import ShardRequest, Source
 from harness.vocabulary import FAILED
@@ -48,27 +48,14 @@ class BaselineResult:
         return Counter(self.table.column("failure").drop_null().to_pylist())
 
 
-def baseline_requests(n: int) -> Iterator[ShardRequest]:
-    """All baseline runs of a campaign, in order."""
+def requests_before(name: str, n: int) -> Iterator[ShardRequest]:
+    """So many baseline runs, or tests of milder events, in order."""
     firsts = enumerate(range(0, n, SHARD_RUNS))
-    return (ShardRequest(index, first, min(SHARD_RUNS, n - first), before=SHADOW) for index, first in firsts)
+    return (ShardRequest(index, first, min(SHARD_RUNS, n - first), before=name) for index, first in firsts)
 
 
-def milder_requests(prescribed: Traffic) -> Iterator[ShardRequest]:
-    """All tests of milder events, in order."""
-    for index, first in enumerate(range(0, len(prescribed), SHARD_RUNS)):
-        of_rows = prescribed.rows(slice(first, first + SHARD_RUNS))
-        yield ShardRequest(index, first, len(of_rows), before=MILDER, prescribed=of_rows)
-
-
-def run_baseline(
-    loop: EpisodeLoop, paths: BaselinePaths | None, resolved: Resolved, request: ShardRequest
-) -> BaselineResult:
-    """Drive the loop's vehicle along a range of paths, or in prescribed tests."""
-    if request.prescribed is not None:
-        shard = loop.beside(keep=ALL_MOTION).run(request.first_episode, request.prescribed)
-        return BaselineResult(request, episodes_table(shard, resolved.campaign.seed))
-    assert paths is not None
+def run_baseline(loop: EpisodeLoop, paths: BaselinePaths, resolved: Resolved, request: ShardRequest) -> BaselineResult:
+    """Drive the loop's vehicle along a range of paths."""
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     some = Paths(paths.index[rows], paths.start[rows])
     shard = without_event(loop, resolved, paths.seed, some, request.first_episode)
@@ -98,22 +85,20 @@ def stored_baseline(
     return BaselineResult(request, table)
 
 
-def begin(source: Source, drive: Callable[[str, Sequence[ShardRequest]], pa.Table]) -> tuple[pa.Table, Recorded]:
+def begin(source: Source, drive: Callable[[str, int], pa.Table]) -> tuple[pa.Table, Recorded]:
     """Let a campaign's tests follow from baseline runs, whose table ``drive`` gives: as it is, and as arrays."""
-    table = drive(SHADOW, list(baseline_requests(len(source.baseline_paths or ()))))
+    table = drive(SHADOW, len(source.baseline_paths or ()))
     runs = as_recorded(table, source.scenario.max_steps)
     source.begin_after(runs)
     return table, runs
 
 
-def read_stored(
-    folder: Path, paths: BaselinePaths, before: Mapping[str, Part], name: str, requests: Sequence[ShardRequest]
-) -> pa.Table:
+def read_stored(folder: Path, paths: BaselinePaths, before: Mapping[str, Part], name: str, n: int) -> pa.Table:
     """All of a run folder's; a `RunFolderError` if some are missing or damaged."""
     stored = stored_table(folder, before, name)
-    if stored is None or any(stored_baseline(stored, paths, request) is None for request in requests):
+    if stored is None or any(stored_baseline(stored, paths, request) is None for request in requests_before(name, n)):
         there = f"{0 if stored is None else stored.num_rows} {IN_WORDS[name]}"
-        expected = f"all {sum(each.n_episodes for each in requests)}: they say what is tested, and how probable it is"
+        expected = f"all {n}: they say what is tested, and how probable it is"
         raise RunFolderError(str(folder / name), there, expected, "Let `harness run` go on with --resume.")
     return stored
 

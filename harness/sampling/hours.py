@@ -7,7 +7,6 @@ that is known worst.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from harness.estimators.per_hour import PerHour
 from harness.estimators.stopping import HourRule
 from harness.estimators.tally import Tally
 from harness.sampling.allocation import CONFIDENCE, Allocation
-from harness.strata import ShellDesign
 from harness.vocabulary import IntArray
 
 _LEVEL = Level.two_sided(CONFIDENCE)
@@ -38,8 +36,8 @@ class HourRounds:
         self._ends = np.cumsum([design.p.size for design in designs])[:-1]
         first = np.concatenate([each.first_tests for each in self._own])[self._order]
         most = np.concatenate(available)[self._order]
-        joint = _joint(hour, designs, self._order, int(inside.sum()))
-        self._all = Allocation(joint, first, most, shells.statement, shells.smallest_round)
+        p = np.concatenate([of.p for of in hour.families])[self._order]
+        self._all = Allocation(p, int(inside.sum()), first, most, shells.statement, shells.smallest_round)
 
     def next_round(self, hour: PerHour) -> list[IntArray]:
         """Tests to add per stratum of each family; all 0 when no stratum or no budget is left."""
@@ -58,18 +56,5 @@ class HourRounds:
         return np.split(added, self._ends)
 
 
-def _joint(hour: PerHour, designs: Sequence[ShellDesign], order: IntArray, n_inside: int) -> ShellDesign:
-    names = [f"{of.family} {name}" for of in hour.families for name in of.seen.design.strata]
-    p = np.concatenate([of.p for of in hour.families])[order]
-    n, none = p.size, np.zeros(0)
-    return replace(
-        designs[0], pool="", strata=tuple(names[place] for place in order.tolist()), cell_stratum=tuple(range(n)),
-        cell_references=(0,) * n, cell_p=p, references=(), reference_rate=none, reference_square=none,
-        n_inside=n_inside, p_unreachable=0.0, available=(), shadow_runs=False, candidates=0,
-    )  # fmt: skip
-
-
 def _side_by_side(tallies: Sequence[Tally], order: IntArray) -> Tally:
-    tests, crashes, failed = (np.concatenate(column)[order] for column in list(zip(*tallies, strict=True))[:3])
-    no_mass = np.zeros((tests.size, tests.size))
-    return Tally(tests, crashes, failed, no_mass, no_mass)
+    return Tally.counted(*(np.concatenate(column)[order] for column in list(zip(*tallies, strict=True))[:3]))

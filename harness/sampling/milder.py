@@ -12,20 +12,25 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from harness.loop.repeat import Traffic
+from harness.loop.loop import EpisodeLoop
 from harness.progress import Progress
+from harness.records.schemas import episodes_table
 from harness.resolved import Resolved
+from harness.sampling.baseline import ALL_MOTION, BaselineResult
 from harness.sampling.forced import Forced
+from harness.sampling.protocol import ShardRequest
 
 N_TESTS = 36
 """One that crashes on a tenth of them is found out 98 times in 100."""
 
 
-def milder_tests(resolved: Resolved) -> Traffic | None:
-    """The milder events that are driven, (`N_TESTS`,); None where there are none."""
-    if (environment := resolved.family.milder(resolved.environment)) is None:
-        return None
-    return Forced(replace(resolved, environment=environment), Progress()).tests(0, N_TESTS)
+def run_milder(loop: EpisodeLoop, resolved: Resolved, request: ShardRequest) -> BaselineResult:
+    """Drive the loop's vehicle in a range of the milder events, of which there are `N_TESTS`."""
+    milder = replace(resolved, environment=resolved.family.milder(resolved.environment))
+    tests = Forced(milder, Progress()).tests(0, N_TESTS)
+    rows = slice(request.first_episode, request.first_episode + request.n_episodes)
+    shard = loop.beside(keep=ALL_MOTION).run(request.first_episode, tests.rows(rows))
+    return BaselineResult(request, episodes_table(shard, resolved.campaign.seed))
 
 
 def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, Any]:

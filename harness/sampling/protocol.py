@@ -42,7 +42,7 @@ from harness.worlds import World
 class ShardRequest:
     """A fixed range of episodes; ``draws`` says which events they are, where that is so.
 
-    What comes ``before`` tests that count has the name of its table; but for baseline runs traffic is ``prescribed``.
+    What comes ``before`` tests that count has the name of its table.
     """
 
     index: int
@@ -50,7 +50,6 @@ class ShardRequest:
     n_episodes: int
     draws: tuple[Draw, ...] = ()
     before: str = ""
-    prescribed: Traffic | None = None
 
 
 class Rounds(Protocol):

@@ -176,8 +176,7 @@ def _differing(pairs: PairCounts) -> Tally:
     """Pairs of which one vehicle has crashed and the other has not, in the crashes' place."""
     differing = pairs.outcomes()[:, 1:3].sum(1)
     may_differ = np.maximum(pairs.tally(0).failed, pairs.tally(1).failed)
-    no_mass = np.zeros((differing.size, differing.size))
-    return Tally(pairs.tests, differing, np.minimum(may_differ, pairs.tests - differing), no_mass, no_mass)
+    return Tally.counted(pairs.tests, differing, np.minimum(may_differ, pairs.tests - differing))
 
 
 def round_requests(

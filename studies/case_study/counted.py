@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from harness.estimators.block import MAX_CONTROL_STEPS, Block
+from harness.estimators.block import Block
 from harness.estimators.estimate import FailureBounds
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import refusal
@@ -118,10 +118,6 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
     if step.spread_tests:
         write_table(context.folder / SPREAD, spread(first_block(run, min(step.spread_tests, n))))
     if rows:
-        total, beyond = (
-            sum(fit.n * fit.intercept for level, fit in fits if level > k) for k in (-1, MAX_CONTROL_STEPS)
-        )
-        figures["late_share"] = figure(beyond / total if total else None)
         late = _spread_of([fit for level, fit in fits if level >= 4])
         left = late["sd_after"] / late["sd_before"] if late["sd_before"] else None
         figures["rate_over_nade"] = exactly(1.0 + max(row["difference"] or 0.0 for row in rows))
@@ -183,22 +179,15 @@ class KnownMeans:
         self._fits, self._of_campaigns = others.fits(TESTS_EACH), list[FloatArray]()
 
     def add(self, block: Block) -> None:
-        """Add a campaign: variances and means of Y, of Y less η_l alone, and less what columns explain, too."""
+        """Add a campaign: variances of Y, and of Y less what columns explain."""
         y = block.weighted_crashes()
-        left = np.vstack([y, y - explained_by(block, self._fits)])
-        self._of_campaigns.append(np.array([left.var(axis=1), left.mean(axis=1)]))
+        self._of_campaigns.append(np.vstack([y, y - explained_by(block, self._fits)[1:]]).var(axis=1))
 
     def row(self, confidence: float) -> dict[str, Any]:
-        """NADE's variance over what is left: by columns in the other tests, by strata, by both, and replicated."""
-        (plain, strata, *columns), (plain_rate, _, *rates) = np.array(self._of_campaigns).transpose(1, 2, 0)
+        """NADE's variance over what is left."""
+        plain, *columns = np.transpose(self._of_campaigns)
         best = int(np.argmin([np.mean(one) for one in columns]))
-        total, left = (sum(getattr(fit, key) for _, fit in self._fits) for key in ("total_squares", "residual_squares"))
-        return {
-            "within_claimed": figure(total / left if left > 0.0 else None),
-            "gain_strata": ratio_of_means(plain, strata, confidence),
-            "gain_known": ratio_of_means(plain, columns[best], confidence),
-            "gain_known_replicated": ratio_of_variances(plain_rate, rates[best], confidence),
-        }
+        return {"gain_known": ratio_of_means(plain, columns[best], confidence)}
 
 
 def _spread_of(fits: Sequence[StratumFit]) -> dict[str, Any]:

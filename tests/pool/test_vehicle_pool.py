@@ -14,9 +14,10 @@ from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import motion_hashes
 from harness.pool.shells import CANDIDATES
 from harness.pool.vehicle_pool import EVENLY, chances, vehicle_pool
+from harness.records.folder import SHADOW
 from harness.resolved import resolve
 from harness.sampling import prepare
-from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline, without_event
+from harness.sampling.baseline import as_recorded, requests_before, run_baseline, without_event
 from harness.strata import weight_of_a_test
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH
@@ -38,7 +39,7 @@ def prepared_after(campaign):
     """The campaign after its baseline runs, its loop, and what the runs left."""
     ready = prepare(resolve(campaign))
     loop = ready.loop(TwinWorld(32))
-    specs = baseline_requests(len(ready.baseline_paths))
+    specs = requests_before(SHADOW, len(ready.baseline_paths))
     tables = [run_baseline(loop, ready.baseline_paths, ready.resolved, spec).table for spec in specs]
     runs = as_recorded(pa.concat_tables(tables), ready.scenario.max_steps)
     ready.begin_after(runs)

@@ -54,7 +54,7 @@ def test_one_that_is_interrupted_before_its_first_test_says_so(run_here, tmp_pat
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(running, "assumed_in", interrupted)
+    monkeypatch.setattr(running, "assumed", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_here(golden("shells-twin"), tmp_path)
     assert manifest(tmp_path)["status"] == "interrupted"

@@ -102,31 +102,33 @@ def test_first_tests_go_in_proportion_to_the_probability():
 
 
 def test_the_boundary_is_passed_when_what_lies_within_is_known():
-    rule = Allocation(replace(DESIGN, n_inside=2), TWELVE, MANY)
+    rule = Allocation(DESIGN.p, 2, TWELVE, MANY)
     assert rule.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [12, 12, 0]
     tests, crashes = np.array([400, 400, 0]), np.array([400, 200, 0])
     assert rule.next_round(tally(tests, crashes, NONE), 10**6).tolist() == [0, 0, 12]
-    inside = Allocation(rule.design, TWELVE, MANY, "library")
+    inside = Allocation(DESIGN.p, 2, TWELVE, MANY, "library")
     assert inside.next_round(tally(tests, crashes, NONE), 10**6)[2] == 0
-    hopeless = Allocation(DESIGN, TWELVE, MANY).next_round(tally(np.array([96, 96, 0]), NONE, NONE), 10**6)
+    hopeless = Allocation(DESIGN.p, DESIGN.n_inside, TWELVE, MANY).next_round(
+        tally(np.array([96, 96, 0]), NONE, NONE), 10**6
+    )
     assert hopeless.tolist() == [0, 0, 12]
 
 
 def test_rounds_grow_to_where_the_interval_is_widest():
-    rule = Allocation(DESIGN, TWELVE, MANY)
+    rule = Allocation(DESIGN.p, DESIGN.n_inside, TWELVE, MANY)
     tests = np.array([400, 400, 800])
     added = rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 10**6)
     assert added.sum() == np.ceil((GROWTH - 1.0) * tests.sum())
     assert added[2] > 0.9 * added.sum()
     assert rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 7).sum() == 7
     assert rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 0).sum() == 0
-    full = Allocation(DESIGN, TWELVE, tests)
+    full = Allocation(DESIGN.p, DESIGN.n_inside, TWELVE, tests)
     assert full.next_round(tally(tests, np.array([200, 10, 0]), NONE), 100).sum() == 0
 
 
 def test_rounds_can_be_made_to_feed_many_workers():
     """By probability while nothing else is known, then to where the interval is widest."""
-    rule = Allocation(DESIGN, TWELVE, MANY, smallest_round=64)
+    rule = Allocation(DESIGN.p, DESIGN.n_inside, TWELVE, MANY, smallest_round=64)
     first = rule.next_round(tally(NONE, NONE, NONE), 10**6)
     assert 64 <= first.sum() <= 66
     assert first[2] == 0
@@ -135,17 +137,17 @@ def test_rounds_can_be_made_to_feed_many_workers():
     assert rule.next_round(tally(NONE, NONE, NONE), 20).sum() == 20
     later = rule.next_round(tally(np.array([40, 40, 40]), np.array([20, 1, 0]), NONE), 10**6)
     assert later.sum() == 64
-    few = Allocation(DESIGN, TWELVE, np.full(3, 15), smallest_round=64)
+    few = Allocation(DESIGN.p, DESIGN.n_inside, TWELVE, np.full(3, 15), smallest_round=64)
     assert few.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [15, 15, 0]
 
 
 def test_failed_tests_draw_further_tests_to_their_shell():
-    rule = Allocation(DESIGN, TWELVE, MANY, "library")
+    rule = Allocation(DESIGN.p, DESIGN.n_inside, TWELVE, MANY, "library")
     tests, crashes = np.array([400, 400, 0]), np.array([20, 0, 0])
     without = rule.next_round(tally(tests, crashes, NONE), 10**6)
     with_failed = rule.next_round(tally(tests, crashes, np.array([0, 40, 0])), 10**6)
     assert with_failed[1] > without[1]
-    undecided = Allocation(DESIGN, TWELVE, MANY)
+    undecided = Allocation(DESIGN.p, DESIGN.n_inside, TWELVE, MANY)
     few, all_of_a = np.array([40, 40, 0]), np.array([40, 0, 0])
     assert undecided.next_round(tally(few, all_of_a, NONE), 10**6)[2] == 12
     assert undecided.next_round(tally(few, all_of_a, np.array([0, 20, 0])), 10**6)[2] == 0

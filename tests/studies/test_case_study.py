@@ -233,9 +233,7 @@ def test_known_means_gain_what_theorem_3_promises():
     known = KnownMeans(scv)
     for _ in range(5):
         known.add(world.block("step_mixture", world.maneuvers(500, rng)))
-    row = known.row(0.9)
-    assert all(row[key]["value"] > 1e6 for key in ("within_claimed", "gain_known", "gain_known_replicated"))
-    assert row["gain_strata"]["value"] == pytest.approx(1.0, rel=0.01)  # all tests have one control step
+    assert known.row(0.9)["gain_known"]["value"] > 1e6
 
 
 def test_relative_variance_of_known_weights():

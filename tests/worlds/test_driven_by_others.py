@@ -10,11 +10,12 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, WorldDisagreementError
+from harness.records.folder import SHADOW
 from harness.resolved import require_ready, resolve
 from harness.runner.run import run_campaign
 from harness.runner.stored import replay_episode
 from harness.sampling import prepare
-from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline
+from harness.sampling.baseline import as_recorded, requests_before, run_baseline
 from harness.vocabulary import AV, BV, CRASH, FAILED, LV
 from harness.worlds import build_world, sumo_driven
 from harness.worlds.program import TraciWorld, own_addresses, require_neighbour
@@ -281,7 +282,7 @@ def driven_in(world, campaign):
     ready = prepare(resolve(campaign))
     loop = ready.loop(world)
     try:
-        specs = list(baseline_requests(len(ready.baseline_paths)))
+        specs = list(requests_before(SHADOW, len(ready.baseline_paths)))
         done = [run_baseline(loop, ready.baseline_paths, ready.resolved, spec) for spec in specs]
         runs = as_recorded(pa.concat_tables(part.table for part in done), ready.scenario.max_steps)
         ready.begin_after(runs)
