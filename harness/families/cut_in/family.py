@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -23,14 +23,10 @@ from harness.families.cut_in.parameters import DEFAULT, SHIPPED_FOLDER, Environm
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
-from harness.families.cut_in.unseen import left_open
 from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
 from harness.families.protocol import Chosen, Column, Exposure, Paths
 from harness.families.words import Shown
 from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
-
-if TYPE_CHECKING:
-    from harness.fitting.protocol import Fitter
 
 _STATE_DOCS = (
     "speed of BV",
@@ -77,13 +73,13 @@ class CutIn:
     follows, stride, pool_error = False, 4, 0.005  # `benchmarks.pool_stride` says what other strides would cost
     ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-2", True: "ladder-lateral-1"})
 
+    fitter = "harness.families.cut_in.fitting.fitter:CutInFitter"
     crosses, words = BV, WORDS
     maps: tuple[tuple[Shown, Shown], ...] = ((GAP, CLOSING),)
     stand_ins: Mapping[str, tuple[str, Surrogate]] = STAND_INS
 
     parameters = staticmethod(load_parameters)
     traffic = staticmethod(load_environment)
-    left_open = staticmethod(left_open)
     events = staticmethod(enumerate_cut_ins)
     script = staticmethod(script_of)
     drive = staticmethod(drive_along)
@@ -125,11 +121,6 @@ class CutIn:
 
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:  # noqa: ARG002 - counted, whatever the laws
         return EXPOSURE
-
-    def fitter(self) -> Fitter:
-        from harness.families.cut_in.fitting.fitter import CutInFitter  # noqa: PLC0415 - reads tables, draws pages
-
-        return CutInFitter()
 
     def milder(self, traffic: Environment) -> None:
         """There are none: all cut-ins count."""
