@@ -98,12 +98,6 @@ def hash_of_index(seed: int, episodes: IntArray) -> FloatArray:
     return hashed
 
 
-def traced_by_index(seed: int, episodes: IntArray, share: float) -> BoolArray:
-    """Which episodes are traced whatever their outcome."""
-    chosen: BoolArray = hash_of_index(seed, episodes) < share
-    return chosen
-
-
 class EpisodeLoop:
     """K idle cells of a world, fed with tests of one campaign; ``av`` is a controller outside of the kernels."""
 
@@ -128,7 +122,7 @@ class EpisodeLoop:
 
     def _run(self, first_episode: int, traffic: Traffic) -> Shard:
         n = len(traffic)
-        traced = traced_by_index(self._scenario.seed, first_episode + np.arange(n), self._keep.trace_share)
+        traced = hash_of_index(self._scenario.seed, first_episode + np.arange(n)) < self._keep.trace_share
         shard = Shard(first_episode, self._scenario, traffic, np.zeros(n, EPISODE_DTYPE), traced)
         self._cells.cell["row"] = -1
         kernel, given, ended = self._kernel_state(shard), 0, 0

@@ -11,7 +11,7 @@ import pytest
 import harness
 from harness.errors import RunFolderError
 from harness.families.cut_in.family import CUT_IN, STATE_FACTS
-from harness.loop.loop import traced_by_index
+from harness.loop.loop import hash_of_index
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
 from harness.vocabulary import AV
 from tests.in_process import run_here
@@ -71,7 +71,7 @@ def test_records_kept_change_nothing_else(stored_run, tmp_path):
 )
 def test_the_policy_says_which_are_traced_and_a_share_is_chosen_by_index(name, policy, stored_run):
     rows = stored_table(stored_run(name), "episodes").to_pylist()
-    of_share = traced_by_index(golden(name).seed, np.arange(len(rows)), 0.05 if "share" in policy else 0.0)
+    of_share = hash_of_index(golden(name).seed, np.arange(len(rows))) < (0.05 if "share" in policy else 0.0)
     wanted = {
         row["episode"]
         for row in rows
@@ -87,10 +87,10 @@ def test_the_policy_says_which_are_traced_and_a_share_is_chosen_by_index(name, p
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 1.0])
 def test_the_share_is_the_share_and_another_seed_chooses_others(share):
     index = np.arange(200_000)
-    chosen = traced_by_index(1, index, share)
+    chosen = hash_of_index(1, index) < share
     assert abs(chosen.mean() - share) < 5 * np.sqrt(share * (1 - share) / index.size) + 1e-12
     if 0.0 < share < 1.0:
-        other = traced_by_index(2, index, share)
+        other = hash_of_index(2, index) < share
         assert abs((chosen & other).mean() - share**2) < 0.005
 
 
