@@ -43,20 +43,20 @@ class Maneuvers(NamedTuple):
 
 
 def enumerate_cut_ins(
-    environment: Environment,
+    traffic: Environment,
     seed: int,
     paths: Paths,
-    followers: Followers,
+    drivers: Followers,
     recorded: Recorded = HOLDING,
     stride: int = 1,
     offset: IntArray | None = None,
 ) -> Events:
     """Every ``stride``-th cut-in of paths (n,), by their steps; see `harness.families.protocol.Family.events`."""
-    n, steps = paths.number.size, int(environment.numbers["max_steps"])
+    n, steps = paths.number.size, int(traffic.numbers["max_steps"])
     found = Events(np.zeros((n, steps)), np.zeros((n, steps), np.int64), np.zeros(n), np.zeros(n))
     first = np.zeros(n, np.int64) if offset is None else offset
-    scratch = empty_trajectory(environment)
-    known = unboxed(environment), unboxed(followers), unboxed(recorded)
+    scratch = empty_trajectory(traffic)
+    known = unboxed(traffic), unboxed(drivers), unboxed(recorded)
     _enumerate(seed, paths.number, paths.start, stride, first, *known, unboxed(scratch), unboxed(found))
     return found
 

@@ -68,12 +68,12 @@ def _place(state: RecordArray, x: FloatArray, v: FloatArray) -> None:
         place(state[i], x[i], v[i])
 
 
-def script_of(environment: Environment, chosen: Chosen) -> Script:
+def script_of(traffic: Environment, chosen: Chosen) -> Script:
     """The motion of LV and BV, to the end of the longest test; beyond the last maneuver nothing can be meant."""
-    facts, n, steps = chosen.facts, len(chosen.facts), int(environment.numbers["max_steps"])
+    facts, n, steps = chosen.facts, len(chosen.facts), int(traffic.numbers["max_steps"])
     x, v, lane = beginning(states_of(facts))
     speed, lanes = np.zeros((n, steps, BV + 1)), np.full((n, steps, BV + 1), LEFT, np.int8)
-    _move(unboxed(maneuvers_of(chosen)), chosen.at, int(environment.numbers["hold_steps"]), v, speed, lanes)
+    _move(unboxed(maneuvers_of(chosen)), chosen.at, int(traffic.numbers["hold_steps"]), v, speed, lanes)
     return natural_script(x, v, lane, speed, lanes, chosen.at, chosen.lead)
 
 
