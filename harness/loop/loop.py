@@ -215,8 +215,11 @@ class EpisodeLoop:
                     world.announce(refilled, cells.cell["announced_index"][refilled])
                 world.place(refilled, world.x, world.v, cells.lane_before)
             contact = world.step(cells.speed, cells.lane)
-        except AVLostError as lost:
-            return self._lose(str(lost), kernel, shard)
+        except AVLostError as lost:  # all running episodes fail
+            running = np.flatnonzero(cells.cell["row"] >= 0)
+            failed = self._fail(dict.fromkeys(running.tolist(), str(lost)), kernel, shard)
+            world.restart()
+            return failed
         ended = judge(kernel, contact)
         if ended < 0:
             raise _disagreement(cells.cell[-1 - ended], bool(contact[-1 - ended]))
@@ -226,13 +229,6 @@ class EpisodeLoop:
             outcome = shard.episode["outcome"]
             shard.failures.update((row, STRAYED) for _, row in self._ended(ended) if outcome[row] == FAILED)
         return ended
-
-    def _lose(self, cause: str, kernel: KernelState, shard: Shard) -> int:
-        """Fail all running episodes and begin again; returns their number."""
-        running = np.flatnonzero(self._cells.cell["row"] >= 0)
-        lost = self._fail(dict.fromkeys(running.tolist(), cause), kernel, shard)
-        self._world.restart()
-        return lost
 
     def _fail(self, failures: Mapping[int, str], kernel: KernelState, shard: Shard) -> int:
         """End episodes whose controller failed (cell → cause), and go on; returns their number."""

@@ -114,7 +114,6 @@ def begin(k: int, kernel: KernelState, nade: Nade) -> None:
     test = kernel.episode[cell.row]
     draws.lv_maneuver = draws.bv_maneuver = draws.n_bv = draws.n_bv_free = 0
     draws.clock = draws.hazard = draws.log_sampled = 0.0
-    draws.hazard_total = math.nan
     u = uniform(kernel.seed, cell.episode, CUT_IN_STREAM, CUT_IN_DRAW)
     draws.target = -math.log1p(-u)
     if importance.n_forced == 0:
