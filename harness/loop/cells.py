@@ -181,10 +181,9 @@ class KernelState(NamedTuple):
     (m/s). ``episode`` (n,) are the results, `EPISODE_DTYPE`. ``principal`` is the
     place of the vehicle that the event is about, and ``ahead`` that of the one ahead of it, -1 without one;
     ``sideways_m`` is the way from its first lateral motion to overlap. ``driver`` is (1,) for a built-in AV, else (0,).
-    ``passed_m`` is the gap to the principal vehicle at which the AV has passed it. ``observation`` is what a controller
-    outside of the kernels sees, ``acts_early`` whether from the start, whatever the script says.
-    ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or somebody is ahead on its
-    lane. What may be so or not is 0 or 1.
+    ``observation`` is what a controller outside of the kernels sees, ``acts_early`` whether from the start, whatever
+    the script says. Else ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or
+    somebody is ahead on its lane. What may be so or not is 0 or 1.
     """
 
     seed: int
@@ -198,7 +197,6 @@ class KernelState(NamedTuple):
     ahead: int
     sideways_m: float
     driver: RecordArray
-    passed_m: float
     keep_traces: int
     observation: BatchObservation
     acts_early: int

@@ -91,7 +91,7 @@ def outcome_of(k: int, kernel: KernelState) -> int:
     if is_ahead(k, kernel):
         if left < CONTACT_M:
             return PASSED
-    elif left <= kernel.passed_m and not (0 <= cell.onset_step < cell.step):
+    elif left <= (PASSED_UNDER_CONTROL_M if kernel.acts_early else PASSED_M) and not (0 <= cell.onset_step < cell.step):
         return PASSED
     if cell.step >= kernel.script.n_steps[cell.row] or both_stand(k, kernel):
         return TIMEOUT

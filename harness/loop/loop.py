@@ -14,7 +14,7 @@ from harness.controllers.protocol import BatchObservation
 from harness.errors import WorldDisagreementError
 from harness.loop.cells import EPISODE_DTYPE, KernelState, PrescribedEvents, idle_cells
 from harness.loop.drive import Past, command, drive, empty_observation, first, hold_cruising, observe
-from harness.loop.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
+from harness.loop.judge import fail, judge
 from harness.loop.repeat import Traffic, refill
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
@@ -171,11 +171,10 @@ class EpisodeLoop:
                 ahead=scenario.ahead,
                 sideways_m=scenario.sideways_m,
                 driver=scenario.driver,
-                passed_m=PASSED_UNDER_CONTROL_M if early else PASSED_M,
                 keep_traces=int(self._keep.any_trace),
                 observation=self._observation,
                 acts_early=int(early),
-                av_cruises=int(cruises and not early),
+                av_cruises=int(cruises),
             )
         )
 

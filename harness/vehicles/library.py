@@ -128,10 +128,8 @@ class Library(Section):
             raise broken_rule(f"{place}.model", envelope.model, expected, mend)
         for name, driver in (self.surrogates | self.references).items():
             if (fastest := driver.parameters.max_acceleration_mps2) > most:
-                found, mend = (
-                    f"{most:g} m/s², less than {name}'s {fastest:g}",
-                    f"Raise it to {fastest:g}, or limit {name}.",
-                )
+                found = f"{most:g} m/s², less than {name}'s {fastest:g}"
+                mend = f"Raise it to {fastest:g}, or limit {name}."
                 expected = "an envelope that accelerates at least as hard as every surrogate"
                 raise broken_rule(f"{place}.parameters.acceleration_mps2", found, expected, mend)
         return self

@@ -20,8 +20,6 @@ CELL_DTYPE = np.dtype(
     [
         ("lv_maneuver", _i8),
         ("bv_maneuver", _i8),
-        ("n_bv", _i8),  # car-following draws so far
-        ("n_bv_free", _i8),  # free-driving draws so far
         ("clock", _f8),  # hazard accumulated by the sampler
         ("target", _f8),  # hazard at which BV cuts in
         ("hazard", _f8),  # hazard accumulated under p

@@ -59,40 +59,39 @@ def draw_maneuvers(k: int, state: State, kernel: KernelState, nade: Nade) -> Non
     """Redraw where a hold period begins; before the cut-in, stay or cut in."""
     hold_steps = nade.environment.numbers.hold_steps
     cell = kernel.cells.cell[k]
-    redraw = cell.step % hold_steps == 0
+    period, redraw = cell.step // hold_steps, cell.step % hold_steps == 0
     if redraw:
-        n_lv = nade.drawn.n_lv[cell.row]
-        u = uniform(kernel.seed, cell.episode, LV_DRAWS, n_lv)
+        u = uniform(kernel.seed, cell.episode, LV_DRAWS, period)
         maneuver = laws.drive_freely(u, kernel.v[k, LV], nade.environment)
-        nade.draws.cell[k].lv_maneuver = nade.drawn.lv_path[cell.row, n_lv] = maneuver
-        nade.drawn.n_lv[cell.row] += 1
+        nade.draws.cell[k].lv_maneuver = nade.drawn.lv_path[cell.row, period] = maneuver
+        nade.drawn.n_lv[cell.row] = period + 1
     if cell.event_step < 0:
         if redraw:
-            redraw_following(k, state, kernel, nade)
+            redraw_following(k, period, state, kernel, nade)
         choose_lane(k, state, kernel, nade)
-    elif (cell.step - cell.event_step - 1) % hold_steps == 0:
-        redraw_free(k, state, kernel, nade)
+        return
+    since = cell.step - cell.event_step - 1
+    if since % hold_steps == 0:
+        redraw_free(k, since // hold_steps, state, kernel, nade)
 
 
 @compiled_inline
-def redraw_following(k: int, state: State, kernel: KernelState, nade: Nade) -> None:
+def redraw_following(k: int, period: int, state: State, kernel: KernelState, nade: Nade) -> None:
     """BV's acceleration behind LV, and what cutting in or staying would be worth during the coming hold period."""
     cell, draws = kernel.cells.cell[k], nade.draws.cell[k]
-    u = uniform(kernel.seed, cell.episode, BV_DRAWS, draws.n_bv)
+    u = uniform(kernel.seed, cell.episode, BV_DRAWS, period)
     draws.bv_maneuver = draw_acceleration(u, laws.car_following(state, nade.environment), nade.environment)
     add_to_path(cell.row, draws.bv_maneuver, nade)
-    draws.n_bv += 1
     if nade.importance.n_surrogates > 0:
         a, cutting, staying = acceleration(draws.bv_maneuver), nade.draws.cut_challenge[k], nade.draws.stay_challenge[k]
         look_ahead(state, a, cell.step, nade.environment, nade.importance, cutting, staying)
 
 
 @compiled_inline
-def redraw_free(k: int, state: State, kernel: KernelState, nade: Nade) -> None:
-    """BV's acceleration for the coming hold period after its cut-in."""
+def redraw_free(k: int, period: int, state: State, kernel: KernelState, nade: Nade) -> None:
+    """BV's acceleration for a hold period after its cut-in."""
     cell, draws = kernel.cells.cell[k], nade.draws.cell[k]
-    u = uniform(kernel.seed, cell.episode, BV_FREE_DRAWS, draws.n_bv_free)
-    draws.n_bv_free += 1
+    u = uniform(kernel.seed, cell.episode, BV_FREE_DRAWS, period)
     if nade.importance.n_surrogates > 0:
         draws.bv_maneuver = controlled_draw(k, u, state, kernel, nade)
     else:
@@ -112,7 +111,7 @@ def begin(k: int, kernel: KernelState, nade: Nade) -> None:
     """Draw when BV will cut in, on the clock of hazards; a forced cut-in on its path."""
     cell, draws, environment, importance = kernel.cells.cell[k], nade.draws.cell[k], nade.environment, nade.importance
     test = kernel.episode[cell.row]
-    draws.lv_maneuver = draws.bv_maneuver = draws.n_bv = draws.n_bv_free = 0
+    draws.lv_maneuver = draws.bv_maneuver = 0
     draws.clock = draws.hazard = draws.log_sampled = 0.0
     u = uniform(kernel.seed, cell.episode, CUT_IN_STREAM, CUT_IN_DRAW)
     draws.target = -math.log1p(-u)
