@@ -183,60 +183,41 @@ class Driven(NamedTuple):
 
 
 class Family(Protocol):
-    """A kind of events, and what most have alike. ``traffic`` is all that its kernels need of its environment.
-
-    Attributes
-    ----------
-    name : str
-        As campaigns call it.
-    vehicles : tuple of str
-        Names of the vehicles of a cell, the AV last.
-    principal, ahead : int
-        Place of the vehicle that events are about, and of the one ahead of it, -1 without one.
-    columns : tuple of Column
-        The facts that records keep.
-    n_uniforms : int
-        How many uniforms the beginning of a path is made from: what a pool is aimed over.
-    shipped : Path
-        Folder of the parameter files that a name alone stands for.
-    default_parameters : str
-        The one of them where nothing is said.
-    ladders : mapping of bool to str
-        Libraries of surrogates where nothing is said, by whether events show themselves before they happen.
-    follows : bool
-        Whether the AV drives from the start, behind a vehicle that does not look at it: events do not depend on it.
-    stride : int
-        Events of a path between two that a pool asks.
-    pool_error : float
-        Relative standard error of its surrogates' crash rates where nothing is said.
-    fitter : str
-        Its fit to trajectories (`harness.fitting.protocol.Fitter`), ``module:class``; empty without one.
-    crosses : int
-        Place of the vehicle that changes lanes, -1 for none.
-    words, maps, stand_ins
-        What pages say of events, the axes (x, y) of their maps, and who is driven in the AV's place: by name a phrase
-        and the driver, the reference driver first.
-    """
+    """A kind of events, and what most have alike. ``traffic`` is all that its kernels need of its environment."""
 
     name: str
     vehicles: tuple[str, ...]
+    """Names of the vehicles of a cell, the AV last."""
     principal: int
+    """Place of the vehicle that events are about."""
     ahead: int
+    """Place of the one ahead of it, -1 without one."""
     columns: tuple[Column, ...]
+    """The facts that records keep."""
     n_uniforms: int
-
+    """From how many uniforms the beginning of a path is made: what a pool is aimed over."""
     shipped: Path
+    """Folder of the parameter files that a name alone stands for."""
     default_parameters: str
+    """The one of them where nothing is said."""
     ladders: Mapping[bool, str]
+    """Libraries of surrogates where nothing is said, by whether events show themselves before they happen."""
     follows: bool
+    """Whether the AV drives from the start, behind a vehicle that does not look at it: events do not depend on it."""
     stride: int
+    """Events of a path between two that a pool asks."""
     pool_error: float
-
+    """Relative standard error of its surrogates' crash rates where nothing is said."""
     fitter: str
+    """Its fit to trajectories (`harness.fitting.protocol.Fitter`), ``module:class``; empty without one."""
     crosses: int
+    """Place of the vehicle that changes lanes, -1 for none."""
     words: Words
+    """What pages say of events."""
     maps: tuple[tuple[Shown, Shown], ...]
+    """Axes (x, y) of their maps."""
     stand_ins: Mapping[str, tuple[str, Surrogate]]
+    """Who is driven in the AV's place, by name: a phrase and the driver, the reference driver first."""
 
     def parameters(self, settings: EnvironmentSettings) -> Parameters:
         """The numbers that a campaign's environment names.
