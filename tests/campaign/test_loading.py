@@ -316,21 +316,6 @@ def test_a_file_counts_as_the_module_that_it_is(own):
 
 
 @pytest.mark.parametrize(
-    ("entries", "where", "words"),
-    [
-        ("  a: {model: idm, parameters: {min_acceleration: -3}}", "avs.a.parameters.min_acceleration", "Did you mean"),
-        ("  a: {model: idm}\n  b: {model: fvdm, reaction: {delay_s: 0.25}}", "avs.b.reaction.delay_s", "0.1 s step"),
-        ("  {}", "avs", "expected one at least"),
-    ],
-)
-def test_a_mistake_in_a_panel_names_its_place(panel, entries, where, words):
-    file = panel(entries)
-    with pytest.raises(CampaignError, match=words) as caught:
-        load_panel(file)
-    assert caught.value.where.startswith(f"{where} ({file}:")
-
-
-@pytest.mark.parametrize(
     ("av", "override", "said"),
     [
         ("{}:idm", [], r"mine.yaml; expected one of a"),

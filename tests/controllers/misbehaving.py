@@ -171,12 +171,6 @@ class Prints(IDM):
         os.write(1, f"{what}, below Python\n".encode())
 
 
-class PrintsMuch(IDM):
-    def step(self, seen):
-        print(f"{seen.time_s:.1f} s {1000 * 'x'}")  # noqa: T201 - what it is for
-        return super().step(seen)
-
-
 class Global(IDM):
     """Draws from a stream of its own."""
 
@@ -219,17 +213,6 @@ class Learned(IDM):
         self.loaded, self.braking = loaded, braking
         braking.append(0.01)
         self.made.append(self)
-
-
-class RaisesInClose(IDM):
-    def __init__(self, note):
-        super().__init__()
-        self.note = note
-
-    def close(self):
-        with Path(self.note).open("a") as file:
-            file.write("closed\n")
-        raise RuntimeError("cannot be closed")
 
 
 class ChangesItsProcess(IDM):

@@ -149,7 +149,7 @@ def test_what_is_not_the_avs_or_not_possible_is_refused(traci, reason, name, arg
 
 
 def test_an_unknown_name_lists_what_there_is(traci):
-    with pytest.raises(AttributeError, match="has no getCO2Emission here; it has .*getLeader.*setSpeed"):
+    with pytest.raises(AttributeError, match=r"has no getCO2Emission here; it has .*getLeader.*setSpeed"):
         _ = traci.vehicle.getCO2Emission
 
 

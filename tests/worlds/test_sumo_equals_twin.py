@@ -137,9 +137,6 @@ def differences(seen: list[Motion], computed: list[Motion]) -> dict[int, set[str
 FORCED, NDE, STEP = (f"testing.method={name}" for name in ("forced", "nde", "step_mixture"))
 AVS = {
     "late": "{model: idm, reaction: {delay_s: 0.6}}",
-    "smooth": "{model: idm, reaction: {max_jerk_mps3: 5}}",
-    "inattentive": "{model: idm, reaction: {inattention_probability: 0.5, inattention_delay_s: 1.5}}",
-    "never_brakes": "{model: constant}",
     "accelerates": "{model: constant, parameters: {acceleration_mps2: 1.3}}",
     "all_at_once": "{model: fvdm, parameters: {min_acceleration_mps2: -6}, reaction: {delay_s: 0.3, max_jerk_mps3: 7.7,"
     " inattention_probability: 0.3, inattention_delay_s: 0.9}}",
@@ -174,7 +171,6 @@ JOBS = {
     **METHODS,
     "vanilla": Job(("seed=3",), 250, 1, vanilla=True),
     "vanilla_bv_into_lv": Job((NDE,), 16, 1, vanilla=True, states=HOPELESS),
-    "late_under_step_mixture": Job((STEP, f"av={AVS['late']}"), 60, 16),
     **{name: Job((FORCED, f"av={av}"), EPISODES, 32) for name, av in AVS.items()},
     # Cut-ins that take time; before some that take long the AV has passed BV.
     "seen": Job((FORCED, LATERAL, "av={model: idm}"), 300, 32),
@@ -235,7 +231,7 @@ def test_among_cut_ins_that_take_time_are_side_contacts_and_vehicles_that_have_p
     assert np.unique(seen["lead_steps"]).size >= 20
 
 
-@pytest.mark.parametrize(("vehicle", "toward"), [(LV, 0.0), (BV, 0.0), (BV, 100.0), (AV, 100.0)])
+@pytest.mark.parametrize(("vehicle", "toward"), [(BV, 0.0), (AV, 100.0)])
 def test_one_speed_command_off_by_one_unit_in_the_last_place_is_found(vehicle, toward, recordings):
     class PerturbedTwin(TwinWorld):
         steps = 0
@@ -250,18 +246,6 @@ def test_one_speed_command_off_by_one_unit_in_the_last_place_is_found(vehicle, t
     found = differences(recordings["mixture"][0], motions_computed(perturbed))
     assert list(found) == [5]
     assert "v" in found[5]
-
-
-def test_a_crash_flagged_a_step_late_is_found(recordings, twins):
-    motions = list(recordings["mixture"][0])
-    row = next(row for row, motion in enumerate(motions) if motion.contact.any())
-    motions[row] = motions[row]._replace(contact=np.zeros_like(motions[row].contact))
-    assert differences(motions, motions_computed(twins["mixture"])) == {row: {"contact"}}
-
-
-def test_another_delay_would_be_found(recordings):
-    other = run_episodes(Job((FORCED, "av={model: idm, reaction: {delay_s: 0.5}}"), EPISODES, 32), TwinWorld(48))
-    assert len(differences(recordings["late"][0], motions_computed(other))) >= 100
 
 
 # -- one step of SUMO, for any two speeds, is next_position to the last bit: standstill included --
