@@ -61,27 +61,6 @@ def test_a_dead_time_is_found_and_the_shell_holds_nearly_all_crashes_beyond_the_
     assert design.p[shell] + design.p[outside] == pytest.approx(beyond)
 
 
-def test_where_a_table_without_the_dead_time_says_otherwise_the_vehicle_does_as_it_was_learned(late):
-    """That is the sibling which the retraced tests have ruled out."""
-    ready, loop, runs, tests = late
-    learned = learned_from(tests, runs)
-    paths, environment = ready.baseline_paths, ready.resolved.environment
-    asked = np.zeros((len(paths), int(environment.numbers["max_steps"])), np.bool_)
-    row, step = ready.prescribed._kept.row, ready.prescribed._kept.step
-    asked[row, step] = True
-
-    def crashes(one):
-        family = ready.resolved.family
-        return family.learned_crashes(environment, paths.seed, paths.paths, one, runs, asked, 0.0)[row, step]
-
-    own, other = crashes(learned), crashes(learned._replace(dead_steps=0))
-    rows = np.flatnonzero(own != other)
-    shard = loop.run(0, ready.prescribed.of_rows(rows, np.zeros(rows.size, np.int64)))
-    crashed = shard.episode["outcome"] == CRASH
-    assert rows.size > 100
-    assert (crashed == own[rows]).mean() > 0.9
-
-
 def test_pilot_tests_are_not_counted_and_fail_like_others(late):
     ready, _, runs, tests = late
     assert tests.num_rows == pytest.approx(ready.campaign.pool.pilot_tests, abs=20)
@@ -100,10 +79,3 @@ def test_a_vehicle_that_crashes_only_where_surrogates_do_has_the_pool_that_it_ha
     ready.begin_after(runs, everywhere)
     assert ready.design.pool != former
     assert LEARNED in ready.design.strata
-
-
-def test_without_pilot_tests_and_within_a_statement_nothing_is_learned():
-    ready, *_ = prepared_after(acting("Speeds", "pool.pilot_tests=0"))
-    assert ready.pilot() is None
-    ready.campaign = acting("Speeds", "testing.shells.statement=library")
-    assert (ready.campaign.pool.pilot_tests, ready.pilot()) == (300, None)

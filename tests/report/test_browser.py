@@ -131,38 +131,6 @@ def test_the_slider_shows_each_step_as_it_was_and_to_scale(opened, replayed):
             assert place["AV"][1] - y == pytest.approx((1.0 - over) * 3.6 * pixels, abs=0.02)
 
 
-def test_a_report_changes_between_crashes(opened, report):
-    page, scenes = opened(report), scenes_in(report.read_text())
-    assert page.locator(".pick button").all_text_contents() == [str(scene["episode"]) for scene in scenes]
-    assert page.inner_text(".player h3") == scenes[0]["title"]
-    page.locator(".pick button").nth(1).click()
-    assert page.inner_text(".player h3") == scenes[1]["title"]
-    page.locator("#worst summary").last.click()  # the table is folded
-    page.locator("a[data-scene='0']").click()
-    assert page.inner_text(".player h3") == scenes[0]["title"]
-    assert page.locator(".told dt").all_text_contents() == [name for name, _ in scenes[0]["facts"]]
-    page.keyboard.press("End")
-    assert page.locator(".go").is_visible()
-
-
-def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
-    file = write_comparison(copy_of(compared, tmp_path / "out"))
-    page, scene = opened(file, 400, "dark"), scenes_in(file.read_text())[0]
-    assert page.evaluate("document.documentElement.scrollWidth") <= 400
-    for step, hit in ((scene["event"], False), (scene["tracks"][2]["crash"], True)):
-        page.fill(".bar input", str(step))
-        for name, track in (("B", scene["tracks"][2]), ("A", scene["ghosts"][0])):
-            assert cell(page, name, "speed, m/s") == f"{track['v'][step - scene['first']]:.1f}"
-        assert page.locator(".star").is_visible() == hit
-    begin = seconds(page)
-    assert page.locator(".car.dashed").is_visible()
-    page.click(".go")
-    page.clock.run_for(1000)
-    assert seconds(page) > begin
-    page.locator(".pick button").last.click()
-    assert "Only A crashes" in page.inner_text(".player h3")
-
-
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(
     width, scheme, browser, report, replayed, crashing, compared, tmp_path
@@ -183,19 +151,3 @@ def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         page.close()
     context.close()
-
-
-def test_the_policy_lets_no_other_script_run(browser, report):
-    page = browser.new_page()
-    page.goto(report.as_uri())
-    blocked = page.evaluate(
-        """new Promise((found) => {
-            document.addEventListener("securitypolicyviolation", (event) => found(event.effectiveDirective));
-            const script = document.createElement("script");
-            script.textContent = "window.ran = true";
-            document.body.append(script);
-        })"""
-    )
-    assert blocked.startswith("script-src")
-    assert page.evaluate("window.ran") is None
-    page.close()

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from functools import partial
-
 import pytest
 
 from harness.cli import main
 from harness.errors import RunFolderError
 from harness.records.folder import read_manifest, require_place, sole_use
-from harness.resolved import resolve
-from harness.runner.kept import require_own_folder
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import run_here
 from tests.stored_runs import copy_of, edit, golden, manifest, part_files, sets, truncate, unlike_columns, unnoted
@@ -137,21 +132,6 @@ def test_what_is_not_as_it_was_left(damage, commands, said, stored, complaint_of
         complaint = complaint_of(name, stored, *more)
         assert str(stored) in complaint
         assert said in complaint
-
-
-def test_a_manifest_cut_anywhere_is_named_and_nothing_is_touched(stored):
-    """Nothing of it is taken for the whole: neither read nor gone on with."""
-    path, resolved = stored / "manifest.json", resolve(golden(NAME))
-    content, files = path.read_bytes(), sorted(stored.rglob("*"))
-    for n in (*range(0, len(content) - len(b"}\n"), 211), len(content) - len(b"}\n")):
-        path.write_bytes(content[:n])
-        for read in (read_manifest, partial(require_own_folder, resolved=resolved, resume=True)):
-            with pytest.raises(RunFolderError) as raised:
-                read(stored)
-            assert raised.value.where == str(path)
-    path.write_bytes(content.rstrip())
-    assert require_own_folder(stored, resolved, resume=True)["n_episodes"] == json.loads(content)["n_episodes"]
-    assert sorted(stored.rglob("*")) == files
 
 
 def test_values_that_no_run_has_written_are_refused(stored):

@@ -11,7 +11,6 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.resolved import require_ready, resolve
-from harness.runner.run import run_campaign
 from harness.runner.stored import replay_episode
 from harness.sampling import prepare
 from harness.sampling.baseline import as_recorded, baseline_requests, run_baseline
@@ -19,6 +18,7 @@ from harness.vocabulary import AV, BV, CRASH, FAILED, LV
 from harness.worlds import build_world, sumo_driven
 from harness.worlds.program import TraciWorld, own_addresses, require_neighbour
 from harness.worlds.sumo_driven import SumoAvWorld, recyclable
+from tests.in_process import run_here
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 from tests.stored_runs import manifest
 from tests.worlds.misbehaving_client import FAULT_STEP
@@ -193,7 +193,7 @@ def test_a_command_that_cannot_be_started_is_an_error_of_the_campaign():
 
 def test_a_run_says_that_it_is_not_reproducible_and_is_not_replayed(tmp_path):
     folder = tmp_path / "run"
-    run_campaign(campaign(program(EXAMPLE), episodes=4), folder, workers=1)
+    run_here(campaign(program(EXAMPLE), episodes=4), folder)
     assert manifest(folder)["reproducible"] is False
     with pytest.raises(CampaignError, match="not reproducible"):
         replay_episode(folder, 0)

@@ -148,7 +148,7 @@ LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
 OUTRUNS = (
     "av={model: constant, parameters: {acceleration_mps2: 5}, reaction: {perceives_lateral_m: 0}, takes_over: onset}"
 )
-EPISODES = 150
+EPISODES = 100
 """Of each driver."""
 HOPELESS = np.array(
     [
@@ -161,20 +161,20 @@ HOPELESS = np.array(
 """Starts from which no braking of BV can avoid LV, which it runs into before AV is past."""
 PUBLISHED = (STEP, "testing.challenge=immediate", TWO, "av.parameters.min_acceleration_mps2=-1", "seed=7")
 METHODS = {
-    "mixture": Job((), 800, 64),
-    "forced_without_shim": Job((FORCED,), 400, 64, shim=False),
+    "mixture": Job((), 600, 64),
+    "forced_without_shim": Job((FORCED,), 250, 64, shim=False),
     "forced_drawn_in_every_step": Job((FORCED, "environment.acceleration_hold_s=0.1", "seed=5"), 64, 64),
     "published": Job(PUBLISHED, 200, 32),
     "bv_into_lv": Job((NDE,), 16, 5, states=HOPELESS),
 }
 JOBS = {
     **METHODS,
-    "vanilla": Job(("seed=3",), 250, 1, vanilla=True),
+    "vanilla": Job(("seed=3",), 150, 1, vanilla=True),
     "vanilla_bv_into_lv": Job((NDE,), 16, 1, vanilla=True, states=HOPELESS),
     **{name: Job((FORCED, f"av={av}"), EPISODES, 32) for name, av in AVS.items()},
     # Cut-ins that take time; before some that take long the AV has passed BV.
-    "seen": Job((FORCED, LATERAL, "av={model: idm}"), 300, 32),
-    "seen_by_a_reference": Job((FORCED, LATERAL, "av={model: r157-cc}"), 300, 32),
+    "seen": Job((FORCED, LATERAL, "av={model: idm}"), 200, 32),
+    "seen_by_a_reference": Job((FORCED, LATERAL, "av={model: r157-cc}"), 200, 32),
     "overtaken": Job((FORCED, "environment.cut_in_lead_s=4", OUTRUNS), 300, 32),
 }
 
@@ -214,9 +214,8 @@ def test_the_episodes_compared_are_many_and_of_every_kind(twins):
     assert (~cut_in).sum() >= 10
     assert (exact["outcome"] == CONTACT).sum() >= 10
     vanilla = twins["vanilla"].episode
-    assert vanilla.size >= 200
-    assert (vanilla["outcome"] == CRASH).sum() >= 50
-    assert ((vanilla["event_step"] >= 0) & (vanilla["outcome"] != CRASH)).sum() >= 50
+    assert (vanilla["outcome"] == CRASH).sum() >= 30
+    assert ((vanilla["event_step"] >= 0) & (vanilla["outcome"] != CRASH)).sum() >= 30
     speeds = [trace[..., 1] for name in ("mixture", "vanilla") for trace in twins[name].traces.values()]
     assert any(((v[1:] == 0.0) & (v[:-1] > 0.0)).any() for v in speeds), "somebody brakes to a standstill"
     assert any(((v[1:] > 0.0) & (v[:-1] == 0.0)).any() for v in speeds), "somebody drives off"
