@@ -49,6 +49,14 @@ def test_check_prints_a_campaign_file(capsys, tmp_path):
     assert output["stop"] == {**output["stop"], "rhw": 0.3, "episodes": 400_000}
 
 
+@pytest.mark.parametrize("asked", ["lead_brake", "cut_in,lead_brake"])
+def test_an_unknown_scenario_is_an_error_of_the_option(asked, capsys):
+    assert main(["run", "idm", "--scenario", asked]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"error: --scenario {asked}\n  found:    'lead_brake'\n")
+    assert "Did you mean 'lead_brakes'?" in err
+
+
 def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     command = ["run", *CAMPAIGN, "--out", str(folder), "--workers", "1", "--resume"]
     assert main(command) == 0

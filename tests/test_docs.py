@@ -117,4 +117,4 @@ def test_the_notebook_runs(stored_run, tmp_path, monkeypatch):
 
 def test_generated_parts_are_current():
     stale = [page for page in generate.pages() if generate.regenerate(text := page.read_text("utf-8")) != text]
-    assert stale == [], "run: python docs/generate.py"
+    assert stale == [], "run: python -m docs.generate"

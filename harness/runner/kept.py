@@ -28,7 +28,6 @@ from harness.estimators.block import Block
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
-    PILOT,
     SHADOW,
     SHELLS,
     TABLES,
@@ -45,7 +44,7 @@ from harness.records.folder import (
 )
 from harness.records.origin import signature
 from harness.records.schemas import ShardTables
-from harness.records.shown import ShownTests
+from harness.records.shown import ShownTests, by_kind
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult
 from harness.sampling.baseline import BaselineResult
@@ -56,8 +55,6 @@ SMALLEST_FAILED_SAMPLE = 200
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
 _INTERVAL_S, _SHARE = 5.0, 0.05
 """Time between two writes, and the share of the time that they may take."""
-COUNTED = {SHADOW: "shadow_runs", PILOT: "pilot_tests"}
-"""Keys of how many there were of what comes before tests."""
 PART_TESTS, PART_ROWS = 50_000, 2_000_000
 """Tests, or rows of all tables, from which on they go on in other files: so many are kept in memory."""
 
@@ -173,7 +170,7 @@ class Run:
         return run if run.is_behind else run.written_if_due()
 
     def with_baseline(self, name: str, result: BaselineResult) -> Run:
-        """The next baseline runs or pilot tests, written as tests are."""
+        """The next baseline runs, or tests of milder events, written as tests are."""
         before = {**self.before, name: (*self.before.get(name, ()), result.table)}
         return replace(self, before=before).written_if_due()
 
@@ -242,7 +239,7 @@ class Run:
             "n_episodes": self.n_episodes,
             "parts": self.parts,
             "before": self.parts_before,
-            **{COUNTED[name]: _counted(tables) for name, tables in self.before.items() if name in COUNTED},
+            **({"shadow_runs": _counted(self.before[SHADOW])} if SHADOW in self.before else {}),
         }
 
 
@@ -296,7 +293,7 @@ def require_few_failed(
 ) -> None:
     """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
     if causes.total() > (most := campaign.run.max_failed_share) * n:
-        cause = "".join(f", {n_such} of them with: {why}" for why, n_such in causes.most_common(1))
+        cause = "".join(f", {n_such} of them with: {why}" for why, n_such in by_kind(causes).most_common(1))
         unbound = "Add --set av.traci_style.decel_mps2=4.5 --set av.traci_style.accel_mps2=2.6 (SUMO's own). "
         raise TooManyFailedError(
             "run.max_failed_share",

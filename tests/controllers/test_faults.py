@@ -11,6 +11,7 @@ from benchmarks.kills import orphans
 from harness.cli import main
 from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.processes import PRINTED
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
 from tests.stored_runs import sets, stored_table
@@ -254,8 +255,16 @@ def test_what_a_controller_prints_does_not_reach_stdout(tmp_path, capfd):
     assert _main("run --json", tmp_path, _of("Prints")) == EXIT_DONE
     printed = capfd.readouterr()
     json.loads(printed.out)
-    assert "made, in Python" in printed.err
-    assert "made, below Python" in printed.err
+    text, told = (tmp_path / "run" / PRINTED).read_text(), printed.err.splitlines()[-2:]
+    assert told[0].startswith(
+        f"{len(text.splitlines()):,} lines printed by the vehicle"
+    )  # of which the terminal shows one
+    assert told[1] == f"  the first: {text.splitlines()[0]}"
+    assert "made, in Python" in text
+    assert "made, below Python" in text
+    assert _main("run --json", tmp_path, _of("Prints")) == EXIT_BAD_INPUT  # nothing is run into a folder that is there
+    assert "made, in Python" in capfd.readouterr().err
+    assert (tmp_path / "run" / PRINTED).read_text() == text
     assert main(["replay", str(tmp_path / "run"), "3", "--json"]) == EXIT_DONE
     printed = capfd.readouterr()
     assert json.loads(printed.out)["bit_equal"] is True

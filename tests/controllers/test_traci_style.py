@@ -5,10 +5,9 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
-from harness.controllers import traci_facade, traci_vehicle
+from harness.controllers import traci_vehicle
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_facade import Traci
-from harness.controllers.traci_style import TraciStyleController
+from harness.controllers.traci_style import Traci, TraciStyleController
 
 
 def seen(time_s=0.0, speed=20.0, *lateral, bv_lane=0, lead_speed=20.0):
@@ -174,5 +173,5 @@ def test_before_the_first_step_what_moves_is_not_known_and_all_else_is():
     vehicle.subscribe("AV")
     assert (vehicle.getMaxSpeed("AV"), vehicle.getLength("BV"), vehicle.getLaneIndex("LV")) == (31.0, 5.0, 1)
     for name in ("getSpeed", "getAcceleration", "getPosition", "getLeader"):
-        with pytest.raises(traci_facade.TraCIException, match="not known before the first step"):
+        with pytest.raises(traci_vehicle.TraCIException, match="not known before the first step"):
             getattr(vehicle, name)("AV")

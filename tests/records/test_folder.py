@@ -20,7 +20,7 @@ import pytest
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
 from harness.records.folder import write_json, write_part, write_together
-from harness.records.reader import read, table_sizes
+from harness.records.reader import read
 from harness.records.schemas import ShardTables
 from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
@@ -139,8 +139,7 @@ def told(folder: Path) -> str:
     page, run = read_run_folder(folder), read(folder)
     summary = {name: repr(value) for name, value in vars(summarise(page)).items()}
     tables = [hashes(run.table(name)) for name in TABLES]
-    sizes = table_sizes(page.manifest["parts"])
-    return repr((tables, estimate_run(folder), page.estimates, page.campaign, sizes, summary))
+    return repr((tables, estimate_run(folder), page.estimates, page.campaign, summary))
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import harness
 from harness.errors import RunFolderError
 from harness.families.cut_in.family import CUT_IN, STATE_FACTS
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
+from harness.records.shown import by_kind
 from harness.vocabulary import AV
 from tests.in_process import run_here
 from tests.stored_runs import copy_of, edit, golden, manifest, stored_table
@@ -138,3 +139,9 @@ def test_what_is_not_there_is_one_error(stored_run, tmp_path):
         run.episodes(["nothing"])
     with pytest.raises(RunFolderError, match="no run folder"):
         harness.read(folder / "episodes").episodes()
+
+
+def test_causes_of_failures_that_differ_in_numbers_alone_are_one_but_not_those_of_other_lines():
+    asked = "step: asked for {} m/s2, outside of av.limits (-15 to 10)"
+    causes = {asked.format("-99"): 1, asked.format("1e+30"): 2, "step: no (a.py:12)": 1, "step: no (a.py:40)": 1}
+    assert by_kind(causes) == {asked.format("1e+30"): 3, "step: no (a.py:12)": 1, "step: no (a.py:40)": 1}

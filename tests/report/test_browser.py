@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 import harness
+from harness.fitting.files import fit_files
 from harness.report.compare_page import write_comparison
 from harness.report.page import write_report
+from tests.fitting.trajectories import overtaking
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of
 
@@ -135,13 +137,15 @@ def test_the_slider_shows_each_step_as_it_was_and_to_scale(opened, replayed):
 def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(
     width, scheme, browser, report, replayed, crashing, compared, tmp_path
 ):
-    """Of one page of each kind: of runs, of a comparison, of one test."""
+    """Of one page of each kind: of runs, of a comparison, of one test, of a fit."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="it brings axe-core").Axe()
     context = browser.new_context(
         viewport={"width": width, "height": 844}, color_scheme=scheme, bypass_csp=True, offline=True
     )
     other, pair = copy_of(crashing["cut_out"], tmp_path / "run"), copy_of(compared, tmp_path / "pair")
-    for file in (report, replayed, write_report(other), write_comparison(pair)):
+    overtaking(2.0).to_parquet(tmp_path / "rows.parquet", index=False)
+    fit_files([tmp_path / "rows.parquet"], tmp_path / "mine.yaml", n_replicates=2)
+    for file in (report, replayed, write_report(other), write_comparison(pair), tmp_path / "mine.html"):
         page = context.new_page()
         page.goto(file.as_uri())
         page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -14,7 +12,6 @@ from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
 from harness.sampling.baseline import run_baseline
-from harness.sampling.shells import Shells
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.conftest import SHELLS
@@ -77,26 +74,6 @@ class Driven:
         return run_baseline(loop, paths, resolved, request)
 
 
-AS_NEEDED = "av.controller=examples.acting:CarefulAsNeeded"
-
-
-@pytest.mark.slow
-def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_is_stored(tmp_path):
-    """Ended among the pilot tests and going on: the same bits."""
-    campaign, out, other = golden(ACTS, AS_NEEDED), tmp_path / "run", tmp_path / "other"
-    run_golden(campaign, out)
-    assert "learned" in json.loads((out / "shells.json").read_text())["strata"]
-    assert "pilot tests" in Shells.stored_design(out).learned
-    [pilot] = (out / "pilot").glob("*.parquet")
-    assert pq.read_table(pilot).num_rows == manifest(out)["pilot_tests"]["n_runs"] >= 300
-    learned = [row for row in stored_table(out, "episodes").to_pylist() if row["outcome"] == "crash"]
-    assert replay(out, learned[-1]["episode"]).bit_equal
-    assert estimate(out)["estimates"]["shells"]["crash_rate"] == estimates(out)["estimates"]["shells"]["crash_rate"]
-    with_fewer_before(copy_of(out, other), "pilot", 200)
-    run_golden(campaign, other, resume=True)
-    assert unlike_columns(out, other) == []
-
-
 NOISY = "parameters: {noise_mps2: 0.2}"
 
 
@@ -108,7 +85,7 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
     asked = (*method, SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
         run_here(campaign(*asked, f"av={of('FreshNoise', NOISY)}"), tmp_path / "fresh")
-    kept = [*(tmp_path / "fresh").glob("pilot/*.parquet"), *(tmp_path / "fresh").glob("episodes/*.parquet")]
+    kept = (tmp_path / "fresh").glob("episodes/*.parquet")
     assert {outcome for file in kept for outcome in pq.read_table(file).column("outcome").to_pylist()} == {"failed"}
     seeded = run_here(campaign(*asked, f"av={of('Speeds', NOISY)}"), tmp_path / "seeded").folder
     assert manifest(seeded)["repeated"]["differing"] == []
