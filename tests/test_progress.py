@@ -64,7 +64,6 @@ def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeyp
         (n.share(1e-7, least=1e-3), "< 0.1 %"),
         (n.half_width(842.79), "> 10"),
         (n.duration(3720.0), "1 h 02 min"),
-        (n.size(1_500_000), "1.5 MB"),
     ],
 )
 def test_numbers_are_written_with_few_digits_and_never_more_than_there_are(written, text):
