@@ -171,6 +171,12 @@ class Prints(IDM):
         os.write(1, f"{what}, below Python\n".encode())
 
 
+class PrintsMuch(IDM):
+    def step(self, seen):
+        print(f"{seen.time_s:.1f} s {1000 * 'x'}")  # noqa: T201 - what it is for
+        return super().step(seen)
+
+
 class Global(IDM):
     """Draws from a stream of its own."""
 

@@ -256,19 +256,28 @@ def test_what_a_controller_prints_does_not_reach_stdout(tmp_path, capfd):
     printed = capfd.readouterr()
     json.loads(printed.out)
     text, told = (tmp_path / "run" / PRINTED).read_text(), printed.err.splitlines()[-2:]
-    assert told[0].startswith(
-        f"{len(text.splitlines()):,} lines printed by the vehicle"
-    )  # of which the terminal shows one
-    assert told[1] == f"  the first: {text.splitlines()[0]}"
-    assert "made, in Python" in text
-    assert "made, below Python" in text
+    assert told[0].startswith(f"{len(text.splitlines()):,} lines printed by the vehicle")
+    assert told[1] == f"  the first: {text.splitlines()[0]}"  # of some hundred lines the terminal shows one
     assert _main("run --json", tmp_path, _of("Prints")) == EXIT_BAD_INPUT  # nothing is run into a folder that is there
     assert "made, in Python" in capfd.readouterr().err
     assert (tmp_path / "run" / PRINTED).read_text() == text
+    assert "made, in Python" in text
+    assert "made, below Python" in text
     assert main(["replay", str(tmp_path / "run"), "3", "--json"]) == EXIT_DONE
     printed = capfd.readouterr()
     assert json.loads(printed.out)["bit_equal"] is True
     assert "started, below Python" in printed.err
+
+
+@pytest.mark.slow
+def test_of_much_that_is_printed_the_first_and_the_last_are_passed_on(tmp_path, capfd):
+    assert _run(tmp_path, _of("PrintsMuch"), "stop.episodes=100") == EXIT_DONE
+    assert len(capfd.readouterr().err) < 1_000
+    printed = (tmp_path / "run" / PRINTED).read_text()
+    assert re.search(r"^\[\d\d[\d,]+ bytes more that a worker has printed\]$", printed, re.MULTILINE)
+    assert 2 * 65_536 < len(printed) < 9 * 65_536
+    assert re.match(r"[-\d.]+ s x", printed)
+    assert printed.endswith("x\n")
 
 
 @pytest.mark.parametrize("field", ["cell", "lv_speed_mps", "episodes"])

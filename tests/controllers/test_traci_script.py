@@ -21,8 +21,8 @@ from tests.worlds.running import drive, motion
 
 SCRIPTS = Path(__file__).parent / "scripts"
 NAMES = {
-    "plain.py", "main_guard.py", "options.py", "with_main.py:main", "listener.py", "subscriptions.py", "around.py",
-    "connection.py", "from_imports.py", "remembers.py", "several/several.py",
+    "plain.py", "main_guard.py", "options.py", "with_class.py", "with_main.py:main", "listener.py", "subscriptions.py",
+    "around.py", "connection.py", "from_imports.py", "remembers.py", "several/several.py",
 }  # fmt: skip
 
 

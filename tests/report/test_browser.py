@@ -10,7 +10,7 @@ import pytest
 import harness
 from harness.fitting.files import fit_files
 from harness.report.compare_page import write_comparison
-from harness.report.page import write_report
+from harness.report.page import write_hours, write_report
 from tests.fitting.trajectories import overtaking
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of
@@ -133,19 +133,74 @@ def test_the_slider_shows_each_step_as_it_was_and_to_scale(opened, replayed):
             assert place["AV"][1] - y == pytest.approx((1.0 - over) * 3.6 * pixels, abs=0.02)
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(
-    width, scheme, browser, report, replayed, crashing, compared, tmp_path
-):
-    """Of one page of each kind: of runs, of a comparison, of one test, of a fit."""
+def test_a_report_changes_between_crashes(opened, report):
+    page, scenes = opened(report), scenes_in(report.read_text())
+    assert page.locator(".pick button").all_text_contents() == [str(scene["episode"]) for scene in scenes]
+    assert page.inner_text(".player h3") == scenes[0]["title"]
+    page.locator(".pick button").nth(1).click()
+    assert page.inner_text(".player h3") == scenes[1]["title"]
+    page.locator("#worst summary").last.click()  # the table is folded
+    page.locator("a[data-scene='0']").click()
+    assert page.inner_text(".player h3") == scenes[0]["title"]
+    assert page.locator(".told dt").all_text_contents() == [name for name, _ in scenes[0]["facts"]]
+    page.keyboard.press("End")
+    assert page.locator(".go").is_visible()
+
+
+def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
+    file = write_comparison(copy_of(compared, tmp_path / "out"))
+    page, scene = opened(file, 400, "dark"), scenes_in(file.read_text())[0]
+    assert page.evaluate("document.documentElement.scrollWidth") <= 400
+    for step, hit in ((scene["event"], False), (scene["tracks"][2]["crash"], True)):
+        page.fill(".bar input", str(step))
+        for name, track in (("B", scene["tracks"][2]), ("A", scene["ghosts"][0])):
+            assert cell(page, name, "speed, m/s") == f"{track['v'][step - scene['first']]:.1f}"
+        assert page.locator(".star").is_visible() == hit
+    begin = seconds(page)
+    assert page.locator(".car.dashed").is_visible()
+    page.click(".go")
+    page.clock.run_for(1000)
+    assert seconds(page) > begin
+    page.locator(".pick button").last.click()
+    assert "Only A crashes" in page.inner_text(".player h3")
+
+
+@pytest.fixture(scope="module")
+def pages(report, replayed, crashing, compared, tmp_path_factory) -> list[Path]:
+    """One of each kind: a run's in each scenario, of a comparison, of one test; without a player of a sum, of a fit."""
+    place = tmp_path_factory.mktemp("pages")
+    runs = [write_report(copy_of(crashing[name], place / name)) for name in ("lead_brakes", "cut_out")]
+    with_player = [report, replayed, *runs, write_comparison(copy_of(compared, place / "compared"))]
+    overtaking(2.0).to_parquet(place / "rows.parquet", index=False)
+    fit_files([place / "rows.parquet"], place / "mine.yaml", n_replicates=2)
+    return [*with_player, hours_page(place), place / "mine.html"]
+
+
+def hours_page(place: Path) -> Path:
+    """The page of a sum, of figures made up."""
+    exposure = {"per_hour": 0.1, "low": 0.02, "high": 0.5, "counted": None, "source": "assumed: no primary rate"}
+    part = {
+        "rate_per_hour": 1.26e-3, "ci_low": 1.19e-3, "ci_high": 1.89e-3, "upper_bound": None, "share": 0.5,
+        "ratio": 34.0, "n_episodes": 100, "n_crashes": 10, "median_impact_mps": 7.0, "exposure": exposure,
+    }  # fmt: skip
+    beside = {"ratio": 15.0, "ratio_low": 14.0, "ratio_high": 22.0, "over_assumed": [4.4, 27.0], "reference": "r157-cc"}
+    content = {
+        "vehicle": "idm", "name": "r157", "n_episodes": 300, "n_crashes": 30, "seed": 1, "confidence": 0.9,
+        "per_hour": {"rate": 1.27e-3, "ci_low": 1.2e-3, "ci_high": 1.9e-3, "upper_bound": None, "rhw": 0.3},
+        "per_1e6_km": 11.3, "beside": beside, "decision": None, "stopped_by": "rhw", "asked_rhw": 0.3,
+        "counts_in_interval": False, "readings": [beside], "milder": {},
+        "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
+    }  # fmt: skip
+    return write_hours(place, content)
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark"), (390, "light")])
+def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(width, scheme, browser, pages):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="it brings axe-core").Axe()
     context = browser.new_context(
         viewport={"width": width, "height": 844}, color_scheme=scheme, bypass_csp=True, offline=True
     )
-    other, pair = copy_of(crashing["cut_out"], tmp_path / "run"), copy_of(compared, tmp_path / "pair")
-    overtaking(2.0).to_parquet(tmp_path / "rows.parquet", index=False)
-    fit_files([tmp_path / "rows.parquet"], tmp_path / "mine.yaml", n_replicates=2)
-    for file in (report, replayed, write_report(other), write_comparison(pair), tmp_path / "mine.html"):
+    for file in pages:
         page = context.new_page()
         page.goto(file.as_uri())
         page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
@@ -155,3 +210,41 @@ def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         page.close()
     context.close()
+
+
+def test_a_phone_shows_all_columns_of_the_player_and_cars_that_can_be_seen(opened, pages):
+    for file in pages[:-2]:
+        page = opened(file, 390)
+        table = page.locator(".now").first
+        assert table.locator("thead th:visible").count() == 6
+        assert table.evaluate("(e) => e.scrollWidth <= e.parentElement.clientWidth")
+        assert float(page.locator(".car .body").first.get_attribute("width")) >= 20.0
+
+
+def test_on_paper_it_is_light_and_without_what_only_a_screen_can_do(opened, pages):
+    for file in pages:
+        page = opened(file, 1280, "dark")
+        page.emulate_media(media="print", color_scheme="dark")
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+        for name in (".bar", ".jumps", "details:not([open]) summary"):
+            assert page.locator(f"{name}:visible").count() == 0
+        page.set_viewport_size({"width": 688, "height": 900})  # A4 within its margins
+        page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+        wide = "[...document.querySelectorAll('table, svg, pre')].map((e) => [e.scrollWidth, e.textContent])"
+        assert [each for each in page.evaluate(wide) if each[0] > 688] == []
+
+
+def test_the_policy_lets_no_other_script_run(browser, report):
+    page = browser.new_page()
+    page.goto(report.as_uri())
+    blocked = page.evaluate(
+        """new Promise((found) => {
+            document.addEventListener("securitypolicyviolation", (event) => found(event.effectiveDirective));
+            const script = document.createElement("script");
+            script.textContent = "window.ran = true";
+            document.body.append(script);
+        })"""
+    )
+    assert blocked.startswith("script-src")
+    assert page.evaluate("window.ran") is None
+    page.close()
