@@ -40,7 +40,7 @@ WORLD_SOURCES = (
 """Files that decide what happens in a test, but for `NO_SOURCES`; pools and tables are made again when one changes."""
 NO_SOURCES = "words.py", "fitting", "fitting.py"
 """Files and folders of families that change no test."""
-KERNEL_SOURCES = (*WORLD_SOURCES, "pool/learned.py", "estimators/likelihood.py")
+KERNEL_SOURCES = (*WORLD_SOURCES, "estimators/likelihood.py")
 """All files that compiled code may come from, or take constants from (a test holds this against the imports)."""
 
 

@@ -18,8 +18,6 @@ OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
 ASSUMPTION_FREE, LIBRARY_STATEMENT = "assumption_free", "library"
 """What is asked about: the rate without an assumption, or that of a vehicle that crashes only inside the boundary."""
-LEARNED = "learned"
-"""Name of the stratum outside on which a surrogate that was learned from the vehicle crashes."""
 FAILED_BASELINE = "failed shadow runs"
 """Name of a stratum that cannot be tested: events on paths on which the vehicle failed before one could come."""
 
@@ -83,7 +81,7 @@ class ShellDesign:
     stratum; empty if that is no limit.
 
     With ``shadow_runs`` the paths are the few that the vehicle has walked itself, chosen from so many ``candidates``
-    (else 0); ``learned`` says how that surrogate was learned, empty if there is none.
+    (else 0).
     """
 
     pool: str
@@ -104,7 +102,6 @@ class ShellDesign:
     available: tuple[int, ...] = ()
     shadow_runs: bool = False
     candidates: int = 0
-    learned: str = ""
 
     @cached_property
     def p(self) -> FloatArray:

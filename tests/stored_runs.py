@@ -76,7 +76,7 @@ def answer_in(folder: Path) -> dict[str, Any]:
 
 
 def with_fewer_before(folder: Path, name: str, n: int) -> None:
-    """Let a run have been ended after so many baseline runs, or pilot tests, and before any test."""
+    """Let a run have been ended after so many baseline runs and before any test."""
     for table in ("episodes", "traces"):
         shutil.rmtree(folder / table)
     before = read_manifest(folder)["before"]

@@ -156,7 +156,7 @@ class Campaign(Section):
         to a smaller RHW or with other resources.
         """
         others = {} if self.scenario == DEFAULT_FAMILY else {"scenario": self.scenario}
-        unused = set() if self.av.acts_before_event else {"shadow_paths", "pilot_tests"}
+        unused = set() if self.av.acts_before_event else {"shadow_paths"}
         content = others | {
             "crash": self.crash.model_dump(),
             "seed": self.seed,

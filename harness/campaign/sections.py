@@ -205,8 +205,6 @@ class PoolSettings(Section):
     """cut-ins kept of each shell: its most tests"""
     shadow_paths: Whole = Field(500, ge=50, le=100_000)
     """baseline runs of a vehicle that acts before the cut-in"""
-    pilot_tests: Whole = Field(300, ge=0, le=100_000)
-    """its tests that do not count, from which a surrogate is learned; 0: none"""
     seed: Whole = Field(1, ge=0, lt=2**63)
     """of the pool and of baseline runs, which another seed alone leaves as they are"""
 

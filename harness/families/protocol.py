@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pyarrow as pa
@@ -22,9 +22,6 @@ from harness.families.words import Shown, Words
 from harness.loop.cells import Script
 from harness.vehicles.drivers import Followers
 from harness.vocabulary import BoolArray, FloatArray, IntArray, Method, RecordArray
-
-if TYPE_CHECKING:
-    from harness.pool.learned import Learned
 
 Environment: TypeAlias = Any
 """All that a family's kernels need of its traffic; what is in it the family alone knows."""
@@ -295,21 +292,6 @@ class Family(Protocol):
         """Every ``stride``-th event of paths, from each one's ``offset`` (n,) on, and which drivers crash on it.
 
         The AV keeps its speed until the event, or did what is ``recorded``; drivers take over from it after the onset.
-        """
-
-    def learned_crashes(
-        self,
-        traffic: Environment,
-        seed: int,
-        paths: Paths,
-        learned: Learned,
-        runs: Recorded,
-        asked: BoolArray,
-        counts_above_mps: float,
-    ) -> BoolArray:
-        """On which events ``asked`` (n, E) a surrogate crashes that was ``learned`` from a vehicle that acts early.
-
-        ``runs`` are its baseline runs on the paths (n,); impacts (m/s) up to some speed are no crashes.
         """
 
     def choose(self, traffic: Environment, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:

@@ -51,7 +51,7 @@ def campaign_pool_key(resolved: Resolved, order: Sequence[str] = ()) -> str:
         {name: model.model_dump() for name, model in library.surrogates.items()},
         [(name, model.model_dump()) for name, model in library.references.items()],
         [library.boundary, library.envelope],
-        resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths", "pilot_tests"}),
+        resolved.campaign.pool.model_dump(exclude={"library", "shadow_paths"}),
         resolved.campaign.crash.counts_above_mps,
         *order,
     ]
@@ -161,14 +161,12 @@ def pool_of(
     library: Library,
     settings: PoolSettings,
     key: str,
-    more: Sequence[str] = (),
 ) -> Pool:
     """Sort the events of paths into shells, by surrogates in this order, and cells; keep a sample of each shell.
 
-    ``seed`` is that of the paths; without an order surrogates are put into that of their rates. ``more`` are surrogates
-    that come after those of the library.
+    ``seed`` is that of the paths; without an order surrogates are put into that of their rates.
     """
-    names, n_references = np.array([*library.surrogates, *more]), len(library.references)
+    names, n_references = np.array(list(library.surrogates)), len(library.references)
     n_surrogates = names.size
     rates, mass = paths.rates(n_surrogates), paths.mass
     order = conservative_first(rates) if order is None else order

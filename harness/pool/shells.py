@@ -10,7 +10,6 @@ even the full-throttle envelope crashes is left out, with crash probability 0, i
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,14 +21,12 @@ from harness.loop.cells import PrescribedEvents
 from harness.loop.repeat import Traffic
 from harness.pool.kept import Pool
 from harness.resolved import Resolved
-from harness.strata import FAILED_BASELINE, LEARNED, OUTSIDE, Reference, ShellDesign
+from harness.strata import FAILED_BASELINE, OUTSIDE, Reference, ShellDesign
 from harness.vocabulary import FloatArray, Int8Array, IntArray
 
 CANDIDATES = 32_768
 """Paths of an AV that holds its speed, of which baseline runs are chosen: they cost milliseconds each, and save two of
 three runs."""
-PILOT_KEY = 0x70696C6F74
-"""Keeps the choice of pilot tests apart from the order of strata."""
 _REFERENCES = {"r157-cc": "a careful and competent driver", "r157-fsm": "a driver by the fuzzy safety model"}
 """Drivers of UN Regulation No. 157 in plain words."""
 
@@ -82,14 +79,7 @@ def shells_in_strata(pool: Pool, limit_mps2: float) -> list[list[int]]:
     tested = present if limit_mps2 > pool.library.envelope_mps2 else [s for s in present if s < len(pool.names)]
     inside = [[s] for s in tested if s <= boundary]
     outside = [s for s in tested if s > boundary]
-    learned = [s for s in outside if _name(pool, s) == LEARNED]
-    return [*inside, *(group for group in (learned, [s for s in outside if s not in learned]) if group)]
-
-
-def _name(pool: Pool, shell: int) -> str:
-    """Of the stratum that begins with a shell."""
-    beyond = shell > boundary_shell(pool)
-    return pool.names[shell] if not beyond or LEARNED in pool.names[shell : shell + 1] else OUTSIDE
+    return [*inside, outside] if outside else inside
 
 
 def boundary_shell(pool: Pool) -> int:
@@ -106,7 +96,7 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
     p = np.asarray(np.bincount(cells[cells >= 0], pool.cell_p[cells >= 0]), np.float64)
     design = ShellDesign(
         pool=pool.key,
-        strata=tuple(_name(pool, group[0]) for group in groups),
+        strata=tuple(OUTSIDE if s > boundary_shell(pool) else pool.names[s] for s, *_ in groups),
         cell_stratum=tuple(stratum.tolist()),
         cell_p=p,
         cell_references=tuple(references.tolist()),
@@ -170,8 +160,7 @@ class PrescribedEpisodes:
         campaign, self._resolved = resolved.campaign, resolved
         limit = acceleration_limit(campaign.av)
         design, groups = design_shells(pool, limit), shells_in_strata(pool, limit)
-        self._kept, self._shell, self._shell_p = pool.events, pool.shell, pool.shell_p
-        self._n_inside = boundary_shell(pool) + 1
+        self._kept = pool.events
         self._cells = cells_in_strata(pool, groups)[0]
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
         self._order += [np.zeros(0, np.int64)] * (len(design.strata) - len(groups))
@@ -181,19 +170,6 @@ class PrescribedEpisodes:
     def available(self) -> IntArray:
         """How many draws each stratum allows, shape (S,)."""
         return np.array(self.design.available, np.int64)
-
-    def pilot(self, n: int, seed: int) -> Traffic:
-        """Some n events to learn the vehicle from: half of them inside the boundary, half evenly of shells beyond.
-
-        Inside they are drawn by probability.
-        """
-        rng = np.random.Generator(np.random.Philox(key=np.array([seed, PILOT_KEY], np.uint64)))
-        p = self._shell_p
-        shells, inside = np.flatnonzero(p[:-1]), p[: self._n_inside].sum()
-        share = [p[s] / inside if s < self._n_inside else 1.0 / (shells >= self._n_inside).sum() for s in shells]
-        kept = [rng.permutation(np.flatnonzero(self._shell == s)) for s in shells]
-        rows = np.concatenate([of[: math.ceil(0.5 * n * part)] for of, part in zip(kept, share, strict=True)])
-        return self.of_rows(rows, np.zeros(rows.size, np.int64))
 
     def rows(self, draws: tuple[Draw, ...]) -> tuple[IntArray, IntArray]:
         """Rows of the pool's events, and their strata, shape (n,) each; IndexError beyond what a stratum allows."""

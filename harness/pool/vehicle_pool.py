@@ -28,19 +28,15 @@ from harness.loop.judge import motion_hashes
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, contributions
 from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.kept import Pool
-from harness.pool.learned import Learned
-from harness.pool.shells import CANDIDATES, conservative_first, shells_of
+from harness.pool.shells import CANDIDATES, conservative_first
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.resolved import Resolved
-from harness.strata import LEARNED
 from harness.vehicles.library import Library
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 EVENLY = 0.1
 """Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
-LEAST_LEARNED = 0.05
-"""Share of the learned surrogate's crash rate beyond the boundary from which on it has a shell there [assumed]."""
 CHOICE_DRAW = 2
 """Draw of a baseline run within the diagnostic stream."""
 
@@ -146,10 +142,8 @@ def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None
     return candidates.draw(settings.shadow_paths)
 
 
-def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded, learned: Learned | None = None) -> Pool:
+def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded) -> Pool:
     """Pool of the vehicle that was driven along the paths.
-
-    A surrogate that was ``learned`` from it has a shell beyond the boundary, if a share of its crashes lies there.
 
     Raises `HarnessError`: no event was found on which even the envelope crashes.
     """
@@ -164,23 +158,10 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded, learn
         )
         raise HarnessError("baseline runs", none, "some: the crash rate is estimated from them", mend)
     mass = found.probability * paths.weight[:, None]
-    known, more = [paths.key, resolved.content_hash, runs.digest()], list[str]()
-    order, crashes = paths.order, found.crashes
-    if learned is not None:
-        asked = (crashes != 0) & (mass > 0.0)
-        given = environment, paths.seed, paths.paths, learned, runs, asked, followers.counts_above_mps
-        place = order.tolist().index(list(library.surrogates).index(library.boundary)) + 1
-        beyond = shells_of(crashes, order) >= place
-        own = resolved.family.learned_crashes(*given)
-        if mass[own & beyond].sum() > LEAST_LEARNED * mass[own].sum():
-            n, more, known = order.size, [LEARNED], [*known, learned.digest()]
-            of_library = crashes & ((1 << n) - 1)
-            crashes = of_library | ((own & beyond).astype(np.int64) << n) | ((crashes >> n) << (n + 1))
-            order = np.insert(order, place, n)
-    enumerated = EnumeratedPaths(paths.index, paths.start, paths.weight, mass, crashes)
-    key = hashlib.sha256(" ".join(known).encode()).hexdigest()[:24]
-    made_of = environment, library, resolved.campaign.pool, key, more
-    pool = pool_of(resolved.family, enumerated, paths.seed, order, *made_of)
+    enumerated = EnumeratedPaths(paths.index, paths.start, paths.weight, mass, found.crashes)
+    key = hashlib.sha256(" ".join((paths.key, resolved.content_hash, runs.digest())).encode()).hexdigest()[:24]
+    made_of = environment, library, resolved.campaign.pool, key
+    pool = pool_of(resolved.family, enumerated, paths.seed, paths.order, *made_of)
     hashes = motion_hashes(runs.x_m, runs.v_mps)
     row, step, onset = pool.events.row, pool.events.step, pool.events.onset
     # A kept event stands for its like nearby, too, where these are too improbable to be kept one by one.

@@ -35,8 +35,8 @@ SHELLS = "shells.json"
 SENSITIVITY = "sensitivity.json"
 """Strata of a shells campaign, as its estimates need them."""
 TABLES = ("episodes", "moments", "traces")
-SHADOW, PILOT, MILDER = BEFORE = ("shadow", "pilot", "milder")
-"""Tables of what comes before tests that count: baseline runs, which keep their first name, pilots, milder ones."""
+SHADOW, MILDER = BEFORE = ("shadow", "milder")
+"""Tables of what comes before tests that count: baseline runs, which keep their first name, and milder events."""
 MEND_PART = "Delete this file and run again with --resume: the same tests are made anew."
 SEAL = "crc32"
 """Key of a JSON file's checksum."""
@@ -284,7 +284,6 @@ class StoredManifest(Stored):
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
     repeated: Repeated | None = None
-    pilot_tests: dict[str, Count] | None = None
     before: dict[str, Part] = {}
 
 

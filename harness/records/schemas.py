@@ -6,7 +6,7 @@ first, then the surrogates; for the others the surrogates alone. Values are from
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -150,21 +150,6 @@ def baseline_schema(columns: Sequence[Column]) -> pa.Schema:
             _field("av_position_m", _MOTION, "m", "front bumper of the AV, initially and after each step"),
             _field("av_speed_mps", _MOTION, "m/s", "speed of the AV, initially and after each step"),
             _or_null("failure", pa.string(), "", "cause, for failed runs"),
-        ]
-    )
-
-
-def pilot_schema() -> pa.Schema:
-    """Schema of the ``pilot`` table: one row per test from which the vehicle was learned."""
-    who, of_steps = ("av", "bv"), "at first and after each step"
-    return pa.schema(
-        [
-            _field("shadow", _I8, "1", "baseline run that the test repeats"),
-            _field("onset_step", _I2, "0.1 s", "step from which on the vehicle may have seen the cut-in"),
-            _field("outcome", _NAME, "", "crash, timeout, bv_lv_contact or failed"),
-            *(_field(f"{each}_position_m", _MOTION, "m", f"front bumper, {of_steps}") for each in who),
-            *(_field(f"{each}_speed_mps", _MOTION, "m/s", of_steps) for each in who),
-            _or_null("failure", pa.string(), "", "cause, for failed tests"),
         ]
     )
 
@@ -368,32 +353,12 @@ def _came_over(episode: RecordArray, state: np.ndarray, distance_m: float) -> Fl
 
 def baseline_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
     """One row per baseline run of a shard that has kept all motion; ``path``, ``weight`` (n,) as in the schema."""
-    e = shard.episode
+    e, traces = shard.episode, [shard.traces[row] for row in range(shard.episode.size)]
     columns = _driven(shard) | {
         "shadow": shard.first_episode + np.arange(e.size),
         "path": path,
         "weight": weight,
-        **_motion(shard, {"av": -1}),
+        "av_position_m": pa.array([each[:, -1, 0] for each in traces], _MOTION),
+        "av_speed_mps": pa.array([each[:, -1, 1] for each in traces], _MOTION),
     }
     return _table(baseline_schema(shard.scenario.columns), columns, e)
-
-
-def pilot_table(shard: Shard) -> pa.Table:
-    """One row per pilot test of a shard that has kept all motion."""
-    script = shard.traffic.script
-    columns = _driven(shard) | {
-        "shadow": script.announced_index,
-        "onset_step": np.maximum(script.at - script.lead, 0).astype(np.int16),
-        **_motion(shard, {"av": -1, "bv": shard.scenario.principal}),
-    }
-    return _table(pilot_schema(), columns, shard.episode)
-
-
-def _motion(shard: Shard, who: Mapping[str, int]) -> dict[str, pa.Array]:
-    """Positions and speeds of vehicles, by their places, in each test."""
-    traces = [shard.traces[row] for row in range(shard.episode.size)]
-    return {
-        f"{name}_{what}": pa.array([each[:, place, k] for each in traces], _MOTION)
-        for name, place in who.items()
-        for k, what in enumerate(("position_m", "speed_mps"))
-    }

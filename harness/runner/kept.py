@@ -28,7 +28,6 @@ from harness.estimators.block import Block
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
-    PILOT,
     SHADOW,
     SHELLS,
     TABLES,
@@ -56,8 +55,6 @@ SMALLEST_FAILED_SAMPLE = 200
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
 _INTERVAL_S, _SHARE = 5.0, 0.05
 """Time between two writes, and the share of the time that they may take."""
-COUNTED = {SHADOW: "shadow_runs", PILOT: "pilot_tests"}
-"""Keys of how many there were of what comes before tests."""
 PART_TESTS, PART_ROWS = 50_000, 2_000_000
 """Tests, or rows of all tables, from which on they go on in other files: so many are kept in memory."""
 
@@ -173,7 +170,7 @@ class Run:
         return run if run.is_behind else run.written_if_due()
 
     def with_baseline(self, name: str, result: BaselineResult) -> Run:
-        """The next baseline runs or pilot tests, written as tests are."""
+        """The next baseline runs, or tests of milder events, written as tests are."""
         before = {**self.before, name: (*self.before.get(name, ()), result.table)}
         return replace(self, before=before).written_if_due()
 
@@ -242,7 +239,7 @@ class Run:
             "n_episodes": self.n_episodes,
             "parts": self.parts,
             "before": self.parts_before,
-            **{COUNTED[name]: _counted(tables) for name, tables in self.before.items() if name in COUNTED},
+            **({"shadow_runs": _counted(self.before[SHADOW])} if SHADOW in self.before else {}),
         }
 
 

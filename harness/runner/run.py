@@ -37,7 +37,7 @@ from harness.runner.kept import (
 from harness.runner.stored import even
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
-from harness.sampling.baseline import IN_WORDS, begin, prescribed_requests, stored_baseline, stored_table
+from harness.sampling.baseline import IN_WORDS, begin, milder_requests, stored_baseline, stored_table
 from harness.sampling.milder import beyond_scope, milder_of, milder_tests
 from harness.sampling.protocol import Rounds, ShardRequest
 from harness.strata import STORED_DESIGN
@@ -190,7 +190,7 @@ def show(run: Run, shard: ShardResult, rule: Rule, progress: Progress) -> None:
 
 
 def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
-    """Drive the vehicle along all paths without a cut-in, and in pilot tests, if tests follow from some.
+    """Drive the vehicle along all paths without a cut-in, if tests follow from some.
 
     Where there are events too mild to count, it meets a few of them.
     """
@@ -212,7 +212,7 @@ def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
 
     try:
         if mild is not None:
-            driven = drive(MILDER, list(prescribed_requests(mild, MILDER)))
+            driven = drive(MILDER, list(milder_requests(mild)))
             run = run.noting(milder=milder_of(run.resolved, driven))
         if paths is None:
             return run

@@ -31,7 +31,7 @@ from harness.records.schemas import ShardTables, shard_tables
 from harness.resolved import Resolved
 from harness.runner.again import repeat
 from harness.sampling import prepare
-from harness.sampling.baseline import BaselineResult, as_recorded, learned_in, run_baseline
+from harness.sampling.baseline import BaselineResult, as_recorded, run_baseline
 from harness.sampling.protocol import ShardRequest
 from harness.worlds import build_world
 
@@ -128,8 +128,7 @@ class ShardRunner:
             return run_baseline(self._loop, paths, source.resolved, request)
         if paths is not None and not self._begun:
             self._begun = True
-            table = read_table(self._baseline)
-            source.begin_after(as_recorded(table, source.scenario.max_steps), learned_in(table))
+            source.begin_after(as_recorded(read_table(self._baseline), source.scenario.max_steps))
             self._loop = self._loop.beside()
         campaign, shard = source.campaign, source.run(self._loop, request)
         keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0

@@ -1,4 +1,4 @@
-"""Before tests that count: baseline runs, pilot tests that a surrogate is learned from, and tests of milder events.
+"""Before tests that count: baseline runs, and tests of milder events.
 
 A vehicle that acts before the event is driven along each path without one, to know where it is.
 
@@ -8,7 +8,6 @@ random stream. What the vehicle did through the step of the event must be the sa
 
 from __future__ import annotations
 
-import pickle
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,20 +21,17 @@ from harness.errors import RunFolderError
 from harness.families.protocol import Paths, Recorded
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
-from harness.pool.learned import Following, Learned, learn
 from harness.pool.vehicle_pool import BaselinePaths
-from harness.records.folder import MILDER, PILOT, SHADOW, Part, read_kept
-from harness.records.schemas import baseline_table, episodes_table, padded, pilot_table
+from harness.records.folder import MILDER, SHADOW, Part, read_kept
+from harness.records.schemas import baseline_table, episodes_table, padded
 from harness.resolved import Resolved
 from harness.sampling.protocol import ShardRequest, Source
 from harness.vocabulary import FAILED
 
 SHARD_RUNS = 50
 """Baseline runs of one task: half a second of a slow controller."""
-IN_WORDS = {SHADOW: "baseline runs", PILOT: "pilot tests", MILDER: "milder events"}
+IN_WORDS = {SHADOW: "baseline runs", MILDER: "milder events"}
 """Of each table."""
-LEARNED = b"harness.learned"
-"""Key in the metadata of the baseline runs as workers get them."""
 ALL_MOTION = RecordPolicy("all", 0.0)
 
 
@@ -58,11 +54,11 @@ def baseline_requests(n: int) -> Iterator[ShardRequest]:
     return (ShardRequest(index, first, min(SHARD_RUNS, n - first), before=SHADOW) for index, first in firsts)
 
 
-def prescribed_requests(prescribed: Traffic, name: str) -> Iterator[ShardRequest]:
-    """All pilot tests, or those of milder events, in order."""
+def milder_requests(prescribed: Traffic) -> Iterator[ShardRequest]:
+    """All tests of milder events, in order."""
     for index, first in enumerate(range(0, len(prescribed), SHARD_RUNS)):
         of_rows = prescribed.rows(slice(first, first + SHARD_RUNS))
-        yield ShardRequest(index, first, len(of_rows), before=name, prescribed=of_rows)
+        yield ShardRequest(index, first, len(of_rows), before=MILDER, prescribed=of_rows)
 
 
 def run_baseline(
@@ -71,8 +67,7 @@ def run_baseline(
     """Drive the loop's vehicle along a range of paths, or in prescribed tests."""
     if request.prescribed is not None:
         shard = loop.beside(keep=ALL_MOTION).run(request.first_episode, request.prescribed)
-        seed, is_pilot = resolved.campaign.seed, request.before == PILOT
-        return BaselineResult(request, pilot_table(shard) if is_pilot else episodes_table(shard, seed))
+        return BaselineResult(request, episodes_table(shard, resolved.campaign.seed))
     assert paths is not None
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
     some = Paths(paths.index[rows], paths.start[rows])
@@ -96,10 +91,7 @@ def stored_baseline(
     if paths is None or request.before == MILDER:  # which they are the campaign says
         return BaselineResult(request, table)
     rows = slice(request.first_episode, request.first_episode + request.n_episodes)
-    name, wanted = "path", paths.index[rows]
-    if request.prescribed is not None:
-        name, wanted = "shadow", request.prescribed.script.announced_index
-    if not np.array_equal(table.column(name).to_numpy(), wanted):
+    if not np.array_equal(table.column("path").to_numpy(), paths.index[rows]):
         expected = "those of this campaign and this version of the harness"
         mend = "Use a new folder, or the version that the run was begun with (manifest.json)."
         raise RunFolderError(request.before, "runs on other paths", expected, mend)
@@ -107,23 +99,11 @@ def stored_baseline(
 
 
 def begin(source: Source, drive: Callable[[str, Sequence[ShardRequest]], pa.Table]) -> tuple[pa.Table, Recorded]:
-    """Let a campaign's tests follow from baseline runs and pilot tests, whose tables ``drive`` gives.
-
-    Returns the baseline runs: as workers get them, with what was learned (`learned_in`), and as arrays.
-    """
-    table, learned = drive(SHADOW, list(baseline_requests(len(source.baseline_paths or ())))), None
+    """Let a campaign's tests follow from baseline runs, whose table ``drive`` gives: as it is, and as arrays."""
+    table = drive(SHADOW, list(baseline_requests(len(source.baseline_paths or ()))))
     runs = as_recorded(table, source.scenario.max_steps)
     source.begin_after(runs)
-    if (pilot := source.pilot()) is not None:
-        learned = learned_from(drive(PILOT, list(prescribed_requests(pilot, PILOT))), runs)
-        source.begin_after(runs, learned)
-    return table.replace_schema_metadata({LEARNED: pickle.dumps(learned)}), runs
-
-
-def learned_in(table: pa.Table) -> Learned | None:
-    """What comes with baseline runs; see `begin`."""
-    found: Learned | None = pickle.loads(table.schema.metadata[LEARNED])  # noqa: S301 - our own
-    return found
+    return table, runs
 
 
 def read_stored(
@@ -136,18 +116,6 @@ def read_stored(
         expected = f"all {sum(each.n_episodes for each in requests)}: they say what is tested, and how probable it is"
         raise RunFolderError(str(folder / name), there, expected, "Let `harness run` go on with --resume.")
     return stored
-
-
-def learned_from(table: pa.Table, runs: Recorded) -> Learned | None:
-    """What all pilot tests teach that have not failed; None if those are none."""
-    table = table.filter(pc.is_null(table.column("failure")))
-    if not table.num_rows:
-        return None
-    width = runs.x_m.shape[1]
-    names = "av_position_m", "av_speed_mps", "bv_position_m", "bv_speed_mps"
-    (x_av, last), *others = (padded(table.column(name), width) for name in names)
-    shadow, onset = (table.column(name).to_numpy().astype(np.int64) for name in ("shadow", "onset_step"))
-    return learn(Following(shadow, onset + 1, last - 1, x_av, *(values for values, _ in others)), runs)
 
 
 def as_recorded(table: pa.Table, max_steps: int) -> Recorded:

@@ -28,7 +28,6 @@ from harness.loop.judge import judge
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
 from harness.pool.kept import Pool
-from harness.pool.learned import Learned
 from harness.pool.shells import Draw
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
@@ -119,16 +118,12 @@ class Source:
         """Strata of a stored run."""
         return None
 
-    def begin_after(self, runs: Recorded, learned: Learned | None = None) -> None:  # noqa: ARG002 - there are none
-        """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`; of pilot tests it learned.
+    def begin_after(self, runs: Recorded) -> None:  # noqa: ARG002 - there are none
+        """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`.
 
         Raises `HarnessError`: nothing on these paths can be tested.
         """
         raise ValueError("this campaign has no baseline runs")
-
-    def pilot(self) -> Traffic | None:
-        """Tests that do not count, after baseline runs, from which a surrogate is to be learned; None for none."""
-        return None
 
     def paths(self, first_episode: int, n_episodes: int) -> Paths:
         """Paths of consecutive episodes, (n_episodes,)."""

@@ -9,7 +9,6 @@ boundary are tested until their rate is roughly known; then all.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -26,11 +25,9 @@ from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
 from harness.families.protocol import Recorded
 from harness.loop.loop import EpisodeLoop, Shard
-from harness.loop.repeat import Traffic
 from harness.numbers import plain
 from harness.pool.build import campaign_pool, campaign_pool_key, pool_name
 from harness.pool.kept import Pool
-from harness.pool.learned import Learned
 from harness.pool.shells import Draw, PrescribedEpisodes
 from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_paths, vehicle_pool
 from harness.progress import Progress
@@ -38,7 +35,7 @@ from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
 from harness.sampling.allocation import CONFIDENCE, Allocation
 from harness.sampling.protocol import Rounds, ShardRequest, Source
-from harness.strata import ASSUMPTION_FREE, LEARNED, ShellDesign, StoredDesign
+from harness.strata import ShellDesign, StoredDesign
 from harness.vocabulary import IntArray
 
 MOST_SHARDS_PER_ROUND = 16
@@ -75,17 +72,10 @@ class Shells(Source):
         """Strata of a stored run; a `RunFolderError` where they are missing, damaged, or of a too early version."""
         return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
 
-    def begin_after(self, runs: Recorded, learned: Learned | None = None) -> None:
+    def begin_after(self, runs: Recorded) -> None:
         if self.baseline_paths is None:
             raise ValueError("this campaign has no baseline runs")
-        self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs, learned))
-        if learned is not None and LEARNED in (design := self.prescribed.design).strata:
-            said = f"{learned.n_tests:,} pilot tests, which do not count: {learned.in_words}"
-            self.design = self.prescribed.design = replace(design, learned=said)
-
-    def pilot(self) -> Traffic | None:
-        n, asked = self.campaign.pool.pilot_tests, self.campaign.testing.shells.statement
-        return self.prescribed.pilot(n, self.campaign.seed) if n and asked == ASSUMPTION_FREE else None
+        self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs))
 
     def rounds(self, held: int = 0) -> ShellRounds:
         return ShellRounds(self.campaign, self.prescribed.design, self.prescribed.available, held)

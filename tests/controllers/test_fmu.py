@@ -59,9 +59,7 @@ def check(fmu, tmp_path, text):
     ("text", "where", "found"),
     [
         ("inputs: {speed_mps: y}, output: a", "inputs.speed_mps", "y, no variable of the FMU"),
-        ("inputs: {speed_mps: a}, output: a", "inputs.speed_mps", "a, a Real output"),
         ("inputs: {speed: x}, output: a", "inputs.speed", "no such observation"),
-        ("inputs: {speed_mps: x}, output: x", "output", "x, a Real input"),
         ("inputs: {speed_mps: x}, output: a, start_values: {k: 1.0}", "start_values", "k, no variable"),
     ],
 )
@@ -108,7 +106,6 @@ def test_where_the_disk_is_full_nothing_half_unpacked_stays_and_the_fmu_is_not_b
     ("old", "new", "found"),
     [
         (rb"<CoSimulation[^>]*>", b'<ModelExchange modelIdentifier="Counter"/>', "for FMI 2.0 model exchange"),
-        (rb'fmiVersion="2.0"', b'fmiVersion="7.0"', "7.0"),
         (None, b"nothing", "cannot be read"),
         (None, None, "found no file"),
     ],

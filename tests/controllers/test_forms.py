@@ -26,9 +26,8 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("cells", [32, 7])
-def test_every_form_gives_the_bits_of_the_built_in_model_in_any_number_of_cells(form, cells):
-    assert motion(FORMS[form], cells=cells) == motion("av={model: idm}")
+def test_every_form_gives_the_bits_of_the_built_in_model_in_other_cells(form):
+    assert motion(FORMS[form], cells=7) == motion("av={model: idm}")
 
 
 def test_over_arrays_it_knows_too_what_to_do_while_nobody_is_ahead():

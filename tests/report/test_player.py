@@ -20,7 +20,7 @@ from harness.report.player import UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
 from harness.resolved import resolve
 from tests.in_process import run_here
-from tests.stored_runs import copy_of, edit, golden, stored_table
+from tests.stored_runs import copy_of, golden, stored_table
 
 OTHER_VEHICLES = {"r157-cc": "{model: r157-cc}", "brakes-8": "{model: idm, parameters: {min_acceleration_mps2: -8}}"}
 KINDS = ("shells-twin", "shells-lateral-sumo", "forced-lateral-twin", "shells-acting-twin", "forced-krauss", "nde-twin")
@@ -160,19 +160,6 @@ def test_a_report_shows_crashes_with_those_who_avoid_them(stored_run, tmp_path):
         assert scene == json.loads(json.dumps(again, default=np.ndarray.tolist))
 
 
-def test_without_the_runs_traffic_its_vehicles_are_played_alone(stored_run, tmp_path):
-    folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
-    for name in ("manifest.json", "estimates.json"):
-        edit(folder, name, campaign_hash="0" * 16)
-    scenes = scenes_in(write_report(folder).read_text(encoding="utf-8"))
-    assert scenes
-    assert not any(scene["ghosts"] for scene in scenes)
-    rows, _ = crashes.crash_gallery(
-        run := read_run_folder(folder), summarise(run), traffic_of(run.campaign, run.manifest)
-    )
-    assert {row.avoided_by for row in rows} == {"–"}
-
-
 def test_replay_says_what_happens_and_writes_the_page(stored_run, tmp_path, capsys):
     folder, file = stored_run("forced-lateral-sumo"), tmp_path / "crash.html"
     episode = crashed(folder)[0]
@@ -188,12 +175,6 @@ def test_replay_says_what_happens_and_writes_the_page(stored_run, tmp_path, caps
     assert f"{row['event_gap_m']:.1f} m ahead and {-row['event_rate_mps']:.1f} m/s slower" in told["BV enters the lane"]
     assert f"{row['onset_gap_m']:.1f} m ahead" in told["BV comes over"]
     assert scenes_in(file.read_text(encoding="utf-8"))[0]["episode"] == episode
-
-
-def test_a_crash_that_was_not_traced_is_listed_without_a_scene(reports):
-    page = (reports["failed"] / "report.html").read_text(encoding="utf-8")
-    assert "<script" not in page
-    assert "nothing to watch" in page
 
 
 @pytest.mark.parametrize(

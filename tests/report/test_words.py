@@ -7,16 +7,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from harness.campaign.files import load_campaign
 from harness.estimators.answer import estimate_blocks
 from harness.records.folder import read_manifest
-from harness.report.lines import LINES, WIDTH, lines, pair_lines
-from harness.report.pair_words import deciding_words, pair_words
+from harness.report.lines import LINES, WIDTH, lines
 from harness.report.rows import width_row
 from harness.report.summary import read_run_folder
-from harness.report.words import answer_of, short_answer, vehicle_words
+from harness.report.words import answer_of, short_answer
 from harness.runner.stored import stored_blocks
-from tests.golden.campaigns import BASE, RUNS
+from tests.golden.campaigns import RUNS
 from tests.stored_runs import answer_in, estimates, golden
 
 SAID = {
@@ -109,22 +107,6 @@ def test_much_to_warn_of_leaves_room_for_the_rate(stored_run):
     assert "  ! 3 more warnings: see the report" in text
     assert sum(line.count("a") for line in text if set(line) <= set("  !a")) == 120  # nothing is cut off
     assert max(map(len, text)) <= WIDTH
-
-
-@pytest.mark.parametrize(
-    ("av", "name", "parameters"),
-    [
-        ("av={controller: 'm:C', parameters: {hard: 8, soft: {a: 1}}}", "m:C", [("hard", "8"), ("soft.a", "1")]),
-        ("av.controller=my_av.py:MyAV", "my_av.py:MyAV", []),
-        ("av={fmu: {file: x/brake.fmu, inputs: {s: speed_mps}, output: a}}", "brake.fmu", []),
-        ("av={traci: {command: './my_av --port {port}'}}", "TraCI client my_av", []),
-        ("av={sumo: {tau: 1}}", "SUMO’s Krauss", [("tau", "1")]),
-        ("av.parameters.min_acceleration_mps2=-8", "idm", [("min_acceleration_mps2", "−8")]),
-    ],
-)
-def test_vehicles_are_named_with_what_is_not_a_default(av, name, parameters):
-    campaign = load_campaign(BASE, ["testing.method=forced", av], check_files=False)
-    assert vehicle_words(campaign.av) == (name, parameters)
 
 
 @pytest.mark.parametrize(
@@ -232,65 +214,6 @@ def test_only_what_the_hardest_brakes_do_not_avoid_is_called_unavoidable(driver,
     assert ("unavoidable" in [row.key for row in severe(stored_run, driver=driver).rows]) == told
 
 
-def test_a_comparison_is_as_short():
-    """With what makes it long: names, far limits, warnings, a margin."""
-    side = {"crash_rate": 1.4e-7, "ci_low": 1e-10, "ci_high": 2e-7, "n_crashes": 93, "upper_bound": 1e-6}
-    side |= {"warnings": [{"key": "w" * 120}] * 2, "details": {"n_failed": 0}}
-    inside = {
-        "ratio": 138.0, "ratio_low": 0.1, "ratio_high": None, "difference": -2e-7, "ci_low": -3e-7, "ci_high": -1e-7,
-        "n_only_a": 31, "n_only_b": 1000, "boundary": "brakes-2-late-1s",
-    }  # fmt: skip
-    content = {
-        **inside, "conditional": inside, "a": side, "b": {**side, "n_crashes": 0}, "n_pairs": 1234, "confidence": 0.9,
-        "campaigns": {"a": {"label": "a" * 40}, "b": {"label": "b c " * 20}},
-        "decision": {"verdict": "open", "margin": 0.1}, "ended": "rhw",
-        "to_decide": {"pairs": 7000, "settings": {"stop.episodes": 7000}, "new_folder": False},
-        "asked": "library",
-    }  # fmt: skip
-    text = pair_lines(content, 2.0, "runs/ab/report.html", 0.01)
-    assert len(text) - sum(line.startswith("    ") for line in text) <= LINES
-    assert max(map(len, text)) <= WIDTH
-    assert text[0].startswith("Open whether B is more than 10 % worse than A · 1,234 pairs of tests")
-    assert text[0].endswith(" · crashes above 2 m/s per test")
-    shown = "\n".join(text)
-    assert "1.00 × 10⁻¹⁰ to 2.00 × 10⁻⁷" in shown
-    for said in (
-        "0.10 to no limit", "no crash seen", "only where brakes-2-late-1s of", "stopped: precise enough",
-        "crashes of A alone 31, B 1,000",
-        "with --margin 0.1 --set stop.episodes=7000: some 5,800 more pairs, 58.0 s",
-    ):  # fmt: skip
-        assert said in " ".join(shown.split())
-
-
-NEW_FOLDER = {"pairs": 1000, "settings": {}, "new_folder": True}
-
-
-@pytest.mark.parametrize(
-    ("verdict", "needed", "said"),
-    [
-        ("proven", None, None),
-        ("open", None, "too alike"),
-        ("open", NEW_FOLDER, "--margin 0 and a new --out: some 1,000"),
-    ],
-)
-def test_what_would_decide(verdict, needed, said):
-    told = deciding_words({"decision": {"verdict": verdict, "margin": 0.0}, "to_decide": needed, "n_pairs": 900})
-    assert told is None if said is None else said in told
-
-
-@pytest.mark.parametrize(
-    ("verdict", "sign", "margin"),
-    [
-        ("proven", "B crashes less often than A", "B is at most 10 % worse than A"),
-        ("refuted", "B crashes more often than A", "B is more than 10 % worse than A"),
-        ("open", "Not told apart", "Open whether B is more than 10 % worse than A"),
-    ],
-)
-def test_the_verdict_of_a_comparison(verdict, sign, margin):
-    told = [pair_words({"margin": of, "verdict": verdict}) for of in (0.0, 0.1)]
-    assert told == [sign, margin]
-
-
 @pytest.mark.parametrize(("name", "untested"), [("shells-inside", True), ("shells-twin", False)])
 def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, untested, stored_run):
     content = estimates(stored_run(name))
@@ -302,11 +225,3 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
     assert rate["remark"].endswith(" per million km")
     assert not rows["ratio"]["value"].startswith("≥")
     assert (rows["unavoidable"]["what"] == "unavoidable so far") == untested
-
-
-def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time(stored_run):
-    for name, shows, warned in (
-        ("forced-krauss", True, True), ("forced-krauss", False, False), ("forced-twin", True, False)
-    ):  # fmt: skip
-        answer = said(read_run_folder(stored_run(name)), manifest={"events_show": shows})
-        assert any("cannot see the other car (BV)" in each for each in answer.warnings) == warned

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 
 import numpy as np
@@ -16,7 +15,6 @@ from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
 from harness.report.page import write_report
 from harness.sampling.baseline import run_baseline
-from harness.sampling.shells import Shells
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.conftest import SHELLS
@@ -80,26 +78,6 @@ class Driven:
         return run_baseline(loop, paths, resolved, request)
 
 
-AS_NEEDED = "av.controller=examples.acting:CarefulAsNeeded"
-
-
-@pytest.mark.slow
-def test_a_vehicle_that_was_learned_goes_on_is_estimated_and_replayed_from_what_is_stored(tmp_path):
-    """Ended among the pilot tests and going on: the same bits."""
-    campaign, out, other = golden(ACTS, AS_NEEDED), tmp_path / "run", tmp_path / "other"
-    run_golden(campaign, out)
-    assert "learned" in json.loads((out / "shells.json").read_text())["strata"]
-    assert "pilot tests" in Shells.stored_design(out).learned
-    [pilot] = (out / "pilot").glob("*.parquet")
-    assert pq.read_table(pilot).num_rows == manifest(out)["pilot_tests"]["n_runs"] >= 300
-    learned = [row for row in stored_table(out, "episodes").to_pylist() if row["outcome"] == "crash"]
-    assert replay(out, learned[-1]["episode"]).bit_equal
-    assert estimate(out)["estimates"]["shells"]["crash_rate"] == estimates(out)["estimates"]["shells"]["crash_rate"]
-    with_fewer_before(copy_of(out, other), "pilot", 200)
-    run_golden(campaign, other, resume=True)
-    assert unlike_columns(out, other) == []
-
-
 NOISY = "parameters: {noise_mps2: 0.2}"
 
 
@@ -111,7 +89,7 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
     asked = (*method, SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
         run_here(campaign(*asked, f"av={of('FreshNoise', NOISY)}"), tmp_path / "fresh")
-    kept = [*(tmp_path / "fresh").glob("pilot/*.parquet"), *(tmp_path / "fresh").glob("episodes/*.parquet")]
+    kept = (tmp_path / "fresh").glob("episodes/*.parquet")
     assert {outcome for file in kept for outcome in pq.read_table(file).column("outcome").to_pylist()} == {"failed"}
     seeded = run_here(campaign(*asked, f"av={of('Speeds', NOISY)}"), tmp_path / "seeded").folder
     assert manifest(seeded)["repeated"]["differing"] == []
@@ -122,7 +100,7 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
 @pytest.mark.slow
 def test_a_vehicle_that_acts_is_tested_in_the_default_traffic(campaign, run_here, tmp_path):
     """Cut-ins take time there, in baseline runs and in tests that follow from them."""
-    traffic = "environment.parameters=ndd-overtaking-2", "stop.episodes=80", "pool.pilot_tests=0"
+    traffic = "environment.parameters=ndd-overtaking-2", "stop.episodes=80"
     folder = run_here(campaign(*SHELLS, SHADOWS, TWIN, *traffic, f"av={of('Yields')}"), tmp_path / "run").folder
     tests = stored_table(folder, "episodes").to_pandas()
     assert manifest(folder)["events_show"]

@@ -9,12 +9,10 @@ from harness.campaign.campaign import Campaign
 from harness.errors import HarnessError
 from harness.progress import Progress
 from harness.vehicles.library import load_library
-from studies.replication import populations
 from studies.replication.judgement import Subject, judge
 from studies.replication.populations import (
     RATE,
     choose_paths,
-    learn_vehicle,
     of_vehicle,
     preventable_by,
     ratio_to,
@@ -74,27 +72,6 @@ def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one
     np.testing.assert_array_equal(found.crashes(VEHICLE), found.crashes(brakes_3))
     sibling = walk(campaign("tests.controllers.early:Speeds", min_acceleration_mps2=-4.0, noise_mps2=0.5), 64)
     assert not np.array_equal(sibling.crashes(VEHICLE), sibling.crashes(brakes_3))
-
-
-def test_a_vehicle_that_is_learned_has_one_stratum_more_of_the_same_cut_ins(monkeypatch):
-    """It holds nearly all of what crashes beyond the boundaries, and nothing else of the pool changes."""
-    monkeypatch.setattr(populations, "LEARNERS", 1)
-    of = campaign("examples.acting:CarefulAsNeeded")
-    paths = choose_paths(of, 5, 256, Progress(), 1024)
-    population = walk_paths(of, paths, Here(), Progress(), 1, learn_vehicle(of, paths))
-    crashing = population.crash_mass({VEHICLE: 1.0})
-    drawn = []
-    for learned in (None, VEHICLE + 1):
-        division = Division(LIBRARY, population, [crashing], 200, limit_mps2=2.0, shadow_runs=True, learned=learned)
-        drawn += division.of_vehicle(crashing).draw(np.random.default_rng(1))
-    former, split = drawn
-    assert split.design.strata == (*former.design.strata[:-1], "learned", "outside")
-    np.testing.assert_allclose(split.design.p[:-2], former.design.p[:-1])
-    assert split.design.p[-2:].sum() == pytest.approx(former.design.p[-1])
-    crashes = split.crash_mass.mean(0) @ split.design.joined
-    assert crashes.sum() == pytest.approx(former.crash_mass.mean(0).sum())
-    assert crashes[-2] > 4 * crashes[-1]
-    assert crashes[-2] > 0.7 * split.design.p[-2]
 
 
 @pytest.mark.parametrize("name", ["FreshNoise", "Breaks"])

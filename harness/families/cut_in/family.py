@@ -17,7 +17,6 @@ from harness.compiled import unboxed
 from harness.errors import CampaignError
 from harness.families.cut_in.events import FREE_DRAWS_PER_CUT_IN, enumerate_cut_ins, write_maneuvers
 from harness.families.cut_in.laws import Environment, InitialStates
-from harness.families.cut_in.learned import learned_crashes
 from harness.families.cut_in.loading import load_environment, load_parameters, require_sound_laws
 from harness.families.cut_in.parameters import DEFAULT, SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
@@ -87,7 +86,6 @@ class CutIn:
     events = staticmethod(enumerate_cut_ins)
     script = staticmethod(script_of)
     drive = staticmethod(drive_along)
-    learned_crashes = staticmethod(learned_crashes)
 
     def traffic_with(
         self, settings: EnvironmentSettings, parameters: EnvironmentParameters, values: Mapping[str, float]

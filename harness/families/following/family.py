@@ -173,9 +173,6 @@ class FollowingFamily:
         enumerate_events(paths.start, accelerations, stride, first, *known, track, at_onset, unboxed(found))
         return found
 
-    def learned_crashes(self, *_: Any) -> BoolArray:
-        raise NotImplementedError("no vehicle acts before it may: there are no baseline runs")
-
     def choose(
         self,
         traffic: Following,
