@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
+from harness.campaign.sections import PoolSettings
 from harness.families import family_named
-<<<<<<< HEAD
-from harness.families.cut_in.family import CUT_IN
-from harness.pool.aim import NATURALISTIC_SHARE, aimed_points, fit_proposal
-from harness.pool.build import cached_pool, campaign_pool, campaign_pool_key, pool_name
-=======
-from harness.families.cut_in.loading import load_environment, load_parameters
-from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.pool.aim import NATURALISTIC_SHARE, Enumerator, aimed_points, fit_proposal
 from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_name
->>>>>>> h-stat
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
 from harness.resolved import resolve
 from harness.vehicles.library import load_library
@@ -99,8 +92,6 @@ def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside
         prescribed.rows((Draw(0, within.size, 1),))
 
 
-<<<<<<< HEAD
-=======
 @pytest.mark.slow
 def test_how_many_paths_a_pool_has_does_not_depend_on_them(campaign, monkeypatch):
     """One that ends where its paths look alike has the rates of paths that look alike, which are too low."""
@@ -117,7 +108,6 @@ def test_how_many_paths_a_pool_has_does_not_depend_on_them(campaign, monkeypatch
     assert build_pool(resolved, "of equal ones").n_paths == n_paths > 1024
 
 
->>>>>>> h-stat
 def test_weights_of_a_proposal_make_up_for_its_aim():
     rng = np.random.default_rng(SEED)
     u = rng.random((4000, 3))
