@@ -121,12 +121,6 @@ def duration(seconds: float | None) -> str:
     return f"{seconds // 3600:.0f} h {seconds % 3600 // 60:02.0f} min"
 
 
-def size(n_bytes: float) -> str:
-    """``1.2 MB``."""
-    unit = min(int(math.log10(max(n_bytes, 1.0))) // 3, 3)
-    return f"{number(n_bytes / 1000.0**unit, 2 if unit else 3, exponent=0)} {('B', 'kB', 'MB', 'GB')[unit]}"
-
-
 def leaves(content: Any, path: str = "") -> list[tuple[str, Any]]:
     """Leaves of nested mappings as (dotted path, value), in order; none of an empty one."""
     if isinstance(content, dict) and (content or not path):

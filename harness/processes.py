@@ -30,7 +30,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from tempfile import TemporaryFile
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 from weakref import finalize
 
 from harness.cache import SAID
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 CLOSED_PIPE_EXIT_CODE = 76
 """Exit code of a process whose controller has closed its pipe."""
+PRINTED = "printed.txt"
+"""What processes have printed, in a run folder."""
 PRINTED_BYTES = 65_536
 """Of what a process prints first, and of what it prints last, that is passed on."""
 _ATTEMPTS = 3
@@ -71,13 +73,30 @@ class SharedFile:
         self.path = Path(f"/proc/{os.getpid()}/fd/{self._file.fileno()}")
 
 
-class Printed:
-    """What a process prints: its first 64 kB pass on to stderr at once, its last 64 kB in the end, no more of it.
-
-    The process writes to the ``pipe``, which is to be closed here once it has it.
-    """
+class Kept:
+    """What processes have printed: the first and last 64 kB of each, and how many lines in all."""
 
     def __init__(self) -> None:
+        self.text, self.n_lines, self._lock = bytearray(), 0, threading.Lock()
+
+    def add(self, text: bytes, n_lines: int) -> None:
+        """Text of one of them, which stands for so many lines."""
+        with self._lock:
+            self.text += text
+            self.n_lines += n_lines
+
+
+class Printed:
+    """What a process prints: its first 64 kB pass on at once, its last 64 kB in the end, no more of it.
+
+    They go to stderr, or are ``kept``. The process writes to the ``pipe``, which is to be closed here once it has it.
+    """
+
+    kept: ClassVar[Kept | None] = None
+    """By what begins meanwhile."""
+
+    def __init__(self) -> None:
+        self._to_others = _to_stderr if self.kept is None else self.kept.add
         self._read, self.pipe = Pipe(duplex=False)
         self._is_over = threading.Event()
         self._thread = threading.Thread(target=self._pass_on, name="printed", daemon=True)
@@ -96,9 +115,9 @@ class Printed:
             last += rest
             n_lost += max(0, len(last) - PRINTED_BYTES)
             del last[:-PRINTED_BYTES]
-            _to_stderr(first)
+            self._to_others(first, chunk.count(b"\n"))
         self._read.close()
-        _to_stderr(f"\n[{n_lost:,} bytes more that a worker has printed]\n".encode() * bool(n_lost) + last)
+        self._to_others(f"\n[{n_lost:,} bytes more that a worker has printed]\n".encode() * bool(n_lost) + last, 0)
 
     def _next(self) -> bytes:
         """What it has printed since; nothing once all is told."""
@@ -108,7 +127,7 @@ class Printed:
         return os.read(self._read.fileno(), PRINTED_BYTES)
 
 
-def _to_stderr(text: bytes) -> None:
+def _to_stderr(text: bytes, _n_lines: int) -> None:
     with suppress(OSError), open(2, "wb", closefd=False) as stderr:
         stderr.write(text)
 
@@ -129,8 +148,8 @@ class WorkerDeath(NamedTuple):
 class Child:
     """A process that calls ``target(connection, *arguments)``, at the other end of a pipe, where it may `tell`.
 
-    It finds modules where this one does, and runs no script again. It prints to stderr (see `Printed`): stdout is for
-    the harness's results.
+    It finds modules where this one does, and runs no script again. What it prints is no result (see `Printed`): stdout
+    is for the harness's.
     """
 
     def __init__(self, target: Callable[..., None], *arguments: Any) -> None:

@@ -104,7 +104,7 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
     command.
     """
     if campaign.scenarios is not None:
-        mend = f"Write --set scenarios=null --set scenario={campaign.scenarios[0]}, or `harness run`, which does all."
+        mend = f"Write --scenario {campaign.scenarios[0]}, or `harness run`, which does all."
         raise CampaignError("scenarios", ", ".join(campaign.scenarios), "one scenario", mend)
     family = family_named(campaign.scenario)
     parameters = family.parameters(campaign.environment)

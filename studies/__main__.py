@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 _ME = "python -m studies"
 _out_option = click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; may be new.")
-_BESIDE = ("ndd-overtaking-1", "ndd-overtaking-2")
 _workers_option = click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
 
 
@@ -320,46 +319,6 @@ def roundtrip(folder: Path, *, hours: Sequence[float], n: int, n_replicates: int
     write_json(folder / "roundtrip.json", rounded(found))
     for words, rows in table(found).items():
         print_table(words, rows)
-
-
-@cli.command(
-    short_help="Put environments beside the motorway trajectories of the package tasi.",
-    epilog=examples(
-        f"pip install tasi==0.15.4 && {_ME} motorway --out runs/motorway",
-        f"{_ME} motorway --out runs/motorway -e my-traffic.yaml",
-    ),
-    context_settings={"show_default": True},
-)
-@_out_option
-@click.option("-e", "--environment", "environments", multiple=True, default=_BESIDE, help="Shipped name, or a file.")
-def motorway(folder: Path, *, environments: Sequence[str]) -> None:
-    """Say in what traffic on a German motorway agrees with environments, and in what it does not.
-
-    The data (DLR Highway Traffic: five minutes of the A39) come with the optional package tasi, and are read there:
-    their licence, CC BY-NC-SA, lets nobody ship them. The folder receives motorway.md, and trajectories.parquet for
-    `harness fit --mirror`.
-    """
-    from harness.campaign.sections import EnvironmentSettings  # noqa: PLC0415 - keeps --help fast
-    from harness.families.cut_in.fitting.laws import Traffic  # noqa: PLC0415
-    from harness.families.cut_in.fitting.observations import Tally, observe  # noqa: PLC0415
-    from harness.families.cut_in.loading import load_environment  # noqa: PLC0415
-    from harness.fitting.table import load_mapping, recordings  # noqa: PLC0415
-    from harness.records.folder import write_bytes  # noqa: PLC0415
-    from studies.motorway import figures, installed_rows, page, trajectories_of  # noqa: PLC0415
-    from studies.trajectories import write  # noqa: PLC0415
-
-    laws = {Path(each).stem: load_environment(EnvironmentSettings(parameters=each)) for each in environments}
-    rows = installed_rows()
-    folder.mkdir(parents=True, exist_ok=True)
-    write(trajectories_of(rows), table := folder / "trajectories.parquet")
-    sides = {}
-    for side in ("left", "right"):
-        seen = list(map(observe, recordings([table], load_mapping(mirror=side == "left"))))
-        tally = Tally.of(seen)
-        sides[side] = tally, figures(Traffic.of(seen), laws)
-    written = page(sides)
-    write_bytes(folder / "motorway.md", written.encode())
-    click.echo(written)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import functools
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,11 @@ from scipy import stats
 
 from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
-from harness.errors import TrajectoryError
 from harness.estimators.traffic import ONE_LAW
 from harness.families.cut_in.fitting.fit import fit_traffic, replicates
 from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
 from harness.families.cut_in.fitting.laws import Traffic
-from harness.families.cut_in.fitting.observations import KINDS, observe, require_enough
+from harness.families.cut_in.fitting.observations import KINDS, observe
 from harness.families.cut_in.loading import evaluate_laws, load_environment, load_parameters
 from harness.families.cut_in.parameters import FIXED, EnvironmentParameters
 from harness.families.cut_in.sections import REPLACED
@@ -126,11 +125,10 @@ class Drivers:
     def __init__(self) -> None:
         settings = {"environment.parameters": TRAFFIC.parameters, "environment.lane_change_level": 1.0}
         resolved = resolve(load_campaign("scenarios/smoke.yaml", [f"{key}={value}" for key, value in settings.items()]))
-        library, nobody = resolved.library, Progress()
-        names = [*library.surrogates, *library.references]
+        names = [*resolved.library.surrogates, *resolved.library.references]
         self._bits = [names.index(driver) for driver in DRIVERS]
         here = load_environment(TRAFFIC, truth())
-        self._paths: Enumerator = take_aim(resolved.family, here, library, resolved.campaign.pool, nobody).enumerator
+        self._paths: Enumerator = take_aim(replace(resolved, environment=here), Progress()).enumerator
         self.true = self._of(here)
 
     def rates(self, parameters: EnvironmentParameters) -> FloatArray:
@@ -419,44 +417,6 @@ def check(sets: Sequence[pd.DataFrame], near: Surrogate, drivers: Drivers, n: in
     return {"n": len(off), "root_mean_square": float(np.sqrt(np.square(off).mean())), "most": float(np.abs(off).max())}
 
 
-def _shifted(table: pd.DataFrame, column: str, rows: int) -> pd.DataFrame:
-    moved = table.groupby(["recording_id", "vehicle_id"])[column].shift(rows)
-    return table.assign(**{column: moved}).dropna()
-
-
-FEET = 1.0 / 0.3048
-WRONG: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
-    "all in feet": lambda of: of.assign(**{name: of[name] * FEET for name in ("s_m", "speed_mps", "length_m")}),
-    "positions in feet": lambda of: of.assign(s_m=of.s_m * FEET),
-    "lengths in feet": lambda of: of.assign(length_m=of.length_m * FEET),
-    "speeds in km/h": lambda of: of.assign(speed_mps=of.speed_mps * 3.6),
-    "times in frames": lambda of: of.assign(time_s=(10.0 * of.time_s).round()),
-    "lanes mirrored": lambda of: of.assign(lane=1 - of.lane),
-    "speeds of 0.5 s before": lambda of: _shifted(of, "speed_mps", 5),
-    "lanes of 3 s before": lambda of: _shifted(of, "lane", 30),
-    "positions that fall": lambda of: of.assign(s_m=-of.s_m),
-    "widths for lengths": lambda of: of.assign(length_m=1.9),
-    "front bumpers for centres": lambda of: of.assign(s_m=of.s_m + 0.5 * of.length_m),
-}
-"""Ways in which a table can be misread."""
-
-
-def misread() -> dict[str, str]:
-    """What is said of tables that are read in a wrong way; of front bumpers nothing, where lengths are alike."""
-    table, found = simulate(load_environment(TRAFFIC, truth()), PART_H, SEED, Differences()), dict[str, str]()
-    for name, wrong in WRONG.items():
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, "trajectories.parquet")
-            write(wrong(table), path)
-            try:
-                found_in = list(map(observe, recordings([path], load_mapping())))
-                require_enough(found_in, path.name, load_mapping())
-                found[name] = "not noticed"
-            except TrajectoryError as error:
-                found[name] = error.found
-    return found
-
-
 def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: int = 20) -> dict[str, Any]:
     """All of it: the mean law is that of the largest sets."""
     sets = {each: kept_data_sets(folder, each) for each in sorted(hours)}
@@ -469,7 +429,6 @@ def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: i
         "traffic": f"{TRAFFIC.parameters}, ignore_share {IGNORE_SHARE:g}, level {TRAFFIC.lane_change_level:g}",
     }
     of_mean = drivers.rates(parameters_of(mean))
-    found["misread"] = misread()
     found["mean_law_over_environment"] = dict(zip(DRIVERS, (of_mean / drivers.true).tolist(), strict=True))
     for each, of in sets.items():
         found[f"{each:g} vehicle-hours"] = {
@@ -493,9 +452,7 @@ def rounded(content: Any) -> Any:
 
 def table(found: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """What was judged, as tables by their titles."""
-    tables: dict[str, list[dict[str, Any]]] = {
-        "Misread tables": [{"mapping": name, "found": words} for name, words in found["misread"].items()]
-    }
+    tables: dict[str, list[dict[str, Any]]] = {}
     for size, of in found.items():
         if not size.endswith(" vehicle-hours"):
             continue

@@ -39,11 +39,9 @@ def flipped(bit: int):
 @pytest.mark.parametrize(
     "damage",
     [
-        *map(flipped, range(0, 8 * 260, 97)),
+        *map(flipped, range(0, 8 * 260, 497)),
         lambda path: path.write_bytes(b""),
         lambda path: path.write_bytes(path.read_bytes()[:-1]),
-        lambda path: path.write_bytes(path.read_bytes()[:3]),
-        lambda path: path.write_bytes(bytes(300)),
         lambda path: shutil.copy(path.with_name("other"), path),
         lambda path: (path.unlink(), path.mkdir()),
     ],

@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import re
 import signal
 import sys
 from contextlib import suppress
@@ -13,19 +12,15 @@ from unittest.mock import Mock
 
 import click
 import pytest
-from click.testing import CliRunner
 
 from harness.campaign.files import load_campaign
-from harness.cli import cli, main
+from harness.cli import main
 from harness.commands.options import run_folder
 from harness.commands.printing import say
-from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooManyFailedError
-from harness.numbers import interval, words
+from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.progress import Progress
 from harness.report.lines import lines
-from harness.report.notes import note_words
 from harness.report.words import answer_of
-from harness.runner.stored import estimate_run
 from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
@@ -43,13 +38,6 @@ def folder(stored_run, tmp_path):
         yield copy_of(stored_run("shells-refuted"), tmp_path / "an out")
 
 
-def test_help_teaches():
-    for command in ([], *([name] for name in cli.commands)):
-        result = CliRunner().invoke(cli, [*command, "--help"])
-        assert result.exit_code == 0
-        assert "Examples:\n    harness " in result.output
-
-
 def test_check_prints_a_campaign_file(capsys, tmp_path):
     assert main(["check", SMOKE, "--set", "stop.rhw=0.2"]) == 0
     output = capsys.readouterr().out
@@ -59,6 +47,14 @@ def test_check_prints_a_campaign_file(capsys, tmp_path):
     assert main(["check", SMOKE, "--json"]) == 0
     output = json.loads(capsys.readouterr().out)
     assert output["stop"] == {**output["stop"], "rhw": 0.3, "episodes": 400_000}
+
+
+@pytest.mark.parametrize("asked", ["lead_brake", "cut_in,lead_brake"])
+def test_an_unknown_scenario_is_an_error_of_the_option(asked, capsys):
+    assert main(["run", "idm", "--scenario", asked]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"error: --scenario {asked}\n  found:    'lead_brake'\n")
+    assert "Did you mean 'lead_brakes'?" in err
 
 
 def test_run_prints_the_answer_and_where_more_is(folder, capsys):
@@ -84,11 +80,7 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
         ["--nothing"],
         ["pool", SMOKE, "--quite"],
         ["check", SMOKE, "--nothing"],
-        ["estimate", "no-such-folder"],
         ["estimate", ".", "--confidence", "1"],
-        ["replay", ".", "-1"],
-        ["replay", ".", "1", "--out", "trace.txt"],
-        ["replay", ".", "1", "--out", "a.xml", "--out", "b.xml"],
         [],
     ],
 )
@@ -136,13 +128,6 @@ def raising(monkeypatch, tmp_path):
     return call
 
 
-def test_a_run_folder_that_was_not_made_is_not_named(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "my_av.py").write_text("class Mine:\n    def step(self, seen):\n        return 0.0\n")
-    assert main(["run", "my_av.py:Min"]) == 2
-    assert capsys.readouterr().err.startswith("error: av.controller\n")
-
-
 WRONG = "episodes/0.parquet", "half a file", "a whole one", "Delete it."
 
 
@@ -174,9 +159,7 @@ def test_an_interrupted_estimate_has_nothing_to_go_on_with(raising, capsys):
     assert "--resume" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "then", [lambda: Progress().advance(1), lambda: int("x"), Mock(side_effect=RunFolderError(*WRONG))]
-)
+@pytest.mark.parametrize("then", [lambda: Progress().advance(1), Mock(side_effect=RunFolderError(*WRONG))])
 @pytest.mark.parametrize(("number", "code"), [("SIGHUP", 129), ("SIGINT", 130), ("SIGTERM", 143)])
 def test_what_a_signal_ends_has_its_exit_code_whatever_becomes_of_the_interruption(capsys, then, number, code):
     def work():
@@ -215,67 +198,11 @@ def test_an_independent_repetition_meets_another_pool_too(monkeypatch, options, 
     assert (campaign.seed, campaign.pool.seed) == seeds
 
 
-def test_estimate_prints_a_table_and_closes_with_what_was_asked(stored_run, capsys):
-    folder = stored_run("mixture-twin")
-    before, content = sorted(folder.iterdir()), estimate_run(folder, estimators=("mixture_cv", "nde"), confidence=0.95)
-    found, reason = content["estimates"]["mixture_cv"], note_words(content["estimates"]["nde"]["why"])
-    command = ["estimate", str(folder), "-e", "nde", "--confidence", "0.95"]
-    assert main([*command, "-e", "mixture_cv"]) == 0
-    out = capsys.readouterr().out
-    row = next(line for line in out.splitlines() if "mixture_cv *" in line)
-    shown = words(found["crash_rate"], 4), interval(found["ci_low"], found["ci_high"])
-    assert [text for text in shown if text not in row] == []
-    assert [
-        text for text in (f"mixture_cv: {note_words(found['warnings'][0])}", f"nde: {reason}") if text not in out
-    ] == []
-    assert main(command) == EXIT_BAD_INPUT  # these records do not allow it
-    out = capsys.readouterr().out
-    assert out.splitlines()[-1] == f"nde: {reason}"
-    assert "mixture_cv" not in out
-    assert out.count(reason) == 1
-    assert sorted(folder.iterdir()) == before
-
-
-def test_estimate_writes_only_when_asked(folder, capsys):
-    assert main(["estimate", str(folder), "--confidence", "0.5", "--write", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == estimates(folder)
-    assert estimates(folder)["confidence"] == 0.5
-
-
-@pytest.mark.parametrize("name", ["x.html", "x.xml"])
-def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_path, name):
+def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_path):
     (tmp_path / "file").write_text("not a folder")
     never = ZeroDivisionError(), "harness.runner.stored.replay_episode", "replay"
-    assert raising(*never, more=["17", "--out", str(tmp_path / "file" / name)]) == 2
+    assert raising(*never, more=["17", "--out", str(tmp_path / "file" / "x.html")]) == 2
     assert "nothing can be written" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="others have no DISPLAY")
-def test_without_a_desktop_a_replay_names_an_option_that_it_has(stored_run, monkeypatch, capsys):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.setattr("harness.report.sumo_files.sumo_program", lambda *_: "sumo-gui")
-    assert main(["replay", str(stored_run("shells-twin")), "3", "--gui"]) == 2
-    options = {name for each in cli.commands["replay"].params for name in each.opts}
-    assert re.search(r"(--\w+) FILE", capsys.readouterr().err)[1] in options
-
-
-def test_every_command_can_be_quiet(monkeypatch):
-    """And those that show progress ask for it."""
-    for command in cli.commands.values():
-        assert "--quiet" in {name for each in command.params for name in each.opts}
-    shown = Mock(side_effect=ZeroDivisionError)
-    monkeypatch.setattr("harness.progress.shown_progress", shown)
-    for quiet in (True, False):
-        with pytest.raises(ZeroDivisionError):
-            main(["pool", *CAMPAIGN, *["--quiet"] * quiet])
-        assert shown.call_args.kwargs == {"quiet": quiet}
-
-
-def test_pool_prints_what_it_has(capsys):
-    assert main(["pool", *CAMPAIGN, "--json"]) == 0
-    content = json.loads(capsys.readouterr().out)
-    assert main(["pool", *CAMPAIGN]) == 0
-    assert f"boundary: {content['boundary']}" in capsys.readouterr().out.splitlines()
 
 
 def test_schema_prints_what_is_committed(capsys):

@@ -30,7 +30,7 @@ from harness.commands.options import (
     set_option,
     workers_option,
 )
-from harness.commands.printing import answer_lines, print_either, print_json, print_table, say
+from harness.commands.printing import answer_lines, print_either, print_json, print_table, prints_kept_in, say
 from harness.numbers import leaves, words
 from harness.processes import start_server
 
@@ -146,7 +146,7 @@ def run(
     chosen, folder = folder is None, folder or run_folder(campaign.name, resume=resume)
     if campaign.run.executor == "local":
         start_server()
-    with named_if_written(folder, chosen=chosen), progress_bar() as bar:
+    with named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
     from harness.runner.run import RunResult  # noqa: PLC0415 - keeps --help fast
 
@@ -225,8 +225,8 @@ def av_check(
     if as_json:
         print_json(found.to_json())
     else:
-        print_table("Vehicle under test", rows(found))
         say(verdict(found))
+        print_table("Vehicle under test", rows(found))
     ctx.exit(found.exit_code)
 
 
@@ -300,7 +300,7 @@ def compare(
     if chosen := folder is None:
         folder = RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b.removeprefix(f'{a.name}, '))}"
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
-    with named_if_written(folder, chosen=chosen), progress_bar() as bar:
+    with named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
         found = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )

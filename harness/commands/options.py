@@ -78,9 +78,11 @@ quiet_option = click.option(
 
 def of_scenario(text: str) -> list[str]:
     """What ``--scenario`` sets."""
-    from harness.families import R157  # noqa: PLC0415 - keeps --help fast
+    from harness.families import R157, family_named  # noqa: PLC0415 - keeps --help fast
 
     names = R157 if text == "all" else tuple(name.strip() for name in text.split(","))
+    for name in names:
+        family_named(name, f"--scenario {text}")
     if len(names) == 1:
         return [f"scenario={names[0]}", "scenarios=null"]
     return [f"scenarios=[{', '.join(names)}]"]

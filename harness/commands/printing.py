@@ -6,15 +6,17 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 import click
 
 from harness.errors import HarnessError, printable
-from harness.numbers import half_width, interval, share, words
+from harness.numbers import count, half_width, interval, share, words
+from harness.processes import PRINTED, Kept, Printed
 
 if TYPE_CHECKING:
     from harness.campaign.campaign import Campaign
@@ -33,6 +35,25 @@ def say(*lines: object, err: bool = False) -> None:
         click.echo(printable("\n".join(map(str, lines))), err=err)
     except BrokenPipeError:
         go_on_unread(sys.stderr if err else sys.stdout)
+
+
+@contextmanager
+def prints_kept_in(folder: Path) -> Iterator[None]:
+    """Let what is printed in workers be a file of the run folder, and say so; to stderr where nothing was run there."""
+    began, before, Printed.kept = time.time(), Printed.kept, (kept := Kept())
+    try:
+        yield
+    finally:
+        Printed.kept = before
+        with suppress(OSError):  # what ends the command is told first of all
+            manifests = *folder.glob("manifest.json"), *folder.glob("*/manifest.json")
+            if not any(each.stat().st_mtime >= began for each in manifests):
+                os.write(2, kept.text)
+            elif first := kept.text.strip().partition(b"\n")[0].decode(errors="replace"):
+                with (folder / PRINTED).open("ab") as file:
+                    file.write(kept.text)
+                by = f"{count(kept.n_lines)} lines printed by the vehicle (or SUMO)"
+                say(f"{by}: {folder / PRINTED}", f"  the first: {first[:80]}", err=True)
 
 
 def go_on_unread(stream: TextIO) -> None:

@@ -142,10 +142,10 @@ def _estimate_hours(
     content, page = estimate_families(folder, given, confidence, counts=counts), None
     if write:
         from harness.records.folder import write_sealed  # noqa: PLC0415 - keeps --help fast
-        from harness.report.hours_page import write_hours_of  # noqa: PLC0415
+        from harness.report.page import write_hours  # noqa: PLC0415
 
         write_sealed(folder / FAMILIES, content)
-        page = write_hours_of(folder, content)
+        page = write_hours(folder, content)
     print_either(content, hour_lines(content, page, readings=True), as_json=as_json)
 
 

@@ -1,4 +1,4 @@
-"""What stands for ``traci.vehicle`` (see `harness.controllers.traci_facade`): questions and commands.
+"""What stands for ``traci.vehicle`` (see `harness.controllers.traci_style`): questions and commands.
 
 What a script may not do here is refused with the reason.
 """

@@ -88,9 +88,7 @@ class FewPaths:
 
     def _walk(self, environment: Environment) -> OnPaths:
         if self._aimed is None:
-            resolved, nobody = self._resolved, Progress()
-            asked = resolved.family, resolved.environment, resolved.library, resolved.campaign.pool
-            self._aimed = take_aim(*asked, nobody).enumerator
+            self._aimed = take_aim(self._resolved, Progress()).enumerator
         paths = replace(self._aimed, environment=environment).run(PILOT_PATHS, N_PATHS, Progress())
         shell, mass, n_shells = shells_of(paths.crashes, self._order), paths.mass / N_PATHS, self._stratum.size
         flat = np.arange(N_PATHS)[:, None] * n_shells + shell

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +25,6 @@ from harness.processes import made_ahead
 from harness.records.folder import (
     CAMPAIGN,
     SHELLS,
-    TABLES,
     Part,
     concatenated,
     no_episodes,
@@ -99,24 +98,6 @@ def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) 
     ]
     found = [table for table in tables if table.num_rows]
     return concatenated(found, folder) if found else None
-
-
-class TableSize(NamedTuple):
-    """How much of one table a run kept."""
-
-    table: str
-    n_files: int
-    n_rows: int
-    n_bytes: int
-
-
-def table_sizes(parts: Sequence[Part]) -> list[TableSize]:
-    """Files, rows and bytes per table."""
-    kept = {table: [part.files[table] for part in parts if table in part.files] for table in TABLES}
-    return [
-        TableSize(table, len(files), sum(file.n_rows for file in files), sum(file.n_bytes for file in files))
-        for table, files in kept.items()
-    ]
 
 
 @dataclass(frozen=True)

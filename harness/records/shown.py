@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ COLUMNS = (
     "episode", "component", "log_weight", "impact_speed_mps", "crash_time_s", "event_step",
     "event_gap_m", "event_rate_mps",
 )  # fmt: skip
+_NUMBER = re.compile(r"(?<!\.py:)(?<!\d)-?\d[\d.]*(e[-+]?\d+)?")
+"""But for the line of the user's code: other lines are other faults."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,14 @@ def _columns(family: Family, *, sees: bool) -> tuple[list[str], list[str]]:
     numbers = [each.name for each in family.columns if not each.length]
     in_time = [LEAD, "contact"] if sees else []
     return [*COLUMNS, *numbers, *in_time, "outcome"], [*path_columns(family), *in_time[:1], "outcome"]
+
+
+def by_kind(causes: Mapping[str, int]) -> Counter[str]:
+    """How often each kind of failure was: of causes that differ in digits alone the most frequent stands for all."""
+    shown, kinds = dict[str, str](), Counter[str]()
+    for cause, n in sorted(causes.items(), key=lambda item: -item[1]):
+        kinds[shown.setdefault(_NUMBER.sub("0", cause), cause)] += n
+    return kinds
 
 
 def _counted(names: pa.ChunkedArray) -> Counter[str]:

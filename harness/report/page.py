@@ -14,9 +14,9 @@ from harness.estimators.traffic import Sensitivity
 from harness.families import family_named
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
-from harness.records.reader import table_sizes
 from harness.report.crashes import crash_gallery, shown_of
 from harness.report.drawing import Plot
+from harness.report.hour_words import called, decided, exposures, family_rows, milder, reading_rows, scope, sum_rows
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
 from harness.report.templates import write_page
@@ -47,9 +47,9 @@ def write_report(folder: str | Path) -> Path:
 
         return write_comparison(folder)
     if (Path(folder) / FAMILIES).is_file():
-        from harness.report.hours_page import write_hours  # noqa: PLC0415
+        from harness.runner.families import read_families  # noqa: PLC0415
 
-        return write_hours(folder)
+        return write_hours(Path(folder), read_families(Path(folder)))
     return write_page_of(read_run_folder(Path(folder)))
 
 
@@ -62,8 +62,7 @@ def write_page_of(run: RunFolder) -> Path:
     page = write_page(
         folder / "report.html", "report.html.j2",
         run=run, answer=answer, summary=summary, gallery=gallery, scenes=scenes, lateral=lateral_facts(run),
-        sizes=table_sizes(run.manifest["parts"]), figures={plot.name: plot for plot in plots},
-        family=family, words=family.words, shown=shown_of(family),
+        figures={plot.name: plot for plot in plots}, family=family, words=family.words, shown=shown_of(family),
         outcomes=list(zip(OUTCOMES, summary.count, summary.weight, strict=True)),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         warnings=[*answer.warnings, *uncovered(run, summary)], diagnostics=diagnostics(run),
@@ -71,6 +70,18 @@ def write_page_of(run: RunFolder) -> Path:
     )  # fmt: skip
     _write_plots(folder / "plots", plots)
     return page
+
+
+def write_hours(folder: Path, content: dict[str, Any]) -> Path:
+    """Write the page of several scenarios: the sum, each one's part of it, and the way to each one's own page."""
+    rows = list(family_rows(content))
+    sizes = [content["families"][row[0]] for row in rows]
+    return write_page(
+        folder / "report.html", "hours.html.j2",
+        content=content, sums=[*sum_rows(content), *reading_rows(content)], verdict=decided(content),
+        rows=list(zip(rows, sizes, strict=True)),
+        warnings=list(milder(content)), exposures=exposures(content), scope=scope(content), called=called,
+    )  # fmt: skip
 
 
 def where_plot_of(run: RunFolder, summary: RunSummary | None = None) -> Plot | None:

@@ -29,7 +29,7 @@ from harness.families.protocol import Environment
 from harness.records.folder import read_as, read_manifest
 from harness.records.reader import read_campaign, read_traces, traffic_of
 from harness.records.schemas import LEAD
-from harness.records.shown import ShownTests
+from harness.records.shown import ShownTests, by_kind
 from harness.sampling.shells import Shells
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
@@ -162,10 +162,10 @@ class RunSummary:
     """Counts and weights of a run's tests, and the columns of those that plots need.
 
     ``count``, ``weight`` (5,) are episodes and sum of weights per outcome, in the order of `OUTCOMES`; ``causes`` are
-    failed episodes per cause. A weight is what a test adds to the sum that is the estimate: its likelihood ratio or, of
-    tests from shells, p_s/n_s. Failed tests are counted and have no weight. ``rows`` (m,) are ``outcome``, ``weight``
-    and the numbers in those of `ShownTests`, NaN where there is none. ``all_weights_one`` says whether no maneuver was
-    drawn from an importance function: plain naturalistic driving.
+    failed episodes per kind of cause. A weight is what a test adds to the sum that is the estimate: its likelihood
+    ratio or, of tests from shells, p_s/n_s. Failed tests are counted and have no weight. ``rows`` (m,) are ``outcome``,
+    ``weight`` and the numbers in those of `ShownTests`, NaN where there is none. ``all_weights_one`` says whether no
+    maneuver was drawn from an importance function: plain naturalistic driving.
     """
 
     count: FloatArray
@@ -225,7 +225,7 @@ def summarise(run: RunFolder) -> RunSummary:
     weight = left_out + np.bincount(outcome, weights=rows["weight"], minlength=len(OUTCOMES))
     weight[FAILED] = 0.0
     all_one = not rows["log_weight"][outcome != FAILED].any()
-    return RunSummary(count, weight, tests.causes, rows, all_one, run.shells is not None)
+    return RunSummary(count, weight, by_kind(tests.causes), rows, all_one, run.shells is not None)
 
 
 def lateral_facts(run: RunFolder) -> dict[str, Any] | None:

@@ -24,6 +24,7 @@ from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import HourRule
 from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
+from harness.processes import PRINTED
 from harness.progress import Progress
 from harness.records.folder import read_as, read_manifest, require_place, sole_use, write_sealed
 from harness.records.reader import read_campaign
@@ -91,9 +92,9 @@ def run_families(
     impacts = {name: _median_impact(each.estimates) for name, each in results.items()}
     content = finite_json({**asked, **_answer(hour, ready, impacts, campaign.stop.confidence)})
     write_sealed(out / FAMILIES, content)
-    from harness.report.hours_page import write_hours_of  # noqa: PLC0415 - draws
+    from harness.report.page import write_hours  # noqa: PLC0415 - draws
 
-    return Hours(out, content, write_hours_of(out, content), results, code)
+    return Hours(out, content, write_hours(out, content), results, code)
 
 
 def _run(
@@ -250,7 +251,7 @@ def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> No
 def require_no_other(out: Path, names: Sequence[str]) -> None:
     """Refuse (`RunFolderError`) a folder that holds something else than runs of these scenarios."""
     require_place(out)
-    known = {*names, FAMILIES, "report.html"}
+    known = {*names, FAMILIES, PRINTED, "report.html"}
     if out.exists() and (
         other := sorted(each.name for each in out.iterdir() if each.name[0] != "." and each.name not in known)
     ):

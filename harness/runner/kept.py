@@ -44,7 +44,7 @@ from harness.records.folder import (
 )
 from harness.records.origin import signature
 from harness.records.schemas import ShardTables
-from harness.records.shown import ShownTests
+from harness.records.shown import ShownTests, by_kind
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult
 from harness.sampling.baseline import BaselineResult
@@ -293,7 +293,7 @@ def require_few_failed(
 ) -> None:
     """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
     if causes.total() > (most := campaign.run.max_failed_share) * n:
-        cause = "".join(f", {n_such} of them with: {why}" for why, n_such in causes.most_common(1))
+        cause = "".join(f", {n_such} of them with: {why}" for why, n_such in by_kind(causes).most_common(1))
         unbound = "Add --set av.traci_style.decel_mps2=4.5 --set av.traci_style.accel_mps2=2.6 (SUMO's own). "
         raise TooManyFailedError(
             "run.max_failed_share",

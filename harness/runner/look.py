@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from harness.controllers.protocol import BatchObservation
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.loop.loop import EpisodeLoop, Shard
+from harness.records.shown import by_kind
 from harness.resolved import require_world, resolve
 from harness.runner.again import Bits, Tests, bits_of, run_elsewhere
 from harness.sampling import prepare
@@ -179,7 +179,7 @@ def check_av(campaign: Campaign | str | Path, n_episodes: Annotated[int, Field(g
         method=tested.testing.method,
         shows=source.scenario.shows,
         n_episodes=n_episodes,
-        failures=_by_cause(first.failures.values()),
+        failures=dict(by_kind(Counter(first.failures.values()))),
         differing=differing,
         likely_cause=cause,
         clock_read_at=clock_read_at,
@@ -300,12 +300,6 @@ def _first_answers(source: Source, av: AutomatedVehicle, n: int) -> dict[int, fl
     ) as loop:
         failed = loop.run(0, source.tests(0, n)).failures
     return {i: answer for i, answer in answers.noted.items() if i not in failed}
-
-
-def _by_cause(causes: Iterable[str]) -> dict[str, int]:
-    """How often each was; of causes that differ in digits alone the first stands for all."""
-    shown: dict[str, str] = {}
-    return dict(Counter(shown.setdefault(re.sub(r"\d[\d.]*(e[-+]?\d+)?", "0", cause), cause) for cause in causes))
 
 
 def _likely_cause(source: Source, episode: int) -> tuple[Cause | None, Sequence[str]]:

@@ -26,7 +26,7 @@ from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
-from harness.estimators.tally import CrashedTests, Tally, combined
+from harness.estimators.tally import CrashedTests, Tally
 from harness.pool.kept import KeptEvents, Pool
 from harness.pool.shells import boundary_shell, cells_in_strata, design_shells, shells_in_strata, shells_of
 from harness.sampling.allocation import Allocation
@@ -50,7 +50,7 @@ EQUAL_RATE = 0.02
 _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
 """How A and B end: both crash, only A, only B."""
 _STATEMENT = ("testing", "shells", "statement")
-BOUND, PAIRS_ALONE = "shells, upper bound", "shells, variance by pairs alone"
+BOUND = "shells, upper bound"
 result_of, bound_outside = f"{FREE}, {{}}".format, f"{FREE}, upper bound beyond {{}}".format
 """Names of a statement's rows, and of the bound on the crash rate beyond its boundary."""
 
@@ -308,10 +308,6 @@ class ShellCampaign(_Drawn):
         for level in self.levels:
             limits = planner.seen.limits_of(ASSUMPTION_FREE, Level.two_sided(level))
             yield replace(row, result=at_level(level), ci_low=limits.low, ci_high=limits.high)
-        if self.siblings and (runs := (tally := planner.tally).runs) is not None:
-            without = tally._replace(runs=runs._replace(own=np.zeros_like(runs.own)))
-            limits = combined(design.p, without, design.n_independent, Level.two_sided(estimate.confidence))
-            yield replace(row, result=PAIRS_ALONE, ci_low=limits.low, ci_high=limits.high, refused=False)
         found = estimate.details["within"]
         beyond_it = estimate.crash_rate - found["crash_rate"]  # whose error nobody claims to know
         for name, first, rate, error, bound in (

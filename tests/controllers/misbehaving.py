@@ -52,13 +52,6 @@ def hangs_for_good():
     hangs()
 
 
-def copies_the_process():
-    """What is left of it keeps the worker's pipe open."""
-    if os.fork() == 0:
-        hangs()
-    return 0.0
-
-
 def computes_otherwise(word, bits):
     """Sets bits of ``fenv_t``: of the x87's control word, or of MXCSR."""
     libm, modes = ctypes.CDLL("libm.so.6"), (ctypes.c_uint32 * 16)()
@@ -76,14 +69,10 @@ FAULTS = {
     "rounds_down": lambda: 0.0 * ctypes.CDLL("libm.so.6").fesetround(0x400),
     "rounds_up_and_raises": rounds_up_and_raises,
     "flushes_to_zero": lambda: computes_otherwise(7, 0x8040),
-    "traps_division": lambda: computes_otherwise(7, 0x0200),
     "asks_another_traci": lambda: __import__("traci").vehicle.getSpeed("AV"),
     "none": lambda: None,
     "nan": lambda: math.nan,
-    "inf": lambda: math.inf,
-    "string": lambda: "fast",
     "boolean": lambda: True,
-    "shape": lambda: np.zeros(2),
     "impossible": lambda: -99.0,
     "lies": lambda: Lying(-1e6),
     "raises": lambda: raises(ZeroDivisionError("no such thing")),
@@ -91,8 +80,6 @@ FAULTS = {
     "raises_what_is_no_utf_8": lambda: raises(FileNotFoundError("no file \udce9.csv")),
     "exits": lambda: sys.exit(5),
     "interrupts": lambda: raises(KeyboardInterrupt()),
-    "copies_the_process": lambda: 0.0 * os.fork(),
-    "copies_the_process_for_good": copies_the_process,
     "hangs": hangs,
     "hangs_and_swallows": hangs_and_swallows,
     "hangs_for_good": hangs_for_good,
@@ -138,24 +125,13 @@ class StartsPrograms(IDM):
 
 
 class Always(IDM):
-    """Commits its fault in every call of one name; in the constructor, from the n-th on that a process makes."""
+    """Commits its fault in every step, or in the constructor."""
 
-    n_made = 0
-
-    def __init__(self, where, how="ends_the_process", first=1):
+    def __init__(self, where, how="ends_the_process"):
         super().__init__()
-        for name in ("start", "step", "start_batch", "step_batch", "close"):
-            if name == where:
-                setattr(self, name, lambda *_: FAULTS[how]())
-            elif name.endswith("batch") and where.endswith("batch"):
-                setattr(self, name, lambda *_: None)
-        Always.n_made += 1
-        if where == "constructor" and Always.n_made >= first:
+        if where == "constructor":
             FAULTS[how]()
-
-
-def idm_of_a_function() -> IDM:
-    return IDM()
+        self.step = lambda _: FAULTS[how]()
 
 
 def only_a_function(seen, min_acceleration_mps2):
@@ -172,23 +148,10 @@ class RaisesForOtherNames(OnlyStep):
         raise RuntimeError(name)
 
 
-class RaisesForOtherNamesAsAClass(type):
-    def __getattr__(cls, name):
-        raise RuntimeError(name)
-
-
-class OfAClassThatRaises(OnlyStep, metaclass=RaisesForOtherNamesAsAClass): ...
-
-
 class OnlyStepBatch:
     def step_batch(self, seen):
         columns = zip(seen.speed_mps, seen.lead_speed_mps, seen.gap_m, strict=True)
         return [idm_acceleration(*map(float, row)) for row in columns]
-
-
-class Misspelt(IDM):
-    def step(self, seen):
-        return seen.speed
 
 
 def says_nothing():
@@ -256,17 +219,6 @@ class Learned(IDM):
         self.loaded, self.braking = loaded, braking
         braking.append(0.01)
         self.made.append(self)
-
-
-class RaisesInClose(IDM):
-    def __init__(self, note):
-        super().__init__()
-        self.note = note
-
-    def close(self):
-        with Path(self.note).open("a") as file:
-            file.write("closed\n")
-        raise RuntimeError("cannot be closed")
 
 
 class ChangesItsProcess(IDM):

@@ -1,7 +1,6 @@
 """Every recipe of docs/controllers.md is run, as it stands on the page, by ``harness run``."""
 
 import contextlib
-import json
 import os
 import re
 import shlex
@@ -80,19 +79,6 @@ def test_recipes_of_the_same_controller_are_the_same_vehicle_and_all_others_run(
         )
     elif recipe in BRAKES:
         assert rows == per_vehicle
-
-
-def test_the_vehicle_that_makes_room_is_asked_from_the_first_step_on(tmp_path, monkeypatch, capsys):
-    page = (ROOT / "docs/acting-vehicles.md").read_text("utf-8")
-    monkeypatch.chdir(tmp_path)
-    (text,) = re.findall(r"^```py\n# room.py\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    Path("room.py").write_text(text, encoding="utf-8")
-    (command,) = re.findall(r"^harness run (room.py:.*?)  ", page, re.MULTILINE)
-    asked = {}
-    for options in (command.split(), command.split()[:1]):
-        assert main(["av-check", *options, "--tests", "20", "--json"]) == 0
-        asked[len(options)] = json.loads(capsys.readouterr().out)
-    assert len({json.dumps(each["behaviour"]) for each in asked.values()}) == 2
 
 
 def test_the_first_vehicle_of_a_new_user_runs(tmp_path, monkeypatch):

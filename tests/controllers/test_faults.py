@@ -11,6 +11,7 @@ from benchmarks.kills import orphans
 from harness.cli import main
 from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.processes import PRINTED
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
 from tests.stored_runs import sets, stored_table
@@ -75,17 +76,14 @@ def quick(n, cases):
 
 MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
 IN_PROCESS = {
-    **dict.fromkeys(("rounds_down", "flushes_to_zero", "traps_division"), f"step: {MODES}"),
+    **dict.fromkeys(("rounds_down", "flushes_to_zero"), f"step: {MODES}"),
     "rounds_up_and_raises": "step: ZeroDivisionError: no such thing",
     "asks_another_traci": "step: FatalTraCIError: Not connected. Use the traci that is handed in "
     "(docs/controllers.md), not the module",
     "raises": "step: ZeroDivisionError: no such thing",
     "none": "step: returned None (is a return missing?), expected an acceleration in m/s2 as a number",
     "nan": "step: returned nan, expected a finite acceleration in m/s2",
-    "inf": "step: returned inf, expected a finite acceleration in m/s2",
-    "string": "step: returned str, expected an acceleration in m/s2 as a number",
     "boolean": "step: returned bool, expected an acceleration in m/s2 as a number",
-    "shape": "step: returned ndarray, expected an acceleration in m/s2 as a number",
     "impossible": "step: asked for -99 m/s2, outside of av.limits (-15 to 10)",
     "lies": "step: asked for -1e+06 m/s2, outside of av.limits (-15 to 10)",
     "raises_what_cannot_be_printed": "step: UnprintableError, whose text raised ValueError",
@@ -132,47 +130,28 @@ def test_a_fault_ends_its_episode_and_changes_no_other(faults, tmp_path, undistu
     assert headline["details"]["crash_rate_if_failed_had_crashed"] > headline["crash_rate"]
 
 
-@pytest.mark.slow
-def test_a_copy_of_the_process_does_not_go_on(tmp_path, undisturbed):
-    copied = {3: "copies_the_process", 20: "copies_the_process_for_good"}
-    assert _run(tmp_path, _misbehaving(copied)) == EXIT_DONE
-    rows = _episodes(tmp_path)
-    assert [row for row in rows if row["episode"] not in copied] == [
-        row for row in undisturbed if row["episode"] not in copied
-    ]
-    assert not [row for row in rows if row["failure"]]
-
-
 NO_FAULT = {
-    "a worker killed from outside": (_misbehaving({57: "is_killed"}, once="NOTE"), 0),
-    "a function that is the vehicle": (_of("only_a_function", min_acceleration_mps2=-4.0), None),
-    "a default timeout of sockets, and a signal ignored": (_of("ChangesItsProcess"), None),
-    "a function that says which controller it makes": (_of("idm_of_a_function"), None),
-    "a class with nothing but step": (_of("OnlyStep"), None),
-    "one with nothing but step_batch": (_of("OnlyStepBatch"), None),
-    "close raises": (_of("RaisesInClose", note="NOTE"), 20),
-    "close ends the process": (_of("Always", where="close"), None),
+    "a worker killed from outside": _misbehaving({57: "is_killed"}, once="NOTE"),
+    "a function that is the vehicle": _of("only_a_function", min_acceleration_mps2=-4.0),
+    "a default timeout of sockets, and a signal ignored": _of("ChangesItsProcess"),
+    "one with nothing but step_batch": _of("OnlyStepBatch"),
 }
 
 
-@pytest.mark.parametrize(("av", "noted"), quick(1, NO_FAULT.values()), ids=NO_FAULT)
-def test_what_is_no_fault_of_an_episode_changes_none(av, noted, tmp_path, undisturbed):
-    note = tmp_path / "note"
-    assert _run(tmp_path, av.replace("NOTE", str(note))) == EXIT_DONE
+@pytest.mark.slow
+@pytest.mark.parametrize("av", NO_FAULT.values(), ids=NO_FAULT)
+def test_what_is_no_fault_of_an_episode_changes_none(av, tmp_path, undisturbed):
+    assert _run(tmp_path, av.replace("NOTE", str(tmp_path / "note"))) == EXIT_DONE
     assert _episodes(tmp_path) == undisturbed
-    assert noted is None or note.read_text().count("closed") >= noted
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("episodes", "n", "share"), quick(1, [(400, 200, 0.005), (40, 40, 0.04)]))
-def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
-    """They end a campaign halfway; one with fewer tests than that takes has no answer either."""
-    av = _misbehaving({5: "raises", 6: "raises"})
-    sizes = f"stop.episodes={episodes}", "run.shard_size=200", f"run.max_failed_share={share}"
-    assert _run(tmp_path, av, *sizes) == EXIT_TOO_MANY_FAILED
+def test_too_many_failures_end_a_campaign_halfway(tmp_path, capsys):
+    sizes = "stop.episodes=400", "run.shard_size=200", "run.max_failed_share=0.005"
+    assert _run(tmp_path, _misbehaving({5: "raises", 6: "raises"}), *sizes) == EXIT_TOO_MANY_FAILED
     err = capsys.readouterr().err
     assert "run.max_failed_share" in err
-    assert f"2 of {n} tests failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
+    assert "2 of 200 tests failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
     assert not (tmp_path / "run/estimates.json").exists()
 
 
@@ -180,10 +159,8 @@ SHORT_MADE = ", limits: {construction_time_s: 0.2}"
 POPEN = "{controller: 'subprocess:Popen', parameters: {args: touch called, shell: true}}"
 IN_CONSTRUCTOR = {
     "raises": "ZeroDivisionError: no such thing",
-    "hangs": LATE_MADE,
     "hangs_for_good": f"{LATE_MADE}, and the call could not be interrupted",
     "ends_the_process": "the controller ended the worker process (exit code 7)",
-    "closes_descriptors": "the controller closed file descriptors that are not its own",
 }
 REFUSED = [
     ("{controller: 'no_such_module:X'}", "av.controller", "cannot be imported"),
@@ -191,14 +168,11 @@ REFUSED = [
     (_of("OnlyStepp"), "av.controller", "Did you mean 'OnlyStep'?"),
     (_of("Misbehaving", badd="x"), "av.parameters", "Did you mean 'bad'?"),
     (_of("only_a_function"), "av.parameters", "min_acceleration_mps2"),
-    (_of("Learned", notes="x"), "av.parameters", "Did you mean 'note'?"),
-    (_of("RaisesInClose", pth="x"), "av.parameters", "pth"),
     *(
         (_of("Always", SHORT_MADE, where="constructor", how=how), "av.controller", words)
         for how, words in IN_CONSTRUCTOR.items()
     ),
     (_of("RaisesForOtherNames"), "av.controller", "fails (RuntimeError: step_batch (misbehaving.py:"),
-    (_of("OfAClassThatRaises"), "av.controller", "looking at its attributes fails (RuntimeError: "),
     (_of("says_nothing"), "av.controller", "without step"),
     (POPEN, "av.controller", "Popen without step"),
 ]
@@ -218,13 +192,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
 
 
 @pytest.mark.parametrize("at", quick(1, ["constructor", "step"]))
-@pytest.mark.parametrize(
-    "what",
-    [
-        *("math.isfinite", "json.dumps", "numpy.stack", "builtins.sorted", "time.monotonic"),
-        *("pyarrow.parquet.write_table", "numpy"),
-    ],
-)
+@pytest.mark.parametrize("what", ["math.isfinite", "pyarrow.parquet.write_table", "numpy"])
 def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, capsys):
     assert _run(tmp_path, _of("Replaces", what=what, at=at)) == EXIT_BAD_INPUT
     err = capsys.readouterr().err
@@ -247,15 +215,6 @@ def test_what_is_loaded_is_loaded_once_a_process_and_shared_and_nothing_else_is(
     host.close()
 
 
-@pytest.mark.slow
-def test_a_constructor_has_a_time_limit_of_its_own_in_tests_too(tmp_path):
-    """The first of a process, that says whether there is a controller at all, is made in time."""
-    av = _of("Always", SHORT_MADE, where="constructor", how="hangs", first=20)
-    assert _run(tmp_path, av, "stop.episodes=20") == EXIT_DONE
-    failed = [row["failure"] for row in _episodes(tmp_path) if row["outcome"] == "failed"]
-    assert set(map(without_place, failed)) == {f"start: StepTimeoutError: {LATE_MADE}"}
-
-
 @pytest.mark.parametrize(
     ("wrong", "words"),
     quick(
@@ -263,7 +222,6 @@ def test_a_constructor_has_a_time_limit_of_its_own_in_tests_too(tmp_path):
         [
             ({"wrong_shape": True}, "an array of shape ("),
             ({"wrong_type": "complex"}, "an array of complex128, expected accelerations in m/s2 as numbers"),
-            ({"wrong_type": "<U3"}, "an array of <U3, expected accelerations in m/s2 as numbers"),
         ],
     ),
 )
@@ -275,54 +233,54 @@ def test_a_batch_controllers_fault_is_laid_at_one_cell_or_else_fails_all_that_we
     assert all(f"step_batch: returned {words}" in cause for cause in failed.values())
 
 
-@pytest.mark.parametrize(
-    ("where", "how"), quick(1, [("step", "ends_the_process"), ("step_batch", "closes_descriptors")])
-)
-def test_one_that_always_ends_its_process_is_named_after_a_few_workers(how, where, tmp_path, capsys, monkeypatch):
+def test_one_that_always_ends_its_process_is_named_after_a_few_workers(tmp_path, capsys, monkeypatch):
     started, start = [], LocalWorkers.new_worker
     monkeypatch.setattr(LocalWorkers, "new_worker", lambda self: (started.append(self), start(self))[1])
-    assert _run(tmp_path, _of("Always", where=where, how=how), "run.max_failed_share=0.01") == EXIT_TOO_MANY_FAILED
+    assert _run(tmp_path, _of("Always", where="step"), "run.max_failed_share=0.01") == EXIT_TOO_MANY_FAILED
     err = capsys.readouterr().err
-    assert OF_THE_PROCESS[how].partition("the controller")[2].partition(" (")[0] in err
+    assert "ended the worker process" in err
     assert 2 <= len(started) <= 7
     assert "run.max_failed_share" in err
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", quick(1, ["run", "check", "av-check --tests 4"]))
-def test_what_a_controller_starts_does_not_outlive_the_command(command, tmp_path):
-    assert _main(command, tmp_path, _of("StartsPrograms", note=f"{tmp_path}/started")) == EXIT_DONE
+def test_what_a_controller_starts_does_not_outlive_the_run(tmp_path):
+    assert _run(tmp_path, _of("StartsPrograms", note=f"{tmp_path}/started")) == EXIT_DONE
     started = (tmp_path / "started").read_text().split()
-    assert len(started) >= (40 if command == "run" else 2)
+    assert len(started) >= 40
     assert orphans(list(map(int, started)), 5.0) == []
 
 
-@pytest.mark.parametrize("command", quick(1, ["check --json", "run --json", "av-check --json --tests 4"]))
-def test_what_a_controller_prints_does_not_reach_stdout(command, tmp_path, capfd):
-    assert _main(command, tmp_path, _of("Prints")) == EXIT_DONE
+def test_what_a_controller_prints_does_not_reach_stdout(tmp_path, capfd):
+    assert _main("run --json", tmp_path, _of("Prints")) == EXIT_DONE
     printed = capfd.readouterr()
     json.loads(printed.out)
-    assert "made, in Python" in printed.err
-    assert "made, below Python" in printed.err
-    if command.startswith("run"):
-        assert main(["replay", str(tmp_path / "run"), "3", "--json"]) == EXIT_DONE
-        printed = capfd.readouterr()
-        assert json.loads(printed.out)["bit_equal"] is True
-        assert "started, below Python" in printed.err
+    text, told = (tmp_path / "run" / PRINTED).read_text(), printed.err.splitlines()[-2:]
+    assert told[0].startswith(f"{len(text.splitlines()):,} lines printed by the vehicle")
+    assert told[1] == f"  the first: {text.splitlines()[0]}"  # of some hundred lines the terminal shows one
+    assert _main("run --json", tmp_path, _of("Prints")) == EXIT_BAD_INPUT  # nothing is run into a folder that is there
+    assert "made, in Python" in capfd.readouterr().err
+    assert (tmp_path / "run" / PRINTED).read_text() == text
+    assert "made, in Python" in text
+    assert "made, below Python" in text
+    assert main(["replay", str(tmp_path / "run"), "3", "--json"]) == EXIT_DONE
+    printed = capfd.readouterr()
+    assert json.loads(printed.out)["bit_equal"] is True
+    assert "started, below Python" in printed.err
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["run", "av-check --tests 20"])
-def test_of_much_that_is_printed_the_first_and_the_last_are_passed_on(command, tmp_path, capfd):
-    assert _main(command, tmp_path, _of("PrintsMuch"), "stop.episodes=100") == EXIT_DONE
-    printed = capfd.readouterr().err
+def test_of_much_that_is_printed_the_first_and_the_last_are_passed_on(tmp_path, capfd):
+    assert _run(tmp_path, _of("PrintsMuch"), "stop.episodes=100") == EXIT_DONE
+    assert len(capfd.readouterr().err) < 1_000
+    printed = (tmp_path / "run" / PRINTED).read_text()
     assert re.search(r"^\[\d\d[\d,]+ bytes more that a worker has printed\]$", printed, re.MULTILINE)
     assert 2 * 65_536 < len(printed) < 9 * 65_536
     assert re.match(r"[-\d.]+ s x", printed)
     assert printed.endswith("x\n")
 
 
-@pytest.mark.parametrize("field", ["cell", "episode", "gap_m", "lv_speed_mps", "cells", "episodes"])
+@pytest.mark.parametrize("field", ["cell", "lv_speed_mps", "episodes"])
 def test_nothing_that_a_batch_controller_is_handed_can_be_written_into(field):
     failures = drive(f"av={_of('Batch', overwrites=field)}", cells=8, n=24).failures
     failures = {k: without_place(cause) for k, cause in failures.items()}

@@ -10,13 +10,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from examples.acting import Careful, Yields
 from examples.idm import IDM, idm_acceleration
-from harness.campaign.files import load_campaign
 from harness.controllers.protocol import BatchObservation
 from harness.controllers.traci_style import TraciStyleController
 from harness.worlds.sumo import SumoWorld
-from tests.stored_runs import ROOT
 from tests.worlds.running import LATERAL, drive, motion
 
 pytestmark = pytest.mark.slow  # at night
@@ -78,18 +75,6 @@ class DelayedScript(TraciStyleController):
         traci.vehicle.setAcceleration(veh_id, a, 0.1)
 
 
-class SlowsDownOnce(TraciStyleController):
-    """Begins, in its first call, to drive 3 m/s slower within 10 s."""
-
-    def on_start(self, random):
-        self._told = False
-
-    def on_step(self, traci, veh_id, time):
-        if not self._told:
-            traci.vehicle.slowDown(veh_id, traci.vehicle.getSpeed(veh_id) - 3.0, 10.0)
-        self._told = True
-
-
 class Notes(IDM):
     """Writes down what it is shown of the last episode that begins; what it answers meanwhile is nonsense."""
 
@@ -117,15 +102,6 @@ def test_a_state_that_starts_empty_is_filled_when_the_controller_acts(form, fill
     assert motion(av(form), cells=7) == filled
     assert motion(av(form, warm_up_s=0.4)) != filled  # not enough
     assert motion(av(form, warm_up_s=0.0)) != filled
-
-
-def test_a_command_of_the_warm_up_begins_anew_at_the_hand_over():
-    runs = [drive(av("SlowsDownOnce", warm_up_s=s), "av.before_event=hold_speed", n=12) for s in (0.0, 2.0, 20.0)]
-    for row, trace in runs[0].traces.items():
-        onset = int(runs[0].episode["onset_step"][row])
-        assert trace[onset + 1, 2, 2] == pytest.approx(-0.3)
-    assert [run.failures for run in runs] == [{}] * 3
-    assert all(run.episode.tobytes() == runs[0].episode.tobytes() for run in runs[1:])
 
 
 @pytest.mark.parametrize("shim", [True, False])
@@ -160,15 +136,6 @@ def test_what_is_shown_is_what_was_and_before_the_test_nobody_changed_speed(epis
         assert math.isnan(each.lead_speed_mps)
 
 
-def test_it_counts_where_it_is_shown():
-    def hashes(source):
-        changes = [[f"av={{{source}}}", f"av.warm_up_s={s}"] for s in (0, 1, 2)]
-        return len({load_campaign(ROOT / "scenarios/smoke.yaml", each).content_hash("p") for each in changes})
-
-    assert [hashes(f"controller: 'a:B', before_event: {when}") for when in ("hold_speed", "controller")] == [3, 1]
-    assert [hashes(source) for source in ("model: idm", "sumo: {tau: 1}", "traci: {command: x}")] == [1, 1, 1]
-
-
 # -- examples that make room: what they do before the cut-in, how hard they brake after it, and by how much late --
 
 
@@ -183,25 +150,3 @@ def seen(speed, gap, *, ahead=np.inf):
         "bv_speed_mps": np.full(2, 30.0),
     }
     return BatchObservation(**columns)
-
-
-@pytest.mark.parametrize(
-    ("speed", "gap", "careful", "yields"),
-    [(36.0, 10.0, -1.5, -1.0), (36.0, -5.0, -1.5, 0.0), (36.0, 45.0, 0.0, -1.0), (32.0, 10.0, 0.0, -1.0)],
-)
-def test_they_slow_down_while_bv_is_near(speed, gap, careful, yields):
-    vehicle = Careful()
-    vehicle.start_batch(np.arange(2), None, None)
-    assert vehicle.step_batch(seen(speed, gap)).tolist() == [careful, 0.0]
-    assert Yields().step_batch(seen(speed, gap))[0] == yields
-
-
-def test_after_the_cut_in_one_brakes_hard_and_what_it_does_comes_late():
-    late, other = Careful(dead_time_s=0.3), Careful()
-    for each in (late, other):
-        each.start_batch(np.arange(2), None, None)
-    assert other.step_batch(seen(36.0, 3.0, ahead=3.0))[0] == -6.0
-    assert Yields().step_batch(seen(36.0, 3.0, ahead=3.0))[0] == -4.0
-    assert [late.step_batch(seen(36.0, 3.0, ahead=3.0))[0] for _ in range(4)] == [0.0, 0.0, 0.0, -6.0]
-    late.start_batch(np.array([0]), None, None)
-    assert late.step_batch(seen(36.0, 3.0, ahead=3.0)).tolist() == [0.0, 0.0]

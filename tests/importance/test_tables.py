@@ -10,7 +10,6 @@ from harness.vehicles.drivers import driver_records
 from tests.kernels import environment
 
 DRIVER = driver_records([IDMParameters()])
-OTHER = driver_records([IDMParameters(time_headway_s=1.5)])
 FIELDS = [name for name in DRIVER.dtype.names if name != "max_jerk_mps3"]  # infinite
 
 
@@ -36,18 +35,6 @@ def built(monkeypatch):
 
 def equal(one, other):
     return all(a.tobytes() == b.tobytes() and a.shape == b.shape for a, b in zip(one, other, strict=True))
-
-
-def test_a_set_of_surrogates_is_built_once_and_another_one_is_another_file(folder, built):
-    told = []
-    one = build_tables(environment(), DRIVER, "immediate")
-    assert equal(build_tables(environment(), DRIVER, "immediate"), one)
-    assert len(built) == 1
-    both = build_tables(environment(), np.concatenate([DRIVER, OTHER]), "immediate", told.append)
-    assert (len(built), told) == (3, [1, 1])
-    assert [path.suffix for path in folder.iterdir()] == [".npy"] * 2  # nothing half-written is left behind
-    assert equal([array[:1] for array in both], one)
-    assert not equal([array[1:] for array in both], one)
 
 
 def one_bit(content):

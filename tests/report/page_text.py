@@ -32,10 +32,8 @@ PAGES = {
         "av.parameters.min_acceleration_mps2=-8",
     ),
     "nde": RUNS["nde-twin"],
-    "failed": (MIXTURE, *UNTRACED, FAILING, "stop.episodes=300"),
     "shells": (*SHELLS, *UNTRACED, FAILING, "stop.episodes=300"),
     "shells_refuted": RUNS["shells-refuted"],
-    "shells_inside_only": (*SHELLS, *UNTRACED, "testing.shells.statement=library", "stop.episodes=240"),
 }
 FIXED = {
     "created": "2025-01-02T03:04:05Z",

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 import harness
+from harness.fitting.files import fit_files
 from harness.report.compare_page import write_comparison
-from harness.report.hours_page import write_hours_of
-from harness.report.page import write_report
+from harness.report.page import write_hours, write_report
+from tests.fitting.trajectories import overtaking
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of
 
@@ -166,10 +167,13 @@ def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
 
 @pytest.fixture(scope="module")
 def pages(report, replayed, crashing, compared, tmp_path_factory) -> list[Path]:
-    """One of each kind: a run's in each scenario, of their sum, of a comparison, of one test."""
+    """One of each kind: a run's in each scenario, of a comparison, of one test; without a player of a sum, of a fit."""
     place = tmp_path_factory.mktemp("pages")
     runs = [write_report(copy_of(crashing[name], place / name)) for name in ("lead_brakes", "cut_out")]
-    return [report, replayed, *runs, write_comparison(copy_of(compared, place / "compared")), hours_page(place)]
+    with_player = [report, replayed, *runs, write_comparison(copy_of(compared, place / "compared"))]
+    overtaking(2.0).to_parquet(place / "rows.parquet", index=False)
+    fit_files([place / "rows.parquet"], place / "mine.yaml", n_replicates=2)
+    return [*with_player, hours_page(place), place / "mine.html"]
 
 
 def hours_page(place: Path) -> Path:
@@ -187,7 +191,7 @@ def hours_page(place: Path) -> Path:
         "counts_in_interval": False, "readings": [beside], "milder": {},
         "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
     }  # fmt: skip
-    return write_hours_of(place, content)
+    return write_hours(place, content)
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark"), (390, "light")])
@@ -209,7 +213,7 @@ def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(width, scheme, b
 
 
 def test_a_phone_shows_all_columns_of_the_player_and_cars_that_can_be_seen(opened, pages):
-    for file in pages[:-1]:
+    for file in pages[:-2]:
         page = opened(file, 390)
         table = page.locator(".now").first
         assert table.locator("thead th:visible").count() == 6
@@ -228,33 +232,6 @@ def test_on_paper_it_is_light_and_without_what_only_a_screen_can_do(opened, page
         page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
         wide = "[...document.querySelectorAll('table, svg, pre')].map((e) => [e.scrollWidth, e.textContent])"
         assert [each for each in page.evaluate(wide) if each[0] > 688] == []
-
-
-def test_a_cut_out_shows_when_the_revealed_vehicle_becomes_visible(opened, crashing):
-    file = write_report(copy_of(crashing["cut_out"], crashing["cut_out"].parent / "shown"))
-    page, scene = opened(file), scenes_in(file.read_text())[0]
-    [step] = [step for step, name in scene["moments"] if name == "SV becomes visible"]
-    assert scene["onset"] <= step <= scene["event"]
-    page.get_by_role("button", name="SV becomes visible", exact=True).click()
-    assert seconds(page) == pytest.approx(STEP_S * step)
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])
-def test_it_is_readable_wide_and_narrow_in_light_and_in_the_dark(width, scheme, opened, report, replayed):
-    for file in (report, replayed):
-        page = opened(file, width, scheme)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        ink, paper = page.evaluate("[getComputedStyle(document.body)].flatMap((s) => [s.color, s.backgroundColor])")
-        light = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
-        assert (light[0] < light[1]) == (scheme == "light")
-        sizes = page.evaluate(
-            "[...document.querySelectorAll('.player text, .player td')].map((e) => getComputedStyle(e).fontSize)"
-        )
-        assert min(float(size.removesuffix("px")) for size in sizes) >= 8
-        page.set_viewport_size({"width": 700, "height": 900})  # what was drawn for one width is drawn for the next
-        road = page.locator(".road").first  # waiting for a function would be `eval`, which the page's policy forbids
-        width = road.evaluate("(e) => e.clientWidth")
-        api.expect(road).to_have_attribute("viewBox", re.compile(rf"^0 0 {width} "))
 
 
 def test_the_policy_lets_no_other_script_run(browser, report):

@@ -9,19 +9,15 @@ import pyarrow.compute as pc
 import pytest
 
 import harness
-from harness.cli import main
 from harness.errors import RunFolderError
 from harness.numbers import interval, number, ratio
 from harness.report.compare_page import crashing_pairs, write_comparison
 from harness.report.pair_words import deciding_words
 from harness.report.plots import WHO
 from harness.report.summary import read_run_folder
-from tests.golden.campaigns import SHELLS
-from tests.golden.record import load
-from tests.in_process import controllers_here, one_process, without_page
 from tests.report.page_text import Page
 from tests.report.test_player import motion, scenes_in
-from tests.stored_runs import answer_in, copy_of, edit, stored_table
+from tests.stored_runs import answer_in, copy_of, stored_table
 
 
 @pytest.fixture(scope="module")
@@ -90,28 +86,6 @@ def test_a_scene_is_the_motion_of_both_tests(compared, page):
         assert told[own["label"]].startswith("crashes")
         assert told[ghost["name"]].startswith("avoids it")
         assert "AV" not in " ".join((*told, *(name for _, name in scene["moments"])))
-
-
-def test_a_test_that_cannot_be_run_again_is_not_drawn(compared, tmp_path):
-    folder = copy_of(compared, tmp_path / "out")
-    for side in "ab":
-        edit(folder / side, reproducible=False)
-    scenes = scenes_in(write_comparison(folder).read_text())
-    assert scenes
-    for scene in scenes:
-        assert scene["ghosts"] == []
-        assert scene["facts"][-1][1].startswith("does not crash; its motion is not on record")
-
-
-def test_without_a_pair_on_which_they_differ_the_page_says_so(tmp_path):
-    shared = (*SHELLS, "world.engine=twin", "stop.rhw=null", "stop.episodes=60", "records.traces=none")
-    with one_process(), controllers_here(), without_page():
-        harness.compare(load(*shared), load(*shared, "name=again"), tmp_path, workers=1)
-    assert main(["report", str(tmp_path)]) == 0
-    words = Page(tmp_path).words
-    assert "There is no cut-in on which only one of them crashed." in words
-    assert "Not told apart" in words
-    assert "<script" not in (tmp_path / "report.html").read_text()
 
 
 def test_runs_of_another_comparison_are_refused(compared, tmp_path):

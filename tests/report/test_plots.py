@@ -1,44 +1,18 @@
 """The look of all plots, scales of axes, intervals where they are, and names that no line can hide."""
 
 import re
-from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-import harness.report
 from harness.families import family_named
 from harness.records.reader import traffic_of
-from harness.report import crashes
-from harness.report.crashes import CANDIDATES, crash_gallery, worst_crashes
 from harness.report.drawing import Axis, Panel
-from harness.report.player import UNKNOWN
-from harness.report.plots import POOL, SHARES, limits_of_others, severity_plot, shells_plot, where_plot
-from harness.report.summary import read_run_folder, summarise
+from harness.report.plots import POOL, limits_of_others, severity_plot, shells_plot
+from harness.report.summary import summarise
 from harness.vocabulary import CRASH, OUTCOMES
-from tests.report.test_page import edit
-
-CSS = (Path(harness.report.__file__).parent / "report.css").read_text(encoding="utf-8")
-LIGHT, DARK = re.findall(r":root \{\n(.*?)\n\s*\}", CSS, flags=re.DOTALL)
-
-
-def colours(plot):
-    return set(re.findall(r"var\(--([\w-]+)\)", plot.markup))
-
-
-@pytest.mark.parametrize("block", [LIGHT, DARK], ids=["light", "dark"])
-def test_every_plot_colour_is_a_css_variable_in_every_scheme(block, runs):
-    run = runs["shells"]
-    plots = [
-        severity_plot(run.estimates),
-        where_plot(summarise(run), family_named("cut_in"), None),
-        shells_plot(run.shells),
-    ]
-    used = set().union(*map(colours, plots), SHARES.values()) - {"reference"}
-    assert used <= set(re.findall(r"--([\w-]+): #[0-9a-f]{6};", block))
 
 
 def marks(panel, kind):
@@ -81,14 +55,6 @@ def test_others_avoid_a_crash_from_the_gap_on_that_their_brakes_need(runs):
     assert np.all(competent[speeds > 3.0] > at_once[speeds > 3.0])
 
 
-def test_the_map_has_a_colour_for_every_cut_in(runs):
-    [panel] = where_plot(summarise(runs["shells"]), family_named("cut_in"), None).panels
-    cells = marks(panel, "boxes")
-    assert next(iter(cells)) == "tested, none"
-    assert set(cells) <= {"tested, none", "≤ 25 %", "≤ 50 %", "≤ 75 %", "≤ 100 %"}
-    assert marks(panel, "line") == {}
-
-
 def test_the_plot_shows_contributions_and_half_widths(runs):
     """The latter are what is not known, that of the pool included."""
     found = runs["shells"].shells
@@ -120,49 +86,6 @@ def test_counts_and_weights_by_outcome(summary, table):
         rows = table[table.outcome == outcome]
         assert summary.count[k] == len(rows)
         assert summary.weight[k] == pytest.approx(np.exp(rows.log_weight).sum(), rel=1e-12)
-
-
-@pytest.mark.parametrize(("ranking", "key"), [("impact_speed_mps", "impact_speed_mps"), ("weight", "log_weight")])
-def test_worst_crashes_are_the_worst(summary, table, ranking, key):
-    crash = table[(table.outcome == "crash") & (table.episode % 3 > 0)]
-    crash = crash.sort_values([key, "episode"], ascending=[False, True])
-    episode = summary.crashes["episode"]
-    kept = episode[worst_crashes(summary.crashes[ranking], episode, episode % 3 > 0)]
-    assert kept.tolist() == crash.episode.head(CANDIDATES).tolist()
-
-
-@pytest.mark.parametrize(("n_episodes", "n_parts"), [(1_234, 3), (2_000, 2)])
-def test_only_the_prefix_that_counts_and_listed_parts_are_read(run_folder, n_episodes, n_parts):
-    parts = edit(run_folder / "manifest.json")["parts"]
-    edit(run_folder / "manifest.json", n_episodes=n_episodes, parts=parts[:n_parts])
-    assert summarise(read_run_folder(run_folder)).n_episodes == n_episodes
-
-
-def test_gallery_prefers_traced_crashes_where_few_are_traced(run_folder, summary, monkeypatch):
-    """With traces of one bad crash only, that one is there to be watched, at its true rank.
-
-    Nobody knows who else crashes here.
-    """
-    monkeypatch.setattr(crashes, "_ends", lambda *_: np.full((summary.n_crashes, 2), UNKNOWN))
-    tenth = int(summary.crashes["episode"][np.argsort(-summary.crashes["impact_speed_mps"], kind="stable")[9]])
-    for path in sorted((run_folder / "traces").iterdir()):
-        traces = pq.read_table(path)
-        pq.write_table(traces.filter(np.asarray(traces.column("episode")) == tenth), path)
-    rows, scenes = crash_gallery(read_run_folder(run_folder), summary, None)
-    shown = [(row.episode, row.reason.split(", ")[0], row.scene) for row in rows if row.scene is not None]
-    assert shown == [(tenth, "hardest no. 10", 0)]
-    assert [scene["episode"] for scene in scenes] == [tenth]
-    assert any(row.scene is None for row in rows)
-
-
-def test_crashes_that_do_not_count_are_none_on_the_page_either(runs):
-    run = runs["weighted"]
-    harder = replace(run, campaign=run.campaign.replaced(("crash", "counts_above_mps"), 5.0))
-    every, counted = summarise(run), summarise(harder)
-    impact, weight = (every.crashes[name] for name in ("impact_speed_mps", "weight"))
-    assert 0 < counted.n_crashes == (impact > 5.0).sum() < every.n_crashes
-    assert counted.n_episodes == every.n_episodes
-    assert counted.weight[CRASH] == pytest.approx(weight[impact > 5.0].sum())
 
 
 @pytest.mark.parametrize("name", ["shells", "shells_refuted"])

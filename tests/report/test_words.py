@@ -1,22 +1,17 @@
 """The answer at a glance of every kind of run: short, and with what changes its meaning."""
 
-import math
 import re
-from dataclasses import asdict, replace
-from types import SimpleNamespace
+from dataclasses import replace
 
 import pytest
 
-from harness.campaign.files import load_campaign
 from harness.estimators.answer import estimate_blocks
 from harness.records.folder import read_manifest
-from harness.report.lines import LINES, WIDTH, lines, pair_lines
-from harness.report.pair_words import deciding_words, pair_words
-from harness.report.rows import width_row
+from harness.report.lines import LINES, WIDTH, lines
 from harness.report.summary import read_run_folder
-from harness.report.words import answer_of, short_answer, vehicle_words
+from harness.report.words import answer_of, short_answer
 from harness.runner.stored import stored_blocks
-from tests.golden.campaigns import BASE, RUNS
+from tests.golden.campaigns import RUNS
 from tests.stored_runs import answer_in, estimates, golden
 
 SAID = {
@@ -89,88 +84,12 @@ def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     assert rows["rate"].remark.startswith("< ")
 
 
-def test_a_vehicle_that_only_touches_is_said_so(stored_run):
-    """Of the same tests had each crash been fifty times softer; its rate is what it was."""
-    folder = stored_run("shells-refuted")
-    blocks = [
-        replace(each, columns={**each.columns, "impact_mps": 0.02 * each.impact_mps}) for each in blocks_of(folder)
-    ]
-    answer = answered(stored_run, "shells-refuted", blocks, ())
-    above, below = r"0 % \(0–\d+ %\) above 5 m/s", r"100 % \(\d+–100 %\) below 1 m/s"
-    text, row = lines(answer, 1.0), rf"  impact speed +median 0.1 m/s +{above} +{below}"
-    assert any(re.match(row, line) for line in text)
-    assert "  ! 100 % of these crashes are touches below 1 m/s: crash.counts_above_mps=1 leaves them out" in text
-    assert asdict(answer.rows[0]) == answer_in(folder)["rows"][0]
-
-
 def test_much_to_warn_of_leaves_room_for_the_rate(stored_run):
     text = lines(replace(answered(stored_run), warnings=("a" * 120, "b", "c", "d", "e")), None)
     assert text[1].startswith("  crash rate ")
     assert "  ! 3 more warnings: see the report" in text
     assert sum(line.count("a") for line in text if set(line) <= set("  !a")) == 120  # nothing is cut off
     assert max(map(len, text)) <= WIDTH
-
-
-@pytest.mark.parametrize(
-    ("av", "name", "parameters"),
-    [
-        ("av={controller: 'm:C', parameters: {hard: 8, soft: {a: 1}}}", "m:C", [("hard", "8"), ("soft.a", "1")]),
-        ("av.controller=my_av.py:MyAV", "my_av.py:MyAV", []),
-        ("av={fmu: {file: x/brake.fmu, inputs: {s: speed_mps}, output: a}}", "brake.fmu", []),
-        ("av={traci: {command: './my_av --port {port}'}}", "TraCI client my_av", []),
-        ("av={sumo: {tau: 1}}", "SUMO’s Krauss", [("tau", "1")]),
-        ("av.parameters.min_acceleration_mps2=-8", "idm", [("min_acceleration_mps2", "−8")]),
-    ],
-)
-def test_vehicles_are_named_with_what_is_not_a_default(av, name, parameters):
-    campaign = load_campaign(BASE, ["testing.method=forced", av], check_files=False)
-    assert vehicle_words(campaign.av) == (name, parameters)
-
-
-@pytest.mark.parametrize(
-    ("alone", "expected", "row"),
-    [
-        (0.4, {"runs": 1300, "tests": 240}, ("± 50 %, mostly by runs", "± 40 %", "try 1,300 runs, 240 tests")),
-        (0.1, None, ("± 50 %, mostly by tests", "± 10 %", "")),
-    ],
-)
-def test_of_a_vehicle_that_acts_it_says_whether_runs_or_tests_are_missing(alone, expected, row):
-    campaign = golden("shells-acting-twin")
-    [found] = width_row(campaign, SimpleNamespace(rhw=0.5, details={"rhw_from_pool": alone}), expected)
-    runs = f"{campaign.pool.shadow_paths:,} baseline runs {row[1]}"
-    assert (found.value, found.interval, found.remark) == (row[0], runs, row[2])
-
-
-def test_where_no_reference_crashes_there_is_no_ratio_and_a_spent_pool_says_what_to_raise(stored_run):
-    run = read_run_folder(stored_run("shells-acting-twin"))
-    details = {**run.estimates.best.details, "references": []}
-    best = replace(run.estimates.best, n_crashes=0, rhw=math.inf, cautions=(), details=details)
-    campaign = golden("shells-acting-twin", "stop.rhw=0.3")
-    manifest = {"remedy": {"pool.events_per_shell": 3200}}
-    answer = said(run, best, campaign, severity=None, stopped_by="pool", manifest=manifest)
-    [row] = [row for row in answer.rows if row.key == "ratio"]
-    assert (row.value, row.remark) == ("no ratio", "that driver never crashes here")
-    assert answer.scope.endswith("would narrow it, no crash seen (asked: ± 30 %); raise pool.events_per_shell to 3,200")
-    run = read_run_folder(stored_run("forced-acting-twin"))
-    answer = said(run, replace(run.estimates.best, cautions=()))  # asks no other driver
-    assert "ratio" not in {row.key for row in answer.rows}
-
-
-@pytest.mark.parametrize(
-    ("name", "shows", "blind", "held"),
-    [
-        ("forced-krauss", True, True, False),
-        ("forced-krauss", False, False, False),
-        ("shells-lateral-twin", True, False, False),
-        ("shells-controller-sumo", True, False, True),
-    ],
-)
-def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(name, shows, blind, held, stored_run):
-    run = read_run_folder(stored_run(name))
-    asked = {**run.estimates.diagnostics, "n_asked_to_speed_up": 1234 * (name != "forced-krauss")}
-    warnings = "".join(said(run, manifest={"events_show": shows}, diagnostics=asked).warnings)
-    assert ("cannot see the other car (BV)" in warnings) == blind
-    assert ("1,234 tests it asked to speed up" in warnings) == held
 
 
 @pytest.mark.parametrize(
@@ -195,102 +114,6 @@ def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, va
     assert (rows[0].key, rows[0].value, rows[0].interval) == (first, value, ends)
 
 
-@pytest.mark.parametrize(("verdict", "untested"), [("rejected", False), ("rejected", True), ("accepted", True)])
-def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
-    """Where a limit is rejected, or the upper end is what has not been tested: the lower end alone says something."""
-    run = read_run_folder(stored_run("shells-accepted"))
-    decision, details = {**run.manifest["decision"], "verdict": verdict}, run.estimates.best.details
-    shells = [{**each, "n_episodes": each["n_episodes"] * (not untested)} for each in details["shells"]]
-    beside = {**details["references"][0], "ratio": 3.98, "ratio_low": 2.0, "ratio_high": 980.0}
-    rate = {"crash_rate": 2e-7, "ci_low": 1e-7, "ci_high": 5e-5, "rhw": 100.0}
-    best = replace(run.estimates.best, **rate, details={**details, "references": [beside], "shells": shells})
-    limits = {"limits_above_5_mps": (0.0, 1.0), "limits_below_1_mps": (0.001, 0.41)}
-    severity = replace(run.estimates.severity, **limits, share_below_1_mps=0.0)
-    rows = said(run, best, severity=severity, decision=decision).rows
-    found = {row.key: row.texts[1:] for row in rows}
-    assert found["rate"][:2] == ("> 1.00 × 10⁻⁷ per test", "estimate 2.00 × 10⁻⁷")
-    assert found["ratio"][:2] == ("> 2.00 (crashes more)", "estimate 3.98")
-    assert found["impact"][1:] == ("", "0 % (0–41 %) below 1 m/s")
-
-
-def severe(stored_run, cut_off=0.0, driver="brakes-8", **of_rate):
-    """The answer of a run, if its tests that were cut off, and ends of its interval, are so many times its rate."""
-    run = read_run_folder(stored_run("shells-twin"))
-    rate, unavoidable = run.estimates.best.crash_rate, replace(run.estimates.severity.unavoidable, driver=driver)
-    best = replace(run.estimates.best, **{name: times * rate for name, times in of_rate.items()})
-    return said(run, best, severity=replace(run.estimates.severity, cut_off=cut_off * rate, unavoidable=unavoidable))
-
-
-@pytest.mark.parametrize(("cut_off", "high", "warned"), [(0.19, 1.1, False), (0.3, 1.2, True), (0.3, 1.4, False)])
-def test_tests_whose_time_was_up_are_warned_of_where_the_interval_leaves_them_out(cut_off, high, warned, stored_run):
-    """They are many, and had they crashed the rate would be above its upper end."""
-    assert any("still closing in" in each for each in severe(stored_run, cut_off, ci_high=high).warnings) == warned
-
-
-@pytest.mark.parametrize(("driver", "told"), [("brakes-8", True), ("brakes-6", False)])
-def test_only_what_the_hardest_brakes_do_not_avoid_is_called_unavoidable(driver, told, stored_run):
-    assert ("unavoidable" in [row.key for row in severe(stored_run, driver=driver).rows]) == told
-
-
-def test_a_comparison_is_as_short():
-    """With what makes it long: names, far limits, warnings, a margin."""
-    side = {"crash_rate": 1.4e-7, "ci_low": 1e-10, "ci_high": 2e-7, "n_crashes": 93, "upper_bound": 1e-6}
-    side |= {"warnings": [{"key": "w" * 120}] * 2, "details": {"n_failed": 0}}
-    inside = {
-        "ratio": 138.0, "ratio_low": 0.1, "ratio_high": None, "difference": -2e-7, "ci_low": -3e-7, "ci_high": -1e-7,
-        "n_only_a": 31, "n_only_b": 1000, "boundary": "brakes-2-late-1s",
-    }  # fmt: skip
-    content = {
-        **inside, "conditional": inside, "a": side, "b": {**side, "n_crashes": 0}, "n_pairs": 1234, "confidence": 0.9,
-        "campaigns": {"a": {"label": "a" * 40}, "b": {"label": "b c " * 20}},
-        "decision": {"verdict": "open", "margin": 0.1}, "ended": "rhw",
-        "to_decide": {"pairs": 7000, "settings": {"stop.episodes": 7000}, "new_folder": False},
-        "asked": "library",
-    }  # fmt: skip
-    text = pair_lines(content, 2.0, "runs/ab/report.html", 0.01)
-    assert len(text) - sum(line.startswith("    ") for line in text) <= LINES
-    assert max(map(len, text)) <= WIDTH
-    assert text[0].startswith("Open whether B is more than 10 % worse than A · 1,234 pairs of tests")
-    assert text[0].endswith(" · crashes above 2 m/s per test")
-    shown = "\n".join(text)
-    assert "1.00 × 10⁻¹⁰ to 2.00 × 10⁻⁷" in shown
-    for said in (
-        "0.10 to no limit", "no crash seen", "only where brakes-2-late-1s of", "stopped: precise enough",
-        "crashes of A alone 31, B 1,000",
-        "with --margin 0.1 --set stop.episodes=7000: some 5,800 more pairs, 58.0 s",
-    ):  # fmt: skip
-        assert said in " ".join(shown.split())
-
-
-NEW_FOLDER = {"pairs": 1000, "settings": {}, "new_folder": True}
-
-
-@pytest.mark.parametrize(
-    ("verdict", "needed", "said"),
-    [
-        ("proven", None, None),
-        ("open", None, "too alike"),
-        ("open", NEW_FOLDER, "--margin 0 and a new --out: some 1,000"),
-    ],
-)
-def test_what_would_decide(verdict, needed, said):
-    told = deciding_words({"decision": {"verdict": verdict, "margin": 0.0}, "to_decide": needed, "n_pairs": 900})
-    assert told is None if said is None else said in told
-
-
-@pytest.mark.parametrize(
-    ("verdict", "sign", "margin"),
-    [
-        ("proven", "B crashes less often than A", "B is at most 10 % worse than A"),
-        ("refuted", "B crashes more often than A", "B is more than 10 % worse than A"),
-        ("open", "Not told apart", "Open whether B is more than 10 % worse than A"),
-    ],
-)
-def test_the_verdict_of_a_comparison(verdict, sign, margin):
-    told = [pair_words({"margin": of, "verdict": verdict}) for of in (0.0, 0.1)]
-    assert told == [sign, margin]
-
-
 @pytest.mark.parametrize(("name", "untested"), [("shells-inside", True), ("shells-twin", False)])
 def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, untested, stored_run):
     content = estimates(stored_run(name))
@@ -302,11 +125,3 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
     assert rate["remark"].endswith(" per million km")
     assert not rows["ratio"]["value"].startswith("≥")
     assert (rows["unavoidable"]["what"] == "unavoidable so far") == untested
-
-
-def test_a_vehicle_that_sumo_moves_is_warned_of_as_blind_where_cut_ins_take_time(stored_run):
-    for name, shows, warned in (
-        ("forced-krauss", True, True), ("forced-krauss", False, False), ("forced-twin", True, False)
-    ):  # fmt: skip
-        answer = said(read_run_folder(stored_run(name)), manifest={"events_show": shows})
-        assert any("cannot see the other car (BV)" in each for each in answer.warnings) == warned
