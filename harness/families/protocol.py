@@ -9,15 +9,16 @@ scripts, judges, counts and shows them, and knows nothing else of it.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 
 from harness.campaign.drivers import Surrogate
 from harness.campaign.sections import EnvironmentSettings
+from harness.families.numbers import ParameterFile
 from harness.families.words import Shown, Words
 from harness.loop.cells import Script
 from harness.vehicles.drivers import Followers
@@ -25,6 +26,8 @@ from harness.vocabulary import BoolArray, FloatArray, IntArray, Method, RecordAr
 
 Environment: TypeAlias = Any
 """All that a family's kernels need of its traffic; what is in it the family alone knows."""
+Parameters: TypeAlias = ParameterFile
+"""Its numbers, each with its provenance."""
 
 
 class Column(NamedTuple):
@@ -106,53 +109,6 @@ class Chosen(NamedTuple):
     facts: RecordArray
     at: IntArray
     lead: IntArray
-
-
-@runtime_checkable
-class Parameters(Protocol):
-    """Numbers of a traffic, each with a ``value`` and its provenance, by flat names ``section__name``.
-
-    ``replicates`` names a ``file`` of numbers that other data would have given, with its ``sha256``; None without one.
-    ``unseen`` says where the data had no event, and is empty where they had. ``blocks`` are sections whose numbers are
-    fitted together, by what they are called.
-    """
-
-    blocks: ClassVar[Mapping[str, tuple[str, ...]]]
-
-    @property
-    def replicates(self) -> Any: ...
-
-    @property
-    def unseen(self) -> str: ...
-
-    def numbers(self) -> dict[str, Any]:
-        """All numbers; ``se`` is a standard error and ``range`` where an assumed one may lie, each None if not said."""
-
-    def content_hash(self) -> str:
-        """Hash of the numbers alone."""
-
-    def without_half(self) -> Mapping[int, Mapping[str, float]]:
-        """Numbers with which there are half as many events of each kind that the data have not."""
-
-    def unseen_in(self, kinds: Collection[int]) -> str:
-        """Where some of these kinds are."""
-
-    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
-        """A replicate with what no event at all leaves open upwards."""
-
-    def left_open(self) -> LeftOpen | None:
-        """What data leave open."""
-
-
-class LeftOpen(NamedTuple):
-    """What data leave open of a traffic: numbers by name at the two ``ends`` of what they may be.
-
-    ``where`` says where nothing was seen, else it is empty and ``highest`` the end of a stated range.
-    """
-
-    where: str
-    highest: float | None
-    ends: tuple[Mapping[str, float], Mapping[str, float]]
 
 
 class Exposure(NamedTuple):
