@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
@@ -14,6 +14,7 @@ from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule, describe_found
 from harness.campaign.sections import Section
 from harness.campaign.yaml_text import read_yaml
+from harness.families.protocol import LeftOpen
 from harness.families.replicates import content_hash
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2
@@ -123,7 +124,34 @@ class SpeedsAndGaps(Section):
 
 
 class ParameterFile(Section):
-    """Sections of numbers, which are known by flat names ``section__name``."""
+    """Sections of numbers; see `harness.families.protocol.Parameters`. ``folder`` has those that files are ``like``.
+
+    Of one whose data have all kinds of events nothing more is to be said.
+    """
+
+    folder: ClassVar[Path]
+    blocks: ClassVar[Mapping[str, tuple[str, ...]]]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_like_another(cls, given: Any) -> Any:
+        return completed(given, cls.folder) if isinstance(given, dict) else given
+
+    @property
+    def unseen(self) -> str:
+        return ""
+
+    def without_half(self) -> Mapping[int, Mapping[str, float]]:
+        return {}
+
+    def unseen_in(self, kinds: Collection[int]) -> str:  # noqa: ARG002 - there is none
+        return ""
+
+    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
+        return dict(row)
+
+    def left_open(self) -> LeftOpen | None:
+        return None
 
     def numbers(self) -> dict[str, Number]:
         """Flat ``section__name``, of those in a list ``section__name__0`` and so on → number, with its provenance."""

@@ -140,6 +140,9 @@ class Parameters(Protocol):
     def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
         """A replicate with what no event at all leaves open upwards."""
 
+    def left_open(self) -> LeftOpen | None:
+        """What data leave open."""
+
 
 class LeftOpen(NamedTuple):
     """What data leave open of a traffic: numbers by name at the two ``ends`` of what they may be.
@@ -180,7 +183,7 @@ class Driven(NamedTuple):
 
 
 class Family(Protocol):
-    """A kind of events. ``traffic`` is all that its kernels need of its environment.
+    """A kind of events, and what most have alike. ``traffic`` is all that its kernels need of its environment.
 
     Attributes
     ----------
@@ -206,6 +209,8 @@ class Family(Protocol):
         Events of a path between two that a pool asks.
     pool_error : float
         Relative standard error of its surrogates' crash rates where nothing is said.
+    fitter : str
+        Its fit to trajectories (`harness.fitting.protocol.Fitter`), ``module:class``; empty without one.
     crosses : int
         Place of the vehicle that changes lanes, -1 for none.
     words, maps, stand_ins
@@ -227,6 +232,7 @@ class Family(Protocol):
     stride: int
     pool_error: float
 
+    fitter: str
     crosses: int
     words: Words
     maps: tuple[tuple[Shown, Shown], ...]
@@ -246,9 +252,6 @@ class Family(Protocol):
     ) -> Environment | None:
         """The same with other numbers; None where they give no laws."""
 
-    def left_open(self, parameters: Any) -> LeftOpen | None:
-        """What data leave open of it."""
-
     def digest(self, traffic: Environment) -> str:
         """Hash of all numbers of it."""
 
@@ -258,14 +261,16 @@ class Family(Protocol):
     def sideways_m(self, traffic: Environment) -> float:
         """Way (m) from a first lateral motion to overlap."""
 
-    def shows(self, traffic: Environment) -> bool:
+    def shows(self, traffic: Environment) -> bool:  # noqa: ARG002 - where nothing else is said
         """Whether events can be seen before they happen."""
+        return False
 
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:
         """How often there are events, as `Events.probability` counts them."""
 
-    def milder(self, traffic: Environment) -> Environment | None:
+    def milder(self, traffic: Environment) -> Environment | None:  # noqa: ARG002
         """The same with events that are too mild to count, of which some are driven all the same; None without any."""
+        return None
 
     def mean_distance_m(self, traffic: Environment) -> float:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens."""
@@ -275,6 +280,7 @@ class Family(Protocol):
 
     def sources(self) -> Mapping[Method, type[Any]]:
         """Methods of its own, which draw the event in the loop: a class each (`harness.sampling.protocol.Source`)."""
+        return {}
 
     def start(self, traffic: Environment, u: FloatArray) -> RecordArray:
         """How paths begin, (n,), from uniforms (n, `n_uniforms`)."""
@@ -300,8 +306,9 @@ class Family(Protocol):
     def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:
         """Steps (m,) at whose end chosen events begin; what happens in them may be later."""
 
-    def told(self, facts: Mapping[str, Any]) -> str:
+    def told(self, facts: Mapping[str, Any]) -> str:  # noqa: ARG002
         """What an event is like, by the columns of its test, as a phrase behind that of its onset; may be empty."""
+        return ""
 
     def script(self, traffic: Environment, chosen: Chosen) -> Script:
         """The motion that chosen events are, from their facts alone."""

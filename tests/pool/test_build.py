@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from harness.campaign.files import load_campaign
+from harness.campaign.sections import PoolSettings
 from harness.families import family_named
-from harness.families.cut_in.family import CUT_IN
-from harness.pool.aim import NATURALISTIC_SHARE, aimed_points, fit_proposal
-from harness.pool.build import cached_pool, campaign_pool, campaign_pool_key, pool_name
+from harness.pool.aim import NATURALISTIC_SHARE, Enumerator, aimed_points, fit_proposal
+from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_name
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
-from harness.records.schemas import fact_columns
 from harness.resolved import resolve
 from harness.vehicles.library import load_library
 from tests.chains.seed import SEED
@@ -71,9 +70,7 @@ def test_a_pool_that_is_damaged_is_built_again(campaign, pool, tmp_path, monkeyp
     again = cached_pool(resolve(campaign))
     assert (again.key, again.names, again.library) == (pool.key, pool.names, pool.library)
     for field in dataclasses.fields(pool.events):
-        if field.name != "facts":  # lists are as wide as the longest that was kept
-            assert np.array_equal(getattr(again.events, field.name), getattr(pool.events, field.name))
-    assert fact_columns(again.events.facts, CUT_IN.columns) == fact_columns(pool.events.facts, CUT_IN.columns)
+        assert np.array_equal(getattr(again.events, field.name), getattr(pool.events, field.name))
     assert np.array_equal(again.mu_covariance, pool.mu_covariance)
     assert again.to_json() == pool.to_json()
 
@@ -93,6 +90,22 @@ def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside
     assert abs(share - p) < 4.0 * np.sqrt(p * (1.0 - p) / 500)  # misses with probability 6e-5
     with pytest.raises(IndexError):
         prescribed.rows((Draw(0, within.size, 1),))
+
+
+@pytest.mark.slow
+def test_how_many_paths_a_pool_has_does_not_depend_on_them(campaign, monkeypatch):
+    """One that ends where its paths look alike has the rates of paths that look alike, which are too low."""
+    settings, run = PoolSettings(relative_error=0.015, events_per_shell=100), Enumerator.run
+    resolved = resolve(campaign.replaced(("pool",), settings))
+
+    def alike(self, first, n, progress):
+        paths = run(self, first, n, progress)
+        same = {"mass": np.full_like(paths.mass, 1e-9), "crashes": np.full_like(paths.crashes, 1)}
+        return dataclasses.replace(paths, **same) if first else paths
+
+    n_paths = build_pool(resolved, "of the paths").n_paths
+    monkeypatch.setattr(Enumerator, "run", alike)
+    assert build_pool(resolved, "of equal ones").n_paths == n_paths > 1024
 
 
 def test_weights_of_a_proposal_make_up_for_its_aim():
