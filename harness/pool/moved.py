@@ -140,7 +140,7 @@ def assumed(
     """
     if pool is None or design is None:
         return asdict(Assumed(traffic.parameters.unseen)) if traffic.parameters.unseen else None
-    if (left := traffic.family.left_open(traffic.parameters)) is None:
+    if (left := traffic.parameters.left_open()) is None:
         return None
     ends = [environment_with(traffic, each) for each in left.ends]
     if None in ends:
