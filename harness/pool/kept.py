@@ -8,12 +8,13 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from harness.pool.aim import PILOT_PATHS
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, Float32Array, FloatArray, IntArray, RecordArray, UInt64Array
 
-FORMAT = 9
+FORMAT = 10
 """Raise it when the meaning of a pool changes."""
 
 
@@ -131,16 +132,17 @@ class Pool:
         }
 
 
-def pool_content(pool: Pool) -> memoryview:
+def pool_content(pool: Pool) -> bytes:
     """A pool as the content of a file, without its library, of which the key holds what matters."""
     known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "events")}
     np.savez(file := BytesIO(), **known, **vars(pool.events))
-    return file.getbuffer()
+    return bytes(pa.compress(file.getbuffer(), codec="zstd", asbytes=True))
 
 
 def pool_from(content: bytes, library: Library) -> Pool:
     """The pool that `pool_content` has written, of a library."""
-    with np.load(BytesIO(content)) as stored:
+    packed = pa.input_stream(pa.BufferReader(content), compression="zstd")
+    with np.load(BytesIO(packed.read())) as stored:
         arrays = {name: stored[name] for name in stored.files}
     events = KeptEvents(**{each.name: arrays.pop(each.name) for each in fields(KeptEvents)})
     names = tuple(arrays.pop("names").tolist())
