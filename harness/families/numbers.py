@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
@@ -14,7 +14,6 @@ from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule, describe_found
 from harness.campaign.sections import Section
 from harness.campaign.yaml_text import read_yaml
-from harness.families.protocol import LeftOpen
 from harness.families.replicates import content_hash
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2
@@ -123,13 +122,27 @@ class SpeedsAndGaps(Section):
     r1_log_sd_u: LogScale
 
 
-class ParameterFile(Section):
-    """Sections of numbers; see `harness.families.protocol.Parameters`. ``folder`` has those that files are ``like``.
+class LeftOpen(NamedTuple):
+    """What data leave open of a traffic: numbers by name at the two ``ends`` of what they may be.
 
-    Of one whose data have all kinds of events nothing more is to be said.
+    ``where`` says where nothing was seen, else it is empty and ``highest`` the end of a stated range.
+    """
+
+    where: str
+    highest: float | None
+    ends: tuple[Mapping[str, float], Mapping[str, float]]
+
+
+class ParameterFile(Section):
+    """Numbers of a traffic in sections, each with its provenance; a file may be ``like`` one of a ``folder``.
+
+    ``replicates`` names a ``file`` of numbers that other data would have given, with its ``sha256``; None without one.
+    ``blocks`` are sections whose numbers are fitted together, by what they are called. Of one whose data have all kinds
+    of events nothing more is to be said.
     """
 
     folder: ClassVar[Path]
+    replicates: ClassVar[Any]
     blocks: ClassVar[Mapping[str, tuple[str, ...]]]
 
     @model_validator(mode="before")
@@ -139,18 +152,23 @@ class ParameterFile(Section):
 
     @property
     def unseen(self) -> str:
+        """Where the data had no event; empty where they had."""
         return ""
 
     def without_half(self) -> Mapping[int, Mapping[str, float]]:
+        """Numbers with which there are half as many events of each kind that the data have not."""
         return {}
 
     def unseen_in(self, kinds: Collection[int]) -> str:  # noqa: ARG002 - there is none
+        """Where some of these kinds are."""
         return ""
 
     def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
+        """A replicate with what no event at all leaves open upwards."""
         return dict(row)
 
     def left_open(self) -> LeftOpen | None:
+        """What data leave open."""
         return None
 
     def numbers(self) -> dict[str, Number]:

@@ -114,31 +114,28 @@ class EpisodeLoop:
         Raises `WorldDisagreementError`: the world did something else than it was told. Raises `CampaignError`: the
         vehicle has replaced what the harness calls, whatever came of that.
         """
-        try:
-            return self._run(first_episode, traffic)
-        finally:
-            if self._av is not None:
-                self._av.require_untouched()
-
-    def _run(self, first_episode: int, traffic: Traffic) -> Shard:
         n = len(traffic)
         traced = hash_of_index(self._scenario.seed, first_episode + np.arange(n)) < self._keep.trace_share
         shard = Shard(first_episode, self._scenario, traffic, np.zeros(n, EPISODE_DTYPE), traced)
         self._cells.cell["row"] = -1
         kernel, given, ended = self._kernel_state(shard), 0, 0
         traffic.begin(self._world.n_cells)
-        while True:
-            placed = refill(kernel, given)
-            traffic.move(kernel, placed)
+        try:
+            while True:
+                placed = refill(kernel, given)
+                traffic.move(kernel, placed)
+                if self._av is not None:
+                    ended += self._ask(self._av, kernel, shard, placed)
+                elif not self._world.drives_av:
+                    drive(kernel)
+                command(kernel)
+                if ended == n:
+                    return shard
+                ended += self._step_and_judge(kernel, shard, placed)
+                given += placed
+        finally:
             if self._av is not None:
-                ended += self._ask(self._av, kernel, shard, placed)
-            elif not self._world.drives_av:
-                drive(kernel)
-            command(kernel)
-            if ended == n:
-                return shard
-            ended += self._step_and_judge(kernel, shard, placed)
-            given += placed
+                self._av.require_untouched()
 
     def beside(self, world: World | None = None, keep: RecordPolicy | None = None) -> EpisodeLoop:
         """Another loop with the same AV, in a world of no more cells, or with other records."""

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
+from harness.families.numbers import ParameterFile
 from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, Family
 from harness.loop.cells import natural_script
 
@@ -22,28 +23,10 @@ RATE = 0.5 * (0.02 + 0.01)
 STEPS = 60
 
 
-class Numbers:
-    """Of which none can be another; see `harness.families.protocol.Parameters`."""
+class Numbers(ParameterFile):
+    """Of which none can be another."""
 
-    blocks, replicates, unseen = {}, None, ""
-
-    def numbers(self):
-        return {}
-
-    def content_hash(self):
-        return "fake"
-
-    def without_half(self):
-        return {}
-
-    def unseen_in(self, kinds):
-        return ""
-
-    def as_if_unseen(self, row):
-        return dict(row)
-
-    def left_open(self):
-        return None
+    folder, blocks, replicates = Path(__file__).parent, {}, None
 
 
 class Fake(Family):

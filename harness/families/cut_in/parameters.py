@@ -14,8 +14,7 @@ from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
 from harness.families.cut_in import sections
 from harness.families.cut_in.sections import REPLACED, SMALLEST_SHARE, STEP
-from harness.families.numbers import FitRange, ParameterFile
-from harness.families.protocol import LeftOpen
+from harness.families.numbers import FitRange, LeftOpen, ParameterFile
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import Record
 
@@ -41,7 +40,7 @@ class EnvironmentParameters(ParameterFile):
     hazard_table: sections.HazardTable | None = None
     acceptance_steps: sections.AcceptanceSteps | None = None
     lateral: sections.Lateral | None = None
-    replicates: sections.Replicates | None = None
+    replicates: sections.Replicates | None = None  # type: ignore[misc] # others have none
 
     @model_validator(mode="after")
     def _one_law_each(self) -> Self:

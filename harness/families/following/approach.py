@@ -10,6 +10,7 @@ from scipy import special
 
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.flow import Flow
+from harness.loop.cells import NEVER
 from harness.random_stream import LV_DRAWS, uniform
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M, next_position, next_speed
@@ -19,7 +20,6 @@ AV_START_M = 100.0
 HOLD_STEPS = 10
 """For which the vehicle ahead keeps a drawn acceleration."""
 LEAD, REVEALED = 0, 1
-NEVER = 2**31
 PARKED_M = 3900.0
 """Where a vehicle stands that nothing reveals."""
 _GRID_MPS2 = 0.2

@@ -36,17 +36,6 @@ CONTROL_STEPS = 16
 """Of a test, for which a shard has room at first; more is made where they are more."""
 
 
-class Draws(NamedTuple):
-    """What is known of the K running tests: ``cell`` (K,) are `CELL_DTYPE` records.
-
-    ``cut_challenge`` and ``stay_challenge`` (K, hold, J) look ahead to the end of the hold period.
-    """
-
-    cell: RecordArray
-    cut_challenge: FloatArray
-    stay_challenge: FloatArray
-
-
 class Drawn(NamedTuple):
     """What has been drawn in the tests (n,) of a shard.
 
@@ -85,10 +74,16 @@ class Scratch(NamedTuple):
 
 
 class Nade(NamedTuple):
-    """All that NADE's kernels need beside the loop's; ``states`` (n,) are the initial states of a shard's tests."""
+    """All that NADE's kernels need beside the loop's.
+
+    ``states`` (n,) are the initial states of a shard's tests, ``cell`` (K,) `CELL_DTYPE` records of those that run, for
+    which ``cut_challenge`` and ``stay_challenge`` (K, hold, J) look ahead to the end of the hold period.
+    """
 
     states: RecordArray
-    draws: Draws
+    cell: RecordArray
+    cut_challenge: FloatArray
+    stay_challenge: FloatArray
     drawn: Drawn
     scratch: Scratch
     environment: Environment
@@ -110,14 +105,9 @@ def empty_nade(
     q, challenge = np.zeros((2, n_surrogates))
     q_acceleration, ratio = np.zeros((n_surrogates, N_ACCELERATIONS)), np.zeros(importance.alpha.size)
     scratch = np.zeros(N_ACCELERATIONS), q, q_acceleration, challenge, ratio, empty_trajectory(environment)
-    return Nade(
-        states,
-        Draws(np.zeros(n_cells, CELL_DTYPE), cutting, staying),
-        Drawn(n_lv, n_bv, log_q, martingale, lv_path, bv_path, *moments),
-        Scratch(*scratch),
-        environment,
-        importance,
-    )
+    running = np.zeros(n_cells, CELL_DTYPE), cutting, staying
+    drawn = Drawn(n_lv, n_bv, log_q, martingale, lv_path, bv_path, *moments)
+    return Nade(states, *running, drawn, Scratch(*scratch), environment, importance)
 
 
 def with_more_room(drawn: Drawn) -> Drawn:

@@ -38,7 +38,7 @@ def decide(kernel: KernelState, nade: Nade, placed: int) -> None:
         if cells.cell[k].row < 0:
             continue
         draw_maneuvers(k, state_of(kernel.x[k], kernel.v[k]), kernel, nade)
-        draws = nade.draws.cell[k]
+        draws = nade.cell[k]
         cells.speed[k, LV] = next_speed(kernel.v[k, LV], acceleration(draws.lv_maneuver))
         cells.speed[k, BV] = next_speed(kernel.v[k, BV], acceleration(draws.bv_maneuver))
 
@@ -48,7 +48,7 @@ def finish(kernel: KernelState, nade: Nade, n: int) -> None:
     """Write what the ``n`` tests weigh that have just ended to their rows."""
     for i in range(n):
         k, row = kernel.cells.ended[i], kernel.cells.ended_row[i]
-        log_sampled = nade.draws.cell[k].log_sampled
+        log_sampled = nade.cell[k].log_sampled
         if nade.importance.mixes_episodes:
             log_sampled = log_mixture(nade.importance.alpha, nade.drawn.log_q[row])
         kernel.episode[row].log_weight = -log_sampled  # exactly 0 without control
@@ -63,7 +63,7 @@ def draw_maneuvers(k: int, state: State, kernel: KernelState, nade: Nade) -> Non
     if redraw:
         u = uniform(kernel.seed, cell.episode, LV_DRAWS, period)
         maneuver = laws.drive_freely(u, kernel.v[k, LV], nade.environment)
-        nade.draws.cell[k].lv_maneuver = nade.drawn.lv_path[cell.row, period] = maneuver
+        nade.cell[k].lv_maneuver = nade.drawn.lv_path[cell.row, period] = maneuver
         nade.drawn.n_lv[cell.row] = period + 1
     if cell.event_step < 0:
         if redraw:
@@ -78,19 +78,19 @@ def draw_maneuvers(k: int, state: State, kernel: KernelState, nade: Nade) -> Non
 @compiled_inline
 def redraw_following(k: int, period: int, state: State, kernel: KernelState, nade: Nade) -> None:
     """BV's acceleration behind LV, and what cutting in or staying would be worth during the coming hold period."""
-    cell, draws = kernel.cells.cell[k], nade.draws.cell[k]
+    cell, draws = kernel.cells.cell[k], nade.cell[k]
     u = uniform(kernel.seed, cell.episode, BV_DRAWS, period)
     draws.bv_maneuver = draw_acceleration(u, laws.car_following(state, nade.environment), nade.environment)
     add_to_path(cell.row, draws.bv_maneuver, nade)
     if nade.importance.n_surrogates > 0:
-        a, cutting, staying = acceleration(draws.bv_maneuver), nade.draws.cut_challenge[k], nade.draws.stay_challenge[k]
+        a, cutting, staying = acceleration(draws.bv_maneuver), nade.cut_challenge[k], nade.stay_challenge[k]
         look_ahead(state, a, cell.step, nade.environment, nade.importance, cutting, staying)
 
 
 @compiled_inline
 def redraw_free(k: int, period: int, state: State, kernel: KernelState, nade: Nade) -> None:
     """BV's acceleration for a hold period after its cut-in."""
-    cell, draws = kernel.cells.cell[k], nade.draws.cell[k]
+    cell, draws = kernel.cells.cell[k], nade.cell[k]
     u = uniform(kernel.seed, cell.episode, BV_FREE_DRAWS, period)
     if nade.importance.n_surrogates > 0:
         draws.bv_maneuver = controlled_draw(k, u, state, kernel, nade)
@@ -109,7 +109,7 @@ def add_to_path(row: int, maneuver: int, nade: Nade) -> None:
 @compiled_inline
 def begin(k: int, kernel: KernelState, nade: Nade) -> None:
     """Draw when BV will cut in, on the clock of hazards; a forced cut-in on its path."""
-    cell, draws, environment, importance = kernel.cells.cell[k], nade.draws.cell[k], nade.environment, nade.importance
+    cell, draws, environment, importance = kernel.cells.cell[k], nade.cell[k], nade.environment, nade.importance
     test = kernel.episode[cell.row]
     draws.lv_maneuver = draws.bv_maneuver = 0
     draws.clock = draws.hazard = draws.log_sampled = 0.0
@@ -142,14 +142,14 @@ def draw_component(u: float, alpha: FloatArray) -> int:
 def choose_lane(k: int, state: State, kernel: KernelState, nade: Nade) -> None:
     """Stay or cut in."""
     scratch, environment, importance = nade.scratch, nade.environment, nade.importance
-    cell, draws = kernel.cells.cell[k], nade.draws.cell[k]
+    cell, draws = kernel.cells.cell[k], nade.cell[k]
     wish = laws.opportunity(state, environment)
     hazard = laws.cut_in_hazard(wish, laws.acceptance(state.r2_m, state.r2dot_mps, environment), environment)
     p = -math.expm1(-hazard) if importance.alpha.size > 0 else 0.0  # only the likelihood ratios ask for it
     critical = False
     if importance.n_surrogates > 0:
         i = cell.step % environment.numbers.hold_steps
-        cut_challenge, stay_challenge = nade.draws.cut_challenge[k, i], nade.draws.stay_challenge[k, i]
+        cut_challenge, stay_challenge = nade.cut_challenge[k, i], nade.stay_challenge[k, i]
         critical = propose_cut_in(p, wish, cut_challenge, stay_challenge, importance, scratch.q, scratch.challenge)
     component = kernel.episode[cell.row].component
     if critical and component != 0:

@@ -51,7 +51,7 @@ class DrawnInLoop(Traffic):
         self.drawn, self._unboxed = self._nade.drawn, unboxed(self._nade)
 
     def move(self, kernel: KernelState, placed: int) -> None:
-        if self.drawn.moment_count[0] > self.drawn.moment.size - len(self._nade.draws.cell):
+        if self.drawn.moment_count[0] > self.drawn.moment.size - len(self._nade.cell):
             self.drawn = with_more_room(self.drawn)
             self._nade = self._nade._replace(drawn=self.drawn)
             self._unboxed = unboxed(self._nade)

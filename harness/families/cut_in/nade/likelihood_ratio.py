@@ -92,7 +92,7 @@ def record_lane(
 
     ``scratch.q`` and ``scratch.challenge`` (J,) are q_j(cut_in) and V_j where it is critical.
     """
-    draws, scratch, importance = nade.draws.cell[k], nade.scratch, nade.importance
+    draws, scratch, importance = nade.cell[k], nade.scratch, nade.importance
     sampled = 1.0
     if critical or importance.n_forced == 1:
         if importance.n_forced == 1:
@@ -129,7 +129,7 @@ def record_acceleration(k: int, state: State, maneuver: int, kernel: KernelState
 @compiled_inline
 def accumulate_step(k: int, kernel: KernelState, nade: Nade) -> float:
     """Take ``scratch.ratio`` and ``scratch.challenge`` of a step into the likelihood ratios; returns its q_α/p."""
-    scratch, importance, draws = nade.scratch, nade.importance, nade.draws.cell[k]
+    scratch, importance, draws = nade.scratch, nade.importance, nade.cell[k]
     row = kernel.cells.cell[k].row
     log_ratio, martingale = nade.drawn.log_q[row], nade.drawn.martingale[row]
     sampled = accumulate(importance, scratch.ratio, scratch.challenge, draws.log_sampled, log_ratio, martingale)
