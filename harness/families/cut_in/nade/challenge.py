@@ -39,7 +39,16 @@ from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.families.cut_in import laws
 from harness.families.cut_in.laws import Environment, InitialStates, acceleration
 from harness.families.cut_in.loading import evaluate_laws
-from harness.families.cut_in.nade.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, shape_of
+from harness.families.cut_in.nade.grid import (
+    AFTER,
+    BEFORE,
+    GridPoints,
+    interpolate,
+    locate,
+    points_of,
+    shape_of,
+    state_at,
+)
 from harness.processes import usable_cpus
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
@@ -93,7 +102,7 @@ def hold_period(
 def transitions(driver: RecordArray, steps: int, first: int, points: GridPoints, out: Float32Array) -> None:
     """State one hold period later for every grid state and acceleration; ``out`` (v, R2, R2dot, 31, 3)."""
     for i, j, k in np.ndindex(out.shape[:3]):
-        v, r2, r2dot = points.speed[i], points.r2[j], points.r2dot[k]
+        v, r2, r2dot = state_at(points, i, j, k)
         for m in range(N_ACCELERATIONS):
             after = hold_period(v, r2, r2dot, acceleration(m), driver[0], steps, first)
             out[i, j, k, m, 0], out[i, j, k, m, 1], out[i, j, k, m, 2] = after
@@ -225,7 +234,7 @@ def roll_out(
     by_level = np.empty(value.shape[0])
     least[:] = _NO_CONTACT_M
     for i, j, k, m in np.ndindex(maneuvers.shape):
-        v, r2, r2dot = points.speed[i], points.r2[j], points.r2dot[k]
+        v, r2, r2dot = state_at(points, i, j, k)
         smallest_gaps(v, r2, r2dot, m, hold, steps_per_level, driver[0], by_level)
         maneuvers[i, j, k, m] = by_level[-1]
         for level in range(by_level.size):
@@ -310,7 +319,7 @@ def backward_period(
 ) -> None:
     """``out`` = G at ``step`` from ``later`` = G one hold period later; both (v, R2, R2dot)."""
     for i, j, k in np.ndindex(out.shape):
-        v, r2, r2dot = points.speed[i], points.r2[j], points.r2dot[k]
+        v, r2, r2dot = state_at(points, i, j, k)
         total = 0.0
         for m in range(N_ACCELERATIONS):
             if pmf[i, m] > _NEGLIGIBLE:

@@ -56,6 +56,12 @@ def points_of(grid: Grid) -> GridPoints:
 
 
 @compiled_inline
+def state_at(points: GridPoints, i: int, j: int, k: int) -> tuple[float, float, float]:
+    """State of a table's entry."""
+    return points.speed[i], points.r2[j], points.r2dot[k]
+
+
+@compiled_inline
 def locate_uniform(x: float, axis: Axis) -> tuple[int, float]:
     """Cell index and the weight of its upper end."""
     position = min(max((x - axis.low) / axis.step, 0.0), axis.size - 1.0)
