@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
+from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings, PoolSettings
-from harness.families import family_named
-from harness.families.cut_in.loading import load_environment
 from harness.pool.aim import PILOT_PATHS
 from harness.pool.build import take_aim
 from harness.progress import Progress
+from harness.resolved import resolve
 from harness.vehicles.library import load_library
 
 LIBRARY = Path(__file__).parent / "lateral_rows.yaml"
@@ -38,9 +38,11 @@ COMPETENT = "competent"
 
 def rates(settings: EnvironmentSettings, n_paths: int) -> tuple[np.ndarray, np.ndarray]:
     """Crash rates of the library's drivers and the covariance of their errors, from so many aimed paths."""
-    library = load_library(str(LIBRARY))
-    aim = take_aim(family_named("cut_in"), load_environment(settings), library, PoolSettings(), Progress())
-    found = aim.enumerator.run(PILOT_PATHS, n_paths, Progress()).rates(len(library.surrogates))[:, :-1]
+    pool = PoolSettings(library=str(LIBRARY))
+    campaign = load_campaign("scenarios/overtaking_shells.yaml")
+    resolved = resolve(campaign.model_copy(update={"environment": settings, "pool": pool}))
+    paths = take_aim(resolved, Progress()).enumerator.run(PILOT_PATHS, n_paths, Progress())
+    found = paths.rates(len(resolved.library.surrogates))[:, :-1]
     return found.mean(0), np.cov(found.T) / n_paths
 
 

@@ -15,7 +15,6 @@ import sys
 import numpy as np
 
 from harness import load_campaign
-from harness.campaign.sections import PoolSettings
 from harness.pool.aim import PILOT_PATHS
 from harness.pool.build import AGGRESSIVE_ERROR, ROUND_PATHS, Aim, planned_number, take_aim
 from harness.progress import Progress
@@ -42,7 +41,7 @@ def stopped(sums: FloatArray, squares: FloatArray, aim: Aim, error: float, rng: 
 def main() -> None:
     """Print the lines."""
     resolved = resolve(load_campaign("scenarios/overtaking_shells.yaml", ["pool.seed=101"]))
-    aim = take_aim(resolved.family, resolved.environment, resolved.library, resolved.campaign.pool, Progress())
+    aim = take_aim(resolved, Progress())
     n_rounds, n_surrogates = int(sys.argv[1]) // ROUND_PATHS if sys.argv[1:] else 1024, len(resolved.library.surrogates)
     firsts = range(PILOT_PATHS, PILOT_PATHS + n_rounds * ROUND_PATHS, ROUND_PATHS)
     rates = (aim.enumerator.run(first, ROUND_PATHS, Progress()).rates(n_surrogates) for first in firsts)
@@ -55,7 +54,7 @@ def report(sums: FloatArray, squares: FloatArray, aim: Aim) -> None:
     truth = sums.mean(0) / ROUND_PATHS
     inside, rng = aim.conservative, np.random.default_rng(1)
     for error in ERRORS:
-        rounds = planned_number(aim, PoolSettings(relative_error=error)) // ROUND_PATHS
+        rounds = planned_number(aim, error) // ROUND_PATHS
         planned = [sums[rng.integers(0, len(sums), rounds)].mean(0) / ROUND_PATHS for _ in range(10 * POOLS)]
         own = [stopped(sums, squares, aim, error, rng) for _ in range(POOLS)]
         far = np.abs(np.mean(own, 0) / truth - 1.0)

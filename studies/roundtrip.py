@@ -125,11 +125,10 @@ class Drivers:
     def __init__(self) -> None:
         settings = {"environment.parameters": TRAFFIC.parameters, "environment.lane_change_level": 1.0}
         resolved = resolve(load_campaign("scenarios/smoke.yaml", [f"{key}={value}" for key, value in settings.items()]))
-        library, nobody = resolved.library, Progress()
-        names = [*library.surrogates, *library.references]
+        names = [*resolved.library.surrogates, *resolved.library.references]
         self._bits = [names.index(driver) for driver in DRIVERS]
         here = load_environment(TRAFFIC, truth())
-        self._paths: Enumerator = take_aim(resolved.family, here, library, resolved.campaign.pool, nobody).enumerator
+        self._paths: Enumerator = take_aim(replace(resolved, environment=here), Progress()).enumerator
         self.true = self._of(here)
 
     def rates(self, parameters: EnvironmentParameters) -> FloatArray:

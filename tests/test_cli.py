@@ -12,19 +12,15 @@ from unittest.mock import Mock
 
 import click
 import pytest
-from click.testing import CliRunner
 
 from harness.campaign.files import load_campaign
-from harness.cli import cli, main
+from harness.cli import main
 from harness.commands.options import run_folder
 from harness.commands.printing import say
-from harness.errors import EXIT_BAD_INPUT, EXIT_REFUTED, RunFolderError, TooManyFailedError
-from harness.numbers import interval, words
+from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.progress import Progress
 from harness.report.lines import lines
-from harness.report.notes import note_words
 from harness.report.words import answer_of
-from harness.runner.stored import estimate_run
 from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
@@ -40,13 +36,6 @@ def folder(stored_run, tmp_path):
     """A copy of a finished run, which a test may write into; pages are others' concern."""
     with one_process(), without_page():
         yield copy_of(stored_run("shells-refuted"), tmp_path / "an out")
-
-
-def test_help_teaches():
-    for command in ([], *([name] for name in cli.commands)):
-        result = CliRunner().invoke(cli, [*command, "--help"])
-        assert result.exit_code == 0
-        assert "Examples:\n    harness " in result.output
 
 
 def test_check_prints_a_campaign_file(capsys, tmp_path):
@@ -207,27 +196,6 @@ def test_an_independent_repetition_meets_another_pool_too(monkeypatch, options, 
     assert main(["run", SMOKE, "--quiet", *options]) == 2
     campaign = runs.call_args.args[0]
     assert (campaign.seed, campaign.pool.seed) == seeds
-
-
-def test_estimate_prints_a_table_and_closes_with_what_was_asked(stored_run, capsys):
-    folder = stored_run("mixture-twin")
-    before, content = sorted(folder.iterdir()), estimate_run(folder, estimators=("mixture_cv", "nde"), confidence=0.95)
-    found, reason = content["estimates"]["mixture_cv"], note_words(content["estimates"]["nde"]["why"])
-    command = ["estimate", str(folder), "-e", "nde", "--confidence", "0.95"]
-    assert main([*command, "-e", "mixture_cv"]) == 0
-    out = capsys.readouterr().out
-    row = next(line for line in out.splitlines() if "mixture_cv *" in line)
-    shown = words(found["crash_rate"], 4), interval(found["ci_low"], found["ci_high"])
-    assert [text for text in shown if text not in row] == []
-    assert [
-        text for text in (f"mixture_cv: {note_words(found['warnings'][0])}", f"nde: {reason}") if text not in out
-    ] == []
-    assert main(command) == EXIT_BAD_INPUT  # these records do not allow it
-    out = capsys.readouterr().out
-    assert out.splitlines()[-1] == f"nde: {reason}"
-    assert "mixture_cv" not in out
-    assert out.count(reason) == 1
-    assert sorted(folder.iterdir()) == before
 
 
 def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_path):

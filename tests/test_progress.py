@@ -13,11 +13,6 @@ from harness import numbers as n
 from harness.progress import Progress, ShownProgress, shown_progress
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
 class Log(io.StringIO):
     """Tells when a line has come."""
 
@@ -27,25 +22,6 @@ class Log(io.StringIO):
 
     def flush(self):
         self.came.set()
-
-
-def test_a_narrow_terminal_shows_rate_figures_and_time_left(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    stream = Terminal()
-    with ShownProgress(stream) as bar:
-        bar.advance(1)  # before any stage it is no error
-        bar.stage("criticality tables", total=3)
-        bar.advance(3)
-        bar.stage("episodes", total=None)
-        bar.status(crashes=3, rhw=96.0)
-        bar.advance(10)
-        assert not {"left", "RHW"} & set(stream.getvalue().splitlines()[-1].split())
-        bar.status(crashes=1_234, rhw=0.0812)
-        bar.advance(4_990)
-    last_line = stream.getvalue().splitlines()[-2]
-    for text in ("episodes", "/s · crashes 1,234 · RHW 0.081"):
-        assert text in last_line
-    assert "criticality" not in last_line
 
 
 def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeypatch):
@@ -88,7 +64,6 @@ def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeyp
         (n.share(1e-7, least=1e-3), "< 0.1 %"),
         (n.half_width(842.79), "> 10"),
         (n.duration(3720.0), "1 h 02 min"),
-        (n.size(1_500_000), "1.5 MB"),
     ],
 )
 def test_numbers_are_written_with_few_digits_and_never_more_than_there_are(written, text):

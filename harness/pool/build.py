@@ -13,14 +13,13 @@ import numpy as np
 from harness import cache
 from harness.campaign.sections import PoolSettings
 from harness.compiled import WORLD_SOURCES, source_hash
-from harness.families.protocol import Environment, Family, Paths
+from harness.families.protocol import Paths
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, Enumerator
 from harness.pool.kept import FORMAT, KeptEvents, Pool, pool_content, pool_from
 from harness.pool.shells import cells_of, conservative_first, shells_of
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.resolved import Resolved
-from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 
 ROUND_PATHS = 1024
@@ -71,9 +70,7 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
     key = campaign_pool_key(resolved, order)
     if (cached := cached_pool(resolved, order)) is not None:
         return cached
-    pool = build_pool(
-        resolved.family, resolved.environment, resolved.library, resolved.campaign.pool, key, progress, order
-    )
+    pool = build_pool(resolved, key, progress, order)
     cache.keep(pool_name(key), pool_content(pool))
     return pool
 
@@ -81,27 +78,18 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
 def cached_pool(resolved: Resolved, order: Sequence[str] = ()) -> Pool | None:
     """The pool of a campaign; None if none has been built on this machine, or its file is damaged."""
     content = cache.read(pool_name(campaign_pool_key(resolved, order)))
-    # The key does not hold what the boundary assumes in words: that is said as of today.
-    return None if content is None else replace(pool_from(content), library=resolved.library)
+    return None if content is None else pool_from(content, resolved.library)
 
 
-def build_pool(
-    family: Family,
-    environment: Environment,
-    library: Library,
-    settings: PoolSettings,
-    key: str,
-    progress: Progress | None = None,
-    order: Sequence[str] = (),
-) -> Pool:
+def build_pool(resolved: Resolved, key: str, progress: Progress | None = None, order: Sequence[str] = ()) -> Pool:
     """Build a pool in the twin, which will carry the content hash ``key``; for ``order`` see `campaign_pool`."""
-    progress = progress or Progress()
-    aim = take_aim(family, environment, library, settings, progress)
-    n = planned_number(aim, settings)
-    progress.stage(f"pool of {family.words.events}", n)
+    progress, names = progress or Progress(), list(resolved.library.surrogates)
+    aim = take_aim(resolved, progress)
+    n = planned_number(aim, resolved.campaign.pool.relative_error or resolved.family.pool_error)
+    progress.stage(f"pool of {resolved.family.words.events}", n)
     paths = aim.enumerator.run(PILOT_PATHS, n, progress)
-    places = np.array([list(library.surrogates).index(name) for name in order], np.int64) if order else None
-    return pool_of(family, paths, settings.seed ^ POOL_SEED, places, environment, library, settings, key)
+    places = np.array([names.index(name) for name in order], np.int64) if order else None
+    return pool_of(resolved, paths, key, places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +106,11 @@ class Aim:
         return np.where(self.conservative, 1.0, AGGRESSIVE_SHARE)
 
 
-def take_aim(
-    family: Family, environment: Environment, library: Library, settings: PoolSettings, progress: Progress
-) -> Aim:
+def take_aim(resolved: Resolved, progress: Progress) -> Aim:
     """Find out by a pilot run of naturalistic paths where surrogates crash."""
+    family, environment, library = resolved.family, resolved.environment, resolved.library
     followers = library.followers(family.shows(environment))
-    pilot = Enumerator(family, environment, followers, settings.seed ^ POOL_SEED)
+    pilot = Enumerator(family, environment, followers, resolved.campaign.pool.seed ^ POOL_SEED)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(library.surrogates))
     mean, boundary = rates.mean(0), list(library.surrogates).index(library.boundary)
@@ -134,8 +121,8 @@ def take_aim(
     return replace(aim, enumerator=pilot.aimed(rates, aim.share))
 
 
-def planned_number(aim: Aim, settings: PoolSettings) -> int:
-    """How many aimed paths the relative errors need by the pilot run; what is left of these is part of every interval.
+def planned_number(aim: Aim, error: float) -> int:
+    """How many aimed paths a relative error needs by the pilot run; what is left of it is part of every interval.
 
     Were paths added until their own errors look small, the rate of a surrogate that few of them meet would come out too
     low (docs/internals/performance.md). The pilot's paths are none of them; each counts by the weight that it has under
@@ -145,27 +132,18 @@ def planned_number(aim: Aim, settings: PoolSettings) -> int:
     mean = rates.mean(0)
     seen = mean > 0.0
     relvar = (rates * rates * weight[:, None]).mean(0)[seen] / mean[seen] ** 2 - 1.0
-    wanted = (settings.relative_error or aim.enumerator.family.pool_error) * np.where(
-        aim.conservative, 1.0, AGGRESSIVE_ERROR
-    )[seen]
+    wanted = error * np.where(aim.conservative, 1.0, AGGRESSIVE_ERROR)[seen]
     rounds = np.ceil(np.max(relvar / wanted**2, initial=1.0) / ROUND_PATHS)
     return ROUND_PATHS * min(int(rounds), MOST_PATHS // ROUND_PATHS)
 
 
-def pool_of(
-    family: Family,
-    paths: EnumeratedPaths,
-    seed: int,
-    order: IntArray | None,
-    environment: Environment,
-    library: Library,
-    settings: PoolSettings,
-    key: str,
-) -> Pool:
+def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArray | None = None) -> Pool:
     """Sort the events of paths into shells, by surrogates in this order, and cells; keep a sample of each shell.
 
-    ``seed`` is that of the paths; without an order surrogates are put into that of their rates.
+    Without an order surrogates are put into that of their rates.
     """
+    family, environment, library = resolved.family, resolved.environment, resolved.library
+    settings = resolved.campaign.pool
     names, n_references = np.array(list(library.surrogates)), len(library.references)
     n_surrogates = names.size
     rates, mass = paths.rates(n_surrogates), paths.mass
@@ -178,7 +156,7 @@ def pool_of(
     cell, cell_shell, cell_references, by_path = cells_of(mass, shell, references, n_references)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
     path, step = _keep(mass, shell, n_surrogates + 1, settings)
-    chosen = family.choose(environment, seed, Paths(paths.index[path], paths.start[path]), step)
+    chosen = family.choose(environment, settings.seed ^ POOL_SEED, Paths(paths.index[path], paths.start[path]), step)
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
     mass_kept = by_path[path].astype(np.float32)

@@ -1,29 +1,20 @@
-"""What a pool is: cells with their probabilities, surrogates with their crash rates, and events to test with.
-
-On disk it is one Parquet file of events, with all that is known of cells and surrogates in its metadata.
-"""
+"""What a pool is: cells with their probabilities, surrogates with their crash rates, and events to test with."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from io import BytesIO
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from harness.families import family_named
 from harness.pool.aim import PILOT_PATHS
-from harness.records.folder import parquet
-from harness.records.schemas import fact_columns, facts_from, rows
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, Float32Array, FloatArray, IntArray, RecordArray, UInt64Array
 
-FORMAT = 8
+FORMAT = 9
 """Raise it when the meaning of a pool changes."""
-_METADATA = b"harness_pool"
 
 
 def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
@@ -140,56 +131,18 @@ class Pool:
         }
 
 
-def pool_content(pool: Pool) -> bytes:
-    """A pool as the content of a file."""
-    return parquet(_table(pool))
-
-
-def _table(pool: Pool) -> pa.Table:
-    c = pool.events
-    probability = pool.shell_p / np.maximum(np.bincount(pool.shell, minlength=pool.shell_p.size), 1)
-    columns: dict[str, tuple[pa.Array, str]] = {
-        "path": (pa.array(c.path), "index of the path in the pool"),
-        "event": (pa.array(c.step.astype(np.int16)), "which of the path's events"),
-        "event_step": (pa.array(c.at.astype(np.int16)), "step (0.1 s) in which it is"),
-        "probability": (pa.array(probability[pool.shell]), "P under the NDE that it stands for"),
-        "shell": (pa.array(pool.shell.astype(np.int8)), "first surrogate that crashes; the last shell: none does"),
-        "cell": (pa.array(c.cell.astype(np.int16)), "shell and references that crash, as the metadata lists cells"),
-        "crashes": (rows(c.crashes), "which surrogates crash, as the metadata orders names, and which references"),
-        "path_mass": (rows(c.path_mass), "P of an event of each cell on the path, times the path's weight"),
-        "lead_steps": (pa.array(c.lead.astype(np.int16)), "steps from the onset of lateral motion to overlap"),
-    }
-    own = family_named(pool.family).columns
-    known_of = fact_columns(c.facts, own)
-    columns |= {each.name: (known_of[each.name], each.doc) for each in own}
-    schema = pa.schema(
-        [pa.field(name, array.type, nullable=False, metadata={"doc": doc}) for name, (array, doc) in columns.items()]
-    )
+def pool_content(pool: Pool) -> memoryview:
+    """A pool as the content of a file, without its library, of which the key holds what matters."""
     known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "events")}
-    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known.items()}
-    table = pa.table([array for array, _ in columns.values()], schema=schema)
-    facts = json.dumps({"library": pool.library.model_dump(), **plain}).encode()
-    return table.replace_schema_metadata({_METADATA: facts})
+    np.savez(file := BytesIO(), **known, **vars(pool.events))
+    return file.getbuffer()
 
 
-def pool_from(content: bytes) -> Pool:
-    """The pool that `pool_content` has written."""
-    with pq.ParquetFile(pa.BufferReader(content)) as file:  # read_table would import, for 0.3 s, what reads folders
-        table = file.read()
-    facts: dict[str, Any] = json.loads(table.schema.metadata[_METADATA])
-
-    def whole(name: str) -> IntArray:
-        return np.asarray(table.column(name)).astype(np.int64)
-
-    def matrix(name: str) -> np.ndarray:
-        values = table.column(name).combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        return np.asarray(values).reshape(table.num_rows, -1)
-
-    path, step, cell, at, lead = map(whole, ("path", "event", "cell", "event_step", "lead_steps"))
-    sample = facts_from(table, family_named(facts["family"]).columns), at, lead, matrix("crashes"), matrix("path_mass")
-    events = KeptEvents(path, step, cell, *sample)
-    known: dict[str, Any] = {
-        name: np.array(value) if isinstance(value, list) else value for name, value in facts.items()
-    }
-    known |= {"library": Library.model_validate(facts["library"]), "names": tuple(facts["names"]), "events": events}
-    return Pool(**{field.name: known[field.name] for field in fields(Pool)})
+def pool_from(content: bytes, library: Library) -> Pool:
+    """The pool that `pool_content` has written, of a library."""
+    with np.load(BytesIO(content)) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    events = KeptEvents(**{each.name: arrays.pop(each.name) for each in fields(KeptEvents)})
+    names = tuple(arrays.pop("names").tolist())
+    known: dict[str, Any] = {name: array if array.ndim else array.item() for name, array in arrays.items()}
+    return Pool(**known, names=names, library=library, events=events)

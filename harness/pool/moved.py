@@ -88,9 +88,7 @@ class FewPaths:
 
     def _walk(self, environment: Environment) -> OnPaths:
         if self._aimed is None:
-            resolved, nobody = self._resolved, Progress()
-            asked = resolved.family, resolved.environment, resolved.library, resolved.campaign.pool
-            self._aimed = take_aim(*asked, nobody).enumerator
+            self._aimed = take_aim(self._resolved, Progress()).enumerator
         paths = replace(self._aimed, environment=environment).run(PILOT_PATHS, N_PATHS, Progress())
         shell, mass, n_shells = shells_of(paths.crashes, self._order), paths.mass / N_PATHS, self._stratum.size
         flat = np.arange(N_PATHS)[:, None] * n_shells + shell
@@ -148,7 +146,7 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
     That is the range that is stated for who does not look, or shares of lane changes at times to collision where none
     was seen, which are anything up to what that many vehicles without one refuse.
     """
-    if (left := traffic.family.left_open(traffic.parameters)) is None:
+    if (left := traffic.parameters.left_open()) is None:
         return None
     ends = [environment_with(traffic, each) for each in left.ends]
     if None in ends:

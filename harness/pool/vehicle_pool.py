@@ -21,18 +21,16 @@ from pathlib import Path
 import numpy as np
 
 from harness import cache
-from harness.campaign.sections import PoolSettings
 from harness.errors import HarnessError
-from harness.families.protocol import Environment, Family, Paths, Recorded
+from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import motion_hashes
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, contributions
-from harness.pool.build import POOL_SEED, ROUND_PATHS, campaign_pool_key, pool_of, take_aim
+from harness.pool.build import ROUND_PATHS, campaign_pool_key, pool_of, take_aim
 from harness.pool.kept import Pool
 from harness.pool.shells import CANDIDATES, conservative_first
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.resolved import Resolved
-from harness.vehicles.library import Library
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 EVENLY = 0.1
@@ -87,26 +85,20 @@ class Candidates(BaselinePaths):
 
 
 def walk_candidates(
-    family: Family,
-    environment: Environment,
-    library: Library,
-    settings: PoolSettings,
-    key: str,
-    progress: Progress | None = None,
-    candidates: int = CANDIDATES,
+    resolved: Resolved, key: str, progress: Progress | None = None, candidates: int = CANDIDATES
 ) -> Candidates:
     """Walk so many paths beside an AV that holds its speed."""
     progress = progress or Progress()
-    aim = take_aim(family, environment, library, settings, progress)
+    aim = take_aim(resolved, progress)
     progress.stage("paths for baseline runs", candidates)
-    n_surrogates = len(library.surrogates)
+    n_surrogates = len(resolved.library.surrogates)
     rounds = range(PILOT_PATHS, PILOT_PATHS + candidates, ROUND_PATHS)
     parts = (aim.enumerator.run(first, ROUND_PATHS, progress) for first in rounds)
     columns = [(part.index, part.start, part.weight, part.rates(n_surrogates)) for part in parts]
     index, start, weight, rates = (np.concatenate(column) for column in zip(*columns, strict=True))
     chance = chances(rates, aim.share)
     order = conservative_first(rates)
-    return Candidates(key, settings.seed ^ POOL_SEED, order, index, start, weight / (candidates * chance), chance)
+    return Candidates(key, aim.enumerator.seed, order, index, start, weight / (candidates * chance), chance)
 
 
 def chances(rates: FloatArray, share: FloatArray) -> FloatArray:
@@ -137,7 +129,7 @@ def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None
             columns = {name: stored[name] for name in ("order", "index", "start", "weight", "chance")}
             candidates = Candidates(key, int(stored["seed"]), **columns)
     else:
-        candidates = walk_candidates(resolved.family, resolved.environment, resolved.library, settings, key, progress)
+        candidates = walk_candidates(resolved, key, progress)
         cache.keep(name, candidates.content())
     return candidates.draw(settings.shadow_paths)
 
@@ -147,8 +139,8 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded) -> Po
 
     Raises `HarnessError`: no event was found on which even the envelope crashes.
     """
-    environment, library = resolved.environment, resolved.library
-    followers = library.followers(resolved.family.shows(environment))
+    environment = resolved.environment
+    followers = resolved.library.followers(resolved.family.shows(environment))
     found = resolved.family.events(environment, paths.seed, paths.paths, followers, runs)
     if not found.crashes.any():
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""
@@ -160,8 +152,7 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded) -> Po
     mass = found.probability * paths.weight[:, None]
     enumerated = EnumeratedPaths(paths.index, paths.start, paths.weight, mass, found.crashes)
     key = hashlib.sha256(" ".join((paths.key, resolved.content_hash, runs.digest())).encode()).hexdigest()[:24]
-    made_of = environment, library, resolved.campaign.pool, key
-    pool = pool_of(resolved.family, enumerated, paths.seed, paths.order, *made_of)
+    pool = pool_of(resolved, enumerated, key, paths.order)
     hashes = motion_hashes(runs.x_m, runs.v_mps)
     row, step, onset = pool.events.row, pool.events.step, pool.events.onset
     # A kept event stands for its like nearby, too, where these are too improbable to be kept one by one.

@@ -263,9 +263,8 @@ def choose_paths(
     campaign: Campaign, seed: int, n_paths: int, progress: Progress, candidates: int = CANDIDATES
 ) -> BaselinePaths:
     """Choose paths in the traffic of a campaign, out of so many, or of as many as are asked for."""
-    resolved, settings = resolve(campaign), campaign.pool.model_copy(update={"seed": seed})
-    where, most = (resolved.family, resolved.environment, resolved.library), max(n_paths, candidates)
-    return walk_candidates(*where, settings, "walked", progress, most).draw(n_paths)
+    resolved = resolve(campaign.replaced(("pool", "seed"), seed))
+    return walk_candidates(resolved, "walked", progress, max(n_paths, candidates)).draw(n_paths)
 
 
 def _ready(campaign: Campaign) -> tuple[Resolved, EpisodeLoop]:

@@ -56,6 +56,7 @@ BROKEN_RULES = (
     ("testing: {method: episode_mixture}\nsurrogates: {}", "surrogates", 3, "at least one surrogate"),
     ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.2}", "testing.alpha", 3, "sum to 1.1"),
     ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
+    ("environment:\n  parameters: gone.yaml", "environment.parameters", 3, "a parameter file"),
     ("environment:\n  parameters: ndd-overtaking-3", "environment.parameters", 3, "Did you mean"),
     ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),
     ("av:\n  traci: {command: 'x {host}'}", "av.traci.command", 3, "Double a brace"),
@@ -313,21 +314,6 @@ def test_a_file_counts_as_the_module_that_it_is(own):
     Path("moved").mkdir()
     moved = Path("my_av.py").rename("moved/my_av.py")
     assert {load_campaign(f"{moved}:MyAV").content_hash("p")} == hashes
-
-
-@pytest.mark.parametrize(
-    ("entries", "where", "words"),
-    [
-        ("  a: {model: idm, parameters: {min_acceleration: -3}}", "avs.a.parameters.min_acceleration", "Did you mean"),
-        ("  a: {model: idm}\n  b: {model: fvdm, reaction: {delay_s: 0.25}}", "avs.b.reaction.delay_s", "0.1 s step"),
-        ("  {}", "avs", "expected one at least"),
-    ],
-)
-def test_a_mistake_in_a_panel_names_its_place(panel, entries, where, words):
-    file = panel(entries)
-    with pytest.raises(CampaignError, match=words) as caught:
-        load_panel(file)
-    assert caught.value.where.startswith(f"{where} ({file}:")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from studies.case_study.theorems import small_chains
 from studies.chains.chain import CHAINS, DECISIVE, decisive, enumerate_episodes, overtaking
 from studies.chains.sampler import Sampler, blocks, draw
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import block, fed
+from tests.estimators.small_blocks import fed
 
 IMMEDIATE = overtaking("immediate", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], challenge="immediate")
 NOISY = overtaking("noisy", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], epsilon=0.5)
@@ -124,14 +124,6 @@ def test_while_few_crashes_count_it_is_as_wide_as_the_plain_mean():
     assert plain.n_effective < 30.0
     assert estimate.std_error == plain.std_error > estimate.details["residual_std_error"]
     assert "plain_width" in [each.key for each in estimate.warnings]
-
-
-def test_what_explains_nothing_is_left():
-    some = block([True, False, False, True])
-    estimate = fed(DoublyRobust(), [some]).result(0.9)
-    assert (estimate.crash_rate, estimate.details["beta"]) == (0.5, [0.0, 0.0])
-    huge = block([True, False, False], [250.0, 0.0, 0.0])
-    assert fed(DoublyRobust(), [huge]).result(0.9).crash_rate == fed(Nade(), [huge]).result(0.9).crash_rate
 
 
 def test_it_is_refused_below_the_tests_from_which_on_it_covers():

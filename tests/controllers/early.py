@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 
 import numpy as np
 
-from examples import idm_batch
 from examples.acting import Holds as HoldsBatch  # noqa: F401
 from examples.idm import IDM, idm_acceleration
 from harness.controllers.traci_style import TraciStyleController
@@ -49,15 +47,6 @@ class SpeedsTraci(TraciStyleController):
         traci.vehicle.setAcceleration(veh_id, a, traci.simulation.getDeltaT())
 
 
-class Yields(idm_batch.IDM):
-    """Follows BV as the IDM does while it is still on the other lane."""
-
-    def step_batch(self, seen):
-        gap = seen.bv_position_m - 5.0 - seen.position_m
-        ahead = seen._replace(gap_m=np.maximum(gap, 0.1), lead_speed_mps=seen.bv_speed_mps)
-        return np.where(np.isinf(seen.gap_m) & (gap <= 0.0), 0.0, super().step_batch(ahead))
-
-
 class YieldsMostly(HoldsThenIdm):
     """Gives way to BV while that is still beside it, but for one index in forty that it is told."""
 
@@ -82,13 +71,4 @@ class Breaks(HoldsThenIdm):
     def before(self, seen):
         if self.index % 50 == 7 and seen.time_s > 2.0:
             raise RuntimeError("sensor lost")
-        return 0.3
-
-
-class Exits(HoldsThenIdm):
-    """Ends its process in the second second of the index 61 that it is told."""
-
-    def before(self, seen):
-        if self.index == 61 and seen.time_s > 1.0:
-            os._exit(9)
         return 0.3

@@ -221,17 +221,6 @@ class Learned(IDM):
         self.made.append(self)
 
 
-class RaisesInClose(IDM):
-    def __init__(self, note):
-        super().__init__()
-        self.note = note
-
-    def close(self):
-        with Path(self.note).open("a") as file:
-            file.write("closed\n")
-        raise RuntimeError("cannot be closed")
-
-
 class ChangesItsProcess(IDM):
     def __init__(self):
         super().__init__()

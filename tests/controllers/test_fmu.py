@@ -106,6 +106,7 @@ def test_where_the_disk_is_full_nothing_half_unpacked_stays_and_the_fmu_is_not_b
     ("old", "new", "found"),
     [
         (rb"<CoSimulation[^>]*>", b'<ModelExchange modelIdentifier="Counter"/>', "for FMI 2.0 model exchange"),
+        (rb'fmiVersion="2.0"', b'fmiVersion="7.0"', "7.0"),
         (None, b"nothing", "cannot be read"),
         (None, None, "found no file"),
     ],

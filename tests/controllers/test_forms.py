@@ -12,7 +12,7 @@ from examples.idm import IDM, idm_acceleration
 from harness.controllers.hosts import BatchHost, Guard
 from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
-from harness.vocabulary import CRASH, PASSED
+from harness.vocabulary import CRASH
 from tests.stored_runs import ROOT
 from tests.worlds.running import LATERAL, drive, fmu_av, forced, motion
 
@@ -28,11 +28,6 @@ FORMS = {
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form_gives_the_bits_of_the_built_in_model_in_other_cells(form):
     assert motion(FORMS[form], cells=7) == motion("av={model: idm}")
-
-
-def test_over_arrays_it_knows_too_what_to_do_while_nobody_is_ahead():
-    """Where cut-ins take time, controllers act from the onset on: then the gap is infinite and the speed ahead NaN."""
-    assert motion(FORMS["batch"], LATERAL, n=30) == motion(FORMS["per vehicle"], LATERAL, n=30)
 
 
 def test_an_fmu_gives_the_same_motion_and_gets_its_start_values_in_every_episode(fmu):
@@ -134,23 +129,6 @@ class Faster(IDM):
         assert ahead == (seen.bv.lane == 0)
         assert ahead or np.isnan(seen.lead_speed_mps)
         return -3.0 if ahead else 0.5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["nde", "step_mixture"])
-def test_a_controller_acts_from_the_first_step(method):
-    shard = drive(EARLY, f"testing={{method: {method}}}", "environment.lane_change_level=350", n=300)
-    assert shard.failures == {}
-    passed = cut_in = 0
-    for i, row in enumerate(shard.episode):
-        trace, cut = shard.traces[i], row["event_step"]
-        np.testing.assert_array_equal(trace[: cut if cut >= 0 else -1, 2, 2], 0.5)
-        cut_in += cut > 0
-        if row["outcome"] == PASSED:
-            r2 = trace[:, 1, 0] - 5.0 - trace[:, 2, 0]
-            assert r2[-1] < -10.0 <= r2[-2]
-            passed += 1
-    assert min(passed, cut_in) > 0
 
 
 def test_a_method_that_draws_the_path_ahead_refuses_it():

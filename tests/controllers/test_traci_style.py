@@ -1,6 +1,5 @@
 """The facade answers as TraCI 1.28 does (numbers below were read from a SUMO), and commands only the AV."""
 
-from contextlib import closing
 from operator import attrgetter
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 
 from harness.controllers import traci_vehicle
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_style import StepListenerController, Traci, TraciStyleController
+from harness.controllers.traci_style import Traci, TraciStyleController
 
 
 def seen(time_s=0.0, speed=20.0, *lateral, bv_lane=0, lead_speed=20.0):
@@ -167,31 +166,6 @@ def test_an_episode_forgets_the_last_ones_command():
     assert [controller.step(seen(0.0)), controller.step(seen(0.1))] == [-1.0, -1.0]
     controller.start(start(1))
     assert controller.step(seen(0.2)) == 0.0
-
-
-class Twice:
-    log = []
-
-    def __init__(self, traci, speed, told):
-        self.traci, self.speed = traci, speed
-        told.append(speed)
-
-    def step(self, t):
-        self.log.append(t)
-        self.traci.vehicle.setSpeed("AV", self.speed)
-        return len(self.log) < 2
-
-    def cleanUp(self):
-        self.log.append("clean")
-
-
-def test_a_step_listener_is_removed_when_it_says_so():
-    told = []
-    with closing(StepListenerController(Twice, speed=19.0, told=told)) as controller:
-        controller.start(start())
-        assert [controller.step(seen(0.1 * i)) for i in range(3)] == pytest.approx([-10.0] * 3)
-    assert Twice.log == [0.0, 0.1, "clean"]
-    assert told == []  # each episode's listener has parameters of its own
 
 
 def test_before_the_first_step_what_moves_is_not_known_and_all_else_is():

@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 
 from examples.idm import IDM, idm_acceleration
-from harness.campaign.files import load_campaign
 from harness.controllers.protocol import BatchObservation
 from harness.controllers.traci_style import TraciStyleController
 from harness.worlds.sumo import SumoWorld
-from tests.stored_runs import ROOT
 from tests.worlds.running import LATERAL, drive, motion
 
 pytestmark = pytest.mark.slow  # at night
@@ -136,15 +134,6 @@ def test_what_is_shown_is_what_was_and_before_the_test_nobody_changed_speed(epis
         assert (each.gap_m, each.bv.lane, each.lv.lane, each.acceleration_mps2) == (math.inf, 1, 1, 0.0)
         assert (each.bv_lateral_m, each.bv_lateral_speed_mps, each.bv_overlaps) == (0.0, 0.0, False)
         assert math.isnan(each.lead_speed_mps)
-
-
-def test_it_counts_where_it_is_shown():
-    def hashes(source):
-        changes = [[f"av={{{source}}}", f"av.warm_up_s={s}"] for s in (0, 1, 2)]
-        return len({load_campaign(ROOT / "scenarios/smoke.yaml", each).content_hash("p") for each in changes})
-
-    assert [hashes(f"controller: 'a:B', before_event: {when}") for when in ("hold_speed", "controller")] == [3, 1]
-    assert [hashes(source) for source in ("model: idm", "sumo: {tau: 1}", "traci: {command: x}")] == [1, 1, 1]
 
 
 # -- examples that make room: what they do before the cut-in, how hard they brake after it, and by how much late --

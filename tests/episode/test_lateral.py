@@ -10,7 +10,7 @@ from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.loop.repeat import Traffic
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.vocabulary import AV, CRASH, CUT_IN, PASSED, STATE_DTYPE
+from harness.vocabulary import CRASH, CUT_IN, PASSED, STATE_DTYPE
 from harness.worlds.twin import TwinWorld
 from tests.episode.twin_runs import campaign, run
 
@@ -45,16 +45,6 @@ def test_the_crossing_looked_for_ahead_is_the_one_met_on_the_way(method, level, 
 def test_one_that_sees_nothing_before_the_overlap_ends_alike_at_every_lead(av, lateral):
     assert outcome_bits(av=av, **lateral) == outcome_bits(av=av)
     assert outcome_bits(**lateral) != outcome_bits()  # one that sees the onset does not
-
-
-def test_the_av_keeps_its_speed_until_it_may_act_and_acts_then():
-    shard = run("forced", n=N, lead_s=1.0, av="sees the onset", traces="all").shard
-    acted = 0
-    for row, trace in list(shard.traces.items())[:500]:
-        commanded, onset = trace[:-1, AV, 2], int(shard.episode["onset_step"][row])
-        assert (commanded[: onset + 1] == 0.0).all()
-        acted += commanded.size > onset + 1 and commanded[onset + 1] != 0.0
-    assert acted > 450
 
 
 BESIDE = [(-0.5, CRASH), (-9.9985, CRASH), (0.5, None), (-9.9995, PASSED), (-0.0005, None), (-0.0015, CRASH)]

@@ -140,11 +140,11 @@ RAISED_RUNS = [
     ("forced", {"n": 40_000}),
     ("step_mixture", {"n": 20_000}),
     ("episode_mixture", {"n": 20_000}),
-    ("episode_mixture", {"n": 20_000, "av": "never_brakes"}),
-    pytest.param("forced", {"n": 20_000, "av": "never_brakes"}, marks=pytest.mark.slow),
+    pytest.param("episode_mixture", {"n": 20_000, "av": "never_brakes"}, marks=pytest.mark.slow),
     *(pytest.param(*each, marks=pytest.mark.slow) for each in HARDLY_BRAKES),
     *(pytest.param(each, EVERY_STEP, marks=pytest.mark.slow) for each in ("forced", "step_mixture", "episode_mixture")),
-    ("step_mixture", PUBLISHED),  # ε = 0.1, with a surrogate that is critical for a step or two
+    # ε = 0.1, with a surrogate that is critical for a step or two:
+    pytest.param("step_mixture", PUBLISHED, marks=pytest.mark.slow),
 ]
 
 

@@ -61,19 +61,10 @@ def test_ratios_are_those_of_the_first_nine_control_steps(tables):
     np.testing.assert_allclose(found.first_ratios, expected, rtol=1e-15)
 
 
-def test_a_failed_episode_may_lack_its_weight_and_its_moments(tables):
-    episodes, moments = tables
-    failed = with_value(with_value(episodes, "outcome", 7, "failed"), "log_weight", 7, float("nan"))
-    found = read(failed, of_others(moments, 7))
-    assert (found.failed[7], found.log_weight[7]) == (True, 0.0)
-    assert np.all(found.first_ratios[7] == 1.0)
-
-
 @pytest.mark.parametrize(
     ("damage", "text"),
     [
         (lambda episodes, moments: (without(episodes, 10), moments), "row 10: found episode 11 after episode 9"),
-        (lambda episodes, moments: (episodes.slice(0, 0), moments), "no rows"),
         (lambda episodes, moments: (with_value(episodes, "log_weight", 5, np.nan), moments), "5: found log_weight nan"),
         (lambda episodes, moments: (episodes, of_others(moments, 100)), "moments, episode 100: found"),
         (lambda episodes, moments: (episodes, moments.take(pa.array(range(len(moments))[::-1]))), "in order"),

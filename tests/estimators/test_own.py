@@ -70,13 +70,6 @@ def test_it_is_ours_with_a_normal_interval_and_is_told_what_tests_are_drawn_by(f
     assert theirs.interval == "normal"
 
 
-def test_failed_tests_count_both_ways(file):
-    failed = block([True, False, False] * 40, failed=[False, True, False] * 40)
-    found = one_pass([failed], [one(file)]).estimates["mine.py:Mean"]
-    assert found.details["crash_rate_if_failed_had_crashed"] == pytest.approx(2 / 3)
-    assert found.ci_high > 2 / 3
-
-
 def test_one_answers_for_a_campaign_draws_its_course_and_stops_it(file, tmp_path):
     campaign = golden("mixture-twin", "stop.rhw=0.9", f"testing.estimator={file}:Mean")
     assert headline_of(campaign).name == "mine.py:Mean"
@@ -89,25 +82,6 @@ def test_one_answers_for_a_campaign_draws_its_course_and_stops_it(file, tmp_path
     edit(other, signature="another's")
     with pytest.raises(HarnessError, match=r"not made on this machine by this user; it names .*mine.py:Mean"):
         harness.estimate(other)
-
-
-def test_an_object_is_asked_as_it_is_and_knows_the_campaign_of_a_stored_run(file, stored_run):
-    seen = []
-
-    class Watches:
-        methods = ("episode_mixture",)
-
-        def add(self, block):
-            seen.append(block.drawn)
-
-        def result(self, confidence):
-            return confidence, 0.0
-
-    found = harness.estimate(stored_run("mixture-twin"), estimators=[Watches(), Watches], confidence=0.8)
-    assert found["estimates"]["Watches"]["crash_rate"] == 0.8
-    campaign = golden("mixture-twin")
-    assert seen[0].names == campaign.importance_names
-    assert (seen[0].epsilon, seen[0].alpha.tolist()) == (campaign.testing.epsilon, list(campaign.mixture_weights))
 
 
 @pytest.mark.parametrize(

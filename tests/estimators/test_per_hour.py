@@ -80,11 +80,6 @@ def test_another_reading_of_the_competent_driver_has_a_ratio_of_its_own():
     assert PerHour(THREE).to_json(0.9, 32.0)["readings"] == []
 
 
-def test_it_is_narrower_than_any_sum_of_limits():
-    found, own = PerHour(THREE).limits(LEVEL), [of.limits(LEVEL) for of in THREE]
-    assert sum(each.low for each in own) < found.low < found.rate < found.high < sum(each.high for each in own)
-
-
 def test_exposures_scale_it_and_one_alone_is_its_own():
     doubled = [of._replace(exposure=of.exposure._replace(per_hour=2.0 * of.exposure.per_hour)) for of in THREE]
     assert PerHour(doubled).limits(LEVEL)[:3] == pytest.approx([2.0 * x for x in PerHour(THREE).limits(LEVEL)[:3]])

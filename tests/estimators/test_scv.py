@@ -10,11 +10,10 @@ from harness.estimators.likelihood import Level
 from harness.estimators.limits import skewed_distances
 from harness.estimators.scv import CHUNK_ROWS, MixtureCv, Scv, Stratum, n_columns, steps_used
 from harness.estimators.weighted import Nade
-from harness.report.notes import note_words
 from studies.chains.chain import DECISIVE, PANEL, overtaking
-from studies.chains.sampler import blocks, draw
+from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import block, fed
+from tests.estimators.small_blocks import fed
 
 SMALL = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)
 LONG = overtaking("long", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=12)
@@ -126,19 +125,6 @@ def test_the_interval_is_as_skewed_as_the_residuals():
     assert above > 1.01 * Level.two_sided(0.9).z * estimate.std_error
 
 
-def test_control_that_never_acted_leaves_the_plain_mean():
-    some = block([True, False, False, True], method="episode_mixture", weight_cap=1.0)
-    estimate = fed(MixtureCv(), [some]).result(0.9)
-    assert estimate.crash_rate == pytest.approx(0.5, rel=1e-14)
-    assert estimate.details["rank"] == 1
-    assert estimate.std_error == pytest.approx(np.std([1, 0, 0, 1], ddof=1) / 2.0, rel=1e-12)
-
-
-def test_fewer_tests_than_columns_claim_no_precision():
-    one = draw(MANY, "episode_mixture", 1, np.random.default_rng(SEED))
-    assert fed(MixtureCv(), [one]).result(0.9).std_error == np.inf
-
-
 def levels_of(parts: list[Block]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Y, ratios (n, 9, J) and control steps of all tests."""
     columns = [(part.weighted_crashes(), part.first_ratios, part.n_control_steps) for part in parts]
@@ -184,18 +170,6 @@ def test_results_that_columns_do_not_explain_have_no_gain_once_corrected():
     assert 1.7 < claimed < 2.4
     assert 0.7 < fair < 1.35
     assert unseen < 0.7  # what is estimated from so few costs more than it gains
-
-
-def test_saturated_strata_are_warned_of_and_deficient_ones_named():
-    parts = list(blocks(LONG, "step_mixture", [200], SEED))
-    estimate = fed(Scv(), parts).result(0.9)
-    gain = estimate.details["gain"]
-    expected = [s["n_control_steps"] for s in estimate.details["strata"] if 0 < s["rank"] >= s["n"] - 1]
-    assert gain["saturated"] == expected != []
-    assert any("saturated (l = " in note_words(warning) for warning in estimate.warnings)
-    short = [s for s in estimate.details["strata"] if s["rank"] < min(s["columns"], s["n"] - 1)]
-    assert gain["rank_deficient"] == [s["n_control_steps"] for s in short]
-    assert gain["claimed"] == pytest.approx(estimate.details["var_y"] / estimate.details["var_z"], rel=1e-9)
 
 
 @pytest.mark.parametrize(("times", "rank"), [(0.5, 1), (2.0, 2)])

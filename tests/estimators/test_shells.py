@@ -114,15 +114,6 @@ def test_the_variance_of_the_pool_is_not_too_small_for_any_vehicle():
         assert np.mean(found) >= 0.9 * true, name
 
 
-def test_crash_shares_and_moments_alone_would_be_too_small_for_the_heaviest_paths():
-    """What the variance was made of before, the sibling that must fail: Σ min(c_s, c_t) E[m_s m_t]."""
-    mass, vehicles, _ = made_up()
-    crashing = mass * vehicles["on the heaviest paths"]
-    rate, share = crashing.sum(1), crashing.mean(0) / mass.mean(0)
-    former = (np.minimum(share[:, None], share) * (mass.T @ mass / N_PATHS)).sum() - rate.mean() ** 2
-    assert former < 0.8 * rate.var()
-
-
 def test_failed_tests_outside_are_not_taken_for_safe_ones():
     estimate = shells_estimate((0, 8, 2, 0), (2, 0, 4, 396))
     conditional = within(estimate)
@@ -176,11 +167,6 @@ def test_it_has_its_own_inside_and_its_own_refutation():
     assert wide["upper_bound_outside"] == pytest.approx(bound)
 
 
-def test_plain_means_do_not_know_what_to_do_with_shells():
-    found = one_pass([in_shells([0], [True])], ("nade", "nde")).estimates
-    assert [found[name].why.key for name in ("nade", "nde")] == ["needs_nade", "needs_nde"]
-
-
 def counted(run, step, mass, stratum, n_runs=100, tests=1000) -> Tally:
     """Crashed tests of baseline runs in two strata, and as many others as never to be a bound."""
     stratum, n = np.asarray(stratum), np.full(2, tests)
@@ -200,16 +186,6 @@ def test_the_mean_square_of_runs_is_that_of_their_tests_and_of_pairs_in_differen
     assert found.runs.square(np.array([1.0, 0.0]), found) == pytest.approx(8.0 + 100 * 4 / 3 * 4)
     assert found.runs.n_pairs(np.ones(2, bool)) == 3.0
     assert found.part(slice(1, 2)).runs.square(np.array([0.5]), found.part(slice(1, 2))) == pytest.approx(12.0)
-
-
-def test_failed_tests_are_of_runs_like_crashed_ones():
-    place = CrashedTests(*np.array([[1, 1, 2], [3, 4, 3], [1, 2, 4], [0, 2, 3]]))  # the second and third have failed
-    one, none = np.array([1, 0]), np.zeros((2, 2))
-    found = Tally(np.array([9, 9]), one, np.array([1, 1]), none, none, OnRuns.of(10, 2, place))
-    whole = np.array([1.0, 1.0])
-    assert found.runs.square(whole, found) == 1.0
-    assert found.failed_as_crashes(np.array([True, False])).runs.n_pairs(whole > 0.0) == 1.0
-    assert found.failed_as_crashes().runs.own.tolist() == [3.0, 4.0, 0.0, 0.0]
 
 
 def test_the_error_of_few_runs_is_neither_a_bound_nor_told_by_pairs_alone():

@@ -8,11 +8,12 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from examples import idm_traci_style
+from examples.idm import IDM
 from harness.sampling import prepare
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
 from tests.families.test_same_bits import LADDERS, require_same, resolved_of, run, source_of
-from tests.families.watching import SEEN
 
 SET_SPEED_MPS = 40.0
 
@@ -56,7 +57,7 @@ def ahead_on_lane(trace, step, visible):
 def test_a_controller_follows_from_the_first_step_and_sees_who_is_revealed_in_time(name):
     traffic = traffic_from(name, 12)
     SEEN.clear()
-    shard = drive(name, "tests.families.watching:Watching", traffic, cells=1)
+    shard = drive(name, "tests.families.test_controllers:Watching", traffic, cells=1)
     vehicles = shard.scenario.vehicles
     assert [len(seen) for _, seen in SEEN] == shard.episode["n_steps"].tolist()
     for row, (start, steps) in enumerate(SEEN):
@@ -88,7 +89,7 @@ def test_a_traci_script_knows_the_vehicles_by_the_scenarios_names(name):
     """Who is not seen yet is not there; a speed's first change is none."""
     traffic = traffic_from(name, 12)
     SEEN.clear()
-    shard = drive(name, "tests.families.watching:WatchingTraci", traffic, cells=1)
+    shard = drive(name, "tests.families.test_controllers:WatchingTraci", traffic, cells=1)
     assert not shard.failures
     vehicles = shard.scenario.vehicles
     for row, (_, steps) in enumerate(SEEN):
@@ -111,3 +112,34 @@ def test_a_traci_script_knows_the_vehicles_by_the_scenarios_names(name):
                     and lane == 0.0
                     and step > traffic.script.at[row] - traffic.script.lead[row]
                 )
+
+
+# -- controllers that drive as the intelligent driver model and keep what they were shown --
+
+
+SEEN = []
+"""What was told of a test, and then step by step."""
+
+
+class Watching(IDM):
+    def start(self, episode):
+        SEEN.append((episode, []))
+
+    def step(self, seen):
+        SEEN[-1][1].append(seen)
+        return super().step(seen)
+
+
+class WatchingTraci(idm_traci_style.IDM):
+    """Of each vehicle that is there: position, speed, acceleration, lane, and how far it is from the lane's middle."""
+
+    asked = ("getLanePosition", "getSpeed", "getAcceleration", "getLaneIndex", "getLateralLanePosition")
+
+    def on_start(self, random):
+        SEEN.append((random, []))
+
+    def on_step(self, traci, veh_id, time):
+        there = traci.vehicle
+        known = {name: [getattr(there, ask)(name) for ask in self.asked] for name in there.getIDList()}
+        SEEN[-1][1].append((known, there.getLeader(veh_id), there.getAllowedSpeed(veh_id)))
+        super().on_step(traci, veh_id, time)

@@ -11,7 +11,6 @@ import pytest
 import harness
 from harness import families
 from harness.campaign.files import load_campaign
-from harness.errors import CampaignError
 from harness.resolved import resolve
 from harness.sampling import prepare
 from tests.families.fake import FAKE, P_EVENT, RATE
@@ -80,8 +79,3 @@ def test_an_installed_package_brings_a_family_by_an_entry_point(monkeypatch):
     monkeypatch.setattr(families, "entry_points", lambda *, group: [entry] if group == families.GROUP else [])
     assert set(INSTALLED()) == {"cut_in", "lead_brakes", "cut_out", "fake"}
     assert INSTALLED()["fake"] is FAKE
-
-
-def test_an_unknown_family_is_refused_by_name():
-    with pytest.raises(CampaignError, match="Did you mean 'fake'"):
-        load_campaign(SMOKE, ["scenario=fak"])

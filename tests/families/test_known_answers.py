@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from harness.campaign.drivers import CarefulCompetentParameters, IDMParameters, Reflexes
+from harness.campaign.drivers import CarefulCompetentParameters
 from harness.families import family_named
 from harness.vehicles.drivers import driver_records
 from harness.vehicles.library import load_library
@@ -111,17 +111,6 @@ def test_where_nothing_happens_nobody_crashes(name):
     crashes, p = crashes_of(name, traffic, paths_at(SPEEDS), drivers)
     assert (p == 1.0).all()
     assert not crashes.any()
-
-
-def test_behind_one_who_stops_as_hard_as_can_be_who_never_brakes_always_crashes():
-    """C4."""
-    traffic = traffic_of(
-        "lead_brakes", {}, [{"peak_mps2": 10.0, "held_s": np.inf, "jerk_mps3": j} for j in (8.0, 16.0)]
-    )
-    drivers = driver_records([IDMParameters()], [Reflexes(delay_s=20.0)])
-    paths = paths_at(SPEEDS)
-    assert crashes_of("lead_brakes", traffic, paths, drivers)[0].all()
-    assert not crashes_of("lead_brakes", traffic, paths, drivers, above_mps=100.0)[0].any()  # impacts are no harder
 
 
 COASTS, BUILT_UP = -0.4, 1.265

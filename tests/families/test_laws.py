@@ -7,11 +7,14 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import lognorm
+from scipy.stats import chi2, lognorm
 
 from harness.campaign.files import load_campaign
+from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError
 from harness.families import family_named
+from harness.families.cut_in.family import CUT_IN
+from harness.families.cut_out.family import CUT_OUT, CutOutParameters
 from harness.records.schemas import chosen_from, episodes_table
 from harness.resolved import resolve
 from harness.sampling import prepare
@@ -112,18 +115,14 @@ LEAD, OUT = LADDERS
 WRONG = [
     (LEAD, assumed("braking", peak_scale_mps2=-1.0), r"braking\.peak_scale_mps2"),
     (LEAD, assumed("braking", lowest_peak_mps2=11.0), r"braking\.lowest_peak_mps2"),
-    (LEAD, assumed("braking", stop_share=1.5), r"braking\.stop_share"),
     (LEAD, assumed("approach", duration_s=30.05), r"approach\.duration_s"),
     (LEAD, assumed("approach", duration_s=40.0), "approach.*the road is 4 km long"),
     (LEAD, assumed("exposure", per_hour=0.0), r"exposure\.per_hour"),
     (LEAD, assumed("free_driving", lowest_mps2=1.5), r"free_driving\.lowest_mps2"),
-    (LEAD, assumed("braking", peak_scale=1.0), r"braking\.peak_scale.*peak_scale_mps2"),
-    (LEAD, {"like": "lead-brakes-9"}, "like.*lead-brakes-1"),
     (LEAD, {"like": "cut-out-1"}, "like.*lead-brakes-1"),
     (OUT, assumed("leaving", careless_least_s=2.5), r"leaving\.careless_least_s"),
     (OUT, assumed("leaving", careless_least_s=12.0, careless_most_s=20.0), "leaving.*careless"),
     (OUT, assumed("leaving", lateral_median_mps=0.05), "leaving.*lateral"),
-    (OUT, assumed("leaving", standing_share=-0.1), r"leaving\.standing_share"),
     (OUT, {"leaving": {"drop_mean": {"value": 0.1, "source": "assumed", "range": [0.2, 0.3]}}}, r"leaving\.drop_mean"),
 ]
 
@@ -133,3 +132,23 @@ def test_a_wrong_number_gives_one_error_with_its_place(name, content, words, tmp
     with pytest.raises(CampaignError, match=words) as caught:
         resolve(load_campaign("idm", [f"scenario={name}", own_file(tmp_path, name, content)]))
     assert str(caught.value).count("expected") == 1
+
+
+# -- how often there are events: what was counted, and its limits --
+
+
+def test_a_counted_exposure_is_what_it_is_counted_from():
+    """Exact Poisson limits at 90 %: half a quantile of χ² with 2 k and 2 k + 2 degrees of freedom."""
+    told = CUT_IN.exposure(None, None)
+    k, hours = told.counted
+    low, high = 0.5 * chi2.ppf(0.05, 2 * k) / hours, 0.5 * chi2.ppf(0.95, 2 * k + 2) / hours
+    assert (told.per_hour, told.low, told.high) == pytest.approx((k / hours, low, high), abs=5e-4)
+
+
+def test_a_file_that_says_what_was_counted_gives_a_counted_exposure_of_the_events_in_scope():
+    counted = {"per_hour": {"value": 2.0, "source": "fitted", "range": [1.1, 3.4]}, "events": 10, "hours": 5.0}
+    parameters = CutOutParameters.model_validate({"like": "cut-out-1", "exposure": counted})
+    told = CUT_OUT.exposure(CUT_OUT.traffic(EnvironmentSettings(), parameters), parameters)
+    assert told.counted[0] == 10
+    assert told.counted[1] > 100 * 5.0  # few of them ask for braking
+    assert told.per_hour == pytest.approx(10 / told.counted[1])

@@ -75,12 +75,9 @@ def test_an_inattentive_driver_is_an_attentive_one_or_a_late_one(name):
 CONTROLLER = "examples.idm:IDM"
 REFUSED = {
     "testing.method=step_mixture": r"testing\.method.*importance functions are those of cut-ins",
-    "testing.method=episode_mixture": r"testing\.method.*importance functions are those of cut-ins",
     f"av={{controller: '{CONTROLLER}', before_event: controller}}": r"av\.before_event.*means nothing there",
     "av={model: r157-fsm}": r"av\.model.*has not been tried",
     "environment.lane_change_level=2": "environment.*numbers of cut-ins",
-    "environment.cut_in_lead_s=1.0": "environment.*numbers of cut-ins",
-    "environment.acceleration_hold_s=0.5": "environment.*numbers of cut-ins",
     "pool.library=ladder-2": r"pool\.library, r157-fsm",
     "environment.parameters=ndd-overtaking-2": r"environment\.parameters",
     "scenario=lead_break": "Did you mean 'lead_brakes'",

@@ -80,19 +80,6 @@ def test_sumo_and_the_twin_have_the_same_bits(name):
     assert 0.2 < (outcome == CRASH).mean() < 0.9
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LADDERS)
-def test_sumo_and_the_twin_have_the_same_bits_in_many_tests(name):
-    """Of all events of other paths, a tenth of them in which nothing happens."""
-    resolved, n = resolved_of(name, CARELESS[name], "testing.method=forced", "world.cells=64"), 2000
-    source, crashes = prepare(resolved), 0
-    for first in range(0, 200_000, n):
-        shards = [run(world, resolved, source.tests(first, n)) for world in (SumoWorld, TwinWorld)]
-        assert shards[0].episode.tobytes() == shards[1].episode.tobytes()
-        crashes += (shards[0].episode["outcome"] == CRASH).sum()
-    assert crashes > 20
-
-
 @pytest.mark.parametrize(("name", "driver"), DRIVERS)
 def test_a_driver_crashes_as_the_av_where_the_pool_says_that_it_does(name, driver):
     """And `drive`, by which replays show it, says the same, step for step."""

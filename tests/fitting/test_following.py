@@ -132,14 +132,6 @@ def test_who_does_not_follow_meets_no_event():
     assert BrakingFitter().seen(recording(left)).hours == pytest.approx(15.0 / 3600, rel=0.1)
 
 
-def test_a_track_that_ends_in_a_braking_gives_a_lower_limit_and_one_that_begins_in_it_nothing():
-    rows = led(one_braking(peak=6.0))
-    for until, kept in ((rows.time_s < 21.6, 1), (rows.time_s > 21.0, 0)):
-        found = BrakingFitter().seen(recording(rows[until]))
-        assert found.events.size == kept
-        assert not found.events["ended"].any()
-
-
 def test_a_cut_out_that_reveals_nobody_slower_is_none():
     time = np.arange(600) / RATE_HZ
     v, lateral = np.full(600, 32.0), np.clip(1.8 + 0.9 * (time - 50.05), 0.0, LANE_M)

@@ -4,7 +4,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness.errors import TrajectoryError
 from harness.families.cut_in.fitting.observations import Observations, Tally, observe, require_distinct, require_enough
 from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
@@ -71,20 +70,6 @@ def test_noise_widens_accelerations_little_and_is_told(tmp_path):
     assert error.std() == pytest.approx(told, rel=0.1)
     assert told < 0.7 * 0.1 * np.sqrt(2)  # a difference of two speeds has 0.14
     assert all(each.noise_mps2 < 1e-2 for each in clean)
-
-
-def test_flicker_of_lanes_makes_no_lane_change(tmp_path):
-    rows = overtaking(2.0)
-    _, total = observed(rows, tmp_path)
-    for time in (0.7, 0.9, 1.1):  # BV has not moved yet
-        rows.loc[(rows.vehicle_id == 1) & np.isclose(rows.time_s, time), "lane"] = 0
-    flickering, smoothed = observed(rows, tmp_path)
-    assert smoothed.flickers > 0
-    assert smoothed.changes == total.changes
-    assert smoothed.used == total.used
-    with pytest.raises(TrajectoryError, match="come back within a second"):
-        require_enough(flickering, "rows.parquet", load_mapping())
-    assert joined(flickering, "leads")["lead_s"].size
 
 
 def test_long_leads_are_missed_no_more_often_than_short_ones(tmp_path):

@@ -82,11 +82,9 @@ REFUSED = {
         lambda: ROWS.assign(**{each: ROWS[each] * FEET for each in ("s_m", "speed_mps", "length_m")}),
         "found a median of .* in speed_mps.*feet|a median of .* in speed_mps.*ft",
     ),
-    "lengths in feet": (changed(length_m=ROWS.length_m * FEET), r"a median of 15\.\d+ in length_m.*ft"),
     "milliseconds": (changed(time_s=ROWS.time_s * 1000), "units: {time_s: ms}"),
     "widths": (changed(length_m=1.9), "the width"),
     "backwards": (changed(s_m=-ROWS.s_m), "speeds -1 times the change.*must rise"),
-    "backwards throughout": (changed(s_m=-ROWS.s_m, speed_mps=-ROWS.speed_mps), "a median of -"),
     "mirrored": (fast_lanes, "--mirror"),
     "front bumpers": (long_followers, "origin: front"),
     "own clocks": (own_clocks, "one clock"),
@@ -122,13 +120,7 @@ REFUSED = {
     "dates": (changed(time_s=pd.Timestamp(0)), "cannot be read .*timestamp"),
     "nobody's row": (with_value(7, "vehicle_id", None), "row 8, vehicle_id: found nothing"),
     "the end of time": (with_value(7, "time_s", 1e12), r"row 8 .*found time_s 1e\+12"),
-    "far away": (with_value(7, "s_m", 1e12), r"row 8 .*found s_m 1e\+12"),
     "lanes": (with_value(7, "lane", 1e12), r"row 8 .*found lane 1e\+12"),
-    "another time": (with_value(7, "time_s", -38.5), r"row 8 .*found s_m"),
-    "a lane of its own": (
-        changed(lane=ROWS.lane.where(ROWS.recording_id > 0, 40 * ROWS.vehicle_id)),
-        r"found lane \d+",
-    ),
     "long": (with_value(7, "length_m", 70.0), r"row 8 .*found length_m 70"),
     "one recording stands still": (
         changed(s_m=ROWS.s_m.where(ROWS.recording_id != 3, first("s_m"))),
@@ -139,17 +131,6 @@ REFUSED = {
         lambda: pd.concat([ROWS, ROWS[(ROWS.vehicle_id == 1) & (ROWS.recording_id == 3)].assign(vehicle_id=9)]),
         "vehicle 9 of recording 3, t = 0 s.: found the time, lane and s_m of another vehicle",
     ),
-    "a part twice": (
-        lambda: pd.concat(
-            [
-                ROWS,
-                ROWS[(ROWS.recording_id == 3) & (ROWS.time_s > 1)].assign(
-                    recording_id=99, time_s=ROWS.time_s + 3.3, vehicle_id=ROWS.vehicle_id + 7
-                ),
-            ]
-        ),
-        r"recording 99: found \d+% of its rows also in",
-    ),
     "no rows": (lambda: ROWS[:0], "no rows"),
 }
 
@@ -159,12 +140,10 @@ FILES = {
     "empty.csv": (b"", "an empty file"),
     "header.csv": (HEAD, "no rows"),
     "ragged.csv": (HEAD + b"1,0,0,30,0,5\n1,0.1,3\n", "as many values as"),
-    "words.csv": (HEAD + b"1,0,0,fast,0,5\n", "invalid value .fast"),
     "comma.csv": (HEAD + b"1,0,0,30,5,0,5\n", "got 7.*Decimal commas"),
     "both.csv": (b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n", r"invalid value .996\.58"),
     "twice.csv": (HEAD[:-1] + b",Lane\n1,0,0,30,0,5,1\n", "more than one column lane"),
     "cut.parquet": (b"PAR1 and no more", "cannot be read"),
-    "binary.csv": (b"\xff\xfe\x00\x01\x80\n\x80\n", "text in UTF-16"),
     "latin.csv": (HEAD + b"\xfcber,0,0,30,0,5\n", "text in UTF-8"),
     "cut.csv.gz": (gzip.compress(ROWS.to_csv(index=False).encode())[:-2000], "cannot be read"),
     "headless.csv": (b"1,0,0,30,0,5\n1,0.1,3,30,0,5\n", r"numbers in place of a header: 6 columns.*header: \["),
@@ -187,16 +166,12 @@ def test_wrong_trajectories_are_refused_by_name(case, tmp_path):
     assert file.name in error.where
 
 
-def test_missing_and_truncated_files(tmp_path):
-    whole = tmp_path / "rows.parquet"
-    ROWS.to_parquet(whole, index=False)
+def test_missing_files(tmp_path):
+    (tmp_path / "rows.parquet").touch()
     with pytest.raises(TrajectoryError, match=r"no such file.*'rows\.parquet'"):
         judged(tmp_path / "row.parquet")
     with pytest.raises(TrajectoryError, match="a folder"):
         judged(tmp_path)
-    whole.write_bytes(whole.read_bytes()[:-1000])
-    with pytest.raises(TrajectoryError, match="cannot be read"):
-        judged(whole)
 
 
 @pytest.mark.parametrize(
@@ -301,11 +276,10 @@ def test_a_recording_is_named_and_left_out(tmp_path):
 
 
 @pytest.mark.parametrize("column", ["s_m", "speed_mps"])
-@pytest.mark.parametrize("row", range(1001, 1007))
-@pytest.mark.parametrize("off", [12.0, 1e4])
-def test_one_wrong_value_is_refused_whatever_its_row(column, row, off, tmp_path):
+@pytest.mark.parametrize("row", range(1001, 1004))
+def test_one_wrong_value_is_refused_whatever_its_row(column, row, tmp_path):
     file = tmp_path / "rows.parquet"
-    with_value(row, column, ROWS[column][row] + off)().to_parquet(file, index=False)
+    with_value(row, column, ROWS[column][row] + 12.0)().to_parquet(file, index=False)
     with pytest.raises(TrajectoryError, match=column) as refused:
         judged(file)
     named = {int(each) for each in re.findall(r"row (\d+)", str(refused.value))}

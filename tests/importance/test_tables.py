@@ -5,12 +5,11 @@ import pytest
 
 from harness.campaign.drivers import IDMParameters
 from harness.families.cut_in.nade import tables as cache
-from harness.families.cut_in.nade.tables import Tables, build_tables, tables_hash, tables_name
+from harness.families.cut_in.nade.tables import Tables, build_tables, tables_name
 from harness.vehicles.drivers import driver_records
 from tests.kernels import environment
 
 DRIVER = driver_records([IDMParameters()])
-OTHER = driver_records([IDMParameters(time_headway_s=1.5)])
 FIELDS = [name for name in DRIVER.dtype.names if name != "max_jerk_mps3"]  # infinite
 
 
@@ -38,18 +37,6 @@ def equal(one, other):
     return all(a.tobytes() == b.tobytes() and a.shape == b.shape for a, b in zip(one, other, strict=True))
 
 
-def test_a_set_of_surrogates_is_built_once_and_another_one_is_another_file(folder, built):
-    told = []
-    one = build_tables(environment(), DRIVER, "immediate")
-    assert equal(build_tables(environment(), DRIVER, "immediate"), one)
-    assert len(built) == 1
-    both = build_tables(environment(), np.concatenate([DRIVER, OTHER]), "immediate", told.append)
-    assert (len(built), told) == (3, [1, 1])
-    assert [path.suffix for path in folder.iterdir()] == [".npy"] * 2  # nothing half-written is left behind
-    assert equal([array[:1] for array in both], one)
-    assert not equal([array[1:] for array in both], one)
-
-
 def one_bit(content):
     return content[:5000] + bytes([content[5000] ^ 1]) + content[5001:]
 
@@ -67,15 +54,15 @@ def test_a_damaged_file_is_built_again(folder, built, damage):
 
 
 def test_what_the_hash_depends_on():
-    reference = tables_hash(environment(), DRIVER, "recursive")
-    assert tables_hash(environment(level=350.0), DRIVER, "recursive") == reference
-    assert tables_hash(environment(hold_s=0.1), DRIVER, "recursive") != reference
-    assert tables_hash(environment(), DRIVER, "immediate") != reference
+    reference = tables_name(environment(), DRIVER, "recursive")
+    assert tables_name(environment(level=350.0), DRIVER, "recursive") == reference
+    assert tables_name(environment(hold_s=0.1), DRIVER, "recursive") != reference
+    assert tables_name(environment(), DRIVER, "immediate") != reference
     for name in FIELDS:
         changed = DRIVER.copy()
         changed[name] += 1
-        assert tables_hash(environment(), changed, "recursive") != reference
+        assert tables_name(environment(), changed, "recursive") != reference
     for name in ("free_driving__df", "cut_in__accept_ttc_s", "guard__margin_m", "initial_state__r1_log_mean"):
         numbers = environment().numbers.copy()
         numbers[name] += 0.1
-        assert tables_hash(environment()._replace(numbers=numbers), DRIVER, "recursive") != reference
+        assert tables_name(environment()._replace(numbers=numbers), DRIVER, "recursive") != reference

@@ -8,18 +8,13 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.campaign.sections import PoolSettings
 from harness.families import family_named
-from harness.families.cut_in.family import CUT_IN
-from harness.families.cut_in.loading import load_environment, load_parameters
-from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.pool.aim import NATURALISTIC_SHARE, Enumerator, aimed_points, fit_proposal
 from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_name
 from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
-from harness.records.schemas import fact_columns
 from harness.resolved import resolve
 from harness.vehicles.library import load_library
 from tests.chains.seed import SEED
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL, enumerated
-from tests.traffic.tables import as_tables
 
 FORCED_RATE = 1.352e-7
 """Crash rate of the default vehicle, a_min -4 m/s², from tests/reference (relative error 0.42 %)."""
@@ -55,22 +50,6 @@ def test_kept_cut_ins_stand_for_their_shell(pool):
         assert abs(pool.shell_p @ share - pool.mu[k]) <= 4.0 * error + 1e-12 * pool.mu[k]
 
 
-@pytest.mark.slow
-def test_tables_that_say_what_the_formulas_do_give_their_rates(campaign, environment):
-    """The same paths are enumerated; a logistic of a thousandth of a second is a step."""
-    library = load_library(campaign.pool.library)
-    shipped = load_parameters(campaign.environment).with_values({"cut_in__accept_scale_s": 0.001})
-    tables = (EnvironmentParameters.model_validate(as_tables(share)) for share in (0.01, 0.02))
-    traffic = [load_environment(campaign.environment, each) for each in (shipped, *tables)]
-    assert len({FAMILY.digest(each) for each in [environment, *traffic]}) == 4
-    found = [enumerated(library, each, 500) for each in traffic]
-    bits = np.arange(16)
-    rates = [np.array([p[crashes >> bit & 1 == 1].sum() for bit in bits]) for p, crashes in found]
-    assert (rates[0] > 0.0).sum() >= 8
-    np.testing.assert_allclose(rates[1], rates[0], rtol=0.01)
-    np.testing.assert_allclose(rates[2][:5], 2.0 * rates[1][:5], rtol=0.01)  # who brakes at once does not from 8 s on
-
-
 def test_what_changes_a_pool_changes_its_key():
     changes = ("seed=7", "environment.lane_change_level=2", "pool.library=ladder-1", "pool.seed=2")
     campaigns = (load_campaign(MIXTURE_FILE, [*SMALL_POOL, change]) for change in changes)
@@ -91,9 +70,7 @@ def test_a_pool_that_is_damaged_is_built_again(campaign, pool, tmp_path, monkeyp
     again = cached_pool(resolve(campaign))
     assert (again.key, again.names, again.library) == (pool.key, pool.names, pool.library)
     for field in dataclasses.fields(pool.events):
-        if field.name != "facts":  # lists are as wide as the longest that was kept
-            assert np.array_equal(getattr(again.events, field.name), getattr(pool.events, field.name))
-    assert fact_columns(again.events.facts, CUT_IN.columns) == fact_columns(pool.events.facts, CUT_IN.columns)
+        assert np.array_equal(getattr(again.events, field.name), getattr(pool.events, field.name))
     assert np.array_equal(again.mu_covariance, pool.mu_covariance)
     assert again.to_json() == pool.to_json()
 
@@ -116,18 +93,19 @@ def test_draws_are_a_permutation_within_a_shell_and_follow_probabilities_outside
 
 
 @pytest.mark.slow
-def test_how_many_paths_a_pool_has_does_not_depend_on_them(environment, monkeypatch):
+def test_how_many_paths_a_pool_has_does_not_depend_on_them(campaign, monkeypatch):
     """One that ends where its paths look alike has the rates of paths that look alike, which are too low."""
     settings, run = PoolSettings(relative_error=0.015, events_per_shell=100), Enumerator.run
+    resolved = resolve(campaign.replaced(("pool",), settings))
 
     def alike(self, first, n, progress):
         paths = run(self, first, n, progress)
         same = {"mass": np.full_like(paths.mass, 1e-9), "crashes": np.full_like(paths.crashes, 1)}
         return dataclasses.replace(paths, **same) if first else paths
 
-    n_paths = build_pool(FAMILY, environment, LIBRARY, settings, "of the paths").n_paths
+    n_paths = build_pool(resolved, "of the paths").n_paths
     monkeypatch.setattr(Enumerator, "run", alike)
-    assert build_pool(FAMILY, environment, LIBRARY, settings, "of equal ones").n_paths == n_paths > 1024
+    assert build_pool(resolved, "of equal ones").n_paths == n_paths > 1024
 
 
 def test_weights_of_a_proposal_make_up_for_its_aim():
@@ -145,11 +123,8 @@ def test_weights_of_a_proposal_make_up_for_its_aim():
 # -- enumerated cut-ins and strata --
 
 
-FAMILY = family_named("cut_in")
 STRIDE = family_named("cut_in").stride
 LIBRARY = load_library("ladder-1")
-NAMES = list(LIBRARY.surrogates)
-ENVELOPE = NAMES.index(LIBRARY.envelope)
 
 
 def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment):

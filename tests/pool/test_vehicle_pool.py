@@ -24,7 +24,6 @@ from harness.worlds.twin import TwinWorld
 from tests.kernels import cut_in_terms
 from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
 
-N = 256
 ACTING = "{{controller: 'tests.controllers.early:{}', before_event: controller, limits: {{max_acceleration_mps2: 2}}}}"
 
 

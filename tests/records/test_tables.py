@@ -11,7 +11,6 @@ import pytest
 import harness
 from harness.errors import RunFolderError
 from harness.families.cut_in.family import CUT_IN, STATE_FACTS
-from harness.loop.loop import traced_by_index
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
 from harness.records.shown import by_kind
 from harness.vocabulary import AV
@@ -59,40 +58,6 @@ def test_records_kept_change_nothing_else(stored_run, tmp_path):
     columns = ["episode", "step", "p"]
     assert len(first) < len(everything)
     assert first[columns].to_numpy().tolist() == expected[columns].to_numpy().tolist()
-
-
-@pytest.mark.parametrize(
-    ("name", "policy"),
-    [
-        ("shells-twin", "all"),
-        ("nde-twin", "crash"),
-        ("mixture-twin", "crash or share"),
-        ("step-immediate-twin", "critical"),
-    ],
-)
-def test_the_policy_says_which_are_traced_and_a_share_is_chosen_by_index(name, policy, stored_run):
-    rows = stored_table(stored_run(name), "episodes").to_pylist()
-    of_share = traced_by_index(golden(name).seed, np.arange(len(rows)), 0.05 if "share" in policy else 0.0)
-    wanted = {
-        row["episode"]
-        for row in rows
-        if policy == "all"
-        or row["outcome"] == "crash"
-        or (policy == "critical" and row["n_control_steps"] > 0)
-        or of_share[row["episode"]]
-    }
-    assert set(stored_table(stored_run(name), "traces")["episode"].to_pylist()) == wanted
-    assert (len(wanted) < len(rows)) == (policy != "all")
-
-
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 1.0])
-def test_the_share_is_the_share_and_another_seed_chooses_others(share):
-    index = np.arange(200_000)
-    chosen = traced_by_index(1, index, share)
-    assert abs(chosen.mean() - share) < 5 * np.sqrt(share * (1 - share) / index.size) + 1e-12
-    if 0.0 < share < 1.0:
-        other = traced_by_index(2, index, share)
-        assert abs((chosen & other).mean() - share**2) < 0.005
 
 
 def test_a_trace_tells_the_same_story_as_its_row(stored_run):
@@ -152,23 +117,6 @@ def test_frames_have_all_rows_and_say_what_columns_mean(stored_run):
     some = run.episodes(["outcome"])
     assert list(some.columns) == list(some.attrs["unit"]) == ["outcome", "weight"]
     assert list(run.traces(["v_mps"]).columns) == ["v_mps"]
-
-
-def test_frames_of_moments_are_of_methods_that_draw_in_the_loop(stored_run):
-    run = harness.read(stored_run("mixture-twin"))
-    assert run.moments().attrs["unit"]["q_sampled"] == "1"
-    assert list(run.moments(["p", "episode"]).columns) == ["p", "episode"]
-    with pytest.raises(RunFolderError, match="no column 'weight' in moments"):
-        run.moments(["weight"])
-    assert list(run.moments().columns) == moments_schema(STATE_FACTS, 3).names
-
-
-def test_traces_of_a_run_without_crashes_are_an_empty_table(tmp_path):
-    campaign = golden(
-        "forced-twin", "stop.episodes=20", "run.shard_size=20", "records.traces=crash", "av={model: r157-cc}"
-    )
-    run_here(campaign, tmp_path / "run")
-    assert list(harness.read(tmp_path / "run").traces().columns) == traces_schema().names
 
 
 @pytest.mark.parametrize("name", ["mixture-twin", "shells-twin"])

@@ -234,33 +234,6 @@ def test_on_paper_it_is_light_and_without_what_only_a_screen_can_do(opened, page
         assert [each for each in page.evaluate(wide) if each[0] > 688] == []
 
 
-def test_a_cut_out_shows_when_the_revealed_vehicle_becomes_visible(opened, crashing):
-    file = write_report(copy_of(crashing["cut_out"], crashing["cut_out"].parent / "shown"))
-    page, scene = opened(file), scenes_in(file.read_text())[0]
-    [step] = [step for step, name in scene["moments"] if name == "SV becomes visible"]
-    assert scene["onset"] <= step <= scene["event"]
-    page.get_by_role("button", name="SV becomes visible", exact=True).click()
-    assert seconds(page) == pytest.approx(STEP_S * step)
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (400, "dark")])
-def test_it_is_readable_wide_and_narrow_in_light_and_in_the_dark(width, scheme, opened, report, replayed):
-    for file in (report, replayed):
-        page = opened(file, width, scheme)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        ink, paper = page.evaluate("[getComputedStyle(document.body)].flatMap((s) => [s.color, s.backgroundColor])")
-        light = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
-        assert (light[0] < light[1]) == (scheme == "light")
-        sizes = page.evaluate(
-            "[...document.querySelectorAll('.player text, .player td')].map((e) => getComputedStyle(e).fontSize)"
-        )
-        assert min(float(size.removesuffix("px")) for size in sizes) >= 8
-        page.set_viewport_size({"width": 700, "height": 900})  # what was drawn for one width is drawn for the next
-        road = page.locator(".road").first  # waiting for a function would be `eval`, which the page's policy forbids
-        width = road.evaluate("(e) => e.clientWidth")
-        api.expect(road).to_have_attribute("viewBox", re.compile(rf"^0 0 {width} "))
-
-
 def test_the_policy_lets_no_other_script_run(browser, report):
     page = browser.new_page()
     page.goto(report.as_uri())

@@ -13,8 +13,7 @@ from junitparser import JUnitXml
 from harness.errors import RunFolderError
 from harness.records.folder import write_sealed
 from harness.report.junit import statement_case, write_junit
-from harness.report.page import uncovered, write_report
-from harness.report.summary import read_run_folder, summarise
+from harness.report.page import write_report
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
 from tests.stored_runs import truncate
 
@@ -60,12 +59,6 @@ def test_the_page_is_self_contained_with_plots_and_words_that_make_sense(reports
     for stem in stems:
         ElementTree.parse(folder / "plots" / f"{stem}.svg")
         assert f"plot-{stem}" in page.ids
-
-
-def test_notes_say_what_is_stale(run_folder):
-    edit(run_folder / "estimates.json", n_episodes=2_000)
-    run = read_run_folder(run_folder)
-    assert "cover 2,000 tests but the records hold 3,000" in "".join(uncovered(run, summarise(run)))
 
 
 def test_hostile_texts_are_escaped_and_no_formula(folders, tmp_path):

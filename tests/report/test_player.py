@@ -19,10 +19,8 @@ from harness.report.page import write_report
 from harness.report.player import UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
 from harness.resolved import resolve
-from tests.in_process import run_here
-from tests.stored_runs import copy_of, golden, stored_table
+from tests.stored_runs import copy_of, stored_table
 
-OTHER_VEHICLES = {"r157-cc": "{model: r157-cc}", "brakes-8": "{model: idm, parameters: {min_acceleration_mps2: -8}}"}
 KINDS = ("shells-twin", "shells-lateral-sumo", "forced-lateral-twin", "shells-acting-twin", "forced-krauss", "nde-twin")
 
 
@@ -62,28 +60,6 @@ def test_a_page_holds_the_motion_to_the_last_bit(name, stored_run, tmp_path):
         assert bool(touched) == (result.row.get("contact") == "side" and scene["onset"] < cut_in)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["forced-twin", "forced-lateral-twin"])
-def test_others_drive_as_they_would_if_they_were_tested(name, stored_run, tmp_path):
-    """The same campaign with another vehicle has the same traffic: before the AV's crash and after it."""
-    folder = stored_run(name)
-    episodes, ended = crashed(folder), []
-    for other, av in OTHER_VEHICLES.items():
-        theirs = run_here(golden(name, f"av={av}"), tmp_path / other).folder
-        for episode in episodes:
-            scene, tested = harness.replay(folder, episode).scene, harness.replay(theirs, episode)
-            [ghost] = [ghost for ghost in scene["ghosts"] if ghost["name"] == other]
-            first, n = scene["first"], len(ghost["x"])
-            for ours, column in (("x", "x_m"), ("v", "v_mps")):
-                assert ghost[ours].tolist() == motion(tested.trace, "AV", column)[first : first + n]
-                [bv] = [track[ours] for track in scene["tracks"] if track["name"] == "BV"]
-                assert bv[:n].tolist() == motion(tested.trace, "BV", column)[first : first + n]
-            if ghost["crash"] is not None:
-                assert (tested.outcome, tested.row["n_steps"]) == ("crash", ghost["crash"])
-            ended.append((other, tested.outcome))
-    assert len(set(ended)) >= 3, "both kinds of endings are needed"
-
-
 @pytest.mark.parametrize("name", ["shells-twin", "shells-acting-twin", "shells-lateral-sumo"])
 def test_who_crashes_is_what_the_records_say(name, stored_run):
     """The pool knows how BV goes on after the AV's crash, the records of the test do not: up to there all are equal."""
@@ -109,41 +85,6 @@ def test_of_a_vehicle_that_acts_nobody_knows_without_its_motion(stored_run):
     scenes = Scenes(campaign, resolve(campaign).environment)
     assert (scenes.ends(rows, None) == UNKNOWN).all()
     assert (Scenes(campaign, None).ends(rows, stored_table(folder, "traces")) == UNKNOWN).all()
-
-
-AVOIDED = "crash {} that r157-cc would have avoided"
-NOBODY, BRAKES, BOTH = (30, 30), (30, -1), (-1, -1)
-
-
-@pytest.mark.parametrize(
-    ("who", "leads"),
-    [
-        ({1: BOTH, 3: BRAKES, 4: BOTH}, [AVOIDED.format(1), AVOIDED.format(2), "hardest avoidable no. 2"]),
-        ({5: BRAKES}, ["hardest avoidable no. 1, typical no. 1, weight no. 1"]),
-        ({}, ["hardest no. 1", "hardest no. 2", "hardest no. 3"]),
-    ],
-)
-def test_crashes_that_the_reference_driver_avoids_come_first_and_hopeless_ones_not(who, leads, runs, monkeypatch):
-    """``who`` avoids the hardest crashes, by rank; nobody the others."""
-    run = runs["weighted"]
-    summary = summarise(run)
-    impact = summary.crashes["impact_speed_mps"]
-    by_rank = np.argsort(-impact, kind="stable")
-    ends = np.full((impact.size, len(STAND_INS)), 30)
-    for rank, end in who.items():
-        ends[by_rank[rank]] = end
-    monkeypatch.setattr(crashes, "_ends", lambda *_: ends)
-    rows, scenes = crashes.crash_gallery(run, summary, traffic_of(run.campaign, run.manifest))
-    assert [row.reason.split(", ")[0] for row in rows][: len(leads)] == [lead.split(", ")[0] for lead in leads]
-    shown = [row.episode for row in rows]
-    allowed = [int(summary.crashes["episode"][by_rank[rank]]) for rank in who or range(impact.size)]
-    assert set(shown) <= set(allowed)
-    words = {NOBODY: "nobody", BRAKES: "brakes-8", BOTH: "r157-cc, brakes-8"}
-    avoided = {allowed[i]: words[end] for i, end in enumerate(who.values())}
-    assert [row.avoided_by for row in rows] == [avoided.get(episode, "nobody") for episode in shown]
-    assert [scene["episode"] for scene in scenes] == shown
-    hardest = [row.crash["impact_speed_mps"] for row in rows if row.reason.startswith("crash")]
-    assert hardest == sorted(hardest, reverse=True)
 
 
 def test_a_report_shows_crashes_with_those_who_avoid_them(stored_run, tmp_path):

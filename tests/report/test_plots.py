@@ -1,7 +1,6 @@
 """The look of all plots, scales of axes, intervals where they are, and names that no line can hide."""
 
 import re
-from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -10,12 +9,10 @@ import pytest
 
 from harness.families import family_named
 from harness.records.reader import traffic_of
-from harness.report.crashes import CANDIDATES, worst_crashes
 from harness.report.drawing import Axis, Panel
 from harness.report.plots import POOL, limits_of_others, severity_plot, shells_plot
-from harness.report.summary import read_run_folder, summarise
+from harness.report.summary import summarise
 from harness.vocabulary import CRASH, OUTCOMES
-from tests.report.test_page import edit
 
 
 def marks(panel, kind):
@@ -89,32 +86,6 @@ def test_counts_and_weights_by_outcome(summary, table):
         rows = table[table.outcome == outcome]
         assert summary.count[k] == len(rows)
         assert summary.weight[k] == pytest.approx(np.exp(rows.log_weight).sum(), rel=1e-12)
-
-
-@pytest.mark.parametrize(("ranking", "key"), [("impact_speed_mps", "impact_speed_mps"), ("weight", "log_weight")])
-def test_worst_crashes_are_the_worst(summary, table, ranking, key):
-    crash = table[(table.outcome == "crash") & (table.episode % 3 > 0)]
-    crash = crash.sort_values([key, "episode"], ascending=[False, True])
-    episode = summary.crashes["episode"]
-    kept = episode[worst_crashes(summary.crashes[ranking], episode, episode % 3 > 0)]
-    assert kept.tolist() == crash.episode.head(CANDIDATES).tolist()
-
-
-@pytest.mark.parametrize(("n_episodes", "n_parts"), [(1_234, 3), (2_000, 2)])
-def test_only_the_prefix_that_counts_and_listed_parts_are_read(run_folder, n_episodes, n_parts):
-    parts = edit(run_folder / "manifest.json")["parts"]
-    edit(run_folder / "manifest.json", n_episodes=n_episodes, parts=parts[:n_parts])
-    assert summarise(read_run_folder(run_folder)).n_episodes == n_episodes
-
-
-def test_crashes_that_do_not_count_are_none_on_the_page_either(runs):
-    run = runs["weighted"]
-    harder = replace(run, campaign=run.campaign.replaced(("crash", "counts_above_mps"), 5.0))
-    every, counted = summarise(run), summarise(harder)
-    impact, weight = (every.crashes[name] for name in ("impact_speed_mps", "weight"))
-    assert 0 < counted.n_crashes == (impact > 5.0).sum() < every.n_crashes
-    assert counted.n_episodes == every.n_episodes
-    assert counted.weight[CRASH] == pytest.approx(weight[impact > 5.0].sum())
 
 
 @pytest.mark.parametrize("name", ["shells", "shells_refuted"])

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import datetime
-import json
 import math
 import os
 import re
-import sys
 import time
 
 import pytest
@@ -19,9 +17,8 @@ from harness.records.folder import read_manifest
 from harness.report.av_check import cause, rows, verdict
 from harness.runner.look import check_av
 from harness.runner.stored import replay_episode, suspects
-from tests.pool.test_vehicle_pool import ACTING
 from tests.stored_runs import answer_in, copy_of, edit
-from tests.worlds.running import EXAMPLE, ROOT
+from tests.worlds.running import ROOT
 
 MIXTURE_FILE, FORCED = (str(ROOT / f"scenarios/overtaking_{name}.yaml") for name in ("mixture", "forced"))
 EXITS = "av={controller: 'tests.controllers.misbehaving:Misbehaving', parameters: {bad: {'2': ends_the_process}}}"
@@ -83,11 +80,6 @@ class KeepsItsAnswer(Steady):
         if (now := time.monotonic()) > self.at + 0.01:
             self.at, self.answer = now, -0.01 * seen.bv.speed_mps
         return self.answer
-
-
-class ReadsTheTimeOfDay(Steady):
-    def step(self, seen):
-        return -1e-6 * datetime.datetime.now(datetime.UTC).timestamp() % 1.0
 
 
 class LooksAtTheClock(Steady):
@@ -157,13 +149,12 @@ def test_the_built_in_idm_is_fine():
     ("name", "why"),
     [
         ("Steady", ""),
-        ("Noisy", ""),
+        pytest.param("Noisy", "", marks=pytest.mark.slow),
         ("tests.controllers.misbehaving:Global", "random numbers of its own"),
         pytest.param("Remembering", "it remembers the last one", marks=pytest.mark.slow),
         pytest.param("Sharing", "they share something", marks=pytest.mark.slow),
         pytest.param("LooksAtTheClock", "", marks=pytest.mark.slow),
         ("KeepsItsAnswer", "It depends on the clock (time.monotonic, test_av_check.py:"),
-        pytest.param("ReadsTheTimeOfDay", "on the clock (time.time, test_av_check.py:", marks=pytest.mark.slow),
         pytest.param("OfItsProcess", "It differs from process to process: ", marks=pytest.mark.slow),
     ],
 )
@@ -196,17 +187,10 @@ def test_what_winds_up_in_a_longer_warm_up_is_seen(overrides, moves):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "n"),
-    [
-        ("Slow", 8),
-        pytest.param("LoadsOnce", 8, marks=pytest.mark.slow),
-        pytest.param("tests.controllers.misbehaving:OnlyStepBatch", 1, marks=pytest.mark.slow),
-    ],
-)
-def test_a_slow_constructor_is_measured_and_counted(name, n):
+@pytest.mark.parametrize("name", ["Slow", "LoadsOnce"])
+def test_a_slow_constructor_is_measured_and_counted(name):
     found = check(name, "world.cells=8")
-    assert found.speed.constructions == n
+    assert found.speed.constructions == 8
     assert (found.speed.construction_s > 0.1, "calls it 8 times" in verdict(found)) == (name == "Slow",) * 2
 
 
@@ -227,10 +211,6 @@ def test_the_command_line(capfd):
     assert "failed: none" in out
     assert "_" not in out
     assert "{}" not in out
-    assert main([*call, "--json"]) == 0
-    assert json.loads(capfd.readouterr().out)["deterministic"] is True
-    assert main([*call, "--set", "av={}", "--set", "av.controller=not_there:X"]) == 2
-    assert "cannot be imported" in capfd.readouterr().err
     assert main([*call, "--set", EXITS]) == 3
     out, err = capfd.readouterr()
     assert out == ""
@@ -242,16 +222,8 @@ def test_the_command_line(capfd):
 
 @pytest.mark.parametrize(
     ("av", "code"),
-    [
-        ("{sumo: {carFollowModel: EIDM}}", 0),
-        pytest.param(
-            f"{{traci: {{command: '{sys.executable} {EXAMPLE} --port {{port}} --cells {{cells}}'}}}}",
-            0,
-            marks=pytest.mark.slow,
-        ),
-        ("{traci: {command: 'false', connect_time_s: 5, restarts: 0}}", 3),
-    ],
-    ids=["SUMO's EIDM", "a program", "a program that dies"],
+    [("{sumo: {carFollowModel: EIDM}}", 0), ("{traci: {command: 'false', connect_time_s: 5, restarts: 0}}", 3)],
+    ids=["SUMO's EIDM", "a program that dies"],
 )
 def test_it_sees_that_each_form_brakes_and_is_deterministic_or_fails(av, code):
     found = check_av(load_campaign(FORCED, [f"av={av}"]), 6)
@@ -315,27 +287,15 @@ def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
 # -- where cut-ins take time --
 
 
-LEAD = "environment.cut_in_lead_s=0.5"
-
-
 @pytest.mark.slow
-def test_av_check_looks_at_a_vehicle_from_the_onset_on_and_at_one_that_acts_before_in_one_step(campaign):
-    with_lead, without = (check_av(campaign("world.engine=twin", *lead), 48) for lead in ((LEAD,), ()))
-    assert (with_lead.exit_code, with_lead.shows, without.shows) == (0, True, False)
-    assert with_lead.behaviour.n_crashes <= without.behaviour.n_crashes
-    early = check_av(campaign(LEAD, "testing.method=forced", f"av={ACTING.format('Speeds')}"), 4)
-    assert (early.exit_code, rows(early)[0]["found"]) == (0, "controller, twin, step_mixture, cut-ins of one step")
-
-
 def test_a_controller_that_acts_early_is_checked_without_forcing():
     found = check("Steady", "av.before_event=controller", "testing.method=nde")
     assert (found.method, found.exit_code) == ("step_mixture", 0)
 
 
-@pytest.mark.parametrize("scenario", ["lead_brakes", "cut_out"])
-def test_of_a_vehicle_that_follows_it_is_said_how(scenario):
+def test_of_a_vehicle_that_follows_it_is_said_how():
     """IDM keeps 1 s and some metres to a vehicle of its own speed; words are the scenario's."""
-    found = check_av(load_campaign("idm", [f"scenario={scenario}"]), 6)
+    found = check_av(load_campaign("idm", ["scenario=cut_out"]), 6)
     assert found.follows == found.idm_follows
     assert 1.0 < found.follows.headway_s < 2.0
     assert found.follows.smallest_gap_m > 10.0
@@ -345,7 +305,6 @@ def test_of_a_vehicle_that_follows_it_is_said_how(scenario):
     assert found.events in told
     assert "headway at the onset, median, s" in told
     assert "cut-in" not in " ".join(told)
-    blind = check_av(
-        load_campaign("idm", [f"scenario={scenario}", "av={model: constant, parameters: {acceleration_mps2: 2}}"]), 6
-    )
+    never_brakes = "av={model: constant, parameters: {acceleration_mps2: 2}}"
+    blind = check_av(load_campaign("idm", ["scenario=cut_out", never_brakes]), 6)
     assert blind.follows.headway_s > found.follows.headway_s  # it does nothing before the event

@@ -117,7 +117,6 @@ def test_other_exposures_need_no_new_tests(run, capsys):
         (["accept={times_reference: {driver: r157-fsm}}", "stop.rhw=null"], "accept.times_reference.driver"),
         (["exposure.cut_inn=1"], "exposure"),
         (["environments.cut_in=ndd-overtaking-1"], "environments"),
-        (["scenarios=[cut_in, cut_in]"], "scenarios"),
         (["scenarios=[cut_in, lead_breaks]"], "scenario"),
     ],
 )

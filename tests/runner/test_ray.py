@@ -5,7 +5,6 @@ Several machines, and cables that are pulled: `python -m benchmarks.ray_cluster`
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
@@ -17,13 +16,11 @@ from pathlib import Path
 import pytest
 
 from benchmarks.kills import descendants, orphans, started_by
-from harness.campaign.yaml_text import yaml_text
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from tests.in_process import workers_alive
 from tests.runner.conftest import SHELLS, TWIN
 from tests.runner.test_shadow_runs import FORCED, SHADOWS, of
 from tests.stored_runs import manifest, part_files, unlike_columns
-from tests.traffic.tables import tabled
 
 ray = pytest.importorskip("ray")
 import harness.runner.ray as on_ray  # noqa: E402 - not without the extra
@@ -68,26 +65,6 @@ def test_shadow_runs_come_to_the_machines(run, campaign, tmp_path):
     assert a.estimates == b.estimates
 
 
-def test_machines_need_no_file_of_the_traffic_though_it_has_tables(run, campaign, tmp_path):
-    (tmp_path / "mine.yaml").write_text(yaml_text(tabled()))
-    settings = (*SHELLS, TWIN[0], "stop.episodes=240", f"environment.parameters={tmp_path / 'mine.yaml'}")
-    a = run(campaign(*settings), tmp_path / "local", workers=2)
-    b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
-    assert a.estimates["estimates"]["shells"]["n_crashes"] > 0
-    assert unlike_columns(a.folder, b.folder) == []
-    assert a.estimates == b.estimates
-
-
-def test_a_controller_that_ends_its_process_leaves_the_same_records(run, campaign, tmp_path, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    bad = json.dumps({"bad": {"17": "ends_the_process", "230": "crashes", "231": "ends_the_process_in_start"}})
-    av = f"av={{controller: 'tests.controllers.misbehaving:Misbehaving', parameters: {bad}}}"
-    settings = (*FORCED, TWIN[0], av, "run.max_failed_share=0.1")
-    a = run(campaign(*settings), tmp_path / "local", workers=2)
-    b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
-    assert unlike_columns(a.folder, b.folder) == []
-
-
 def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
     settings = (*FORCED, TWIN[0], "stop.episodes=12000", "run.shard_size=400")
     a = run(campaign(*settings), tmp_path / "local", workers=2)
@@ -108,7 +85,7 @@ def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
     assert unlike_columns(a.folder, b.folder) == []
 
 
-@pytest.mark.parametrize("struck", [b"", b"ray::OnMachine", WORKER], ids=["none", "actor", "its child"])
+@pytest.mark.parametrize("struck", [b"", b"ray::OnMachine"], ids=["none", "actor"])
 def test_what_a_controller_starts_ends_with_the_run_and_no_file_is_left(struck, run, campaign, tmp_path, monkeypatch):
     """One in a session of its own, one adopted; the vehicle acts early, so that machines are handed baseline runs."""
     monkeypatch.chdir(ROOT)
@@ -156,28 +133,6 @@ def test_nobody_answers_at_the_address(run, campaign, tmp_path, monkeypatch):
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     with pytest.raises(HarnessError, match=r"run\.ray\.address: found 127\.0\.0\.1:9: .*refused"):
         run(campaign(*TWIN, ON_RAY, "run.ray.address='127.0.0.1:9'"), tmp_path / "run")
-
-
-def test_sigterm_while_it_connects_is_the_harness_s(run, campaign, tmp_path, monkeypatch):
-    def init(**_: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # Ray puts its own handler in, which exits with the number
-        sys.exit(signal.SIGTERM)
-
-    monkeypatch.setattr(ray, "is_initialized", lambda: False)
-    monkeypatch.setattr(ray, "init", init)
-    seen: list[int] = []
-
-    def note(number: int, _: object) -> None:
-        seen.append(number)
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, note)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            run(campaign(*TWIN, ON_RAY), tmp_path / "run")
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert seen == [signal.SIGTERM]
 
 
 def test_another_version_on_a_machine_is_refused(run, campaign, tmp_path, monkeypatch):

@@ -18,7 +18,6 @@ from harness.estimators.traffic import ONE_LAW, uncertain
 from harness.pool import moved
 from harness.pool.moved import assumed
 from harness.progress import Progress
-from harness.report.traffic_words import too_few
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
@@ -68,28 +67,6 @@ def test_of_a_vehicle_whose_shares_may_change_there_is_an_upper_limit_alone(stor
     assert traffic["rate"]["both"] == [0.0, pytest.approx(estimate["upper_bound"] * traffic["rate"]["times"][1])]
     (row,) = [row for row in told(content)["rows"] if row["key"] == "traffic"]
     assert (row["value"][:6], row["interval"][:2]) == ("up to ", "< ")
-
-
-@pytest.mark.slow
-def test_what_was_found_once_is_not_looked_for_again(stored_run, tmp_path, monkeypatch):
-    folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.005, 0.02]})
-    first = estimate_in_other_traffic(folder, mine)
-    monkeypatch.setattr(moved.FewPaths, "_walk", None)
-    monkeypatch.setattr(moved.cache, "keep", None)  # a cache may be there to be read alone
-    assert estimate_in_other_traffic(folder, mine) == first
-
-
-@pytest.mark.slow
-def test_replicates_that_tests_cannot_answer_leave_the_interval_open(stored_run, tmp_path):
-    """One in which the AV closes in faster than in any test, one whose laws are none."""
-    columns = {"initial_state__r2dot_min_mps": [-10.0, -16.0, -10.0], "cut_in__intercept": [-8.7, -8.7, 900.0]}
-    content = estimate_in_other_traffic(stored_run("shells-twin"), fitted(tmp_path, **columns))
-    traffic, answer = content["traffic"], told(content)
-    assert (traffic["n_replicates"], traffic["n_refused"]) == (3, 2)
-    assert traffic["rate"]["times"] == [0.0, None]
-    (row,) = [row for row in answer["rows"] if row["key"].startswith("traffic")]
-    assert (row["value"], row["remark"]) == ("no limit", "2 of 3 replicates unlike what was tested")
-    assert "∞" not in f"{answer}"
 
 
 @pytest.mark.slow
@@ -193,13 +170,7 @@ def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
 
 @pytest.mark.parametrize(
     ("columns", "found"),
-    [
-        ({"cut_in__look": [0.1]}, "column cut_in__look"),
-        ({"scenario__step_s": [0.1]}, "column scenario__step_s"),
-        ({LOOK: ["few"]}, "else than numbers"),
-        ({LOOK: []}, "no rows"),
-        (None, "no such file"),
-    ],
+    [({"cut_in__look": [0.1]}, "column cut_in__look"), ({LOOK: ["few"]}, "else than numbers"), (None, "no such file")],
 )
 def test_replicates_that_are_none_are_refused(stored_run, tmp_path, columns, found):
     mine = fitted(tmp_path, **(columns or {}))
@@ -222,10 +193,3 @@ def test_both_errors_add_as_squares_of_distances_on_a_logarithmic_scale():
     assert (only.times[0], only.both[0]) == (0.0, 0.0)
     wider = uncertain(2e-7, ends, factors, exact + 0.1, 0, 0.9).times
     assert wider == pytest.approx((found.times[0] / 1.1, found.times[1] * 1.1))
-
-
-@pytest.mark.parametrize(("n", "said"), [(19, "needs at least 20"), (20, "20 replicates: "), (100, "")])
-def test_few_replicates_are_warned_of(n, said):
-    words = "".join(too_few(n, 0.9))
-    assert said in words
-    assert bool(words) == bool(said)

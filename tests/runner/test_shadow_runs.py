@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -13,7 +11,6 @@ from harness.errors import RunFolderError, TooManyFailedError
 from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
-from harness.report.page import write_report
 from harness.sampling.baseline import run_baseline
 from tests.in_process import run_here as run_golden
 from tests.pool.test_vehicle_pool import ACTING
@@ -21,7 +18,6 @@ from tests.runner.conftest import SHELLS
 from tests.stored_runs import (
     answer_in,
     copy_of,
-    edit,
     estimates,
     golden,
     manifest,
@@ -97,21 +93,6 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
     assert replay(seeded, 123).bit_equal
 
 
-@pytest.mark.slow
-def test_a_vehicle_that_acts_is_tested_in_the_default_traffic(campaign, run_here, tmp_path):
-    """Cut-ins take time there, in baseline runs and in tests that follow from them."""
-    traffic = "environment.parameters=ndd-overtaking-2", "stop.episodes=80"
-    folder = run_here(campaign(*SHELLS, SHADOWS, TWIN, *traffic, f"av={of('Yields')}"), tmp_path / "run").folder
-    tests = stored_table(folder, "episodes").to_pandas()
-    assert manifest(folder)["events_show"]
-    assert tests.failure.isna().all()
-    assert (tests.lead_steps > 0).all()
-    assert (tests.onset_step == np.maximum(tests.event_step - tests.lead_steps, 0)).all()
-    # It has made room by then: at the cut-in it closes in more slowly than when the test began.
-    assert (tests.event_rate_mps > tests.r2dot_mps).mean() > 0.5
-    assert replay(folder, 17).bit_equal
-
-
 def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp_path):
     """Three in 120 fail: refused at one per cent; with five they are a part of the upper limit that no test takes."""
     breaks = (*SHELLS, SHADOWS, TWIN, f"av={of('Breaks')}")
@@ -177,27 +158,3 @@ def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
     with pytest.raises(RunFolderError, match="0 baseline runs; expected all 60"):
         replay(folder, 5)
     assert estimate(folder) == estimates(folder)  # needs no path
-
-
-@pytest.mark.slow
-def test_a_vehicle_that_ends_its_process_in_a_shadow_run_fails_there(campaign, run, tmp_path):
-    """Nothing else is lost, and the tests under the same numbers are run."""
-    exits = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('Exits')}", "run.max_failed_share=0.05", "stop.rhw=9")
-    folder = run(exits, tmp_path / "run", workers=1).folder
-    rows = [row for path in files_of(folder) for row in pq.read_table(path).to_pylist()]
-    assert [row["shadow"] for row in rows if row["outcome"] == "failed"] == [61]
-    assert "exit code 9" in rows[61]["failure"]
-    assert manifest(folder)["shadow_runs"] == {"n_runs": 120, "n_failed": 1}
-    assert stored_table(folder, "episodes").column("outcome").to_pylist()[61] != "failed"
-
-
-def test_a_page_is_written_where_so_few_paths_crashed_that_the_pool_s_error_is_not_known(stored_run, tmp_path):
-    folder = copy_of(stored_run(ACTS), tmp_path / "run")
-    content = estimates(folder)["estimates"]
-    details = content["shells"]["details"]
-    for part in (details, details["within"]):
-        part.update(rhw_from_pool=None, rhw_from_pool_at_least=None)
-    edit(folder, "estimates.json", estimates=content)
-    page = write_report(folder).read_text()
-    assert "pool’s own error is not known" in page
-    assert "nan" not in set(re.findall(r"[a-z]+", (folder / "plots" / "shells.svg").read_text().lower()))

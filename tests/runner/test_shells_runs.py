@@ -13,8 +13,7 @@ from harness import estimate, replay
 from harness.errors import RunFolderError
 from harness.report.notes import note_words
 from harness.runner.kept import Run
-from harness.sampling.allocation import GROWTH, Allocation, first_tests
-from harness.sampling.shells import round_requests
+from harness.sampling.allocation import Allocation, first_tests
 from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import tally as counted
 from tests.in_process import run_here as run_golden
@@ -110,60 +109,6 @@ def test_the_boundary_is_passed_when_what_lies_within_is_known():
     assert inside.next_round(tally(tests, crashes, NONE), 10**6)[2] == 0
     hopeless = Allocation(DESIGN, TWELVE, MANY).next_round(tally(np.array([96, 96, 0]), NONE, NONE), 10**6)
     assert hopeless.tolist() == [0, 0, 12]
-
-
-def test_rounds_grow_to_where_the_interval_is_widest():
-    rule = Allocation(DESIGN, TWELVE, MANY)
-    tests = np.array([400, 400, 800])
-    added = rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 10**6)
-    assert added.sum() == np.ceil((GROWTH - 1.0) * tests.sum())
-    assert added[2] > 0.9 * added.sum()
-    assert rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 7).sum() == 7
-    assert rule.next_round(tally(tests, np.array([200, 10, 0]), NONE), 0).sum() == 0
-    full = Allocation(DESIGN, TWELVE, tests)
-    assert full.next_round(tally(tests, np.array([200, 10, 0]), NONE), 100).sum() == 0
-
-
-def test_rounds_can_be_made_to_feed_many_workers():
-    """By probability while nothing else is known, then to where the interval is widest."""
-    rule = Allocation(DESIGN, TWELVE, MANY, smallest_round=64)
-    first = rule.next_round(tally(NONE, NONE, NONE), 10**6)
-    assert 64 <= first.sum() <= 66
-    assert first[2] == 0
-    inside = DESIGN.p[:2] / DESIGN.p[:2].sum()
-    assert (first[:2] - 12).tolist() == np.ceil(40 * inside).tolist()
-    assert rule.next_round(tally(NONE, NONE, NONE), 20).sum() == 20
-    later = rule.next_round(tally(np.array([40, 40, 40]), np.array([20, 1, 0]), NONE), 10**6)
-    assert later.sum() == 64
-    few = Allocation(DESIGN, TWELVE, np.full(3, 15), smallest_round=64)
-    assert few.next_round(tally(NONE, NONE, NONE), 10**6).tolist() == [15, 15, 0]
-
-
-def test_failed_tests_draw_further_tests_to_their_shell():
-    rule = Allocation(DESIGN, TWELVE, MANY, "library")
-    tests, crashes = np.array([400, 400, 0]), np.array([20, 0, 0])
-    without = rule.next_round(tally(tests, crashes, NONE), 10**6)
-    with_failed = rule.next_round(tally(tests, crashes, np.array([0, 40, 0])), 10**6)
-    assert with_failed[1] > without[1]
-    undecided = Allocation(DESIGN, TWELVE, MANY)
-    few, all_of_a = np.array([40, 40, 0]), np.array([40, 0, 0])
-    assert undecided.next_round(tally(few, all_of_a, NONE), 10**6)[2] == 12
-    assert undecided.next_round(tally(few, all_of_a, np.array([0, 20, 0])), 10**6)[2] == 0
-
-
-def test_a_round_is_divided_into_shards_without_gap():
-    specs = round_requests(np.array([12, 12, 100]), np.array([70, 0, 300]), 5, 124, 100)
-    assert [spec.index for spec in specs] == list(range(5, 5 + len(specs)))
-    assert specs[0].first_episode == 124
-    assert sum(spec.n_episodes for spec in specs) == 370
-    assert max(spec.n_episodes for spec in specs) <= 100
-    for spec in specs:
-        assert sum(draw.n for draw in spec.draws) == spec.n_episodes
-    taken = {0: [], 2: []}
-    for spec in specs:
-        for draw in spec.draws:
-            taken[draw.stratum] += range(draw.first, draw.first + draw.n)
-    assert taken == {0: list(range(12, 82)), 2: list(range(100, 400))}
 
 
 def test_what_is_traced_may_change_when_a_run_goes_on(campaign, run_here, tmp_path):

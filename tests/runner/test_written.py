@@ -16,12 +16,11 @@ import harness
 from harness import cache
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.report.page import write_report
-from harness.resolved import require_ready
 from harness.runner import kept
 from harness.vehicles import library
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import controllers_here, one_process, run_here, run_with_workers
-from tests.stored_runs import golden, manifest, part_files, stored_table, unlike_columns
+from tests.stored_runs import golden, manifest, part_files, unlike_columns
 
 opened: dict[Path, Counter[str]] = {}
 hooked: list[bool] = []
@@ -59,7 +58,7 @@ def inputs_in(folder, name):
     return [*RUNS[name], "environment.parameters=traffic.yaml", "pool.library=drivers.yaml"]
 
 
-@pytest.mark.parametrize("name", ["nde-twin", "shells-twin", "step-recursive-twin", "shells-acting-twin"])
+@pytest.mark.parametrize("name", ["shells-twin", pytest.param("shells-acting-twin", marks=pytest.mark.slow)])
 def test_the_answer_and_the_page_come_from_what_is_in_hand(name, tmp_path):
     """But for traces, which the page plays; made from the folder it is the same page. Each input is read once."""
     overrides = inputs_in(tmp_path, name)
@@ -70,16 +69,6 @@ def test_the_answer_and_the_page_come_from_what_is_in_hand(name, tmp_path):
     assert read == dict.fromkeys(inputs, 1)
     page = (tmp_path / "run" / "report.html").read_bytes()
     assert write_report(tmp_path / "run").read_bytes() == page
-
-
-def test_workers_and_page_need_no_file_once_it_is_resolved(stored_run, tmp_path):
-    overrides = inputs_in(tmp_path, "shells-twin")
-    resolved = require_ready(harness.load_campaign(tmp_path / "campaign.yaml", overrides))
-    for name in ("campaign", "traffic", "drivers"):
-        (tmp_path / f"{name}.yaml").unlink()
-    assert harness.run(resolved, tmp_path / "run", workers=2).report.is_file()
-    tables = (stored_table(folder, "episodes") for folder in (tmp_path / "run", stored_run("shells-twin")))
-    assert next(tables).equals(next(tables))
 
 
 def test_a_pool_is_read_once_by_the_run_and_once_by_each_worker(stored_run, tmp_path):
@@ -108,12 +97,3 @@ def test_there_is_one_file_per_table_and_none_without_rows(stored_run, tmp_path)
         assert all(pq.read_metadata(path).num_rows for path in files)
         assert [path.name for path in files] in ([], [f"{0:09d}-{n:09d}.parquet"])
     assert unlike_columns(stored_run("nde-twin"), tmp_path / "run") == []
-
-
-def test_what_there_is_is_written_again_while_a_file_is_not_full(stored_run, tmp_path, monkeypatch):
-    """With every shard, here: the end is the same, and no earlier file of it is left."""
-    monkeypatch.setattr(kept, "_INTERVAL_S", 0.0)
-    monkeypatch.setattr(kept, "_SHARE", 1e9)
-    run_with_workers(golden("mixture-twin"), tmp_path / "run", workers=1)
-    assert len(part_files(tmp_path / "run")) == 1
-    assert unlike_columns(stored_run("mixture-twin"), tmp_path / "run") == []

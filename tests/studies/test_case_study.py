@@ -12,7 +12,6 @@ from studies.__main__ import main
 from studies.case_study import tested
 from studies.case_study.counted import KnownMeans, spread
 from studies.case_study.figures import exactly, figure, marked, ratio_of_means, ratio_of_variances, verdict
-from studies.case_study.page import claim_rows
 from studies.case_study.repeated import variants_of
 from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
@@ -188,20 +187,6 @@ def test_the_shipped_study_is_right_and_its_claims_ask_for_what_there_is():
 )
 def test_a_verdict_is_of_the_whole_interval(found, expected):
     assert verdict(10.0, found, within=2.0, tolerance=None, at_most=False) == expected
-
-
-def test_claims_of_one_fact_share_a_row_wherever_they_stand():
-    def claim(says, paper, value, fact=""):
-        found = figure(value, value - 0.5, value + 0.5)
-        usual = {"within": 2.0, "tolerance": None, "at_most": False, "verdict": "not reproduced"}
-        return {"says": says, "paper": paper, "found": found, "fact": fact, **usual}
-
-    claims = [claim("gain, α 1", 8.0, 1.0, "the gain"), claim("tests: A", 300.0, 20.0), claim("tests: B", 200.0, 20.0)]
-    rows = claim_rows([*claims, claim("gain, α 2", 12.0, 2.0, "the gain")], "not reproduced")
-    gain, tests = rows
-    assert gain == ("1, 4", "the gain", "8.00 to 12.0", "1.00 (1.00 to 2.00)")
-    assert tests[:3] == ("2–3", "tests: A, B", "300, 200")
-    assert claim_rows(claims, "reproduced") == []
 
 
 def test_ratios_of_paired_repetitions():

@@ -19,7 +19,6 @@ from studies.rnot import (
     acceleration,
     plain_rhw,
     required_tests,
-    required_tests_of_runs,
     scv_rhw,
     shuffled,
 )
@@ -105,16 +104,6 @@ def test_a_stored_run_gives_what_its_blocks_give(stored_run, capsys):
     assert [row["mean"] for row in rows] == [nade.mean, scv.mean]
     assert (SCV_REMARK in rows[1]["remarks"], SCV_REMARK in rows[0]["remarks"]) == (True, False)
     assert rows[0]["grid"] == f"10 to 240 by 0.3 n ({len(grid)} looks)"
-
-
-def test_two_runs_that_never_settle_have_no_acceleration(stored_run):
-    folders = [stored_run(name) for name in ("nde-twin", "mixture-twin")]
-    content = required_tests_of_runs(folders, replace(QUICK, rhw=1e-9))
-    assert json.loads(json.dumps(content, allow_nan=False)) == content
-    for row in content["rows"]:
-        assert (row["mean"], row["mean_is_lower_limit"], row["never_reached"]) == (240, True, 5)
-        assert "the mean is a lower limit" in row["remarks"][0]
-    assert (row["aar"], row["aar_is"]) == (None, "unknown")
 
 
 def test_the_command_refuses_shells_in_plain_words(stored_run, capsys):

@@ -1,16 +1,22 @@
 """Simulated trajectories follow the laws that they were made from, as far as these can be read off the table."""
 
+import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
+from scipy import stats
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.loading import evaluate_laws, load_environment
+from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.vocabulary import ACCELERATIONS_MPS2
 from studies.__main__ import main
+from studies.traffic import beside_published
 from studies.trajectories import ALIKE, CLOSEST_M, Differences, simulate
 
 pytestmark = pytest.mark.slow
@@ -112,14 +118,41 @@ def test_vehicles_differ_and_are_measured_with_errors_that_were_asked_for(enviro
     assert not different.lane.equals(measured.lane) or not different.time_s.equals(measured.time_s)
 
 
-@pytest.mark.parametrize("name", ["data.csv", "data.parquet"])
-def test_the_command_writes_what_it_is_named_after(tmp_path: Path, name: str) -> None:
-    file = tmp_path / name
-    call = ["trajectories", "ndd-overtaking-1", "--hours", "0.1", "--seed", "3", "--exact", "--out", str(file)]
-    assert main(call) == 0
-    table = pd.read_csv(file) if file.suffix == ".csv" else pd.read_parquet(file)
-    again = simulate(
-        load_environment(EnvironmentSettings(parameters="ndd-overtaking-1", lane_change_level=1000.0)), 0.1, 3
-    )
-    pd.testing.assert_frame_equal(table, again, check_dtype=False)
-    assert "lateral_m" not in table
+# -- environments beside published figures --
+
+
+SHIPPED = (SHIPPED_FOLDER / "ndd-overtaking-2.yaml").read_text(encoding="utf-8")
+
+
+def test_the_default_traffic_is_as_published(capsys: pytest.CaptureFixture[str]):
+    assert main(["traffic", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["figure"] for row in rows if row["verdict"] == "fail"] == []
+    assert sum(row["verdict"] == "pass" for row in rows) >= 10
+    lead = {row["figure"]: row["model"] for row in rows}["onset to middle of a cut-in, 95 %"]
+    assert lead == pytest.approx(1.7 / 0.867 * math.exp(0.30 * stats.norm.isf(0.05)), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fails"),
+    [
+        ("accept_ttc_s: {value: 5.5", "accept_ttc_s: {value: 5.0", "the same, of the scenario's cut-ins"),
+        (
+            "share: {value: 0.01, source: assumed, range: [0.001, 0.25]",
+            "share: {value: 0.3, source: user",
+            "drivers who do not look",
+        ),
+        ("speed_median_mps: {value: 0.867", "speed_median_mps: {value: 1.1", "onset to middle of a cut-in, median"),
+        ("speed_log_sd: {value: 0.30", "speed_log_sd: {value: 0.5", "time to line crossing, lowest 1 %"),
+    ],
+)
+def test_wrong_numbers_are_found(tmp_path: Path, old: str, new: str, fails: str):
+    assert old in SHIPPED
+    (file := tmp_path / "wrong.yaml").write_text(SHIPPED.replace(old, new), encoding="utf-8")
+    assert fails in [row["figure"] for row in beside_published(str(file)) if row["verdict"] == "fail"]
+
+
+def test_the_range_of_who_does_not_look_ends_where_published_figures_do():
+    number = yaml.safe_load(SHIPPED)["cut_in"]["ignore_share"]
+    (row,) = [row for row in beside_published("ndd-overtaking-2") if row["figure"] == "drivers who do not look"]
+    assert row["within"][1] / 100.0 == pytest.approx(number["range"][1], abs=0.005)

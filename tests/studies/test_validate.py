@@ -1,13 +1,6 @@
 """The command end to end: files, table, the same bits for any number of workers, which do not outlive it, the twin."""
 
 import json
-import os
-import select
-import signal
-import subprocess
-import sys
-import time
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -17,7 +10,6 @@ from harness.errors import CampaignError
 from studies.__main__ import main
 from studies.replication import run
 from studies.replication.experiment import load_experiment
-from studies.work import worker_processes
 from tests.studies.here import Here
 
 pytestmark = pytest.mark.slow
@@ -32,18 +24,6 @@ replications: 12
 chains: [good surrogates, strong noise]
 campaign: {testing: {method: shells}, stop: {rhw: 0.5, episodes: 3000}}
 super_population: {pool_paths: 256}
-"""
-TWIN = """
-format: validation-experiment
-version: 1
-name: twin
-replications: 16
-campaign:
-  environment: {parameters: ndd-overtaking-1, lane_change_level: 1e4}
-  testing: {method: forced}
-  stop: {episodes: 500}
-super_population: {reference_paths: 1024}
-avs: {table-1: {}}
 """
 
 
@@ -69,16 +49,6 @@ def test_workers_change_no_bit_and_the_online_rule_is_followed(tmp_path, monkeyp
             continue
         rhw = (row["ci_high"] - row["ci_low"]) / 2.0 / row["crash_rate"] if row["crash_rate"] else float("inf")
         assert row["reached"] == (rhw <= 0.5 and row["n_crashes"] > 0)
-
-
-def test_weighted_methods_run_in_the_twin(tmp_path, capsys, monkeypatch):
-    (tmp_path / "x.yaml").write_text(TWIN)
-    monkeypatch.setattr(run, "worker_processes", lambda workers: Here())
-    assert main(["validate", str(tmp_path / "x.yaml"), "--out", str(tmp_path / "out")]) == 0
-    assert "table-1" in capsys.readouterr().out
-    (found,) = json.loads((tmp_path / "out" / "results.json").read_text())["judgements"]
-    assert (found["result"], found["tests_median"]) == ("nade", 500)
-    assert abs(found["bias"]) < 5.0 * found["bias_std_error"]
 
 
 ENUMERATED = """
@@ -124,49 +94,10 @@ def test_enumerated_vehicles_alone_and_compared(tmp_path, monkeypatch):
     assert found["pair", "difference"]["truth"] == pytest.approx(-beyond) != 0.0
 
 
-PARENT = """
-import os, time
-from studies.work import worker_processes
-
-if __name__ == "__main__":
-    with worker_processes(1) as executor:
-        print(executor.submit(os.getpid).result(), flush=True)
-        executor.submit(time.sleep, 60).result()
-"""
-
-
-@pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="waits for the end of another's child: Linux only")
-def test_a_worker_ends_when_the_experiment_is_killed(tmp_path):
-    script = tmp_path / "parent.py"
-    script.write_text(PARENT, encoding="utf-8")
-    found = {**os.environ, "PYTHONPATH": str(FOLDER.parents[1])}
-    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=found) as parent:
-        worker = os.pidfd_open(int(parent.stdout.readline()))  # can be read from when it ends
-        assert select.select([worker], [], [], 0.0)[0] == []
-        parent.send_signal(signal.SIGKILL)
-    assert select.select([worker], [], [], 20.0)[0] == [worker]
-    os.close(worker)
-
-
-def test_an_interrupted_experiment_does_not_wait_for_its_workers():
-    futures = []
-
-    def interrupt():
-        with worker_processes(1) as executor:
-            assert executor.submit(os.getpid).result() != os.getpid()  # it has started
-            futures.append(executor.submit(sum, range(10**11)))  # minutes in which it keeps the interpreter lock
-            time.sleep(0.5)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupt()
-    assert isinstance(futures[0].exception(), BrokenProcessPool)  # not the sum
-
-
 # -- experiments are read strictly, and what cannot be repeated is refused in words --
 
 HEAD = "format: validation-experiment\nversion: 1\nname: x\n"
-SHELLS, FORCED = (f"campaign: {{testing: {{method: {method}}}}}\n" for method in ("shells", "forced"))
+SHELLS = "campaign: {testing: {method: shells}}\n"
 ACTS = "avs: {c: {controller: 'a.b:C', before_event: controller}}\n"
 
 
@@ -194,9 +125,7 @@ def test_budgets_end_with_that_of_the_campaign(tmp_path):
     [
         ("avs: {acc: {sumo: {carFollowModel: ACC}}}\n" + SHELLS, "avs.acc", "av.sumo"),
         ("avs: {mine: {controller: 'a.b:C'}}\n" + SHELLS, "avs.mine", "av.controller with before_event hold_speed"),
-        (ACTS + FORCED, "avs.c", "controller"),
         (ACTS + "pairs: {p: {a: c, b: c}}\n" + SHELLS, "pairs.p", "'c'"),
-        ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\n" + FORCED, "campaign.testing.method", "forced"),
         ("avs: {a: {}}\npairs: {p: {a: a, b: a}}\nlimits: [1]\n" + SHELLS, "limits", "pairs"),
         ("avs: {a: {}}\nverdicts: [1]\n" + SHELLS, "beside", "none"),
         ("avs: {a: {before_event: controller}}\n" + SHELLS, "avs.a", "a built-in model"),

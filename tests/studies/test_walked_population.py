@@ -64,16 +64,6 @@ def speeds(walk):
     return walk(campaign("examples.acting:Speeds"), PATHS)
 
 
-def test_a_vehicle_that_is_a_surrogate_from_the_cut_in_on_crashes_where_that_one_does(walk):
-    """Each of its own tests, against the surrogate that takes over; and a sibling that brakes harder does not."""
-    brakes_3 = list(LIBRARY.surrogates).index("brakes-3")
-    found = walk(campaign("tests.controllers.early:Speeds", min_acceleration_mps2=-3.0, noise_mps2=0.5), 64)
-    assert 50 < found.crashes(VEHICLE).sum() < found.bits.size - 50
-    np.testing.assert_array_equal(found.crashes(VEHICLE), found.crashes(brakes_3))
-    sibling = walk(campaign("tests.controllers.early:Speeds", min_acceleration_mps2=-4.0, noise_mps2=0.5), 64)
-    assert not np.array_equal(sibling.crashes(VEHICLE), sibling.crashes(brakes_3))
-
-
 @pytest.mark.parametrize("name", ["FreshNoise", "Breaks"])
 def test_a_vehicle_without_a_known_truth_is_refused(walk, name):
     with pytest.raises(HarnessError, match="failed"):

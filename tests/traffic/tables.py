@@ -4,7 +4,6 @@ import copy
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -47,21 +46,4 @@ def tabled(**changes: Any) -> dict[str, Any]:
     for path, value in changes.items():
         section, name = path.split("__")
         content[section][name] = value
-    return content
-
-
-def as_tables(share: float) -> dict[str, Any]:
-    """Tables that say what the paper's formula of the wish does, and accept all from 8 s on, and a share below."""
-    c = {name: number["value"] for name, number in DATA["cut_in"].items()}
-    v, r1, r1dot = np.linspace(20.0, 40.0, 41), np.expm1(np.linspace(0.0, np.log(116.0), 41)), np.linspace(-10, 10, 41)
-    u, q = (v - 30.0) / 10.0, r1dot / 5.0
-    logs = {
-        "v": c["intercept"] + c["u"] * u + c["u_squared"] * u**2,
-        "r1": c["log_gap"] * np.log1p(r1),
-        "r1dot": c["rate"] * q + c["rate_squared"] * q**2,
-    }
-    content = tabled(acceptance_steps__events=None, acceptance_steps__exposure=None)
-    content["hazard_table"] = {"v_mps": of(v), "r1_m": of(r1), "r1dot_mps": of(r1dot)}
-    content["hazard_table"] |= {f"{name}_log": of(values) for name, values in logs.items()}
-    content["acceptance_steps"] = {"ttc_s": of([8.0]), "share": of([share, 1.0])}
     return content

@@ -20,7 +20,7 @@ from tests.traffic.tables import DATA, SHIPPED, of, tabled
 PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
 TEXT = SHIPPED.read_text(encoding="utf-8")
 NUMBERS = [(section, name) for section, numbers in DATA.items() if isinstance(numbers, dict) for name in numbers]
-NOT_NUMBERS = [".nan", "-.inf", "'1'", "true", "null", "1" + "0" * 400]
+NOT_NUMBERS = [".nan", "'1'", "null", "1" + "0" * 400]
 DF = "  df: {value: 16.0, source: ndd}"
 
 
@@ -89,7 +89,6 @@ def dumped(**changes):
 RANGED = {"value": 1.0, "source": "user"}
 REFUSED = [
     *((changed(("cut_in", "ignore_share", text)), "cut_in.ignore_share.value") for text in ["7", *NOT_NUMBERS]),
-    (changed(("initial_state", "v_scale_mps", "-5")), "initial_state.v_scale_mps.value"),
     (changed(("initial_state", "r2_min_m", "100"), ("initial_state", "r2_max_m", "20")), "initial_state.r2_min_m"),
     (changed(("initial_state", "r2dot_min_mps", "-5"), ("initial_state", "r2dot_max_mps", "-10")), "r2dot_min_mps"),
     (changed(("fit_range", "v_min_mps", "40"), ("fit_range", "v_max_mps", "20")), "fit_range.v_min_mps"),
@@ -114,7 +113,6 @@ REFUSED = [
     (dumped(cut_in__ignore_share={"value": 0.1, "source": "user"}), "ignore_share besides"),
     (yaml.safe_dump(tabled() | {"hazard_table": None}), "u, log_gap"),
     (dumped(guard__margin_m={**RANGED, "range": [2.0, 3.0]}), "guard.margin_m.range"),
-    (dumped(guard__margin_m={**RANGED, "range": [-2.0, 3.0]}), "guard.margin_m.range"),
     ("like: ndd-overtaking-3\n", "like ("),
     ("like: ndd-overtaking-1\nguard: {margn_m: {value: 2.0, source: user}}\n", "guard.margn_m"),
 ]
@@ -213,9 +211,3 @@ def test_who_perceives_so_much_may_act_from_that_step(perceives_m, lead, expecte
     assert reached >= min(perceives_m, 1.7) - 1e-9
     assert lead == 0 or first == 91 or lateral_position(first - 1, 100, lead, 1.7) < perceives_m
     assert earlier == pytest.approx((reached - min(perceives_m, 1.7)) * lead / 1.7, abs=1e-8)
-
-
-def test_an_onset_before_the_test_is_seen_in_its_first_step_with_what_has_come_over_by_then():
-    assert perceived_in(0.0, 4, 20, 1.7) == (1, 0.0)
-    assert perceived_in(0.375, 4, 20, 1.7) == (1, 0.0)  # 1.275 m have come over
-    assert perceived_in(1.5, 4, 20, 1.7)[0] == 3

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
 import time
 from pathlib import Path
@@ -15,12 +13,6 @@ import idm_client
 FAULT_STEP = 60
 
 
-def slows_lv(traci):
-    traci.vehicle.setSpeedMode("LV1", 0)
-    traci.vehicle.slowDown("LV1", 0.0, 2.0)
-    traci.vehicle.setPreviousSpeed("LV1", 1.0)
-
-
 def changes_lane(traci):
     for k in range(4):
         traci.vehicle.setActionStepLength(f"AV{k}", 0.1, True)
@@ -29,11 +21,9 @@ def changes_lane(traci):
 
 FAULTS = {
     "exits": lambda traci: sys.exit(7),
-    "is_killed": lambda traci: os.kill(os.getpid(), signal.SIGKILL),
     "hangs": lambda traci: time.sleep(600),
     "closes": lambda traci: (traci.close(), time.sleep(600)),
     "moves_bv": lambda traci: traci.vehicle.moveTo("BV1", "cell1_1", 500.0),
-    "slows_lv": slows_lv,
     "changes_lane": changes_lane,
 }
 
@@ -60,9 +50,6 @@ def main():
     fault, port, cells = sys.argv[1], int(sys.argv[3]), int(sys.argv[5])
     if fault == "never_connects":
         time.sleep(600)
-    if fault == "connects_late":
-        time.sleep(1.5)
-        fault = "pushes_held_avs"
     idm_client.drive(Faulty(idm_client.connect(port), fault), cells)
 
 

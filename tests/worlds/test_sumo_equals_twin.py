@@ -137,9 +137,6 @@ def differences(seen: list[Motion], computed: list[Motion]) -> dict[int, set[str
 FORCED, NDE, STEP = (f"testing.method={name}" for name in ("forced", "nde", "step_mixture"))
 AVS = {
     "late": "{model: idm, reaction: {delay_s: 0.6}}",
-    "smooth": "{model: idm, reaction: {max_jerk_mps3: 5}}",
-    "inattentive": "{model: idm, reaction: {inattention_probability: 0.5, inattention_delay_s: 1.5}}",
-    "never_brakes": "{model: constant}",
     "accelerates": "{model: constant, parameters: {acceleration_mps2: 1.3}}",
     "all_at_once": "{model: fvdm, parameters: {min_acceleration_mps2: -6}, reaction: {delay_s: 0.3, max_jerk_mps3: 7.7,"
     " inattention_probability: 0.3, inattention_delay_s: 0.9}}",
@@ -151,7 +148,7 @@ LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
 OUTRUNS = (
     "av={model: constant, parameters: {acceleration_mps2: 5}, reaction: {perceives_lateral_m: 0}, takes_over: onset}"
 )
-EPISODES = 150
+EPISODES = 100
 """Of each driver."""
 HOPELESS = np.array(
     [
@@ -164,21 +161,20 @@ HOPELESS = np.array(
 """Starts from which no braking of BV can avoid LV, which it runs into before AV is past."""
 PUBLISHED = (STEP, "testing.challenge=immediate", TWO, "av.parameters.min_acceleration_mps2=-1", "seed=7")
 METHODS = {
-    "mixture": Job((), 800, 64),
-    "forced_without_shim": Job((FORCED,), 400, 64, shim=False),
+    "mixture": Job((), 600, 64),
+    "forced_without_shim": Job((FORCED,), 250, 64, shim=False),
     "forced_drawn_in_every_step": Job((FORCED, "environment.acceleration_hold_s=0.1", "seed=5"), 64, 64),
     "published": Job(PUBLISHED, 200, 32),
     "bv_into_lv": Job((NDE,), 16, 5, states=HOPELESS),
 }
 JOBS = {
     **METHODS,
-    "vanilla": Job(("seed=3",), 250, 1, vanilla=True),
+    "vanilla": Job(("seed=3",), 150, 1, vanilla=True),
     "vanilla_bv_into_lv": Job((NDE,), 16, 1, vanilla=True, states=HOPELESS),
-    "late_under_step_mixture": Job((STEP, f"av={AVS['late']}"), 60, 16),
     **{name: Job((FORCED, f"av={av}"), EPISODES, 32) for name, av in AVS.items()},
     # Cut-ins that take time; before some that take long the AV has passed BV.
-    "seen": Job((FORCED, LATERAL, "av={model: idm}"), 300, 32),
-    "seen_by_a_reference": Job((FORCED, LATERAL, "av={model: r157-cc}"), 300, 32),
+    "seen": Job((FORCED, LATERAL, "av={model: idm}"), 200, 32),
+    "seen_by_a_reference": Job((FORCED, LATERAL, "av={model: r157-cc}"), 200, 32),
     "overtaken": Job((FORCED, "environment.cut_in_lead_s=4", OUTRUNS), 300, 32),
 }
 
@@ -218,9 +214,8 @@ def test_the_episodes_compared_are_many_and_of_every_kind(twins):
     assert (~cut_in).sum() >= 10
     assert (exact["outcome"] == CONTACT).sum() >= 10
     vanilla = twins["vanilla"].episode
-    assert vanilla.size >= 200
-    assert (vanilla["outcome"] == CRASH).sum() >= 50
-    assert ((vanilla["event_step"] >= 0) & (vanilla["outcome"] != CRASH)).sum() >= 50
+    assert (vanilla["outcome"] == CRASH).sum() >= 30
+    assert ((vanilla["event_step"] >= 0) & (vanilla["outcome"] != CRASH)).sum() >= 30
     speeds = [trace[..., 1] for name in ("mixture", "vanilla") for trace in twins[name].traces.values()]
     assert any(((v[1:] == 0.0) & (v[:-1] > 0.0)).any() for v in speeds), "somebody brakes to a standstill"
     assert any(((v[1:] > 0.0) & (v[:-1] == 0.0)).any() for v in speeds), "somebody drives off"
@@ -235,7 +230,7 @@ def test_among_cut_ins_that_take_time_are_side_contacts_and_vehicles_that_have_p
     assert np.unique(seen["lead_steps"]).size >= 20
 
 
-@pytest.mark.parametrize(("vehicle", "toward"), [(LV, 0.0), (BV, 0.0), (BV, 100.0), (AV, 100.0)])
+@pytest.mark.parametrize(("vehicle", "toward"), [(BV, 0.0), (AV, 100.0)])
 def test_one_speed_command_off_by_one_unit_in_the_last_place_is_found(vehicle, toward, recordings):
     class PerturbedTwin(TwinWorld):
         steps = 0
@@ -250,18 +245,6 @@ def test_one_speed_command_off_by_one_unit_in_the_last_place_is_found(vehicle, t
     found = differences(recordings["mixture"][0], motions_computed(perturbed))
     assert list(found) == [5]
     assert "v" in found[5]
-
-
-def test_a_crash_flagged_a_step_late_is_found(recordings, twins):
-    motions = list(recordings["mixture"][0])
-    row = next(row for row, motion in enumerate(motions) if motion.contact.any())
-    motions[row] = motions[row]._replace(contact=np.zeros_like(motions[row].contact))
-    assert differences(motions, motions_computed(twins["mixture"])) == {row: {"contact"}}
-
-
-def test_another_delay_would_be_found(recordings):
-    other = run_episodes(Job((FORCED, "av={model: idm, reaction: {delay_s: 0.5}}"), EPISODES, 32), TwinWorld(48))
-    assert len(differences(recordings["late"][0], motions_computed(other))) >= 100
 
 
 # -- one step of SUMO, for any two speeds, is next_position to the last bit: standstill included --

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import pickle
-import shutil
 from collections.abc import Callable
 
 import libsumo
 import numpy as np
 import pytest
 
+from harness.compiled import unboxed
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
+from harness.families.cut_in.loading import load_environment
+from harness.families.cut_in.path import empty_trajectory
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
+from harness.records.schemas import episodes_table
 from harness.resolved import resolve
 from harness.sampling import prepare
-from harness.vocabulary import BV, CRASH, LV, VEHICLES
-from harness.worlds import sumo
-from harness.worlds.shim import Shim, open_shim, shim_library
-from harness.worlds.sumo import committed_file
+from harness.vehicles.drivers import Followers
+from harness.vehicles.library import load_library
+from harness.vocabulary import BV, CONTACT, CRASH, LV, STATE_DTYPE, TIMEOUT, VEHICLES
+from harness.worlds.shim import open_shim, shim_library
 from harness.worlds.twin import TwinWorld
+from studies.alarm import replay_surrogates, stored_paths
+from tests.episode.test_lateral import BESIDE, at_once, beside
+from tests.retracing import retraced
 from tests.worlds.running import smoke
 
 X, V = (np.tile(values, (8, 1)) for values in ([300.0, 200.0, 100.0], [30.0, 28.0, 35.0]))
@@ -62,7 +68,7 @@ def test_a_second_simulation_is_refused_and_closing_twice_leaves_the_next_one_al
 
 
 @pytest.mark.parametrize("shim", [True, False])
-@pytest.mark.parametrize("victim", ["LV0", "BV3", "AV7"])
+@pytest.mark.parametrize("victim", ["BV3", "AV7"])
 def test_a_vehicle_one_unit_in_the_last_place_off_is_noticed_at_once(victim, shim, driving):
     world = driving(8, shim=shim)
     drive(world)
@@ -77,7 +83,7 @@ def test_a_vehicle_one_unit_in_the_last_place_off_is_noticed_at_once(victim, shi
 
 
 @pytest.mark.parametrize(("shim", "steps"), [(True, 1), (False, 10)])
-@pytest.mark.parametrize("victim", ["LV1", "BV0", "AV2"])
+@pytest.mark.parametrize("victim", ["LV1", "AV2"])
 def test_a_speed_one_unit_in_the_last_place_off_is_noticed_within_ten_steps(victim, shim, steps, driving):
     """It does not show in a position of some 100 m: the shim compares speeds always, Python asks now and then."""
     if shim and shim_library() is None:
@@ -156,16 +162,6 @@ compiled_shim = pytest.mark.skipif(shim_library() is None, reason="no compiled s
 
 
 @compiled_shim
-@pytest.mark.parametrize(("switch", "used"), [("1", True), ("0", False)])
-def test_where_it_is_built_it_is_used_unless_it_is_switched_off(switch, used, driving, monkeypatch):
-    steps, step = [], Shim.step
-    monkeypatch.setattr(Shim, "step", lambda shim, wanted: steps.append(wanted) or step(shim, wanted))
-    monkeypatch.setenv("HARNESS_SHIM", switch)
-    drive(driving(2))
-    assert len(steps) == used
-
-
-@compiled_shim
 def test_vehicles_that_are_gone_are_an_error_and_those_of_another_simulation_are_found_anew(driving):
     world, names = driving(2), [f"{vehicle}{k}" for k in range(2) for vehicle in VEHICLES]
     shim = open_shim(names, V[:2].copy(), X[:2] + 0.1 * V[:2], V[:2].copy())  # a second one for the same vehicles
@@ -182,8 +178,62 @@ def test_vehicles_that_are_gone_are_an_error_and_those_of_another_simulation_are
     assert world.x[0, 0] == libsumo.vehicle.getLanePosition("LV0") > 300.0
 
 
-def test_sumo_reads_its_files_from_an_installation_in_a_folder_of_any_name(driving, tmp_path, monkeypatch):
-    folder = tmp_path / "a,b ${HOME}"
-    shutil.copytree(committed_file("vehicles.add.xml").parent, folder)
-    monkeypatch.setattr(sumo, "committed_file", lambda name: folder / name)
-    drive(driving(2))
+# -- prescribed traffic: cut-ins close to LV and to the AV, and fewer episodes than cells --
+
+
+STATES = np.array(
+    [
+        (21.0, 0.3, -4.0, 30.0, -8.0),  # BV is over LV's rear when it has left the lane
+        (21.0, 3.0, -4.0, 30.0, -8.0),  # in good time
+        (21.0, 30.0, 0.0, 0.5, -8.0),  # in front of the AV's bumper
+        (21.0, 0.3, -4.0, 0.5, -8.0),  # both at once
+    ],
+    STATE_DTYPE,
+)
+OUTCOMES = [CONTACT, TIMEOUT, CRASH, CONTACT]
+
+
+def loop_in(world, model: str) -> EpisodeLoop:
+    resolved = resolve(smoke("testing.method=shells", f"av={{model: {model}}}"))
+    return EpisodeLoop(world, resolved.scenario, RecordPolicy("all", 0.0))
+
+
+def run(world) -> Shard:
+    return loop_in(world, "idm").run(0, at_once(STATES))
+
+
+def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes():
+    campaign = smoke("testing.method=shells")
+    environment, library = load_environment(campaign.environment), load_library("ladder-1")
+    shard = run(TwinWorld(4))
+    assert shard.episode["outcome"].tolist() == OUTCOMES
+    assert shard.episode["n_steps"].tolist() == [1, 200, 1, 1]
+    episodes = episodes_table(shard, campaign.seed)
+    assert retraced(episodes, resolve(campaign)) == []
+    crashes = np.full(len(STATES), -1, np.int64)
+    stored, room = stored_paths(episodes, campaign.seed), empty_trajectory(environment)
+    followers = Followers(library.followers(environment.lateral.present).drivers)
+    assert replay_surrogates(*map(unboxed, (stored, environment, followers, room)), crashes) == -1
+    everybody = 2 ** len(library.surrogates) - 1
+    assert crashes.tolist()[::2] == [0, everybody]
+    assert crashes[3] == 0
+
+
+@pytest.mark.parametrize("shim", [True, False])
+@pytest.mark.parametrize("n_cells", [1, 64])
+def test_sumo_agrees_also_with_cells_that_stay_empty(open_world, n_cells, shim):
+    twin, sumo = run(TwinWorld(4)), run(open_world(n_cells, shim=shim))
+    assert twin.episode.tobytes() == sumo.episode.tobytes()
+    for row, trace in twin.traces.items():
+        assert np.array_equal(trace, sumo.traces[row], equal_nan=True)
+
+
+def test_sumo_flags_vehicles_beside_each_other_by_the_rule_of_the_first_overlap(open_world):
+    """Around -0.001 and -9.999 m: the loop stops where SUMO's own flag says something else than the positions."""
+    traffic = beside([r2_m for r2_m, _ in BESIDE])
+    episode = {}
+    for name, world in (("twin", TwinWorld(4)), ("sumo", open_world(4))):
+        episode[name] = loop_in(world, "constant").run(0, traffic).episode
+    assert episode["sumo"].tobytes() == episode["twin"].tobytes()
+    for row, (_, outcome) in zip(episode["sumo"], BESIDE, strict=True):
+        assert (row["n_steps"] > 1) if outcome is None else (row["outcome"], row["n_steps"]) == (outcome, 1)
