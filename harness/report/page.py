@@ -75,13 +75,12 @@ def write_page_of(run: RunFolder) -> Path:
 
 def write_hours(folder: Path, content: dict[str, Any]) -> Path:
     """Write the page of several scenarios: the sum, each one's part of it, and the way to each one's own page."""
-    rows, decision = list(family_rows(content)), content["decision"]
-    sizes = [content["families"][row[0]] for row in rows]
+    decision = content["decision"]
     return write_page(
         folder / "report.html", "hours.html.j2",
         content=content, sums=[*sum_rows(content), *reading_rows(content)],
         verdict=None if decision is None else decided(decision).texts,
-        rows=list(zip(rows, sizes, strict=True)),
+        rows=[(row, content["families"][row[0]]) for row in family_rows(content)],
         warnings=list(milder(content)), exposures=exposures(content), scope=scope(content), called=called,
     )  # fmt: skip
 
