@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
@@ -122,8 +122,54 @@ class SpeedsAndGaps(Section):
     r1_log_sd_u: LogScale
 
 
+class LeftOpen(NamedTuple):
+    """What data leave open of a traffic: numbers by name at the two ``ends`` of what they may be.
+
+    ``where`` says where nothing was seen, else it is empty and ``highest`` the end of a stated range.
+    """
+
+    where: str
+    highest: float | None
+    ends: tuple[Mapping[str, float], Mapping[str, float]]
+
+
 class ParameterFile(Section):
-    """Sections of numbers, which are known by flat names ``section__name``."""
+    """Numbers of a traffic in sections, each with its provenance; a file may be ``like`` one of a ``folder``.
+
+    ``replicates`` names a ``file`` of numbers that other data would have given, with its ``sha256``; None without one.
+    ``blocks`` are sections whose numbers are fitted together, by what they are called. Of one whose data have all kinds
+    of events nothing more is to be said.
+    """
+
+    folder: ClassVar[Path]
+    replicates: ClassVar[Any]
+    blocks: ClassVar[Mapping[str, tuple[str, ...]]]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_like_another(cls, given: Any) -> Any:
+        return completed(given, cls.folder) if isinstance(given, dict) else given
+
+    @property
+    def unseen(self) -> str:
+        """Where the data had no event; empty where they had."""
+        return ""
+
+    def without_half(self) -> Mapping[int, Mapping[str, float]]:
+        """Numbers with which there are half as many events of each kind that the data have not."""
+        return {}
+
+    def unseen_in(self, kinds: Collection[int]) -> str:  # noqa: ARG002 - there is none
+        """Where some of these kinds are."""
+        return ""
+
+    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
+        """A replicate with what no event at all leaves open upwards."""
+        return dict(row)
+
+    def left_open(self) -> LeftOpen | None:
+        """What data leave open."""
+        return None
 
     def numbers(self) -> dict[str, Number]:
         """Flat ``section__name``, of those in a list ``section__name__0`` and so on → number, with its provenance."""

@@ -9,15 +9,16 @@ scripts, judges, counts and shows them, and knows nothing else of it.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 
 from harness.campaign.drivers import Surrogate
 from harness.campaign.sections import EnvironmentSettings
+from harness.families.numbers import ParameterFile
 from harness.families.words import Shown, Words
 from harness.loop.cells import Script
 from harness.vehicles.drivers import Followers
@@ -25,6 +26,8 @@ from harness.vocabulary import BoolArray, FloatArray, IntArray, Method, RecordAr
 
 Environment: TypeAlias = Any
 """All that a family's kernels need of its traffic; what is in it the family alone knows."""
+Parameters: TypeAlias = ParameterFile
+"""Its numbers, each with its provenance."""
 
 
 class Column(NamedTuple):
@@ -108,50 +111,6 @@ class Chosen(NamedTuple):
     lead: IntArray
 
 
-@runtime_checkable
-class Parameters(Protocol):
-    """Numbers of a traffic, each with a ``value`` and its provenance, by flat names ``section__name``.
-
-    ``replicates`` names a ``file`` of numbers that other data would have given, with its ``sha256``; None without one.
-    ``unseen`` says where the data had no event, and is empty where they had. ``blocks`` are sections whose numbers are
-    fitted together, by what they are called.
-    """
-
-    blocks: ClassVar[Mapping[str, tuple[str, ...]]]
-
-    @property
-    def replicates(self) -> Any: ...
-
-    @property
-    def unseen(self) -> str: ...
-
-    def numbers(self) -> dict[str, Any]:
-        """All numbers; ``se`` is a standard error and ``range`` where an assumed one may lie, each None if not said."""
-
-    def content_hash(self) -> str:
-        """Hash of the numbers alone."""
-
-    def without_half(self) -> Mapping[int, Mapping[str, float]]:
-        """Numbers with which there are half as many events of each kind that the data have not."""
-
-    def unseen_in(self, kinds: Collection[int]) -> str:
-        """Where some of these kinds are."""
-
-    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
-        """A replicate with what no event at all leaves open upwards."""
-
-
-class LeftOpen(NamedTuple):
-    """What data leave open of a traffic: numbers by name at the two ``ends`` of what they may be.
-
-    ``where`` says where nothing was seen, else it is empty and ``highest`` the end of a stated range.
-    """
-
-    where: str
-    highest: float | None
-    ends: tuple[Mapping[str, float], Mapping[str, float]]
-
-
 class Exposure(NamedTuple):
     """How many events there are in an hour of driving, between ``low`` and ``high``.
 
@@ -180,57 +139,41 @@ class Driven(NamedTuple):
 
 
 class Family(Protocol):
-    """A kind of events. ``traffic`` is all that its kernels need of its environment.
-
-    Attributes
-    ----------
-    name : str
-        As campaigns call it.
-    vehicles : tuple of str
-        Names of the vehicles of a cell, the AV last.
-    principal, ahead : int
-        Place of the vehicle that events are about, and of the one ahead of it, -1 without one.
-    columns : tuple of Column
-        The facts that records keep.
-    n_uniforms : int
-        How many uniforms the beginning of a path is made from: what a pool is aimed over.
-    shipped : Path
-        Folder of the parameter files that a name alone stands for.
-    default_parameters : str
-        The one of them where nothing is said.
-    ladders : mapping of bool to str
-        Libraries of surrogates where nothing is said, by whether events show themselves before they happen.
-    follows : bool
-        Whether the AV drives from the start, behind a vehicle that does not look at it: events do not depend on it.
-    stride : int
-        Events of a path between two that a pool asks.
-    pool_error : float
-        Relative standard error of its surrogates' crash rates where nothing is said.
-    crosses : int
-        Place of the vehicle that changes lanes, -1 for none.
-    words, maps, stand_ins
-        What pages say of events, the axes (x, y) of their maps, and who is driven in the AV's place: by name a phrase
-        and the driver, the reference driver first.
-    """
+    """A kind of events, and what most have alike. ``traffic`` is all that its kernels need of its environment."""
 
     name: str
     vehicles: tuple[str, ...]
+    """Names of the vehicles of a cell, the AV last."""
     principal: int
+    """Place of the vehicle that events are about."""
     ahead: int
+    """Place of the one ahead of it, -1 without one."""
     columns: tuple[Column, ...]
+    """The facts that records keep."""
     n_uniforms: int
-
+    """From how many uniforms the beginning of a path is made: what a pool is aimed over."""
     shipped: Path
+    """Folder of the parameter files that a name alone stands for."""
     default_parameters: str
+    """The one of them where nothing is said."""
     ladders: Mapping[bool, str]
+    """Libraries of surrogates where nothing is said, by whether events show themselves before they happen."""
     follows: bool
+    """Whether the AV drives from the start, behind a vehicle that does not look at it: events do not depend on it."""
     stride: int
+    """Events of a path between two that a pool asks."""
     pool_error: float
-
+    """Relative standard error of its surrogates' crash rates where nothing is said."""
+    fitter: str
+    """Its fit to trajectories (`harness.fitting.protocol.Fitter`), ``module:class``; empty without one."""
     crosses: int
+    """Place of the vehicle that changes lanes, -1 for none."""
     words: Words
+    """What pages say of events."""
     maps: tuple[tuple[Shown, Shown], ...]
+    """Axes (x, y) of their maps."""
     stand_ins: Mapping[str, tuple[str, Surrogate]]
+    """Who is driven in the AV's place, by name: a phrase and the driver, the reference driver first."""
 
     def parameters(self, settings: EnvironmentSettings) -> Parameters:
         """The numbers that a campaign's environment names.
@@ -246,9 +189,6 @@ class Family(Protocol):
     ) -> Environment | None:
         """The same with other numbers; None where they give no laws."""
 
-    def left_open(self, parameters: Any) -> LeftOpen | None:
-        """What data leave open of it."""
-
     def digest(self, traffic: Environment) -> str:
         """Hash of all numbers of it."""
 
@@ -258,14 +198,16 @@ class Family(Protocol):
     def sideways_m(self, traffic: Environment) -> float:
         """Way (m) from a first lateral motion to overlap."""
 
-    def shows(self, traffic: Environment) -> bool:
+    def shows(self, traffic: Environment) -> bool:  # noqa: ARG002 - where nothing else is said
         """Whether events can be seen before they happen."""
+        return False
 
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:
         """How often there are events, as `Events.probability` counts them."""
 
-    def milder(self, traffic: Environment) -> Environment | None:
+    def milder(self, traffic: Environment) -> Environment | None:  # noqa: ARG002
         """The same with events that are too mild to count, of which some are driven all the same; None without any."""
+        return None
 
     def mean_distance_m(self, traffic: Environment) -> float:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens."""
@@ -275,6 +217,7 @@ class Family(Protocol):
 
     def sources(self) -> Mapping[Method, type[Any]]:
         """Methods of its own, which draw the event in the loop: a class each (`harness.sampling.protocol.Source`)."""
+        return {}
 
     def start(self, traffic: Environment, u: FloatArray) -> RecordArray:
         """How paths begin, (n,), from uniforms (n, `n_uniforms`)."""
@@ -300,8 +243,9 @@ class Family(Protocol):
     def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:
         """Steps (m,) at whose end chosen events begin; what happens in them may be later."""
 
-    def told(self, facts: Mapping[str, Any]) -> str:
+    def told(self, facts: Mapping[str, Any]) -> str:  # noqa: ARG002
         """What an event is like, by the columns of its test, as a phrase behind that of its onset; may be empty."""
+        return ""
 
     def script(self, traffic: Environment, chosen: Chosen) -> Script:
         """The motion that chosen events are, from their facts alone."""

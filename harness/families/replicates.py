@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pyarrow as pa
 
 from harness.campaign.files import shipped_or_own
 from harness.errors import RunFolderError
-from harness.families.protocol import Parameters
 from harness.records.folder import read_table
+
+if TYPE_CHECKING:
+    from harness.families.numbers import ParameterFile
 
 OF_REPLICATES = b"harness fit"
 """Key in the metadata of a file: hash of the numbers that they belong to."""
@@ -21,7 +24,7 @@ def content_hash(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()[:16]
 
 
-def read_replicates(name: str, parameters: Parameters, shipped: Path) -> list[dict[str, float]]:
+def read_replicates(name: str, parameters: ParameterFile, shipped: Path) -> list[dict[str, float]]:
     """Numbers that vary, of each replicate that an environment, a name of a file that is ``shipped`` or a path, names.
 
     Raises `HarnessError`: the file is missing or damaged, or is not of these numbers.

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import yaml
@@ -88,7 +89,7 @@ def fit_files(
     progress, out = progress or Progress(), Path(out)
     paths = [Path(file) for file in files]
     read = load_mapping(mapping, mirror=mirror, leave_out=leave_out)
-    fitters: dict[str, Fitter] = {name: of.fitter() for name, of in families().items() if hasattr(of, "fitter")}
+    fitters: dict[str, Fitter] = {name: resolve_name(of.fitter)() for name, of in families().items() if of.fitter}
     marks = {path: mark for each in fitters.values() for path, mark in each.marks(out).items()}
     _require_ours(out, marks, [*paths, Path(mapping or ".")], force=force)
     require_place(out.parent)

@@ -56,11 +56,11 @@ def _near(column: str, most: float) -> Rule:
     return Rule(column, lambda x: np.abs(x - np.median(x)) <= most, f"{column} {{:g}}", expected)
 
 
-NUMBERS = tuple(
-    Rule(name, np.isfinite, "no finite number", "a number in every row")
-    for name in ("time_s", "s_m", "speed_mps", "lane", "length_m")
+_NUMBERS = "time_s", "s_m", "speed_mps", "lane", "length_m"
+NUMBERS = (
+    *(Rule(name, np.isfinite, "no finite number", "a number in every row") for name in _NUMBERS),
+    Rule("lane", lambda x: x % 1 == 0, "{:g}", "a whole number", "Number the lanes by whole numbers."),
 )
-WHOLE_LANE = Rule("lane", lambda x: x % 1 == 0, "{:g}", "a whole number", "Number the lanes by whole numbers.")
 SOME_LENGTH = Rule("length_m", lambda x: x > 0.0, "no length", "a length above 0 m", NO_LENGTH)
 NEAR_TIME = _near("time_s", 1e7)
 NEAR = _near("s_m", 1e5), _near("lane", 20), _near("length_m", 50.0)

@@ -24,17 +24,7 @@ from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.problems import did_you_mean
 from harness.campaign.sections import Section
 from harness.errors import TrajectoryError
-from harness.fitting.recording import (
-    NAMES,
-    NO_LENGTH,
-    NUMBERS,
-    UNITS,
-    WHOLE_LANE,
-    Recording,
-    Unit,
-    recording_of,
-    require,
-)
+from harness.fitting.recording import NAMES, NO_LENGTH, NUMBERS, UNITS, Recording, Unit, recording_of, require
 
 Needed = Literal["vehicle_id", "time_s", "s_m", "speed_mps", "lane", "length_m"]
 Measured = Literal["time_s", "s_m", "speed_mps", "length_m", "lateral_m"]
@@ -269,7 +259,7 @@ def _standard(rows: pd.DataFrame, path: Path, mapping: Mapping) -> pd.DataFrame:
             rows[column] *= UNITS[unit] if isinstance(unit, str) else unit
     if mapping.layout == "highd":
         rows = _from_highd(rows, path)
-    for rule in (*NUMBERS, WHOLE_LANE):
+    for rule in NUMBERS:
         require(rule, rows, lambda i, of=rule.column: f"{path}, row {rows.row.iloc[i]}, {of}")  # type: ignore[misc]
     if isinstance(mapping.lanes, list):
         order = {float(lane): i for i, lane in enumerate(mapping.lanes)}

@@ -13,17 +13,8 @@ IN_VIEW_M = 100.0
 """Where so much of the road behind is in view and empty, nobody is behind."""
 
 
-class FitRange(NamedTuple):
-    """Range of the states that laws are fitted to."""
-
-    v_min_mps: float = 20.0
-    v_max_mps: float = 40.0
-    r1_min_m: float = 0.0
-    r1_max_m: float = 115.0
-
-
-USUAL_RANGE = FitRange()
-"""Fit range of the shipped environments."""
+V_MIN_MPS, V_MAX_MPS, R1_MAX_M = 20.0, 40.0, 115.0
+"""Range of the states that laws are fitted to: that of the shipped environments."""
 
 
 class Scene:
@@ -54,13 +45,12 @@ class Scene:
 
     def states(self, rows: IntArray, side: int) -> States:
         """States of some rows (m,) towards the lane ``side``."""
-        track, fit = self._track, USUAL_RANGE
-        v = track.v[rows]
+        track = self._track
         leader, _ = self.neighbours(rows, 0)
         r1 = track.gap(leader, rows)
-        fits = (v >= fit.v_min_mps) & (v <= fit.v_max_mps)
-        follows = (leader >= 0) & (r1 <= fit.r1_max_m)
-        behind = follows & fits & (r1 > max(fit.r1_min_m, 0.0))
+        fits = (track.v[rows] >= V_MIN_MPS) & (track.v[rows] <= V_MAX_MPS)
+        follows = (leader >= 0) & (r1 <= R1_MAX_M)
+        behind = follows & fits & (r1 > 0.0)
         ahead, after = self.neighbours(rows, side)
         r2, r2dot = track.gap(rows, after), track.rate(rows, after)
         ttc_s = np.full(rows.size, np.inf)

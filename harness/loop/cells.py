@@ -28,16 +28,8 @@ CELL_DTYPE = np.dtype(
         ("lead", _i8),  # steps from its onset to it
         ("onset_step", _i8),  # -1: nobody knows of an onset yet
         ("acts_from", _i8),  # first step in which the AV may act
-        ("component", _i8),  # what the test was drawn from: stratum, or importance function; -1: nothing of the kind
-        ("n_control", _i8),
-        ("log_weight", _f8),
-        ("log_p_event", _f8),
-        ("min_ttc", _f8),
-        *((name, _f8) for name in ("event_gap", "event_rate", "onset_gap", "onset_rate", "av_start")),
         ("cruises", _i8),  # whether the AV still keeps its speed, whatever it asks for but to brake
         ("set_speed", _f8),  # at which the AV cruises
-        ("took_over_step", _i8),  # first step in which it did what it asked for; -1: none yet
-        ("asked_to_speed_up", _i8),  # whether it asked for that while it was held
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration
     ]
 )
@@ -53,6 +45,9 @@ EPISODE_DTYPE = np.dtype(
     + [(name, np.int16) for name in _STEPS]
     + [(name, _f8) for name in (*_AT_EVENT, *_AT_END)]
 )
+"""What becomes of a test. ``component`` is the stratum or importance function that it was drawn from, -1 for none;
+``took_over_step`` the first in which the AV did what it asked for, -1 for none, and ``asked_to_speed_up`` whether it
+asked for that while it was held."""
 
 
 class Script(NamedTuple):
@@ -186,10 +181,9 @@ class KernelState(NamedTuple):
     (m/s). ``episode`` (n,) are the results, `EPISODE_DTYPE`. ``principal`` is the
     place of the vehicle that the event is about, and ``ahead`` that of the one ahead of it, -1 without one;
     ``sideways_m`` is the way from its first lateral motion to overlap. ``driver`` is (1,) for a built-in AV, else (0,).
-    ``passed_m`` is the gap to the principal vehicle at which the AV has passed it. ``observation`` is what a controller
-    outside of the kernels sees, ``acts_early`` whether from the start, whatever the script says.
-    ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or somebody is ahead on its
-    lane. What may be so or not is 0 or 1.
+    ``observation`` is what a controller outside of the kernels sees, ``acts_early`` whether from the start, whatever
+    the script says. Else ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or
+    somebody is ahead on its lane. What may be so or not is 0 or 1.
     """
 
     seed: int
@@ -203,7 +197,6 @@ class KernelState(NamedTuple):
     ahead: int
     sideways_m: float
     driver: RecordArray
-    passed_m: float
     keep_traces: int
     observation: BatchObservation
     acts_early: int

@@ -64,7 +64,7 @@ def follow(k: int, kernel: KernelState) -> None:
     headway_s = headway_of(driver, script.headway_s[cell.row], script.v[cell.row, script.v.shape[1] - 1])
     memory = follow_on(driver, headway_s, memory, cell.step - reacts, waits, speed, lead, revealed)
     cells.acceleration[k], cell.danger = memory.acceleration, memory.danger
-    cell.took_over_step = 0
+    kernel.episode[cell.row].took_over_step = 0
 
 
 @compiled_inline
@@ -83,11 +83,12 @@ def ahead_of(k: int, other: int, kernel: KernelState) -> Ahead:
 def held_if_cruising(k: int, asked: float, kernel: KernelState) -> float:
     """Acceleration (m/s²) of an AV that asks for one: none while it cruises."""
     cell = kernel.cells.cell[k]
+    test = kernel.episode[cell.row]
     if still_cruises(cell.cruises, 0 <= cell.event_step < cell.step, asked):
-        cell.asked_to_speed_up |= asked > 0.0
+        test.asked_to_speed_up |= asked > 0.0
         return 0.0
-    if cell.took_over_step < 0:
-        cell.cruises, cell.took_over_step = 0, cell.step
+    if test.took_over_step < 0:
+        cell.cruises, test.took_over_step = 0, cell.step
     return asked
 
 

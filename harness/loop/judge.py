@@ -44,7 +44,8 @@ def judge(kernel: KernelState, contact: BoolArray) -> int:
         if is_ahead(k, kernel):
             left, rate = gap_and_rate(k, kernel)
             if rate < 0.0 and left >= 0.0:
-                cell.min_ttc = min(cell.min_ttc, left / -rate)
+                test = kernel.episode[cell.row]
+                test.min_ttc_s = min(test.min_ttc_s, left / -rate)
         outcome = outcome_of(k, kernel)
         if contact[k] != (outcome in (CRASH, CONTACT)):
             return -1 - k
@@ -64,19 +65,15 @@ def is_ahead(k: int, kernel: KernelState) -> bool:
 
 
 @compiled_inline
-def touch(k: int, one: int, other: int, kernel: KernelState) -> bool:
-    """Whether two vehicles overlap that are on one lane, or were when the step began."""
-    cells = kernel.cells
-    now = cells.lane[k, one] == cells.lane[k, other]
-    before = cells.lane_before[k, one] == cells.lane_before[k, other]
-    return (now or before) and overlaps(kernel.x[k, one], kernel.x[k, other])
-
-
-@compiled_inline
 def touched_by(k: int, vehicle: int, kernel: KernelState) -> int:
-    """The first vehicle before it in the order of vehicles that touches a vehicle; -1 for none."""
+    """The first vehicle before it in the order of vehicles that touches a vehicle; -1 for none.
+
+    Two touch that overlap on one lane, or on the one that they shared when the step began.
+    """
+    lane, before = kernel.cells.lane, kernel.cells.lane_before
     for other in range(vehicle):
-        if touch(k, other, vehicle, kernel):
+        shared = lane[k, other] == lane[k, vehicle] or before[k, other] == before[k, vehicle]
+        if shared and overlaps(kernel.x[k, other], kernel.x[k, vehicle]):
             return other
     return -1
 
@@ -94,7 +91,7 @@ def outcome_of(k: int, kernel: KernelState) -> int:
     if is_ahead(k, kernel):
         if left < CONTACT_M:
             return PASSED
-    elif left <= kernel.passed_m and not (0 <= cell.onset_step < cell.step):
+    elif left <= (PASSED_UNDER_CONTROL_M if kernel.acts_early else PASSED_M) and not (0 <= cell.onset_step < cell.step):
         return PASSED
     if cell.step >= kernel.script.n_steps[cell.row] or both_stand(k, kernel):
         return TIMEOUT
@@ -138,21 +135,16 @@ def fail(kernel: KernelState, failed: IntArray) -> None:
 
 @compiled_inline
 def end_test(k: int, outcome: int, n: int, kernel: KernelState) -> None:
-    """Write the finished test of cell ``k`` to its row, idle the cell, and list it in place ``n`` of those ended."""
+    """Finish the row of the test in cell ``k``, idle the cell, and list it in place ``n`` of those ended."""
     cells, v, av = kernel.cells, kernel.v, kernel.x.shape[1] - 1
     cell = cells.cell[k]
     row = kernel.episode[cell.row]
-    row.outcome, row.n_steps, row.n_control_steps, row.component = outcome, cell.step, cell.n_control, cell.component
+    row.outcome, row.n_steps = outcome, cell.step
     row.event_step, row.lead_steps, row.onset_step = cell.event_step, cell.lead, cell.onset_step
-    row.event_gap_m, row.event_rate_mps, row.min_ttc_s = cell.event_gap, cell.event_rate, cell.min_ttc
-    row.onset_gap_m, row.onset_rate_mps = cell.onset_gap, cell.onset_rate
-    row.crash_time_s = row.impact_speed_mps = math.nan
     if outcome == CRASH:
         row.crash_time_s = cell.step * STEP_S
         row.impact_speed_mps = v[k, av] - v[k, touched_by(k, av, kernel)]
-    row.av_distance_m = kernel.x[k, av] - cell.av_start
-    row.log_weight, row.log_p_event = cell.log_weight, cell.log_p_event
-    row.took_over_step, row.asked_to_speed_up = cell.took_over_step, cell.asked_to_speed_up
+    row.av_distance_m = kernel.x[k, av] - kernel.script.x[cell.row, av]
     if kernel.keep_traces:
         for vehicle in range(av + 1):
             here = cells.trace[k, cell.step, vehicle]

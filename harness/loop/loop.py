@@ -14,7 +14,7 @@ from harness.controllers.protocol import BatchObservation
 from harness.errors import WorldDisagreementError
 from harness.loop.cells import EPISODE_DTYPE, KernelState, PrescribedEvents, idle_cells
 from harness.loop.drive import Past, command, drive, empty_observation, first, hold_cruising, observe
-from harness.loop.judge import PASSED_M, PASSED_UNDER_CONTROL_M, fail, judge
+from harness.loop.judge import fail, judge
 from harness.loop.repeat import Traffic, refill
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray, RecordArray
@@ -98,12 +98,6 @@ def hash_of_index(seed: int, episodes: IntArray) -> FloatArray:
     return hashed
 
 
-def traced_by_index(seed: int, episodes: IntArray, share: float) -> BoolArray:
-    """Which episodes are traced whatever their outcome."""
-    chosen: BoolArray = hash_of_index(seed, episodes) < share
-    return chosen
-
-
 class EpisodeLoop:
     """K idle cells of a world, fed with tests of one campaign; ``av`` is a controller outside of the kernels."""
 
@@ -120,31 +114,28 @@ class EpisodeLoop:
         Raises `WorldDisagreementError`: the world did something else than it was told. Raises `CampaignError`: the
         vehicle has replaced what the harness calls, whatever came of that.
         """
-        try:
-            return self._run(first_episode, traffic)
-        finally:
-            if self._av is not None:
-                self._av.require_untouched()
-
-    def _run(self, first_episode: int, traffic: Traffic) -> Shard:
         n = len(traffic)
-        traced = traced_by_index(self._scenario.seed, first_episode + np.arange(n), self._keep.trace_share)
+        traced = hash_of_index(self._scenario.seed, first_episode + np.arange(n)) < self._keep.trace_share
         shard = Shard(first_episode, self._scenario, traffic, np.zeros(n, EPISODE_DTYPE), traced)
         self._cells.cell["row"] = -1
         kernel, given, ended = self._kernel_state(shard), 0, 0
         traffic.begin(self._world.n_cells)
-        while True:
-            placed = refill(kernel, given)
-            traffic.move(kernel, placed)
+        try:
+            while True:
+                placed = refill(kernel, given)
+                traffic.move(kernel, placed)
+                if self._av is not None:
+                    ended += self._ask(self._av, kernel, shard, placed)
+                elif not self._world.drives_av:
+                    drive(kernel)
+                command(kernel)
+                if ended == n:
+                    return shard
+                ended += self._step_and_judge(kernel, shard, placed)
+                given += placed
+        finally:
             if self._av is not None:
-                ended += self._ask(self._av, kernel, shard, placed)
-            elif not self._world.drives_av:
-                drive(kernel)
-            command(kernel)
-            if ended == n:
-                return shard
-            ended += self._step_and_judge(kernel, shard, placed)
-            given += placed
+                self._av.require_untouched()
 
     def beside(self, world: World | None = None, keep: RecordPolicy | None = None) -> EpisodeLoop:
         """Another loop with the same AV, in a world of no more cells, or with other records."""
@@ -177,11 +168,10 @@ class EpisodeLoop:
                 ahead=scenario.ahead,
                 sideways_m=scenario.sideways_m,
                 driver=scenario.driver,
-                passed_m=PASSED_UNDER_CONTROL_M if early else PASSED_M,
                 keep_traces=int(self._keep.any_trace),
                 observation=self._observation,
                 acts_early=int(early),
-                av_cruises=int(cruises and not early),
+                av_cruises=int(cruises),
             )
         )
 
@@ -221,8 +211,11 @@ class EpisodeLoop:
                     world.announce(refilled, cells.cell["announced_index"][refilled])
                 world.place(refilled, world.x, world.v, cells.lane_before)
             contact = world.step(cells.speed, cells.lane)
-        except AVLostError as lost:
-            return self._lose(str(lost), kernel, shard)
+        except AVLostError as lost:  # all running episodes fail
+            running = np.flatnonzero(cells.cell["row"] >= 0)
+            failed = self._fail(dict.fromkeys(running.tolist(), str(lost)), kernel, shard)
+            world.restart()
+            return failed
         ended = judge(kernel, contact)
         if ended < 0:
             raise _disagreement(cells.cell[-1 - ended], bool(contact[-1 - ended]))
@@ -232,13 +225,6 @@ class EpisodeLoop:
             outcome = shard.episode["outcome"]
             shard.failures.update((row, STRAYED) for _, row in self._ended(ended) if outcome[row] == FAILED)
         return ended
-
-    def _lose(self, cause: str, kernel: KernelState, shard: Shard) -> int:
-        """Fail all running episodes and begin again; returns their number."""
-        running = np.flatnonzero(self._cells.cell["row"] >= 0)
-        lost = self._fail(dict.fromkeys(running.tolist(), cause), kernel, shard)
-        self._world.restart()
-        return lost
 
     def _fail(self, failures: Mapping[int, str], kernel: KernelState, shard: Shard) -> int:
         """End episodes whose controller failed (cell → cause), and go on; returns their number."""

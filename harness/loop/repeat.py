@@ -73,30 +73,23 @@ def refill(kernel: KernelState, given: int) -> int:
 def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     """Reset cell ``k`` for the test of a row."""
     script, av = kernel.script, kernel.x.shape[1] - 1
-    cell, episode = kernel.cells.cell[k], kernel.first_episode + row
-    cell.row, cell.episode, cell.step, cell.n_control, cell.motion_hash = row, episode, 0, 0, 0
-    cell.event_step = cell.planned = cell.onset_step = cell.took_over_step = -1
-    cell.lead = cell.asked_to_speed_up = 0
+    cell, test, episode = kernel.cells.cell[k], kernel.episode[row], kernel.first_episode + row
+    cell.row, cell.episode, cell.step, cell.lead, cell.motion_hash = row, episode, 0, 0, 0
+    cell.event_step = cell.planned = cell.onset_step = -1
     cell.acts_from = 0 if kernel.acts_early else script.acts_from[row]
     cell.cruises, told = kernel.av_cruises if cell.acts_from > 0 else 0, script.set_speed_mps[row]
     cell.set_speed = kernel.v[k, av] if math.isnan(told) else told
     cell.announced_index = script.announced_index[row] if script.announced_index[row] >= 0 else episode
-    cell.component, cell.log_weight = script.stratum[row], script.log_weight[row]
-    cell.log_p_event = script.log_p_event[row]
-    cell.min_ttc = cell.danger = math.inf
-    cell.event_gap = cell.event_rate = cell.onset_gap = cell.onset_rate = math.nan
-    cell.av_start = kernel.x[k, av]
+    cell.danger = test.min_ttc_s = math.inf
+    test.took_over_step, test.component = -1, script.stratum[row]
+    test.log_weight, test.log_p_event = script.log_weight[row], script.log_p_event[row]
+    test.event_gap_m = test.event_rate_mps = test.onset_gap_m = test.onset_rate_mps = math.nan
+    test.crash_time_s = test.impact_speed_mps = math.nan
     kernel.cells.acceleration[k] = 0.0
     if script.at[row] >= 0:
-        plan(k, script.at[row], script.lead[row], kernel)
-
-
-@compiled_inline
-def plan(k: int, at: int, lead: int, kernel: KernelState) -> None:
-    """The event will be in a step, and show itself some steps earlier."""
-    cell = kernel.cells.cell[k]
-    cell.planned, cell.lead, cell.onset_step = at, lead, onset_of(at, lead)
-    cell.acts_from = min(cell.acts_from, cell.onset_step + 1)
+        cell.planned, cell.lead = script.at[row], script.lead[row]
+        cell.onset_step = onset_of(cell.planned, cell.lead)
+        cell.acts_from = min(cell.acts_from, cell.onset_step + 1)
 
 
 @compiled
@@ -113,7 +106,8 @@ def repeat(kernel: KernelState) -> None:
         note_onset(k, kernel)
         if cell.step == script.at[cell.row]:
             note_event(k, kernel)
-            cell.n_control += cell.component >= 0 or cell.log_weight != 0.0  # drawn otherwise than traffic would
+            test = kernel.episode[cell.row]
+            test.n_control_steps += test.component >= 0 or test.log_weight != 0.0  # drawn otherwise than traffic would
 
 
 @compiled_inline
@@ -121,18 +115,19 @@ def note_onset(k: int, kernel: KernelState) -> None:
     """Keep where the principal vehicle is when its event begins to show itself."""
     cell = kernel.cells.cell[k]
     if cell.step == cell.onset_step:
-        cell.onset_gap, cell.onset_rate = gap_and_rate(k, kernel)
+        test = kernel.episode[cell.row]
+        test.onset_gap_m, test.onset_rate_mps = gap_and_rate(k, kernel)
 
 
 @compiled_inline
 def note_event(k: int, kernel: KernelState) -> None:
     """The event is in this step: keep where the principal vehicle is."""
     cell = kernel.cells.cell[k]
-    cell.event_step = cell.step
+    test, cell.event_step = kernel.episode[cell.row], cell.step
     if cell.onset_step < 0:
         cell.planned = cell.onset_step = cell.step
         cell.acts_from = min(cell.acts_from, cell.step + 1)
-    cell.event_gap, cell.event_rate = gap_and_rate(k, kernel)
+    test.event_gap_m, test.event_rate_mps = gap_and_rate(k, kernel)
 
 
 @compiled_inline

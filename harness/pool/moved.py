@@ -146,7 +146,7 @@ def assumed(traffic: Resolved, pool: Pool, design: ShellDesign, progress: Progre
     That is the range that is stated for who does not look, or shares of lane changes at times to collision where none
     was seen, which are anything up to what that many vehicles without one refuse.
     """
-    if (left := traffic.family.left_open(traffic.parameters)) is None:
+    if (left := traffic.parameters.left_open()) is None:
         return None
     ends = [environment_with(traffic, each) for each in left.ends]
     if None in ends:

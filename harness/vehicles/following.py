@@ -26,7 +26,7 @@ from harness.vehicles.drivers import (
     idm_acceleration,
 )
 from harness.vehicles.kinematics import STEP_S
-from harness.vehicles.references import Memory, built_up, changing, part_after
+from harness.vehicles.references import Memory, built_up, changing, following, part_after
 from harness.vocabulary import Record
 
 _ROUNDING = 1e-9
@@ -66,24 +66,14 @@ class Ahead(NamedTuple):
 
 
 @compiled_inline
-def model_acceleration(driver: Record, headway_s: float, speed: float, lead: Ahead, revealed: Ahead) -> float:
-    """Acceleration (m/s²) of a driver's model behind one vehicle, or two of which it minds both."""
-    wanted = behind(driver, headway_s, speed, lead)
-    if revealed.gap < math.inf:
-        wanted = min(wanted, behind(driver, headway_s, speed, revealed))
-    return wanted
-
-
-@compiled_inline
 def behind(driver: Record, headway_s: float, speed: float, lead: Ahead) -> float:
-    """The same behind one vehicle."""
-    if driver.kind >= 0 and driver.kind != IDM_KIND:
-        return float(driver_acceleration(driver, speed, lead.speed, lead.gap))
-    hardest = driver.min_acceleration_mps2
+    """Acceleration (m/s²) of a driver's model behind one vehicle."""
     if driver.kind < 0:
-        hardest = max(driver.following_min_acceleration_mps2, hardest)
+        return following(driver, headway_s, speed, lead.speed, lead.gap)
+    if driver.kind != IDM_KIND:
+        return driver_acceleration(driver, speed, lead.speed, lead.gap)
     wanted = idm_acceleration(driver, headway_s, speed, lead.speed, max(lead.gap, SMALLEST_GAP_M))
-    return float(min(max(wanted, hardest), driver.max_acceleration_mps2))
+    return float(min(max(wanted, driver.min_acceleration_mps2), driver.max_acceleration_mps2))
 
 
 @compiled_inline
@@ -108,7 +98,9 @@ def follow_on(
     if driver.kind == CAREFUL_COMPETENT_KIND and since >= 0:
         wanted, danger = careful_competent(driver, headway_s, memory, since, speed, lead, revealed)
     else:
-        wanted = model_acceleration(driver, headway_s, speed, lead, revealed)
+        wanted = behind(driver, headway_s, speed, lead)
+        if revealed.gap < math.inf:
+            wanted = min(wanted, behind(driver, headway_s, speed, revealed))
     change = driver.max_jerk_mps3 * STEP_S
     return Memory(min(max(wanted, before - change), before + change), danger, memory.used_up)
 

@@ -107,10 +107,10 @@ class Library(Section):
                 expected = f"one of the surrogates: {', '.join(self.surrogates)}"
                 mend = did_you_mean(name, list(self.surrogates)) or "Add it to surrogates, or name another."
                 raise broken_rule(key, f"'{name}'", expected, mend)
-            if name is not None and name == self.envelope and key != "envelope":
-                expected = "a driver that reacts: the envelope crashes nearly always, which says nothing"
-                mend = "Name the most careless driver that the vehicle can be expected to outdo."
-                raise broken_rule(key, f"'{name}', which is the envelope", expected, mend)
+        if self.boundary == self.envelope:
+            expected = "a driver that reacts: the envelope crashes nearly always, which says nothing"
+            mend = "Name the most careless driver that the vehicle can be expected to outdo."
+            raise broken_rule("boundary", f"'{self.boundary}', which is the envelope", expected, mend)
         if (n := self.n_drivers) > MOST_SURROGATES:
             mend = "Every shell costs tests: keep those that differ in crash rate by a quarter or more."
             raise broken_rule("surrogates", f"{n} of them, with the references", f"at most {MOST_SURROGATES}", mend)
@@ -128,10 +128,8 @@ class Library(Section):
             raise broken_rule(f"{place}.model", envelope.model, expected, mend)
         for name, driver in (self.surrogates | self.references).items():
             if (fastest := driver.parameters.max_acceleration_mps2) > most:
-                found, mend = (
-                    f"{most:g} m/s², less than {name}'s {fastest:g}",
-                    f"Raise it to {fastest:g}, or limit {name}.",
-                )
+                found = f"{most:g} m/s², less than {name}'s {fastest:g}"
+                mend = f"Raise it to {fastest:g}, or limit {name}."
                 expected = "an envelope that accelerates at least as hard as every surrogate"
                 raise broken_rule(f"{place}.parameters.acceleration_mps2", found, expected, mend)
         return self
@@ -144,9 +142,9 @@ def shipped_drivers() -> dict[str, Surrogate]:
     return {name: each for one in libraries for name, each in (one.surrogates | one.references).items()}
 
 
-def load_library(name: str | None, *, shows: bool = False) -> Library:
-    """Read a shipped library by name, or a file by its path; without either that for cut-ins that take time, or not.
+def load_library(name: str | None) -> Library:
+    """Read a shipped library by name, or a file by its path; without either that for cut-ins of one step.
 
     Raises `CampaignError`: names every place that is wrong.
     """
-    return read_model(shipped_or_own(name or OF_TRAFFIC[shows], SHIPPED_FOLDER, "pool.library"), Library)
+    return read_model(shipped_or_own(name or OF_TRAFFIC[False], SHIPPED_FOLDER, "pool.library"), Library)

@@ -50,9 +50,9 @@ def changing(part: float, before: float, after: float) -> float:
 
 
 @compiled_inline
-def following(driver: Record, speed: float, lead_speed: float, gap: float) -> float:
-    """Acceleration (m/s²) of the IDM by which a reference driver follows."""
-    wanted = idm_acceleration(driver, driver.time_headway_s, speed, lead_speed, max(gap, SMALLEST_GAP_M))
+def following(driver: Record, headway_s: float, speed: float, lead_speed: float, gap: float) -> float:
+    """Acceleration (m/s²) of the IDM by which a reference driver follows, at a time headway."""
+    wanted = idm_acceleration(driver, headway_s, speed, lead_speed, max(gap, SMALLEST_GAP_M))
     hardest = max(driver.following_min_acceleration_mps2, driver.min_acceleration_mps2)
     return float(min(max(wanted, hardest), driver.max_acceleration_mps2))
 
@@ -85,7 +85,7 @@ def careful_competent(
     elif danger == math.inf and gap < driver.critical_ttc_s * (speed - lead_speed):
         danger = first_perceived(memory, step)
     idle = 0.0 if danger == math.inf else max(-driver.coasting_mps2, driver.min_acceleration_mps2)
-    follows = built_up(driver, memory, idle, following(driver, speed, lead_speed, gap))
+    follows = built_up(driver, memory, idle, following(driver, driver.time_headway_s, speed, lead_speed, gap))
     a = changing(part_after(step, -memory.used_up, driver.reaction_steps), idle, follows)
     if danger < math.inf:
         brakes = built_up(driver, memory, idle, driver.min_acceleration_mps2)
@@ -154,7 +154,7 @@ def fuzzy_safety(
     wanted = fuzzy_braking(driver, memory, speed, lead_speed, gap)
     if wanted > 0.0 and danger == math.inf:
         danger = first_perceived(memory, step)
-    follows = built_up(driver, memory, 0.0, following(driver, speed, lead_speed, gap))
+    follows = built_up(driver, memory, 0.0, following(driver, driver.time_headway_s, speed, lead_speed, gap))
     a = changing(part_after(step, -memory.used_up, driver.reaction_steps), 0.0, follows)
     if wanted > 0.0:
         brakes = built_up(driver, memory, 0.0, max(-wanted, driver.min_acceleration_mps2))

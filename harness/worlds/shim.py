@@ -31,8 +31,6 @@ def open_shim(names: Sequence[str], told: FloatArray, x: FloatArray, v: FloatArr
         return None
     import libsumo  # noqa: PLC0415 - takes 0.2 s, and only worlds need it
 
-    if (inner := getattr(libsumo, "_libsumo", None)) is None:
-        return None
     try:
         library = ctypes.CDLL(str(path))
         library.shim_open.restype = _POINTER
@@ -43,7 +41,7 @@ def open_shim(names: Sequence[str], told: FloatArray, x: FloatArray, v: FloatArr
     except (OSError, AttributeError):
         return None  # built for another machine, or by an earlier version
     encoded = (ctypes.c_char_p * len(names))(*map(str.encode, names))
-    handle = library.shim_open(inner.__file__.encode(), encoded, ctypes.c_long(len(names)))
+    handle = library.shim_open(libsumo._libsumo.__file__.encode(), encoded, ctypes.c_long(len(names)))
     return Shim(library, handle, told, x, v) if handle else None
 
 

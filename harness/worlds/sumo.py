@@ -198,16 +198,11 @@ class SumoWorld(SumoCells):
         atexit.register(self.close)
         self._populate(self._api)
         # What is called in every step is called without libsumo's Python wrappers, which cost a quarter.
-        self._set_speed = self._function("vehicle", "setSpeed")
-        self._get_position = self._function("vehicle", "getLanePosition")
-        self._get_speed = self._function("vehicle", "getSpeed")
-        self._get_collisions = self._function("simulation", "getCollisions")
-        self._simulation_step = self._function("simulation", "step")
+        inner = self._api._libsumo
+        self._get_position, self._get_speed = inner.vehicle_getLanePosition, inner.vehicle_getSpeed
+        self._set_speed, self._simulation_step = inner.vehicle_setSpeed, inner.simulation_step
+        self._get_collisions = inner.simulation_getCollisions
         self._shim = open_shim(self._flat, self._told, self.x, self.v) if shim else None
-
-    def _function(self, domain: str, name: str) -> Any:
-        inner = getattr(self._api, "_libsumo", None)
-        return getattr(inner, f"{domain}_{name}", None) or getattr(getattr(self._api, domain), name)
 
     def _type_of(self, vehicle: int) -> str:
         return "vanilla" if self._vanilla else super()._type_of(vehicle)

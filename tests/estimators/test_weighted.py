@@ -56,6 +56,24 @@ def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
 
 
 @pytest.mark.parametrize(
+    ("weights", "cap", "told"),
+    [
+        ([0.0] + [-9.0] * 59, None, ["effective sample size", "one crash carries", "weights of these tests are unbou"]),
+        ([0.0] * 60, 1e-3, ["contradict the campaign"]),
+        ([0.0] * 3, 1.0, ["only 3 crashes"]),
+        ([0.0] * 60, 1.0, []),
+    ],
+)
+def test_what_a_user_must_be_told(weights, cap, told):
+    method = "step_mixture" if cap is None else "forced"
+    estimate = nade(block([True] * len(weights), weights, method=method, weight_cap=cap)).result(0.9)
+    assert all(any(part in note_words(warning) for warning in estimate.warnings) for part in told)
+    assert bool(estimate.warnings) == bool(told)
+    assert list(estimate.warnings[: len(estimate.cautions)]) == list(estimate.cautions)
+    assert (estimate.precision == math.inf) == (cap != 1.0)
+
+
+@pytest.mark.parametrize(
     ("epsilon", "log_weight", "cap", "told"),
     [
         (1.0, 0.0, 1.0, ""),

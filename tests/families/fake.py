@@ -8,7 +8,8 @@ import numpy as np
 import pyarrow as pa
 
 from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
-from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure
+from harness.families.numbers import ParameterFile
+from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, Family
 from harness.loop.cells import natural_script
 
 AT = np.array([5, 7])
@@ -22,28 +23,13 @@ RATE = 0.5 * (0.02 + 0.01)
 STEPS = 60
 
 
-class Numbers:
-    """Of which none can be another; see `harness.families.protocol.Parameters`."""
+class Numbers(ParameterFile):
+    """Of which none can be another."""
 
-    blocks, replicates, unseen = {}, None, ""
-
-    def numbers(self):
-        return {}
-
-    def content_hash(self):
-        return "fake"
-
-    def without_half(self):
-        return {}
-
-    def unseen_in(self, kinds):
-        return ""
-
-    def as_if_unseen(self, row):
-        return dict(row)
+    folder, blocks, replicates = Path(__file__).parent, {}, None
 
 
-class Fake:
+class Fake(Family):
     """See `harness.families.protocol.Family`."""
 
     name = "fake"
@@ -57,19 +43,13 @@ class Fake:
     default_parameters, follows, stride, pool_error = "two-events", False, 4, 0.005
     shipped = Path(__file__).parent
     words = WORDS._replace(rests=lambda *_: "the numbers of this file", limits="")
-    crosses, maps, stand_ins = 0, ((GAP, CLOSING),), STAND_INS
+    fitter, crosses, maps, stand_ins = "", 0, ((GAP, CLOSING),), STAND_INS
     ladders = {False: "ladder-2", True: "ladder-2"}
 
     def parameters(self, settings):
         return Numbers()
 
     def traffic_with(self, settings, parameters, values):
-        return None
-
-    def left_open(self, parameters):
-        return None
-
-    def milder(self, traffic):
         return None
 
     def traffic(self, settings, parameters=None):
@@ -84,9 +64,6 @@ class Fake:
     def sideways_m(self, traffic):
         return 1.7
 
-    def shows(self, traffic):
-        return False
-
     def exposure(self, traffic, parameters):
         return Exposure(2.0, 1.0, 4.0, None, "assumed")
 
@@ -95,9 +72,6 @@ class Fake:
 
     def mean_speed_mps(self, traffic):
         return 30.0
-
-    def sources(self):
-        return {}
 
     def start(self, traffic, u):
         return np.array([(NEAR_M if one < 0.5 else FAR_M,) for one in u[:, 0]], [("gap_m", float)])
@@ -117,9 +91,6 @@ class Fake:
 
     def onset(self, traffic, chosen):
         return chosen.at
-
-    def told(self, facts):
-        return ""
 
     def script(self, traffic, chosen):
         n = len(chosen.facts)

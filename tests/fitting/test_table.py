@@ -122,6 +122,10 @@ REFUSED = {
     "the end of time": (with_value(7, "time_s", 1e12), r"row 8 .*found time_s 1e\+12"),
     "lanes": (with_value(7, "lane", 1e12), r"row 8 .*found lane 1e\+12"),
     "long": (with_value(7, "length_m", 70.0), r"row 8 .*found length_m 70"),
+    "one recording stands still": (
+        changed(s_m=ROWS.s_m.where(ROWS.recording_id != 3, first("s_m"))),
+        r"of recording 3, t = 0 s\): found s_m -40, and -40 in row 4981, where speeds say -36.* such pairs of rows",
+    ),
     "all stand still": (changed(s_m=first("s_m")), r"row 1 .*found s_m 60, and 60 in row 11, where speeds say 8"),
     "a vehicle twice": (
         lambda: pd.concat([ROWS, ROWS[(ROWS.vehicle_id == 1) & (ROWS.recording_id == 3)].assign(vehicle_id=9)]),

@@ -5,7 +5,7 @@ import pytest
 
 from harness.campaign.drivers import IDMParameters
 from harness.families.cut_in.nade import tables as cache
-from harness.families.cut_in.nade.tables import Tables, build_tables, tables_hash, tables_name
+from harness.families.cut_in.nade.tables import Tables, build_tables, tables_name
 from harness.vehicles.drivers import driver_records
 from tests.kernels import environment
 
@@ -54,15 +54,15 @@ def test_a_damaged_file_is_built_again(folder, built, damage):
 
 
 def test_what_the_hash_depends_on():
-    reference = tables_hash(environment(), DRIVER, "recursive")
-    assert tables_hash(environment(level=350.0), DRIVER, "recursive") == reference
-    assert tables_hash(environment(hold_s=0.1), DRIVER, "recursive") != reference
-    assert tables_hash(environment(), DRIVER, "immediate") != reference
+    reference = tables_name(environment(), DRIVER, "recursive")
+    assert tables_name(environment(level=350.0), DRIVER, "recursive") == reference
+    assert tables_name(environment(hold_s=0.1), DRIVER, "recursive") != reference
+    assert tables_name(environment(), DRIVER, "immediate") != reference
     for name in FIELDS:
         changed = DRIVER.copy()
         changed[name] += 1
-        assert tables_hash(environment(), changed, "recursive") != reference
+        assert tables_name(environment(), changed, "recursive") != reference
     for name in ("free_driving__df", "cut_in__accept_ttc_s", "guard__margin_m", "initial_state__r1_log_mean"):
         numbers = environment().numbers.copy()
         numbers[name] += 0.1
-        assert tables_hash(environment()._replace(numbers=numbers), DRIVER, "recursive") != reference
+        assert tables_name(environment()._replace(numbers=numbers), DRIVER, "recursive") != reference

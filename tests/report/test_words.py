@@ -8,6 +8,7 @@ import pytest
 from harness.estimators.answer import estimate_blocks
 from harness.records.folder import read_manifest
 from harness.report.lines import LINES, WIDTH, lines
+from harness.report.pair_words import pair_words
 from harness.report.summary import read_run_folder
 from harness.report.words import answer_of, short_answer
 from harness.runner.stored import stored_blocks
@@ -93,6 +94,23 @@ def test_much_to_warn_of_leaves_room_for_the_rate(stored_run):
 
 
 @pytest.mark.parametrize(
+    ("name", "shows", "blind", "held"),
+    [
+        ("forced-krauss", True, True, False),
+        ("forced-krauss", False, False, False),
+        ("shells-lateral-twin", True, False, False),
+        ("shells-controller-sumo", True, False, True),
+    ],
+)
+def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(name, shows, blind, held, stored_run):
+    run = read_run_folder(stored_run(name))
+    asked = {**run.estimates.diagnostics, "n_asked_to_speed_up": 1234 * (name != "forced-krauss")}
+    warnings = "".join(said(run, manifest={"events_show": shows}, diagnostics=asked).warnings)
+    assert ("cannot see the other car (BV)" in warnings) == blind
+    assert ("1,234 tests it asked to speed up" in warnings) == held
+
+
+@pytest.mark.parametrize(
     ("seen", "high", "first", "value", "ends"),
     [
         (0.0, 0.2, "ratio", "< 0.20", "no crash seen"),
@@ -112,6 +130,19 @@ def test_what_is_known_of_an_attentive_vehicle_comes_first(seen, high, first, va
     best = replace(run.estimates.best, **rate, n_crashes=2 * (seen > 0.0), details=details)
     rows = said(run, best, golden("shells-lateral-twin", "stop.rhw=0.3"), severity=None).rows
     assert (rows[0].key, rows[0].value, rows[0].interval) == (first, value, ends)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "sign", "margin"),
+    [
+        ("proven", "B crashes less often than A", "B is at most 10 % worse than A"),
+        ("refuted", "B crashes more often than A", "B is more than 10 % worse than A"),
+        ("open", "Not told apart", "Open whether B is more than 10 % worse than A"),
+    ],
+)
+def test_the_verdict_of_a_comparison(verdict, sign, margin):
+    told = [pair_words({"margin": of, "verdict": verdict}) for of in (0.0, 0.1)]
+    assert told == [sign, margin]
 
 
 @pytest.mark.parametrize(("name", "untested"), [("shells-inside", True), ("shells-twin", False)])

@@ -95,6 +95,7 @@ def test_a_reference_driver_told_too_low_is_as_far_off_as_one_told_too_high(stor
         ("shells-twin", "ndd-overtaking-1-lateral", "in which events take time"),
         ("forced-twin", "ndd-overtaking-1", "tests by forced"),
         ("shells-acting-twin", "ndd-overtaking-1", "acts before the event"),
+        ("shells-twin", "nowhere", "which is not shipped"),
     ],
 )
 def test_what_cannot_be_answered_is_refused(stored_run, name, where, found):

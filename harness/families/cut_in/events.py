@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.compiled import compiled_inline, compiled_threads, unboxed
+from harness.compiled import compiled_threads, unboxed
 from harness.families.cut_in import laws
 from harness.families.cut_in.lateral import draw_lead
 from harness.families.cut_in.laws import Environment
@@ -43,20 +43,20 @@ class Maneuvers(NamedTuple):
 
 
 def enumerate_cut_ins(
-    environment: Environment,
+    traffic: Environment,
     seed: int,
     paths: Paths,
-    followers: Followers,
+    drivers: Followers,
     recorded: Recorded = HOLDING,
     stride: int = 1,
     offset: IntArray | None = None,
 ) -> Events:
     """Every ``stride``-th cut-in of paths (n,), by their steps; see `harness.families.protocol.Family.events`."""
-    n, steps = paths.number.size, int(environment.numbers["max_steps"])
+    n, steps = paths.number.size, int(traffic.numbers["max_steps"])
     found = Events(np.zeros((n, steps)), np.zeros((n, steps), np.int64), np.zeros(n), np.zeros(n))
     first = np.zeros(n, np.int64) if offset is None else offset
-    scratch = empty_trajectory(environment)
-    known = unboxed(environment), unboxed(followers), unboxed(recorded)
+    scratch = empty_trajectory(traffic)
+    known = unboxed(traffic), unboxed(drivers), unboxed(recorded)
     _enumerate(seed, paths.number, paths.start, stride, first, *known, unboxed(scratch), unboxed(found))
     return found
 
@@ -89,7 +89,10 @@ def _enumerate(
             if path.hazard[cut] > 0.0 and cut % stride == offset[i]:
                 found.probability[i, cut] = stride * (math.exp(-hazard) * -math.expm1(-path.hazard[cut]))
                 if followers.drivers.size > 0:
-                    found.crashes[i, cut] = who_crashes_after(cut, seed, index[i], followers, environment, path)
+                    leave(cut, max_steps, seed, index[i], cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
+                    if gap(path.x[cut + 1, LV], path.x_after[cut + 1]) >= CONTACT_M:  # else it ends as bv_lv_contact
+                        lead = draw_lead(cut, seed, index[i], environment.lateral)
+                        found.crashes[i, cut] = who_crashes(followers, cut, lead, environment, path)
             hazard += path.hazard[cut]
         found.log_any[i] = math.log(-math.expm1(-hazard))
         if recorded.failed.size > 0 and recorded.failed[i]:
@@ -98,17 +101,6 @@ def _enumerate(
                 wish = laws.opportunity(state_of(path.x[step], path.v[step]), environment)
                 most += laws.cut_in_hazard(wish, 1.0, environment)
             found.after_failure[i] = math.exp(-hazard) * -math.expm1(-most)
-
-
-@compiled_inline
-def who_crashes_after(
-    cut: int, seed: int, index: int, followers: Followers, environment: Environment, path: Trajectory
-) -> int:
-    """One bit for each driver that crashes if BV cuts in in a step of a path that has been walked."""
-    leave(cut, environment.numbers.max_steps, seed, index, cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
-    if gap(path.x[cut + 1, LV], path.x_after[cut + 1]) < CONTACT_M:
-        return 0  # the episode ends as bv_lv_contact
-    return who_crashes(followers, cut, draw_lead(cut, seed, index, environment.lateral), environment, path)
 
 
 def write_maneuvers(

@@ -5,13 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from harness.campaign.drivers import Surrogate
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
 from harness.errors import CampaignError
@@ -22,14 +20,9 @@ from harness.families.cut_in.parameters import DEFAULT, SHIPPED_FOLDER, Environm
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
-from harness.families.cut_in.unseen import left_open
 from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
-from harness.families.protocol import Chosen, Column, Exposure, Paths
-from harness.families.words import Shown
+from harness.families.protocol import Chosen, Column, Exposure, Family, Paths
 from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
-
-if TYPE_CHECKING:
-    from harness.fitting.protocol import Fitter
 
 _STATE_DOCS = (
     "speed of BV",
@@ -62,27 +55,27 @@ EXPOSURE = Exposure(
 )
 
 
-class CutIn:
+class CutIn(Family):
     """See `harness.families.protocol.Family`."""
 
     name = "cut_in"
-    vehicles: tuple[str, ...] = VEHICLES
+    vehicles = VEHICLES
     principal, ahead = BV, LV
-    columns: tuple[Column, ...] = (*(each._replace(doc=f"initial {each.doc}") for each in STATE_FACTS), *MANEUVER_FACTS)
+    columns = (*(each._replace(doc=f"initial {each.doc}") for each in STATE_FACTS), *MANEUVER_FACTS)
     n_uniforms = len(STATE_COLUMNS)
 
     shipped = SHIPPED_FOLDER
     default_parameters = DEFAULT
     follows, stride, pool_error = False, 4, 0.005  # `benchmarks.pool_stride` says what other strides would cost
-    ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-2", True: "ladder-lateral-1"})
+    ladders = {False: "ladder-2", True: "ladder-lateral-1"}
 
+    fitter = "harness.families.cut_in.fitting.fitter:CutInFitter"
     crosses, words = BV, WORDS
-    maps: tuple[tuple[Shown, Shown], ...] = ((GAP, CLOSING),)
-    stand_ins: Mapping[str, tuple[str, Surrogate]] = STAND_INS
+    maps = ((GAP, CLOSING),)
+    stand_ins = STAND_INS
 
     parameters = staticmethod(load_parameters)
     traffic = staticmethod(load_environment)
-    left_open = staticmethod(left_open)
     events = staticmethod(enumerate_cut_ins)
     script = staticmethod(script_of)
     drive = staticmethod(drive_along)
@@ -124,14 +117,6 @@ class CutIn:
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:  # noqa: ARG002 - counted, whatever the laws
         return EXPOSURE
 
-    def fitter(self) -> Fitter:
-        from harness.families.cut_in.fitting.fitter import CutInFitter  # noqa: PLC0415 - reads tables, draws pages
-
-        return CutInFitter()
-
-    def milder(self, traffic: Environment) -> None:
-        """There are none: all cut-ins count."""
-
     def sources(self) -> Mapping[Method, type[Any]]:
         from harness.families.cut_in.nade.in_loop import InLoop  # noqa: PLC0415 - imports what draws on families
 
@@ -146,9 +131,6 @@ class CutIn:
 
     def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:  # noqa: ARG002 - records have its lead
         return np.asarray(np.maximum(chosen.at - chosen.lead, 0))
-
-    def told(self, facts: Mapping[str, Any]) -> str:  # noqa: ARG002 - where and how fast is all
-        return ""
 
     def avoidable(
         self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray

@@ -150,27 +150,19 @@ def evaluate_laws(environment: Environment, states: FloatArray, approaches: Floa
     """In states (n, 3) of v_BV, R1, R1dot and approaches (m, 2) of R2, R2dot, as kernels evaluate them."""
     n, m = len(states), len(approaches)
     out = LawValues(np.empty((2, n, N_ACCELERATIONS)), np.empty((2, n)), np.empty(n), np.empty(m))
-    _evaluate(states, approaches, unboxed(environment), *out)
+    _evaluate(states, approaches, unboxed(environment), unboxed(out))
     return out
 
 
 @compiled_threads
-def _evaluate(
-    states: FloatArray,
-    approaches: FloatArray,
-    environment: Environment,
-    pmf: FloatArray,
-    scale: FloatArray,
-    chance: FloatArray,
-    accepted: FloatArray,
-) -> None:
+def _evaluate(states: FloatArray, approaches: FloatArray, environment: Environment, out: LawValues) -> None:
     for j in range(approaches.shape[0]):
-        accepted[j] = laws.acceptance(approaches[j, 0], approaches[j, 1], environment)
+        out.accepted[j] = laws.acceptance(approaches[j, 0], approaches[j, 1], environment)
     for i in range(states.shape[0]):
         speed, r1, r1dot = states[i]
         state = State(speed, r1, r1dot, math.nan, math.nan)
         free, following = laws.free_driving(speed, environment), laws.car_following(state, environment)
-        laws.acceleration_pmf(free, environment, pmf[0, i])
-        laws.acceleration_pmf(following, environment, pmf[1, i])
-        scale[0, i], scale[1, i] = 1.0 / free.inverse_scale, 1.0 / following.inverse_scale
-        chance[i] = laws.opportunity(state, environment)
+        laws.acceleration_pmf(free, environment, out.pmf[0, i])
+        laws.acceleration_pmf(following, environment, out.pmf[1, i])
+        out.scale[0, i], out.scale[1, i] = 1.0 / free.inverse_scale, 1.0 / following.inverse_scale
+        out.chance[i] = laws.opportunity(state, environment)

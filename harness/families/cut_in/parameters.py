@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -13,14 +13,15 @@ from pydantic import model_validator
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
 from harness.campaign.problems import broken_rule
 from harness.families.cut_in import sections
-from harness.families.cut_in.sections import REPLACED, STEP
-from harness.families.numbers import FitRange, ParameterFile, completed
+from harness.families.cut_in.sections import REPLACED, SMALLEST_SHARE, STEP
+from harness.families.numbers import FitRange, LeftOpen, ParameterFile
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import Record
 
 SHIPPED_FOLDER, DEFAULT = Path(__file__).parent, "ndd-overtaking-2"
 FIXED = {"step_s": STEP_S, "vehicle_length_m": VEHICLE_LENGTH_M}
 """What the compiled motion and SUMO's network are made for: no file can change it, but campaigns' hashes contain it."""
+NOT_LOOKING = "cut_in__ignore_share"
 _NOT_IN_RECORD = ("lateral__", "hazard_table__", "acceptance_steps__")
 
 
@@ -39,12 +40,7 @@ class EnvironmentParameters(ParameterFile):
     hazard_table: sections.HazardTable | None = None
     acceptance_steps: sections.AcceptanceSteps | None = None
     lateral: sections.Lateral | None = None
-    replicates: sections.Replicates | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _is_like_another(cls, given: Any) -> Any:
-        return completed(given, SHIPPED_FOLDER) if isinstance(given, dict) else given
+    replicates: sections.Replicates | None = None  # type: ignore[misc] # others have none
 
     @model_validator(mode="after")
     def _one_law_each(self) -> Self:
@@ -71,6 +67,7 @@ class EnvironmentParameters(ParameterFile):
             raise broken_rule("initial_state", found, f"speeds from 0 to {MAX_CONFIGURED_SPEED_MPS:g} m/s", mend)
         return self
 
+    folder: ClassVar[Path] = SHIPPED_FOLDER
     blocks: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "initial state": ("initial_state",),
         "free driving": ("free_driving",),
@@ -79,30 +76,33 @@ class EnvironmentParameters(ParameterFile):
         "lead of cut-ins": ("lateral",),
     }
 
-    @property
-    def _counted(self) -> sections.AcceptanceSteps | None:
-        """Steps of acceptance that say how many lane changes were seen."""
-        steps = self.acceptance_steps
-        return None if steps is None or steps.events is None or steps.exposure is None else steps
+    # Kinds of events are steps of acceptance here.
 
     @property
     def unseen(self) -> str:
-        """Times to collision at which the data that it was fitted to have no lane change; empty without such."""
-        return "" if (steps := self._counted) is None else steps.where(steps.without_events)
+        return "" if (steps := self.acceptance_steps) is None else steps.where(steps.without_events)
 
     def without_half(self) -> dict[int, dict[str, float]]:
-        """Numbers with which half as many change lanes in a step, of each step without events."""
-        if (steps := self._counted) is None:
+        if (steps := self.acceptance_steps) is None:
             return {}
         return {step: {f"{STEP}{step}": 0.5 * steps.share[step].value} for step in steps.without_events}
 
-    def unseen_in(self, steps: Collection[int]) -> str:
-        """Times to collision of some of these steps."""
-        return "" if self._counted is None else self._counted.where(steps)
+    def unseen_in(self, kinds: Collection[int]) -> str:
+        return "" if self.acceptance_steps is None else self.acceptance_steps.where(kinds)
 
     def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
-        """A replicate with what zero events leave open upwards; see `AcceptanceSteps`."""
-        return dict(row) if self._counted is None else self._counted.as_if_unseen(row)
+        return dict(row) if self.acceptance_steps is None else self.acceptance_steps.as_if_unseen(row)
+
+    def left_open(self) -> LeftOpen | None:
+        """The range that is stated for who does not look, or shares of lane changes where none was seen."""
+        share, steps = self.cut_in.ignore_share, self.acceptance_steps
+        if share is not None and share.range is not None:
+            low, high = share.range
+            return LeftOpen("", high, ({NOT_LOOKING: low}, {NOT_LOOKING: high}))
+        if steps is not None and steps.without_events:
+            least = {f"{STEP}{step}": SMALLEST_SHARE for step in steps.without_events}
+            return LeftOpen(self.unseen, None, (least, steps.as_if_unseen({})))
+        return None
 
     def values(self) -> dict[str, float]:
         """The same without provenance; what is fixed is among them."""

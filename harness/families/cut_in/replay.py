@@ -104,15 +104,15 @@ def drive_others(
 
 
 def drive_along(
-    environment: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
+    traffic: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
 ) -> Driven:
     """See `harness.families.protocol.Family.drive`."""
-    n, steps = len(chosen.facts), int(environment.numbers["max_steps"])
+    n, steps = len(chosen.facts), int(traffic.numbers["max_steps"])
     known = maneuvers_of(chosen)
     stored = StoredPaths(0, np.zeros(n, np.int64), states_of(chosen.facts), np.full(n, steps), chosen.at, known)
-    end, path = np.zeros((n, len(drivers)), np.int64), empty_trajectory(environment)
+    end, path = np.zeros((n, len(drivers)), np.int64), empty_trajectory(traffic)
     motion = np.zeros((len(drivers), steps + 1, 2) if last else (0, 0, 0))
-    drive_others(unboxed(stored), start, unboxed(environment), drivers, unboxed(path), end, motion)
+    drive_others(unboxed(stored), start, unboxed(traffic), drivers, unboxed(path), end, motion)
     return Driven(end, motion, np.stack((path.x_after, path.v_after), axis=1))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.compiled import compiled_threads
+from harness.compiled import compiled_threads, unboxed
 from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.laws import Environment, acceleration
 from harness.families.cut_in.path import place
@@ -68,37 +68,27 @@ def _place(state: RecordArray, x: FloatArray, v: FloatArray) -> None:
         place(state[i], x[i], v[i])
 
 
-def script_of(environment: Environment, chosen: Chosen) -> Script:
+def script_of(traffic: Environment, chosen: Chosen) -> Script:
     """The motion of LV and BV, to the end of the longest test; beyond the last maneuver nothing can be meant."""
-    facts, n, steps = chosen.facts, len(chosen.facts), int(environment.numbers["max_steps"])
+    facts, n, steps = chosen.facts, len(chosen.facts), int(traffic.numbers["max_steps"])
     x, v, lane = beginning(states_of(facts))
     speed, lanes = np.zeros((n, steps, BV + 1)), np.full((n, steps, BV + 1), LEFT, np.int8)
-    _move(*maneuvers_of(chosen)[:4], chosen.at, int(environment.numbers["hold_steps"]), v, speed, lanes)
+    _move(unboxed(maneuvers_of(chosen)), chosen.at, int(traffic.numbers["hold_steps"]), v, speed, lanes)
     return natural_script(x, v, lane, speed, lanes, chosen.at, chosen.lead)
 
 
 @compiled_threads
-def _move(
-    lv: Int8Array,
-    bv: Int8Array,
-    n_lv: IntArray,
-    n_bv: IntArray,
-    cut: IntArray,
-    hold_steps: int,
-    v: FloatArray,
-    speed: FloatArray,
-    lanes: Int8Array,
-) -> None:
+def _move(told: Maneuvers, cut: IntArray, hold_steps: int, v: FloatArray, speed: FloatArray, lanes: Int8Array) -> None:
     for i in range(cut.size):
         v_lv, v_bv, a_lv, a_bv, used = v[i, LV], v[i, BV], 0.0, 0.0, 0
         for step in range(speed.shape[1]):
             left, redraws = 0 <= cut[i] < step, step % hold_steps == 0
-            if redraws and step // hold_steps < n_lv[i]:
-                a_lv = acceleration(lv[i, step // hold_steps])
+            if redraws and step // hold_steps < told.n_lv[i]:
+                a_lv = acceleration(told.lv[i, step // hold_steps])
             if left:
                 redraws = (step - cut[i] - 1) % hold_steps == 0
-            if redraws and used < n_bv[i]:
-                a_bv = acceleration(bv[i, used])
+            if redraws and used < told.n_bv[i]:
+                a_bv = acceleration(told.bv[i, used])
                 used += 1
             if step == cut[i]:
                 used += 1  # the mark

@@ -208,8 +208,8 @@ class AcceptanceSteps(Section):
 
     @property
     def without_events(self) -> list[int]:
-        """Steps in which no lane change was seen."""
-        return [step for step, events in enumerate(self.events or ()) if not events]
+        """Steps in which no lane change was seen, though some were counted."""
+        return [step for step, events in enumerate(self.events or ()) if not events and self.exposure is not None]
 
     def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
         """A replicate with what zero events leave open upwards, in place of the draw that is right in the mean.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -15,18 +14,15 @@ from scipy.special import ndtr, ndtri
 from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
 from harness.families.cut_out.words import CLOSING, TTC, WORDS
-from harness.families.following.approach import NEVER, Following
+from harness.families.following.approach import Following
 from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import FollowingParameters, grid_of
 from harness.families.numbers import Number, Share, ordered, within
 from harness.families.protocol import Column
-from harness.families.words import Shown
+from harness.loop.cells import NEVER
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, RecordArray
-
-if TYPE_CHECKING:
-    from harness.fitting.protocol import Fitter
 
 TTC_EDGES_S = np.array([0.5, 0.75, 1, 1.25, 1.5, 1.75, 2, 2.25, 2.5, 2.75, 3, 3.5, 4, 4.5, 5, 6, 7, 8, 10, 12])
 N_DROPS = 12
@@ -106,9 +102,9 @@ class CutOut(FollowingFamily):
     """See `harness.families.following.family`."""
 
     name = "cut_out"
-    vehicles: tuple[str, ...] = ("LV", "SV", "AV")
+    vehicles = ("LV", "SV", "AV")
     principal, ahead = 1, 0
-    columns: tuple[Column, ...] = (
+    columns = (
         *START_FACTS,
         Column("revealed_speed_mps", pa.float64(), "m/s", "speed of the vehicle that is revealed"),
         Column("closing_mps", pa.float64(), "m/s", "speed of the one ahead less that"),
@@ -117,17 +113,13 @@ class CutOut(FollowingFamily):
         Column("visible_s", pa.float64(), "s", "from when the revealed one is seen to the lane being clear"),
     )
     shipped = Path(__file__).parent
-    ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-cut-out-1"})
+    ladders = {False: "ladder-cut-out-1"}
     default_parameters = "cut-out-1"
+    fitter = "harness.families.cut_out.fitting:CutOutFitter"
     crosses, words = 0, WORDS
-    maps: tuple[tuple[Shown, Shown], ...] = ((CLOSING, TTC._replace(edges=TTC_EDGES_S)),)
+    maps = ((CLOSING, TTC._replace(edges=TTC_EDGES_S)),)
     stride = 10
     model = CutOutParameters
-
-    def fitter(self) -> Fitter:
-        from harness.families.cut_out.fitting import CutOutFitter  # noqa: PLC0415 - reads tables
-
-        return CutOutFitter()
 
     def told(self, facts: Mapping[str, Any]) -> str:
         speed = facts["revealed_speed_mps"]

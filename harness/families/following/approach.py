@@ -10,6 +10,7 @@ from scipy import special
 
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.flow import Flow
+from harness.loop.cells import NEVER
 from harness.random_stream import LV_DRAWS, uniform
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M, next_position, next_speed
@@ -19,7 +20,6 @@ AV_START_M = 100.0
 HOLD_STEPS = 10
 """For which the vehicle ahead keeps a drawn acceleration."""
 LEAD, REVEALED = 0, 1
-NEVER = 2**31
 PARKED_M = 3900.0
 """Where a vehicle stands that nothing reveals."""
 _GRID_MPS2 = 0.2
@@ -113,7 +113,7 @@ def happen(event: Record, until: int, numbers: Record, motion: Motion) -> int:
     if math.isnan(event.ratio):
         x[:, REVEALED], v[:, REVEALED] = PARKED_M, 0.0
         return NEVER
-    steps = clear_after(event, numbers)
+    steps = seen_after(numbers.clear_m, event.lateral_mps, NEVER)
     slow, leaves = event.ratio * v[onset, LEAD], v[onset, LEAD] * (steps * STEP_S)
     rear = x[onset, LEAD] + leaves + event.ttc_s * (v[onset, LEAD] - slow) - slow * (steps * STEP_S)
     x[0, REVEALED] = rear + VEHICLE_LENGTH_M - slow * (onset * STEP_S)
@@ -121,12 +121,6 @@ def happen(event: Record, until: int, numbers: Record, motion: Motion) -> int:
         v[step, REVEALED] = v[step + 1, REVEALED] = slow
         x[step + 1, REVEALED] = next_position(x[step, REVEALED], slow, slow)
     return int(onset + steps)
-
-
-@compiled_inline
-def clear_after(event: Record, numbers: Record) -> int:
-    """Steps from the onset until the vehicle ahead has left the lane."""
-    return int(seen_after(numbers.clear_m, event.lateral_mps, NEVER))
 
 
 @compiled_inline

@@ -9,13 +9,11 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
 
-from harness.campaign.drivers import Surrogate
 from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
@@ -29,15 +27,14 @@ from harness.families.following.approach import (
     starts_from,
 )
 from harness.families.following.follow import STATE, drive_others, enumerate_events, move_others
-from harness.families.following.parameters import NO_EVENT, FollowingParameters
+from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
 from harness.families.following.words import STAND_INS
-from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, LeftOpen, Paths, Recorded
-from harness.families.words import Shown, Words
+from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, Family, Paths, Recorded
 from harness.loop.cells import Script, natural_script
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray, Method, RecordArray
+from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
 
 START_FACTS = (
     Column("start_speed_mps", pa.float64(), "m/s", "initial speed of all but a revealed vehicle"),
@@ -52,26 +49,10 @@ MILDEST_MPS2 = 0.5
 """Braking that an event asks for: below this nothing is tested [assumed]."""
 
 
-class FollowingFamily:
-    """See `harness.families.protocol.Family`; a family says which parameters, vehicles and facts it has."""
+class FollowingFamily(Family):
+    """A family says which parameters, vehicles and facts it has. When somebody sees an event its drivers know."""
 
-    name: str
-    vehicles: tuple[str, ...]
-    principal: int
-    ahead: int
-    columns: tuple[Column, ...]
-    n_uniforms = 2
-    shipped: Path
-    ladders: Mapping[bool, str]
-    default_parameters: str
-    follows = True
-    stride: int
-    pool_error = 0.01
-    crosses: int
-    words: Words
-    maps: tuple[tuple[Shown, Shown], ...]
-    stand_ins: Mapping[str, tuple[str, Surrogate]] = STAND_INS
-
+    n_uniforms, follows, pool_error, stand_ins = 2, True, 0.01, STAND_INS
     model: ClassVar[type[FollowingParameters]]
 
     def parameters(self, settings: EnvironmentSettings) -> FollowingParameters:
@@ -100,9 +81,6 @@ class FollowingFamily:
         except (CampaignError, ValueError):
             return None
 
-    def left_open(self, parameters: FollowingParameters) -> LeftOpen | None:  # noqa: ARG002 - its range is no law's
-        return None
-
     def digest(self, traffic: Following) -> str:
         numbers = {name: traffic.numbers[name].item() for name in traffic.numbers.dtype.names or ()}
         digest = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode())
@@ -115,24 +93,18 @@ class FollowingFamily:
     def sideways_m(self, traffic: Following) -> float:
         return float(np.nan_to_num(traffic.numbers["clear_m"]))
 
-    def shows(self, traffic: Following) -> bool:  # noqa: ARG002 - when somebody sees it, its drivers know themselves
-        return False
-
     def mean_distance_m(self, traffic: Following) -> float:
         return self.mean_speed_mps(traffic) * int(traffic.numbers["max_steps"]) * STEP_S
 
     def mean_speed_mps(self, traffic: Following) -> float:
         """Of the vehicle ahead, as it approaches."""
-        paths = Paths(np.arange(N_SPEEDS), np.zeros(N_SPEEDS, START_DTYPE))
-        paths.start["speed_mps"] = _speeds(traffic)
-        speed = self._moved(traffic, self.choose(traffic, 0, paths, np.full(N_SPEEDS, -1)).facts)[1]
+        nothing = self.choose(traffic, 0, _usual_paths(traffic), np.full(N_SPEEDS, -1))
+        speed = self._moved(traffic, nothing.facts)[1]
         return float(speed[:, : int(traffic.numbers["onset"]), 0].mean())
 
     def share_in_scope(self, traffic: Following) -> float:
         """Share of events that are in scope."""
-        start = np.zeros(N_SPEEDS, START_DTYPE)
-        start["speed_mps"] = _speeds(traffic)
-        found = self.events(traffic, 0, Paths(np.arange(N_SPEEDS), start), Followers(driver_records([])))
+        found = self.events(traffic, 0, _usual_paths(traffic), Followers(driver_records([])))
         return float(np.exp(found.log_any).mean())
 
     def exposure(self, traffic: Following, parameters: FollowingParameters) -> Exposure:
@@ -146,9 +118,6 @@ class FollowingFamily:
         numbers = traffic.numbers.copy()
         numbers["scope_mps2"], numbers["below_mps2"] = MILDEST_MPS2, scope
         return traffic._replace(numbers=numbers)
-
-    def sources(self) -> Mapping[Method, type[Any]]:
-        return {}
 
     def start(self, traffic: Following, u: FloatArray) -> RecordArray:
         return starts_from(traffic.numbers, u)
@@ -198,9 +167,9 @@ class FollowingFamily:
         lead = np.where(clear - onset < traffic.numbers["max_steps"], clear - onset - 1, 0)
         return Chosen(facts, np.where(event < 0, -1, onset + lead), np.where(event < 0, 0, lead))
 
-    def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
-        """Facts of the family's own, of events (n,) with a vehicle ahead at a speed."""
-        raise NotImplementedError
+    def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:  # noqa: ARG002
+        """Facts of the family's own, of events (n,) with a vehicle ahead at a speed: here those of its grid."""
+        return {each.name: events[each.name] for each in self.columns if each.name in (EVENT_DTYPE.names or ())}
 
     def _moved(self, traffic: Following, facts: RecordArray) -> tuple[FloatArray, FloatArray, IntArray]:
         n, others = len(facts), len(self.vehicles) - 1
@@ -233,9 +202,6 @@ class FollowingFamily:
 
     def onset(self, traffic: Following, chosen: Chosen) -> IntArray:
         return np.where(chosen.at < 0, -1, int(traffic.numbers["onset"]))
-
-    def told(self, facts: Mapping[str, Any]) -> str:
-        raise NotImplementedError
 
     def drive(
         self,
@@ -271,6 +237,6 @@ def events_of(traffic: Following, number: IntArray) -> RecordArray:
     return np.append(traffic.grid, NO_EVENT)[number]
 
 
-def _speeds(traffic: Following) -> FloatArray:
+def _usual_paths(traffic: Following) -> Paths:
     u = (np.arange(N_SPEEDS) + 0.5) / N_SPEEDS
-    return np.asarray(starts_from(traffic.numbers, np.column_stack((u, u)))["speed_mps"])
+    return Paths(np.arange(N_SPEEDS), starts_from(traffic.numbers, np.column_stack((u, u))))

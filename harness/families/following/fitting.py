@@ -21,7 +21,7 @@ from harness.families.following.family import FollowingFamily
 from harness.fitting.files import OF_YAML, environment_text
 from harness.fitting.protocol import Asked, Fitted
 from harness.fitting.recording import Recording
-from harness.fitting.tracks import USUAL_RANGE, Scene
+from harness.fitting.tracks import R1_MAX_M, V_MAX_MPS, V_MIN_MPS, Scene
 from harness.numbers import number
 from harness.vocabulary import BoolArray, IntArray, RecordArray
 
@@ -48,9 +48,9 @@ def followed(track: Recording) -> Followed:
     """Find the vehicle ahead in every row."""
     rows = np.arange(track.v.size)
     ahead, _ = Scene(track, np.ones(rows.size, np.bool_)).neighbours(rows, 0)
-    gap, fit = track.gap(ahead, rows), USUAL_RANGE
-    follows = track.fitted & (ahead >= 0) & (gap > fit.r1_min_m) & (gap <= fit.r1_max_m)
-    follows &= (track.v >= fit.v_min_mps) & (track.v <= fit.v_max_mps)
+    gap = track.gap(ahead, rows)
+    follows = track.fitted & (ahead >= 0) & (gap > 0.0) & (gap <= R1_MAX_M)
+    follows &= (track.v >= V_MIN_MPS) & (track.v <= V_MAX_MPS)
     behind = np.full(rows.size, -1)
     behind[ahead[follows]] = rows[follows]
     return Followed(ahead, follows, behind)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -20,7 +18,6 @@ from harness.families.numbers import (
     ParameterFile,
     Speed,
     SpeedsAndGaps,
-    completed,
     in_whole_steps,
     ordered,
     within,
@@ -95,15 +92,7 @@ class FollowingParameters(ParameterFile):
     approach: Approach
     exposure: Counted
 
-    folder: ClassVar[Path]
     replicates: ClassVar[None] = None
-    unseen: ClassVar[str] = ""
-    blocks: ClassVar[Mapping[str, tuple[str, ...]]]
-
-    @model_validator(mode="before")
-    @classmethod
-    def _is_like_another(cls, given: Any) -> Any:
-        return completed(given, cls.folder) if isinstance(given, dict) else given
 
     @model_validator(mode="after")
     def _fits_the_road(self) -> Self:
@@ -122,15 +111,3 @@ class FollowingParameters(ParameterFile):
         low, high = number.range or (number.value, number.value)
         counted = None if events is None or hours is None else (events, hours)
         return Exposure(number.value, low, high, counted, number.note or number.source)
-
-    def without_half(self) -> Mapping[int, Mapping[str, float]]:
-        """There is no kind of events that data have not."""
-        return {}
-
-    def unseen_in(self, kinds: Collection[int]) -> str:  # noqa: ARG002 - there is none
-        """See `without_half`."""
-        return ""
-
-    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
-        """See `without_half`."""
-        return dict(row)

@@ -5,25 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import pyarrow as pa
 from scipy.special import ndtri
 
 from harness.campaign.sections import Section
-from harness.families.following.approach import Following
 from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import FollowingParameters, grid_of
 from harness.families.lead_brakes.words import HEADWAY, HELD, PEAK, WORDS
 from harness.families.numbers import Number, Share, ordered, within
 from harness.families.protocol import Column
-from harness.families.words import Shown
 from harness.vocabulary import FloatArray, RecordArray
-
-if TYPE_CHECKING:
-    from harness.fitting.protocol import Fitter
 
 PEAK_BIN_MPS2 = 0.2
 N_HELD = 11
@@ -79,33 +73,26 @@ class LeadBrakes(FollowingFamily):
     """See `harness.families.following.family`."""
 
     name = "lead_brakes"
-    vehicles: tuple[str, ...] = ("LV", "AV")
+    vehicles = ("LV", "AV")
     principal, ahead = 0, -1
-    columns: tuple[Column, ...] = (
+    columns = (
         *START_FACTS,
         Column("peak_mps2", pa.float64(), "m/s²", "how hard the vehicle ahead brakes"),
         Column("held_s", pa.float64(), "s", "for how long so hard, infinite: to standstill"),
         Column("jerk_mps3", pa.float64(), "m/s³", "how abruptly"),
     )
     shipped = Path(__file__).parent
-    ladders: Mapping[bool, str] = MappingProxyType({False: "ladder-lead-1"})
+    ladders = {False: "ladder-lead-1"}
     default_parameters = "lead-brakes-1"
+    fitter = "harness.families.lead_brakes.fitting:BrakingFitter"
     crosses, words = -1, WORDS
-    maps: tuple[tuple[Shown, Shown], ...] = ((HEADWAY, PEAK), (HELD, PEAK))
+    maps = ((HEADWAY, PEAK), (HELD, PEAK))
     stride = 37  # of 840 events; each stride that divides them meets one jerk alone
     model = LeadBrakesParameters
-
-    def fitter(self) -> Fitter:
-        from harness.families.lead_brakes.fitting import BrakingFitter  # noqa: PLC0415 - reads tables
-
-        return BrakingFitter()
 
     def told(self, facts: Mapping[str, Any]) -> str:
         held = f"for {facts['held_s']:.1f} s" if facts["held_s"] < math.inf else "to a standstill"
         return f"with {facts['peak_mps2']:.1f} m/s² {held}"
-
-    def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:  # noqa: ARG002
-        return {name: events[name] for name in ("peak_mps2", "held_s", "jerk_mps3")}
 
 
 LEAD_BRAKES = LeadBrakes()

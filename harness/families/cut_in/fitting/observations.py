@@ -21,7 +21,7 @@ import pandas as pd
 from harness.errors import TrajectoryError
 from harness.fitting.recording import ONE_CLOCK, Recording
 from harness.fitting.table import Mapping
-from harness.fitting.tracks import USUAL_RANGE, Scene, durations_s, noise_of, slopes
+from harness.fitting.tracks import R1_MAX_M, Scene, durations_s, noise_of, slopes
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 
@@ -140,7 +140,7 @@ def observe(track: Recording) -> Observations:
     second = whole & track.same_run(rows, n)
     acceleration = np.full(rows.size, np.nan)
     acceleration[second] = slopes(track, rows[second])
-    seen = (state.leader >= 0) | (track.s[rows] + USUAL_RANGE.r1_max_m <= track.view[1, track.road[rows]])
+    seen = (state.leader >= 0) | (track.s[rows] + R1_MAX_M <= track.view[1, track.road[rows]])
     since = track.frame[rows] - track.frame[np.searchsorted(track.vehicle, track.vehicle[rows])]
     crosses = np.isin(rows, changes)
     columns: dict[str, Any] = {"vehicle": track.vehicle[rows], "duration_s": duration_s, "v_mps": track.v[rows]}

@@ -20,10 +20,6 @@ CELL_DTYPE = np.dtype(
     [
         ("lv_maneuver", _i8),
         ("bv_maneuver", _i8),
-        ("n_lv", _i8),  # draws so far
-        ("n_bv", _i8),  # car-following draws so far
-        ("n_bv_free", _i8),  # free-driving draws so far
-        ("n_path", _i8),  # entries of BV's path, the cut-in included
         ("clock", _f8),  # hazard accumulated by the sampler
         ("target", _f8),  # hazard at which BV cuts in
         ("hazard", _f8),  # hazard accumulated under p
@@ -40,38 +36,13 @@ CONTROL_STEPS = 16
 """Of a test, for which a shard has room at first; more is made where they are more."""
 
 
-class Draws(NamedTuple):
-    """What is drawn in the K running tests.
-
-    ``cell`` (K,) are `CELL_DTYPE` records. ``log_ratio`` (K, M) is L_j, ``martingale`` (K, J). ``cut_challenge`` and
-    ``stay_challenge`` (K, hold, J) look ahead to the end of the hold period. ``lv_path``, ``bv_path`` (K, draws) hold
-    maneuver indices.
-    """
-
-    cell: RecordArray
-    log_ratio: FloatArray
-    martingale: FloatArray
-    cut_challenge: FloatArray
-    stay_challenge: FloatArray
-    lv_path: Int8Array
-    bv_path: Int8Array
-
-
-def empty_draws(n_cells: int, environment: Environment, importance: Importance) -> Draws:
-    """Room for K tests."""
-    _, hold_steps, draws = lengths(environment)
-    log_ratio, martingale = np.zeros((n_cells, importance.alpha.size)), np.zeros((n_cells, importance.n_surrogates))
-    cutting, staying = np.zeros((2, n_cells, hold_steps, importance.n_surrogates))
-    lv_path, bv_path = np.zeros((2, n_cells, draws), np.int8)
-    return Draws(np.zeros(n_cells, CELL_DTYPE), log_ratio, martingale, cutting, staying, lv_path, bv_path)
-
-
 class Drawn(NamedTuple):
-    """What was drawn in the tests (n,) of a shard.
+    """What has been drawn in the tests (n,) of a shard.
 
-    ``n_lv``, ``n_bv`` (n,) are the lengths of ``lv_path``, ``bv_path`` (n, draws). ``moment`` (capacity,)
-    `MOMENT_DTYPE` with ``moment_q``, ``moment_v`` (capacity, J) are control steps; ``moment_count`` (1,) says how many
-    are used and ``moment_limit`` how many are kept of each test.
+    ``n_lv``, ``n_bv`` (n,) are the lengths of ``lv_path``, ``bv_path`` (n, draws), which hold maneuver indices.
+    ``log_q`` (n, M) is L_j, ``martingale`` (n, J). ``moment`` (capacity,) `MOMENT_DTYPE` with ``moment_q``,
+    ``moment_v`` (capacity, J) are control steps; ``moment_count`` (1,) says how many are used and ``moment_limit`` how
+    many are kept of each test.
     """
 
     n_lv: IntArray
@@ -85,25 +56,6 @@ class Drawn(NamedTuple):
     moment_v: FloatArray
     moment_count: IntArray
     moment_limit: int
-
-
-def nothing_drawn(
-    n: int, environment: Environment, importance: Importance, *, moment_limit: int, capacity: int
-) -> Drawn:
-    """Room for ``n`` tests and ``capacity`` control steps."""
-    draws, n_surrogates = lengths(environment)[2], importance.n_surrogates
-    lv_path, bv_path = np.zeros((2, n, draws), np.int8)
-    log_q, martingale = np.zeros((n, importance.alpha.size)), np.zeros((n, n_surrogates))
-    q, v = np.zeros((2, capacity, n_surrogates))
-    of_moments = np.zeros(capacity, MOMENT_DTYPE), q, v, np.zeros(1, np.int64), moment_limit
-    return Drawn(np.zeros(n, np.int64), np.zeros(n, np.int64), log_q, martingale, lv_path, bv_path, *of_moments)
-
-
-def with_more_room(drawn: Drawn) -> Drawn:
-    """The same with room for twice as many control steps."""
-    old = drawn.moment, drawn.moment_q, drawn.moment_v
-    moment, moment_q, moment_v = (np.concatenate([each, np.zeros_like(each)]) for each in old)
-    return drawn._replace(moment=moment, moment_q=moment_q, moment_v=moment_v)
 
 
 class Scratch(NamedTuple):
@@ -121,20 +73,45 @@ class Scratch(NamedTuple):
     path: Trajectory
 
 
-def empty_scratch(environment: Environment, importance: Importance) -> Scratch:
-    """Room for M importance functions and J surrogates."""
-    n_surrogates = importance.n_surrogates
-    q, challenge = np.zeros((2, n_surrogates))
-    q_acceleration, ratio = np.zeros((n_surrogates, N_ACCELERATIONS)), np.zeros(importance.alpha.size)
-    return Scratch(np.zeros(N_ACCELERATIONS), q, q_acceleration, challenge, ratio, empty_trajectory(environment))
-
-
 class Nade(NamedTuple):
-    """All that NADE's kernels need beside the loop's; ``states`` (n,) are the initial states of a shard's tests."""
+    """All that NADE's kernels need beside the loop's.
+
+    ``states`` (n,) are the initial states of a shard's tests, ``cell`` (K,) `CELL_DTYPE` records of those that run, for
+    which ``cut_challenge`` and ``stay_challenge`` (K, hold, J) look ahead to the end of the hold period.
+    """
 
     states: RecordArray
-    draws: Draws
+    cell: RecordArray
+    cut_challenge: FloatArray
+    stay_challenge: FloatArray
     drawn: Drawn
     scratch: Scratch
     environment: Environment
     importance: Importance
+
+
+def empty_nade(
+    states: RecordArray, n_cells: int, environment: Environment, importance: Importance, moment_limit: int
+) -> Nade:
+    """Room for the tests (n,) that begin in ``states``, of which K run side by side."""
+    n, n_surrogates, capacity = len(states), importance.n_surrogates, CONTROL_STEPS * len(states) + n_cells
+    _, hold_steps, n_draws = lengths(environment)
+    cutting, staying = np.zeros((2, n_cells, hold_steps, n_surrogates))
+    n_lv, n_bv = np.zeros((2, n), np.int64)
+    log_q, martingale = np.zeros((n, importance.alpha.size)), np.zeros((n, n_surrogates))
+    lv_path, bv_path = np.zeros((2, n, n_draws), np.int8)
+    moment_q, moment_v = np.zeros((2, capacity, n_surrogates))
+    moments = np.zeros(capacity, MOMENT_DTYPE), moment_q, moment_v, np.zeros(1, np.int64), moment_limit
+    q, challenge = np.zeros((2, n_surrogates))
+    q_acceleration, ratio = np.zeros((n_surrogates, N_ACCELERATIONS)), np.zeros(importance.alpha.size)
+    scratch = np.zeros(N_ACCELERATIONS), q, q_acceleration, challenge, ratio, empty_trajectory(environment)
+    running = np.zeros(n_cells, CELL_DTYPE), cutting, staying
+    drawn = Drawn(n_lv, n_bv, log_q, martingale, lv_path, bv_path, *moments)
+    return Nade(states, *running, drawn, Scratch(*scratch), environment, importance)
+
+
+def with_more_room(drawn: Drawn) -> Drawn:
+    """The same with room for twice as many control steps."""
+    old = drawn.moment, drawn.moment_q, drawn.moment_v
+    moment, moment_q, moment_v = (np.concatenate([each, np.zeros_like(each)]) for each in old)
+    return drawn._replace(moment=moment, moment_q=moment_q, moment_v=moment_v)

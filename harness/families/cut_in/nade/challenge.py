@@ -31,12 +31,14 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from functools import reduce
 
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.families.cut_in import laws
 from harness.families.cut_in.laws import Environment, InitialStates, acceleration
+from harness.families.cut_in.loading import evaluate_laws
 from harness.families.cut_in.nade.grid import (
     AFTER,
     BEFORE,
@@ -51,7 +53,7 @@ from harness.processes import usable_cpus
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from harness.vehicles.references import Memory, react
-from harness.vocabulary import N_ACCELERATIONS, Float32Array, FloatArray, Record, RecordArray
+from harness.vocabulary import N_ACCELERATIONS, STATE_COLUMNS, Float32Array, FloatArray, Record, RecordArray
 
 LEVELS = 12
 """Seconds of remaining time that are told apart; later crashes are counted in the last level."""
@@ -132,13 +134,6 @@ def maneuver_challenge(after: Float32Array, value: Float32Array, out: Float32Arr
         out[i, j, k, m] = value_of(after[i, j, k, m], value)
 
 
-@compiled_threads
-def free_driving_table(speeds: FloatArray, environment: Environment, out: FloatArray) -> None:
-    """Free-driving probabilities at grid speeds; ``out`` (v, 31)."""
-    for i in range(speeds.size):
-        laws.acceleration_pmf(laws.free_driving(speeds[i], environment), environment, out[i])
-
-
 def level_steps(hold_steps: int) -> int:
     """Steps between two stored levels of U: the multiple of the hold period nearest to one second."""
     return hold_steps * max(1, round(10 / hold_steps))
@@ -152,8 +147,8 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
     points, shape = points_of(AFTER), shape_of(AFTER)
     hold = int(environment.numbers["hold_steps"])
     lagging = lags(driver.view(np.recarray)[0])
-    pmf = np.empty((points.speed.size, N_ACCELERATIONS))
-    free_driving_table(points.speed, unboxed(environment), pmf)
+    at_speeds = np.pad(points.speed[:, None], ((0, 0), (0, 2)))  # R1 and R1dot do not matter
+    pmf = evaluate_laws(environment, at_speeds).pmf[laws.FREE_DRIVING]
     after = np.empty((*shape, N_ACCELERATIONS, 3), np.float32)
     transitions(driver, hold, LONG, points, after)
     if lagging:
@@ -333,27 +328,17 @@ def backward_period(
         out[i, j, k] = total
 
 
-@compiled_threads
-def mean_car_following_pmf(states: RecordArray, environment: Environment, out: FloatArray) -> None:
-    """Car-following probabilities averaged over states (n,), written to ``out`` (31,)."""
-    one = np.empty(N_ACCELERATIONS)
-    out[:] = 0.0
-    for i in range(states.shape[0]):
-        laws.acceleration_pmf(laws.car_following(states[i], environment), environment, one)
-        for k in range(N_ACCELERATIONS):
-            out[k] += one[k] / states.shape[0]
-
-
 def naturalistic_pmf(environment: Environment) -> FloatArray:
     """BV's accelerations at the grid speeds, averaged over (R1, R1dot): shape (v, 31)."""
     side = (np.arange(24) + 0.5) / 24
     gap_u, rate_u = (axis.ravel() for axis in np.meshgrid(side, side, indexing="ij"))
     sampler = InitialStates(environment.numbers)
-    speeds = points_of(BEFORE).speed
-    out = np.empty((speeds.size, N_ACCELERATIONS))
-    for i, speed in enumerate(speeds.tolist()):
-        mean_car_following_pmf(sampler.given_speed(speed, gap_u, rate_u), unboxed(environment), out[i])
-    return out
+    means = []
+    for speed in points_of(BEFORE).speed.tolist():
+        states = sampler.given_speed(speed, gap_u, rate_u)
+        pmf = evaluate_laws(environment, np.column_stack([states[name] for name in STATE_COLUMNS[:3]])).pmf
+        means.append(reduce(np.add, pmf[laws.CAR_FOLLOWING] / len(states)))  # one by one: the order decides on bits
+    return np.array(means)
 
 
 def build_before_cut_in(environment: Environment, value: Float32Array) -> Float32Array:

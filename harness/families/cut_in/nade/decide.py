@@ -10,19 +10,18 @@ import math
 
 from harness.compiled import compiled, compiled_inline
 from harness.families.cut_in import laws
-from harness.families.cut_in.lateral import draw_lead
 from harness.families.cut_in.laws import acceleration, draw_acceleration
 from harness.families.cut_in.nade.cells import Nade
 from harness.families.cut_in.nade.challenge import remaining_level
 from harness.families.cut_in.nade.functions import challenges_nobody, look_ahead, propose_acceleration, propose_cut_in
-from harness.families.cut_in.nade.likelihood_ratio import log_weight, record_acceleration, record_lane
+from harness.families.cut_in.nade.likelihood_ratio import log_mixture, record_acceleration, record_lane
 from harness.families.cut_in.path import state_of, walk, weigh_cut_ins
 from harness.loop.cells import KernelState
-from harness.loop.repeat import note_event, note_onset, plan
+from harness.loop.repeat import note_event
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.random_stream import CUT_IN as CUT_IN_STREAM
 from harness.vehicles.kinematics import next_speed
-from harness.vocabulary import BV, CUT_IN, LV, N_ACCELERATIONS, FloatArray, Int8Array, State
+from harness.vocabulary import BV, CUT_IN, LV, N_ACCELERATIONS, FloatArray, State
 
 COMPONENT_DRAW, CUT_IN_DRAW = 0, 1
 """Indices within the cut-in stream."""
@@ -39,31 +38,20 @@ def decide(kernel: KernelState, nade: Nade, placed: int) -> None:
         if cells.cell[k].row < 0:
             continue
         draw_maneuvers(k, state_of(kernel.x[k], kernel.v[k]), kernel, nade)
-        draws = nade.draws.cell[k]
+        draws = nade.cell[k]
         cells.speed[k, LV] = next_speed(kernel.v[k, LV], acceleration(draws.lv_maneuver))
         cells.speed[k, BV] = next_speed(kernel.v[k, BV], acceleration(draws.bv_maneuver))
 
 
 @compiled
 def finish(kernel: KernelState, nade: Nade, n: int) -> None:
-    """Write what is known of the ``n`` tests that have just ended to their rows."""
-    draws, drawn = nade.draws, nade.drawn
+    """Write what the ``n`` tests weigh that have just ended to their rows."""
     for i in range(n):
         k, row = kernel.cells.ended[i], kernel.cells.ended_row[i]
-        cell = draws.cell[k]
-        drawn.n_lv[row], drawn.n_bv[row] = cell.n_lv, cell.n_path
-        kernel.episode[row].log_weight = log_weight(nade.importance, draws.log_ratio[k], cell.log_sampled)
-        copy_row(draws.log_ratio[k], drawn.log_q[row])
-        copy_row(draws.martingale[k], drawn.martingale[row])
-        copy_row(draws.lv_path[k], drawn.lv_path[row])
-        copy_row(draws.bv_path[k], drawn.bv_path[row])
-
-
-@compiled_inline
-def copy_row(source: FloatArray | Int8Array, target: FloatArray | Int8Array) -> None:
-    """Copy element by element: an array assignment would allocate."""
-    for i in range(source.size):
-        target[i] = source[i]
+        log_sampled = nade.cell[k].log_sampled
+        if nade.importance.mixes_episodes:
+            log_sampled = log_mixture(nade.importance.alpha, nade.drawn.log_q[row])
+        kernel.episode[row].log_weight = -log_sampled  # exactly 0 without control
 
 
 @compiled_inline
@@ -71,115 +59,72 @@ def draw_maneuvers(k: int, state: State, kernel: KernelState, nade: Nade) -> Non
     """Redraw where a hold period begins; before the cut-in, stay or cut in."""
     hold_steps = nade.environment.numbers.hold_steps
     cell = kernel.cells.cell[k]
-    redraw = cell.step % hold_steps == 0
+    period, redraw = cell.step // hold_steps, cell.step % hold_steps == 0
     if redraw:
-        u = uniform(kernel.seed, cell.episode, LV_DRAWS, nade.draws.cell[k].n_lv)
-        take_lv(k, laws.drive_freely(u, kernel.v[k, LV], nade.environment), nade)
+        u = uniform(kernel.seed, cell.episode, LV_DRAWS, period)
+        maneuver = laws.drive_freely(u, kernel.v[k, LV], nade.environment)
+        nade.cell[k].lv_maneuver = nade.drawn.lv_path[cell.row, period] = maneuver
+        nade.drawn.n_lv[cell.row] = period + 1
     if cell.event_step < 0:
         if redraw:
-            redraw_following(k, state, kernel, nade)
-        if not may_show(nade):
-            choose_lane(k, state, kernel, nade)
-            return
-        note_onset(k, kernel)
-        if cell.step == cell.planned:  # it was decided before anybody could see it
-            begin_cut_in(k, kernel, nade)
-    elif (cell.step - cell.event_step - 1) % hold_steps == 0:
-        redraw_free(k, state, kernel, nade)
+            redraw_following(k, period, state, kernel, nade)
+        choose_lane(k, state, kernel, nade)
+        return
+    since = cell.step - cell.event_step - 1
+    if since % hold_steps == 0:
+        redraw_free(k, since // hold_steps, state, kernel, nade)
 
 
 @compiled_inline
-def redraw_following(k: int, state: State, kernel: KernelState, nade: Nade) -> None:
+def redraw_following(k: int, period: int, state: State, kernel: KernelState, nade: Nade) -> None:
     """BV's acceleration behind LV, and what cutting in or staying would be worth during the coming hold period."""
-    cell, draws = kernel.cells.cell[k], nade.draws.cell[k]
-    u = uniform(kernel.seed, cell.episode, BV_DRAWS, draws.n_bv)
-    take_bv(k, draw_acceleration(u, laws.car_following(state, nade.environment), nade.environment), nade)
-    draws.n_bv += 1
+    cell, draws = kernel.cells.cell[k], nade.cell[k]
+    u = uniform(kernel.seed, cell.episode, BV_DRAWS, period)
+    draws.bv_maneuver = draw_acceleration(u, laws.car_following(state, nade.environment), nade.environment)
+    add_to_path(cell.row, draws.bv_maneuver, nade)
     if nade.importance.n_surrogates > 0:
-        a, cutting, staying = acceleration(draws.bv_maneuver), nade.draws.cut_challenge[k], nade.draws.stay_challenge[k]
+        a, cutting, staying = acceleration(draws.bv_maneuver), nade.cut_challenge[k], nade.stay_challenge[k]
         look_ahead(state, a, cell.step, nade.environment, nade.importance, cutting, staying)
 
 
 @compiled_inline
-def redraw_free(k: int, state: State, kernel: KernelState, nade: Nade) -> None:
-    """BV's acceleration for the coming hold period after its cut-in."""
-    draws = nade.draws.cell[k]
-    u = uniform(kernel.seed, kernel.cells.cell[k].episode, BV_FREE_DRAWS, draws.n_bv_free)
-    draws.n_bv_free += 1
+def redraw_free(k: int, period: int, state: State, kernel: KernelState, nade: Nade) -> None:
+    """BV's acceleration for a hold period after its cut-in."""
+    cell, draws = kernel.cells.cell[k], nade.cell[k]
+    u = uniform(kernel.seed, cell.episode, BV_FREE_DRAWS, period)
     if nade.importance.n_surrogates > 0:
-        take_bv(k, controlled_draw(k, u, state, kernel, nade), nade)
+        draws.bv_maneuver = controlled_draw(k, u, state, kernel, nade)
     else:
-        take_bv(k, laws.drive_freely(u, state.v_bv_mps, nade.environment), nade)
+        draws.bv_maneuver = laws.drive_freely(u, state.v_bv_mps, nade.environment)
+    add_to_path(cell.row, draws.bv_maneuver, nade)
 
 
 @compiled_inline
-def take_lv(k: int, maneuver: int, nade: Nade) -> None:
-    """LV holds a maneuver from now on."""
-    draws = nade.draws.cell[k]
-    draws.lv_maneuver = maneuver
-    nade.draws.lv_path[k, draws.n_lv] = maneuver
-    draws.n_lv += 1
-
-
-@compiled_inline
-def take_bv(k: int, maneuver: int, nade: Nade) -> None:
-    """BV holds a maneuver from now on."""
-    draws = nade.draws.cell[k]
-    draws.bv_maneuver = maneuver
-    nade.draws.bv_path[k, draws.n_path] = maneuver
-    draws.n_path += 1
-
-
-@compiled_inline
-def may_show(nade: Nade) -> bool:
-    """Whether cut-ins can be seen before they happen, so that they have to be drawn when the test begins."""
-    return bool(nade.environment.lateral.cumulative.size > 1)
+def add_to_path(row: int, maneuver: int, nade: Nade) -> None:
+    """What BV does from now on in the test of a row."""
+    nade.drawn.bv_path[row, nade.drawn.n_bv[row]] = maneuver
+    nade.drawn.n_bv[row] += 1
 
 
 @compiled_inline
 def begin(k: int, kernel: KernelState, nade: Nade) -> None:
-    """Draw when BV will cut in, on the clock of hazards; a forced cut-in, or one that shows itself, on its path."""
-    cell, draws, environment, importance = kernel.cells.cell[k], nade.draws.cell[k], nade.environment, nade.importance
-    draws.lv_maneuver = draws.bv_maneuver = draws.n_lv = draws.n_bv = draws.n_bv_free = draws.n_path = 0
+    """Draw when BV will cut in, on the clock of hazards; a forced cut-in on its path."""
+    cell, draws, environment, importance = kernel.cells.cell[k], nade.cell[k], nade.environment, nade.importance
+    test = kernel.episode[cell.row]
+    draws.lv_maneuver = draws.bv_maneuver = 0
     draws.clock = draws.hazard = draws.log_sampled = 0.0
-    draws.hazard_total = math.nan
-    nade.draws.log_ratio[k, :] = 0.0
-    nade.draws.martingale[k, :] = 0.0
-    forced = False
-    if importance.mixes_episodes:
-        u = uniform(kernel.seed, cell.episode, CUT_IN_STREAM, COMPONENT_DRAW)
-        cell.component = draw_component(u, importance.alpha)
-        forced = cell.component == 0
     u = uniform(kernel.seed, cell.episode, CUT_IN_STREAM, CUT_IN_DRAW)
     draws.target = -math.log1p(-u)
-    if importance.n_forced == 0 and not may_show(nade):
+    if importance.n_forced == 0:
         return
     path, max_steps = nade.scratch.path, environment.numbers.max_steps
     steps = walk(nade.states[cell.row], kernel.seed, cell.episode, 0, max_steps, True, environment, path)
-    hazard_total = weigh_cut_ins(steps, environment, path)
-    if importance.n_forced == 1:
-        p_event = -math.expm1(-hazard_total)
-        draws.hazard_total, cell.log_p_event = hazard_total, math.log(p_event)
-        if forced:
-            draws.target = min(-math.log1p(-u * p_event), hazard_total)
-    if may_show(nade):
-        look_for_cut_in(k, steps, kernel, nade)
-
-
-@compiled_inline
-def look_for_cut_in(k: int, steps: int, kernel: KernelState, nade: Nade) -> None:
-    """Plan the cut-in that the cell's clock leads to on a path that has been walked, if there is one."""
-    draws, hazard = nade.draws.cell[k], nade.scratch.path.hazard
-    for step in range(steps):
-        draws.clock += hazard[step]
-        cut = draws.clock >= draws.target
-        if nade.importance.n_forced == 1:
-            state = state_of(nade.scratch.path.x[step], nade.scratch.path.v[step])
-            record_lane(k, step, state, cut, -math.expm1(-hazard[step]), hazard[step], False, kernel, nade)
-        if cut:
-            lead = draw_lead(step, kernel.seed, kernel.cells.cell[k].episode, nade.environment.lateral)
-            plan(k, step, lead, kernel)
-            return
+    draws.hazard_total = weigh_cut_ins(steps, environment, path)
+    p_event = -math.expm1(-draws.hazard_total)
+    test.log_p_event = math.log(p_event)
+    test.component = draw_component(uniform(kernel.seed, cell.episode, CUT_IN_STREAM, COMPONENT_DRAW), importance.alpha)
+    if test.component == 0:
+        draws.target = min(-math.log1p(-u * p_event), draws.hazard_total)
 
 
 @compiled_inline
@@ -197,39 +142,35 @@ def draw_component(u: float, alpha: FloatArray) -> int:
 def choose_lane(k: int, state: State, kernel: KernelState, nade: Nade) -> None:
     """Stay or cut in."""
     scratch, environment, importance = nade.scratch, nade.environment, nade.importance
-    cell, draws = kernel.cells.cell[k], nade.draws.cell[k]
+    cell, draws = kernel.cells.cell[k], nade.cell[k]
     wish = laws.opportunity(state, environment)
     hazard = laws.cut_in_hazard(wish, laws.acceptance(state.r2_m, state.r2dot_mps, environment), environment)
     p = -math.expm1(-hazard) if importance.alpha.size > 0 else 0.0  # only the likelihood ratios ask for it
     critical = False
     if importance.n_surrogates > 0:
         i = cell.step % environment.numbers.hold_steps
-        cut_challenge, stay_challenge = nade.draws.cut_challenge[k, i], nade.draws.stay_challenge[k, i]
+        cut_challenge, stay_challenge = nade.cut_challenge[k, i], nade.stay_challenge[k, i]
         critical = propose_cut_in(p, wish, cut_challenge, stay_challenge, importance, scratch.q, scratch.challenge)
-    if critical and (importance.mixes_steps or cell.component > 0):
-        q = sampled_probability(cell.component, importance.alpha, scratch.q)
+    component = kernel.episode[cell.row].component
+    if critical and component != 0:
+        q = sampled_probability(component, importance.alpha, scratch.q)
         draws.clock += -math.log1p(-min(q, 1.0))
     else:
         draws.clock += hazard
     cut = draws.clock >= draws.target
-    record_lane(k, cell.step, state, cut, p, hazard, critical, kernel, nade)
+    record_lane(k, state, cut, p, hazard, critical, kernel, nade)
     if cut:
-        begin_cut_in(k, kernel, nade)
-
-
-@compiled_inline
-def begin_cut_in(k: int, kernel: KernelState, nade: Nade) -> None:
-    """BV moves to the right lane in this step."""
-    draws = nade.draws.cell[k]
-    note_event(k, kernel)
-    kernel.cells.lane[k, BV] = RIGHT
-    nade.draws.bv_path[k, draws.n_path] = CUT_IN
-    draws.n_path += 1
+        note_event(k, kernel)
+        kernel.cells.lane[k, BV] = RIGHT
+        add_to_path(cell.row, CUT_IN, nade)
 
 
 @compiled_inline
 def sampled_probability(component: int, alpha: FloatArray, q: FloatArray) -> float:
-    """Probability of a maneuver under the episode's importance function, or the step mixture of all, ``q`` (J,)."""
+    """Probability of a maneuver under the episode's importance function, or the step mixture of all, ``q`` (J,).
+
+    Component 0 is the forced cut-in, which leaves maneuvers to traffic; in a step mixture it is -1.
+    """
     if component > 0:
         return float(q[component - 1])
     mixed = 0.0
@@ -251,8 +192,9 @@ def controlled_draw(k: int, u: float, state: State, kernel: KernelState, nade: N
     laws.acceleration_pmf(law, environment, p)
     if not propose_acceleration(state, level, p, importance, q, scratch.challenge):
         return draw_acceleration(u, law, environment)
-    if importance.mixes_steps or cell.component > 0:
-        maneuver = draw_from(u, cell.component, importance.alpha, q)
+    component = kernel.episode[cell.row].component
+    if component != 0:
+        maneuver = draw_from(u, component, importance.alpha, q)
     else:
         maneuver = draw_acceleration(u, law, environment)
     record_acceleration(k, state, maneuver, kernel, nade)

@@ -28,9 +28,9 @@ from harness.vocabulary import N_ACCELERATIONS, BoolArray, Float32Array, FloatAr
 class Importance(NamedTuple):
     """All that kernels need to sample critical moments.
 
-    What may be so or not is 0 or 1. ``recursive`` says which challenge; ``mixes_steps`` and ``mixes_episodes`` whether
-    importance functions are mixed in every critical step, or one is drawn per episode. ``n_surrogates`` is 0 where
-    nobody is asked; ``n_forced`` is 1 where the forced cut-in is importance function 0: surrogates follow after it.
+    What may be so or not is 0 or 1. ``recursive`` says which challenge; ``mixes_episodes`` whether one importance
+    function is drawn per episode, or all are mixed in every critical step. ``n_surrogates`` is 0 where nobody is asked;
+    ``n_forced`` is 1 where the forced cut-in is importance function 0: surrogates follow after it.
     ``steps_per_level`` lie between two levels of ``value``.
     ``alpha`` (M,) are the mixture weights. ``value`` (J, levels + 1, v, R2, R2dot), ``maneuvers`` (J, v, R2, R2dot, 31)
     and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `tables`).
@@ -40,7 +40,6 @@ class Importance(NamedTuple):
     """
 
     recursive: int
-    mixes_steps: int
     mixes_episodes: int
     n_surrogates: int
     n_forced: int
@@ -65,7 +64,6 @@ def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
     none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1, 1), np.bool_)
     return Importance(
         int(recursive),
-        int(sampling.mixes_steps),
         int(sampling.mixes_episodes),
         len(campaign.surrogates) if sampling.mixes else 0,
         int(sampling.forces),

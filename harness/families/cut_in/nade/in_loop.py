@@ -10,14 +10,7 @@ from harness.compiled import unboxed
 from harness.estimators.block import EPISODE_COLUMNS
 from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.nade.cells import (
-    CONTROL_STEPS,
-    Nade,
-    empty_draws,
-    empty_scratch,
-    nothing_drawn,
-    with_more_room,
-)
+from harness.families.cut_in.nade.cells import empty_nade, with_more_room
 from harness.families.cut_in.nade.decide import decide, finish
 from harness.families.cut_in.nade.functions import Importance, build_importance
 from harness.families.cut_in.nade.own import own_challenge
@@ -54,14 +47,11 @@ class DrawnInLoop(Traffic):
 
     def begin(self, n_cells: int) -> None:
         states, environment, importance, limit = self._given
-        room = CONTROL_STEPS * len(states) + n_cells
-        self.drawn = nothing_drawn(len(states), environment, importance, moment_limit=limit, capacity=room)
-        draws, scratch = empty_draws(n_cells, environment, importance), empty_scratch(environment, importance)
-        self._nade = Nade(states, draws, self.drawn, scratch, environment, importance)
-        self._unboxed = unboxed(self._nade)
+        self._nade = empty_nade(states, n_cells, environment, importance, limit)
+        self.drawn, self._unboxed = self._nade.drawn, unboxed(self._nade)
 
     def move(self, kernel: KernelState, placed: int) -> None:
-        if self.drawn.moment_count[0] > self.drawn.moment.size - len(self._nade.draws.cell):
+        if self.drawn.moment_count[0] > self.drawn.moment.size - len(self._nade.cell):
             self.drawn = with_more_room(self.drawn)
             self._nade = self._nade._replace(drawn=self.drawn)
             self._unboxed = unboxed(self._nade)

@@ -8,8 +8,7 @@ shared history*, is the mixture Σ_j w_j q_j with
 * episode mixture: the posterior weights w_j ∝ α_j exp(L_j). The drawn component itself is not part of the history.
 
 Hence log q_sampled/p accumulates to Σ log Σ_j α_j q_j/p (step), or to log Σ_j α_j exp(L_j) (episode). Each control step
-adds its ratios (`record_lane`, `record_acceleration`), and where the episode is over (`decide.finish`) `log_weight` is
-what its record says.
+adds its ratios (`record_lane`, `record_acceleration`); `decide.finish` writes the weight where the episode is over.
 
 **What surrogates predicted** is summed up beside it: W_t C_j(s_t, a_t) − W_{t−1} V_j(s_t) over control steps, W being
 the weight so far. Given the shared history its mean is 0 in every step, whatever the surrogate is, since q_sampled can
@@ -25,16 +24,6 @@ from harness.families.cut_in.nade.cells import Nade
 from harness.families.cut_in.nade.functions import Importance
 from harness.loop.cells import KernelState
 from harness.vocabulary import CUT_IN, STAY, FloatArray, State
-
-
-@compiled_inline
-def log_weight(importance: Importance, log_ratio: FloatArray, log_sampled: float) -> float:
-    """Log p(x_c) − log q_sampled(x_c) of a finished episode; exactly 0 without control.
-
-    ``log_ratio`` (M,) are the L_j of the importance functions, which the episode mixture weighs; ``log_sampled`` is log
-    q_sampled/p under any other way of drawing.
-    """
-    return -log_mixture(importance.alpha, log_ratio) if importance.mixes_episodes else -log_sampled
 
 
 @compiled_inline
@@ -97,13 +86,13 @@ def forced_ratio(before: float, after: float, total: float, cut: bool) -> float:
 
 @compiled_inline
 def record_lane(
-    k: int, step: int, state: State, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState, nade: Nade
+    k: int, state: State, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState, nade: Nade
 ) -> None:
     """Likelihood ratios of having stayed or cut in, and the moment if it was one of control.
 
     ``scratch.q`` and ``scratch.challenge`` (J,) are q_j(cut_in) and V_j where it is critical.
     """
-    draws, scratch, importance = nade.draws.cell[k], nade.scratch, nade.importance
+    draws, scratch, importance = nade.cell[k], nade.scratch, nade.importance
     sampled = 1.0
     if critical or importance.n_forced == 1:
         if importance.n_forced == 1:
@@ -112,13 +101,13 @@ def record_lane(
             q = scratch.q[j]
             scratch.ratio[importance.n_forced + j] = (q / p if cut else (1.0 - q) / (1.0 - p)) if critical else 1.0
             scratch.challenge[j] = scratch.challenge[j] if critical else 0.0
-        sampled = accumulate_step(k, nade)
+        sampled = accumulate_step(k, kernel, nade)
     draws.hazard += hazard
     if critical:
         exposure = p if cut else 1.0 - p
         for j in range(importance.n_surrogates):
             scratch.q[j] = scratch.q[j] if cut else 1.0 - scratch.q[j]
-        record_moment(k, step, state, CUT_IN if cut else STAY, exposure, exposure * sampled, kernel, nade)
+        record_moment(k, state, CUT_IN if cut else STAY, exposure, exposure * sampled, kernel, nade)
 
 
 @compiled_inline
@@ -127,40 +116,39 @@ def record_acceleration(k: int, state: State, maneuver: int, kernel: KernelState
 
     ``scratch.p`` (31,), ``scratch.q_acceleration`` (J, 31) and ``scratch.challenge`` (J,) are what it was drawn by.
     """
-    cell, scratch, importance = kernel.cells.cell[k], nade.scratch, nade.importance
-    p = scratch.p[maneuver]
+    scratch, importance, p = nade.scratch, nade.importance, nade.scratch.p[maneuver]
     if importance.n_forced == 1:
         scratch.ratio[0] = 1.0
     for j in range(importance.n_surrogates):
         scratch.q[j] = scratch.q_acceleration[j, maneuver]
         scratch.ratio[importance.n_forced + j] = scratch.q[j] / p
-    sampled = accumulate_step(k, nade)
-    record_moment(k, cell.step, state, maneuver, p, p * sampled, kernel, nade)
+    sampled = accumulate_step(k, kernel, nade)
+    record_moment(k, state, maneuver, p, p * sampled, kernel, nade)
 
 
 @compiled_inline
-def accumulate_step(k: int, nade: Nade) -> float:
+def accumulate_step(k: int, kernel: KernelState, nade: Nade) -> float:
     """Take ``scratch.ratio`` and ``scratch.challenge`` of a step into the likelihood ratios; returns its q_α/p."""
-    scratch, importance, draws = nade.scratch, nade.importance, nade.draws.cell[k]
-    log_ratio, martingale = nade.draws.log_ratio[k], nade.draws.martingale[k]
+    scratch, importance, draws = nade.scratch, nade.importance, nade.cell[k]
+    row = kernel.cells.cell[k].row
+    log_ratio, martingale = nade.drawn.log_q[row], nade.drawn.martingale[row]
     sampled = accumulate(importance, scratch.ratio, scratch.challenge, draws.log_sampled, log_ratio, martingale)
-    if importance.mixes_steps:
-        draws.log_sampled += math.log(sampled)
+    draws.log_sampled += math.log(sampled)
     return sampled
 
 
 @compiled_inline
 def record_moment(
-    k: int, step: int, state: State, maneuver: int, p: float, q_sampled: float, kernel: KernelState, nade: Nade
+    k: int, state: State, maneuver: int, p: float, q_sampled: float, kernel: KernelState, nade: Nade
 ) -> None:
     """Count a control step, and keep it if the campaign keeps that many of an episode."""
     results, scratch, cell = nade.drawn, nade.scratch, kernel.cells.cell[k]
-    cell.n_control += 1
-    if cell.n_control > results.moment_limit:
+    kernel.episode[cell.row].n_control_steps += 1
+    if kernel.episode[cell.row].n_control_steps > results.moment_limit:
         return
     i = results.moment_count[0]
     moment = results.moment[i]
-    moment.row, moment.step, moment.maneuver = cell.row, step, maneuver
+    moment.row, moment.step, moment.maneuver = cell.row, cell.step, maneuver
     moment.v_bv_mps, moment.r1_m, moment.r1dot_mps = state.v_bv_mps, state.r1_m, state.r1dot_mps
     moment.r2_m, moment.r2dot_mps = state.r2_m, state.r2dot_mps
     moment.p, moment.q_sampled = p, q_sampled

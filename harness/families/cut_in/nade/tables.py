@@ -41,17 +41,12 @@ class Tables(NamedTuple):
     least: Float32Array
 
 
-def tables_hash(environment: Environment, drivers: RecordArray, challenge: str) -> str:
-    """Hash of what the surrogates' tables depend on; the level of lane changing is not among it."""
+def tables_name(environment: Environment, drivers: RecordArray, challenge: str) -> str:
+    """What the tables of a set of surrogates are kept under; the level of lane changing is not among it."""
     numbers = {name: value for name, value in environment.content().items() if name != "level"}
     surrogates = drivers.dtype.names, drivers.tolist()
     content = json.dumps([_FORMAT, challenge, numbers, AFTER, BEFORE, surrogates, LEVELS], sort_keys=True)
-    return hashlib.sha256(content.encode()).hexdigest()[:24]
-
-
-def tables_name(environment: Environment, drivers: RecordArray, challenge: str) -> str:
-    """What the tables of a set of surrogates are kept under."""
-    return f"tables/{tables_hash(environment, drivers, challenge)}.npy"
+    return f"tables/{hashlib.sha256(content.encode()).hexdigest()[:24]}.npy"
 
 
 def _load(path: Path) -> Tables:
