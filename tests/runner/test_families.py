@@ -12,7 +12,7 @@ from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.pool import moved
 from harness.processes import PRINTED
-from harness.records.folder import read_manifest
+from harness.records.folder import read_manifest, write_sealed
 from harness.resolved import resolve
 from harness.runner.families import estimate_families
 
@@ -145,6 +145,13 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
     with pytest.raises(RunFolderError, match=r"mine\.txt"):
         harness.run(campaign(), tmp_path)
     assert [each.name for each in Path(tmp_path).iterdir()] == ["mine.txt"]
+
+
+def test_an_answer_of_another_version_is_refused(run, tmp_path, capsys):
+    older = {key: value for key, value in run.content.items() if key != "readings"}
+    write_sealed(tmp_path / "families.json", older)
+    assert main(["report", str(tmp_path)]) == 2
+    assert "no key readings" in capsys.readouterr().err
 
 
 def test_what_the_answer_of_one_scenario_depends_on(run, monkeypatch):
