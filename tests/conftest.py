@@ -49,26 +49,32 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 
 @pytest.fixture(scope="session")
-def stored_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The folder of a golden campaign, run when it is first asked for, once for all workers. Damage a copy only."""
-    from tests.in_process import run_here
-    from tests.stored_runs import golden
-
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """A folder of some name, made when it is first asked for, once for all workers. Damage a copy only."""
     folder = tmp_path_factory.getbasetemp()
     folder = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "stored"
     folder.mkdir(exist_ok=True)
 
-    def of(name: str) -> Path:
+    def of(name: str, make: Callable[[Path], object]) -> Path:
         out, done = folder / name, folder / f"{name}.done"
         with (folder / f"{name}.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not done.exists():
                 shutil.rmtree(out, ignore_errors=True)
-                run_here(golden(name), out)
+                make(out)
                 done.touch()
         return out
 
     return of
+
+
+@pytest.fixture(scope="session")
+def stored_run(made_once) -> Callable[[str], Path]:
+    """The folder of a golden campaign, see `made_once`."""
+    from tests.in_process import run_here
+    from tests.stored_runs import golden
+
+    return lambda name: made_once(name, lambda out: run_here(golden(name), out))
 
 
 @pytest.fixture

@@ -1,4 +1,3 @@
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from tests.golden.campaigns import SHELLS
 from tests.golden.record import load
 from tests.in_process import controllers_here, one_process, run_here, without_page
 from tests.report.page_text import write_run
+from tests.stored_runs import copy_of
 
 
 class OnDemand(dict):
@@ -27,15 +27,19 @@ class OnDemand(dict):
 
 
 @pytest.fixture(scope="session")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One run folder of each, without its report unless `reports` was asked for it; tests must not change them."""
-    return OnDemand(lambda name: write_run(tmp_path_factory.mktemp(name) / "run", name))
+def folders(made_once) -> dict[str, Path]:
+    """One run folder of each, without its report; tests must not change them."""
+    return OnDemand(lambda name: made_once(f"page-{name}", lambda out: write_run(out / "run", name)) / "run")
 
 
 @pytest.fixture(scope="session")
-def reports(folders: dict[str, Path]) -> dict[str, Path]:
-    """The same folders with their reports."""
-    return OnDemand(lambda name: write_report(folders[name]).parent)
+def reports(made_once, folders: dict[str, Path]) -> dict[str, Path]:
+    """The same with their reports."""
+
+    def make(name: str) -> Path:
+        return made_once(f"report-{name}", lambda out: write_report(copy_of(folders[name], out / "run"))) / "run"
+
+    return OnDemand(make)
 
 
 @pytest.fixture(scope="session")
@@ -45,24 +49,27 @@ def runs(folders: dict[str, Path]) -> dict[str, RunFolder]:
 
 
 @pytest.fixture(scope="session")
-def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def compared(made_once) -> Path:
     """A comparison without its page: of A, and of B, which brakes harder and later, there are crashes alone."""
     shared = (*SHELLS, "world.engine=twin", "stop.rhw=0.4", "stop.episodes=240", "records.traces=crash")
     late = "av={model: idm, parameters: {min_acceleration_mps2: -8}, reaction: {delay_s: 0.5}}"
-    out = tmp_path_factory.mktemp("compared") / "out"
-    with one_process(), controllers_here(), without_page():
-        harness.compare(load(*shared), load(*shared, late), out, workers=1)
-    return out
+
+    def make(out: Path) -> None:
+        with one_process(), controllers_here(), without_page():
+            harness.compare(load(*shared), load(*shared, late), out, workers=1)
+
+    return made_once("compared", make)
 
 
 @pytest.fixture(scope="session")
-def crashing(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def crashing(made_once) -> dict[str, Path]:
     """A run of each scenario, by its name, of a pool that is small: idm crashes in all; tests must not change them."""
+    small = "pool.relative_error=0.2", "pool.events_per_shell=200", "stop.episodes=200", "stop.rhw=0.9"
+    settings = "world.engine=twin", "records.traces=crash", *small
 
     def make(scenario: str) -> Path:
-        small = "pool.relative_error=0.2", "pool.events_per_shell=200", "stop.episodes=200", "stop.rhw=0.9"
-        campaign = load_campaign("idm", [f"scenario={scenario}", "world.engine=twin", "records.traces=crash", *small])
-        return run_here(campaign, tmp_path_factory.mktemp(scenario) / "run").folder
+        campaign = load_campaign("idm", [f"scenario={scenario}", *settings])
+        return made_once(scenario, lambda out: run_here(campaign, out))
 
     return OnDemand(make)
 
@@ -70,4 +77,4 @@ def crashing(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture
 def run_folder(folders: dict[str, Path], tmp_path: Path) -> Path:
     """A copy of a full run without report, to be damaged."""
-    return shutil.copytree(folders["weighted"], tmp_path / "run", ignore=shutil.ignore_patterns("plots", "report.html"))
+    return copy_of(folders["weighted"], tmp_path / "run")

@@ -47,11 +47,9 @@ def sumo_run(stored_run) -> Path:
 
 
 @pytest.fixture(scope="session")
-def twin_run(campaign, run_here, tmp_path_factory) -> Path:
+def twin_run(campaign, run_here, made_once) -> Path:
     """Its first 400 episodes in the twin. Never written to: damage a copy."""
-    out = tmp_path_factory.mktemp("twin") / "run"
-    run_here(campaign(*TWIN), out)
-    return out
+    return made_once("twin", lambda out: run_here(campaign(*TWIN), out))
 
 
 @pytest.fixture

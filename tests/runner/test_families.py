@@ -11,6 +11,7 @@ import harness
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.pool import moved
+from harness.processes import PRINTED
 from harness.records.folder import read_manifest, write_sealed
 from harness.resolved import resolve
 from harness.runner.families import estimate_families
@@ -74,6 +75,7 @@ def test_workers_and_interruptions_change_no_bit(run, tmp_path):
     harness.run(campaign("stop.rhw=2.0"), stopped, workers=1)
     held = json.loads((stopped / "families.json").read_text())["n_episodes"]
     assert held < run.content["n_episodes"]
+    (stopped / PRINTED).write_text("what a vehicle has printed")
     harness.run(campaign(), stopped, workers=1, resume=True)
     assert bits(stopped) == bits(run.folder)
     with pytest.raises(RunFolderError, match="already begun"):

@@ -141,7 +141,7 @@ def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(camp
 
 def test_a_forced_test_fails_where_its_shadow_run_did(campaign, run_here, tmp_path):
     """A row, with the weight of the cut-in that it may have hidden, and counted as a crash in the upper limit."""
-    loose = campaign(*FORCED, TWIN, "run.max_failed_share=0.05", f"av={of('Breaks')}")
+    loose = campaign(*FORCED, TWIN, "stop.episodes=200", "run.max_failed_share=0.05", f"av={of('Breaks')}")
     result = run_here(loose, tmp_path / "run")
     rows = [row for row in stored_table(result.folder, "episodes").to_pylist() if row["outcome"] == "failed"]
     assert rows

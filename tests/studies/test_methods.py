@@ -102,6 +102,7 @@ def committed(name: str) -> tuple[dict[tuple[str, str], Judgement], Experiment]:
         experiment["campaign"]["testing"]["shells"].pop(key, None)
     experiment["campaign"]["stop"].pop("estimator", None)
     shipped, pool = load_experiment(ROOT / "scenarios" / "validate" / f"{name}.yaml"), experiment["campaign"]["pool"]
+    pool.pop("pilot_tests", None)
     if shipped.campaign.pool.relative_error is None and pool["relative_error"] == family_named("cut_in").pool_error:
         pool["relative_error"] = None  # the default was a number
     both = Experiment.model_validate(experiment), shipped
