@@ -32,21 +32,9 @@ if TYPE_CHECKING:
     from harness.runner.stored import replay_episode as replay
 
 __all__ = [
-    "HarnessError",
-    "av_check",
-    "compare",
-    "estimate",
-    "estimate_families",
-    "estimate_in_other_traffic",
-    "fit",
-    "load_campaign",
-    "read",
-    "replay",
-    "run",
-    "sensitivity",
-    "write_motion",
-    "write_report",
-]
+    "HarnessError", "av_check", "compare", "estimate", "estimate_families", "estimate_in_other_traffic", "fit",
+    "load_campaign", "read", "replay", "run", "sensitivity", "write_motion", "write_report",
+]  # fmt: skip
 
 _PLACES = {
     "HarnessError": ("harness.errors", "HarnessError"),

@@ -83,12 +83,7 @@ def find(name: str) -> Path | None:
 
 def read(name: str) -> bytes | None:
     """What is kept under a name; None if nothing is, or it is damaged."""
-    for path in places(name):
-        with suppress(OSError):
-            content = path.read_bytes()
-            if zlib.crc32(content, zlib.crc32(name.encode())) == _SEALED:
-                return content[:-_SEAL_BYTES]
-    return None
+    return None if (path := find(name)) is None else path.read_bytes()[:-_SEAL_BYTES]
 
 
 def keep(name: str, content: bytes | memoryview) -> Path:

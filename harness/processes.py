@@ -160,6 +160,18 @@ class Child:
             self._process = _started(work)
         atexit.register(self.kill)
 
+    def give(self, *work: Any) -> bool:
+        """Send it work; False if it is dead."""
+        try:
+            self.connection.send(work)
+        except OSError:
+            return False
+        return True
+
+    def dismiss(self) -> None:
+        """Tell it that no more work comes, so that it can end in its own way."""
+        self.connection.close()
+
     @property
     def handles(self) -> tuple[Connection, int]:
         """What there is to wait for: that it sends something, or dies."""

@@ -33,7 +33,7 @@ def without_page() -> Iterator[None]:
 
 
 class WorkerInThisProcess:
-    """Stands in for `WorkerProcess` where the tests are not about processes: spares starting one."""
+    """Stands in for `Child` where the tests are not about processes: spares starting one."""
 
     def __init__(self, _serve: Callable[..., None], resolved: Resolved, baseline: Path) -> None:
         self._runner = ShardRunner(resolved, baseline)
@@ -58,7 +58,7 @@ class WorkerInThisProcess:
 def one_process() -> Iterator[None]:
     """Where shards are run, it is here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers, "WorkerProcess", WorkerInThisProcess)
+        patch.setattr(workers, "Child", WorkerInThisProcess)
         patch.setattr(workers.LocalWorkers, "first_to_answer", lambda _, busy: busy[0])
         patch.setattr(workers, "start_server", lambda: None)
         patch.setattr(kept, "PART_TESTS", 80)  # several files of small runs

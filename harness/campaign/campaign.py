@@ -66,9 +66,8 @@ class Campaign(Section):
     description: str = Field("", description="what this campaign is for, in a sentence")
     seed: Whole = Field(1, ge=0, lt=2**63)
     """random numbers of the tests follow from it; those of the pool from pool.seed"""
-    scenario: str = Field(
-        DEFAULT_FAMILY, description="kind of events that are tested: cut_in, or one that a package brings"
-    )
+    scenario: str = DEFAULT_FAMILY
+    """kind of events that are tested: cut_in, or one that a package brings"""
     scenarios: Annotated[list[str], Field(min_length=1)] | None = None
     """several kinds of events in one answer per hour, in place of scenario"""
     exposure: dict[str, Positive] = Field(default_factory=dict, description="events per hour of driving, by scenario")
@@ -157,6 +156,7 @@ class Campaign(Section):
         """
         others = {} if self.scenario == DEFAULT_FAMILY else {"scenario": self.scenario}
         unused = set() if self.av.acts_before_event else {"shadow_paths"}
+        challenged = {"challenge": challenge or self.testing.challenge}
         content = others | {
             "crash": self.crash.model_dump(),
             "seed": self.seed,
@@ -164,10 +164,7 @@ class Campaign(Section):
             "environment_parameters": environment_parameters,
             "av": self.av.identity(),
             "surrogates": [(name, model.identity()) for name, model in self.surrogates.items()],
-            "testing": {
-                **self.testing.model_dump(exclude={"estimator"}),
-                "challenge": challenge or self.testing.challenge,
-            },
+            "testing": self.testing.model_dump(exclude={"estimator"}) | challenged,
             "pool": self.pool.model_dump(exclude=unused) if self.sampling.strata else None,
             "engine": self.world.engine,
             "moments": self.records.moments,
@@ -214,32 +211,24 @@ _TAKES_TIME = "where cut-ins take time (`lateral` of the environment)"
 REFUSED = (
     # -- limits --
     Combination(
-        "accept",
-        lambda c, _: c.accept is not None and not c.sampling.strata,
+        "accept", lambda c, _: c.accept is not None and not c.sampling.strata,
         "a limit, with testing.method {testing.method}",
         "testing.method shells: how often decisions are wrong is known for its intervals alone",
         "Choose shells, or delete the section and compare the interval with the limit yourself.",
     ),
     # -- several scenarios --
     Combination(
-        "scenarios",
-        lambda c, _: c.scenarios is not None and len(set(c.scenarios)) < len(c.scenarios),
-        "a scenario that is named twice",
-        "each once",
-        "Delete one of both.",
+        "scenarios", lambda c, _: c.scenarios is not None and len(set(c.scenarios)) < len(c.scenarios),
+        "a scenario that is named twice", "each once", "Delete one of both.",
     ),
     Combination(
-        "testing.method",
-        lambda c, _: c.scenarios is not None and not c.sampling.strata,
+        "testing.method", lambda c, _: c.scenarios is not None and not c.sampling.strata,
         "{testing.method}, with several scenarios",
-        "shells: rates of several kinds of events are one sum over strata",
-        "Choose shells, or write one scenario.",
+        "shells: rates of several kinds of events are one sum over strata", "Choose shells, or write one scenario.",
     ),
     Combination(
-        "accept",
-        lambda c, _: c.scenarios is not None and c.accept is not None and c.accept.times_reference is None,
-        "a limit of crashes per test, with several scenarios",
-        "times_reference: their tests are not of one kind",
+        "accept", lambda c, _: c.scenarios is not None and c.accept is not None and c.accept.times_reference is None,
+        "a limit of crashes per test, with several scenarios", "times_reference: their tests are not of one kind",
         "Write accept: {times_reference: {driver: r157-cc}}, or one scenario.",
     ),
     Combination(
@@ -250,24 +239,19 @@ REFUSED = (
         "Delete the key, or write one scenario.",
     ),
     Combination(
-        "pool.library",
-        lambda c, _: c.scenarios is not None and c.pool.library is not None,
-        "one library, with several scenarios",
-        "null: each scenario has its own",
+        "pool.library", lambda c, _: c.scenarios is not None and c.pool.library is not None,
+        "one library, with several scenarios", "null: each scenario has its own",
         "Delete the key, or write one scenario.",
     ),
     Combination(
-        "exposure",
-        lambda c, _: bool(set(c.exposure) - set(c.scenarios or ())),
-        "of a scenario that is not among scenarios",
-        "events per hour of those that are tested",
+        "exposure", lambda c, _: bool(set(c.exposure) - set(c.scenarios or ())),
+        "of a scenario that is not among scenarios", "events per hour of those that are tested",
         "Name it among scenarios, or delete it: one scenario alone has no rate per hour.",
     ),
     Combination(
         "environments",
         lambda c, _: bool(set(c.environments) - set(c.scenarios or ()) | {DEFAULT_FAMILY} & set(c.environments)),
-        "a file of a scenario that is not among scenarios, or of cut_in",
-        "files of the others that are tested",
+        "a file of a scenario that is not among scenarios, or of cut_in", "files of the others that are tested",
         "Name it among scenarios; that of cut_in, or of one scenario alone, is environment.parameters.",
     ),
     # -- vehicles that act before the cut-in --
@@ -281,31 +265,24 @@ REFUSED = (
         "Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths first.",
     ),
     Combination(
-        "av.before_event",
-        lambda c, _: c.av.acts_before_event and c.av.model is not None,
+        "av.before_event", lambda c, _: c.av.acts_before_event and c.av.model is not None,
         "controller, with the built-in model {av.model}",
         "hold_speed: a built-in model has nothing to follow before the cut-in",
         "Delete the key, or bring a controller of your own.",
     ),
     # -- where tests are simulated --
     Combination(
-        "world.engine",
-        lambda c, _: c.world.engine == "twin" and c.av.source in ("sumo", "traci"),
-        "twin, with an AV that SUMO moves (av.{av.source})",
-        "sumo",
-        "Write engine: sumo.",
+        "world.engine", lambda c, _: c.world.engine == "twin" and c.av.source in ("sumo", "traci"),
+        "twin, with an AV that SUMO moves (av.{av.source})", "sumo", "Write engine: sumo.",
     ),
     # -- what methods need and allow --
     Combination(
-        "surrogates",
-        lambda c, _: not c.surrogates and c.sampling.mixes,
-        "none",
-        "at least one surrogate for testing.method {testing.method}",
+        "surrogates", lambda c, _: not c.surrogates and c.sampling.mixes,
+        "none", "at least one surrogate for testing.method {testing.method}",
         "Leave surrogates out for the three of the paper, or choose method forced or nde.",
     ),
     Combination(
-        "stop.rhw",
-        lambda c, _: c.stop.rhw is not None and not c.sampling.bounded and c.testing.epsilon < 1.0,
+        "stop.rhw", lambda c, _: c.stop.rhw is not None and not c.sampling.bounded and c.testing.epsilon < 1.0,
         "{stop.rhw:g}, with testing.method {testing.method}",
         "no precision to stop at: weights of the step mixture may reach 1/epsilon to the power of its steps, and while "
         "the large ones are missing its interval looks narrow",
@@ -320,8 +297,7 @@ REFUSED = (
     ),
     # -- cut-ins that take time --
     Combination(
-        "testing.method",
-        lambda c, use: use.shows and c.sampling.mixes,
+        "testing.method", lambda c, use: use.shows and c.sampling.mixes,
         "{testing.method}, " + _TAKES_TIME,
         "shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at those that an "
         "attentive vehicle avoids",
@@ -329,63 +305,50 @@ REFUSED = (
     ),
     # -- scenarios in which the AV follows --
     Combination(
-        "testing.method",
-        lambda c, use: use.follows and c.sampling.mixes,
-        "{testing.method}, " + _FOLLOWS,
-        "shells, forced or nde: importance functions are those of cut-ins",
+        "testing.method", lambda c, use: use.follows and c.sampling.mixes,
+        "{testing.method}, " + _FOLLOWS, "shells, forced or nde: importance functions are those of cut-ins",
         "Choose shells, or scenario: cut_in.",
     ),
     Combination(
-        "av.before_event",
-        lambda c, use: use.follows and c.av.acts_before_event,
+        "av.before_event", lambda c, use: use.follows and c.av.acts_before_event,
         "controller, " + _FOLLOWS,
-        "hold_speed, which means nothing there: the vehicle drives in any case",
-        "Delete the key.",
+        "hold_speed, which means nothing there: the vehicle drives in any case", "Delete the key.",
     ),
     Combination(
-        "av.model",
-        lambda c, use: use.follows and c.av.model == "r157-fsm",
+        "av.model", lambda c, use: use.follows and c.av.model == "r157-fsm",
         "r157-fsm, " + _FOLLOWS,
         "another driver: how the fuzzy safety model meets lead braking has not been tried",
         "Choose r157-cc, idm or fvdm, or bring a controller of your own.",
     ),
     Combination(
-        "av.parameters.time_headway_s",
-        lambda c, use: use.command is not None and not use.follows and _natural(c),
-        "natural, in {scenario}",
-        "seconds: the vehicle does not follow before the event",
+        "av.parameters.time_headway_s", lambda c, use: use.command is not None and not use.follows and _natural(c),
+        "natural, in {scenario}", "seconds: the vehicle does not follow before the event",
         "Write a number, or scenario: lead_brakes.",
     ),
     Combination(
         "environment",
         lambda c, use: use.follows and c.environment != EnvironmentSettings(parameters=c.environment.parameters),
         "numbers of cut-ins, " + _FOLLOWS,
-        "parameters alone",
-        "Delete lane_change_level, acceleration_hold_s and cut_in_lead_s.",
+        "parameters alone", "Delete lane_change_level, acceleration_hold_s and cut_in_lead_s.",
     ),
     # -- comparisons --
     Combination(
-        "testing.method",
-        lambda c, use: use.command == "compare" and not c.sampling.strata,
-        "{testing.method}, in a comparison",
-        "shells, under which both vehicles meet the same cut-ins",
+        "testing.method", lambda c, use: use.command == "compare" and not c.sampling.strata,
+        "{testing.method}, in a comparison", "shells, under which both vehicles meet the same cut-ins",
         "Write --set testing.method=shells; or run both by themselves and put their intervals side by side.",
     ),
     Combination(
-        "accept",
-        lambda c, use: use.command == "compare" and c.accept is not None,
-        "a limit of one crash rate",
-        "none in a comparison",
+        "accept", lambda c, use: use.command == "compare" and c.accept is not None,
+        "a limit of one crash rate", "none in a comparison",
         "Write --set accept=null, and --margin if something is to be decided.",
     ),
     Combination(
-        "av.before_event",
-        lambda c, use: use.command == "compare" and c.has_baseline_runs,
+        "av.before_event", lambda c, use: use.command == "compare" and c.has_baseline_runs,
         "controller: a vehicle that acts before the cut-in has cut-ins of its own",
         "hold_speed in A and B: pairs need the same cut-ins",
         "Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",
     ),
-)
+)  # fmt: skip
 """All that is refused, in the order in which it is told."""
 
 

@@ -9,19 +9,19 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import ModelName, default_surrogates
-from harness.campaign.problems import MOST_SHOWN, NAME_PATTERN, describe_found, did_you_mean, in_words
+from harness.campaign.problems import MOST_SHOWN, describe_found, did_you_mean, in_words
 from harness.campaign.python_files import in_python_file, is_script
 from harness.campaign.sections import DEFAULT, Section
-from harness.campaign.vehicle import AV_SOURCES, AutomatedVehicle, with_another_driver
+from harness.campaign.vehicle import AV_SOURCES, Panel, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml, yaml_text
 from harness.errors import CampaignError
 from harness.files import real_path
@@ -59,7 +59,7 @@ def load_campaign(
     Raises `CampaignError`: the file cannot be read, is not YAML, or says something wrong; the error names every place.
     """
     laid = [] if av is None else [Override(("av",), named_vehicle(av, "--av "), f"--av {av}")]
-    of_file, folder = names_a_campaign(path), Path(path).parent
+    of_file = names_a_campaign(path)
     data, lines = read_yaml(path) if of_file else (_default_campaign(str(path)), {})
     typed = [parse_override(each) for each in overrides]
     place = Places(str(path), lines, [*laid, *_nothing_sooner(typed), *typed])
@@ -68,22 +68,8 @@ def load_campaign(
         for each in filter(_asks_for_precision, typed):
             found, expected = "a precision, in a campaign with a limit", "one of the two: a limit ends it at a decision"
             raise CampaignError(each.option, found, expected, "Add --set accept=null.")
-    files = _FILES | {("environments", each): _FILES["environment", "parameters"] for each in campaign.environments}
-    for where, expected in files.items():
-        name, end = campaign.at(where), ""
-        if where[-1] in ("controller", "estimator", "challenge") and name is not None and ".py:" in name:
-            name, _, end = name.rpartition(":")
-        elif name is None or (where[-1] != "file" and not names_a_file(name)):
-            continue
-        file = _absolute(name, folder if of_file else Path.cwd())
-        if not Path(file).exists() and place(where).startswith("--set"):  # typed in another folder than the campaign's
-            file = _absolute(name, Path.cwd())
-        if check_files and not Path(file).is_file():
-            beside = Path(file).parent.glob("*" + Path(name).suffix)
-            meant = did_you_mean(Path(name).name, [each.name for each in beside])
-            mend = meant or "Correct the path; it is relative to the folder of the campaign file."
-            raise CampaignError(place(where), f"no file {file}", expected, mend)
-        campaign = campaign.replaced(where, f"{file}:{end}" if end else file)
+    folder = Path(path).parent
+    campaign = _with_real_paths(campaign, place, folder if of_file else Path.cwd(), check_files=check_files)
     if check_files:
         from harness.families import family_named  # noqa: PLC0415 - families read campaigns' sections
 
@@ -95,6 +81,27 @@ def load_campaign(
     env = campaign.run.ray.runtime_env
     paths = {key: _absolute(env[key], folder) for key in ("working_dir", "py_modules") if key in env}
     return campaign.replaced(("run", "ray", "runtime_env"), {**env, **paths})
+
+
+def _with_real_paths(campaign: Campaign, place: Places, folder: Path, *, check_files: bool) -> Campaign:
+    """The campaign with every file that it names by an absolute path; one typed after ``--set`` may lie here."""
+    files = _FILES | {("environments", each): _FILES["environment", "parameters"] for each in campaign.environments}
+    for where, expected in files.items():
+        name, end = campaign.at(where), ""
+        if where[-1] in ("controller", "estimator", "challenge") and name is not None and ".py:" in name:
+            name, _, end = name.rpartition(":")
+        elif name is None or (where[-1] != "file" and not names_a_file(name)):
+            continue
+        file = _absolute(name, folder)
+        if not Path(file).exists() and place(where).startswith("--set"):
+            file = _absolute(name, Path.cwd())
+        if check_files and not Path(file).is_file():
+            beside = Path(file).parent.glob("*" + Path(name).suffix)
+            meant = did_you_mean(Path(name).name, [each.name for each in beside])
+            mend = meant or "Correct the path; it is relative to the folder of the campaign file."
+            raise CampaignError(place(where), f"no file {file}", expected, mend)
+        campaign = campaign.replaced(where, f"{file}:{end}" if end else file)
+    return campaign
 
 
 def campaign_of(campaign: Campaign | str | Path) -> Campaign:
@@ -277,16 +284,6 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(few)}{more}"
     mend = in_python_file(text) or did_you_mean(name, [*files, *known]) or "Name one of them."
     raise CampaignError(f"{option}{text}", found, expected, mend)
-
-
-class Panel(Section):
-    """Automated vehicles by name: ``av`` sections that experiments, tests and tables share."""
-
-    format: Literal["av-panel"]
-    version: Literal[1]
-    description: str = ""
-    avs: dict[Annotated[str, Field(pattern=NAME_PATTERN)], AutomatedVehicle] = Field(min_length=1)
-    """av sections by name"""
 
 
 def load_panel(path: str | Path = SHIPPED_PANEL) -> Panel:

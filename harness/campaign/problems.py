@@ -99,7 +99,7 @@ def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:
         return "Remove the quotes."
     if kind == "string_type" and isinstance(value, bool | int | float):
         return "Put it in quotes if it is meant as text."
-    about = field and field.description
+    about = " ".join(field.description.split()) if field and field.description else ""
     return f"Correct it; the key means: {about.rstrip('.')}." if about else "Correct the value."
 
 

@@ -124,11 +124,9 @@ class CrashSettings(Section):
 class ShellSettings(Section):
     """How tests are spread over the shells of the pool, and what is said about vehicles that keep to some of them."""
 
-    statement: Literal["assumption_free", "library"] = Field(
-        "assumption_free",
-        description="what stop.rhw or accept is about; library: if the vehicle crashes only inside the library's "
-        "boundary, outside of which nothing is tested then",
-    )
+    statement: Literal["assumption_free", "library"] = "assumption_free"
+    """what stop.rhw or accept is about; library: if the vehicle crashes only inside the library's boundary, outside of
+    which nothing is tested then"""
     first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = None
     """tests of each shell before any is preferred; none: by its probability"""
     smallest_round: Whole = Field(1, ge=1, le=10_000)
@@ -141,26 +139,16 @@ CHALLENGE = r"^(immediate|recursive|.+\.py:\w+)$"
 class Testing(Section):
     """How maneuvers are drawn at critical moments."""
 
-    method: Method = Field(
-        "shells",
-        description="shells: cut-ins of a pool; forced: a cut-in in every test; nde: no control; step_mixture: NADE as "
-        "published; episode_mixture: one importance function per test",
-    )
+    method: Method = "shells"
+    """shells: cut-ins of a pool; forced: a cut-in in every test; nde: no control; step_mixture: NADE as published;
+    episode_mixture: one importance function per test"""
     estimator: str | None = None
     """what answers and stops instead of the method's own: a name, or my.py:MyEstimator"""
-    challenge: str = Field(
-        "recursive",
-        json_schema_extra={"pattern": CHALLENGE},
-        description="immediate: crash if BV cuts in now (published); recursive: backward induction; my.py:function: "
-        "your own",
-    )
-    epsilon: float = Field(
-        0.1,
-        ge=1e-6,
-        le=1.0,
-        description="share of natural driving in every importance function; at 0 what no surrogate crashes on would "
-        "never be drawn, and the rate be too low",
-    )
+    challenge: str = Field("recursive", json_schema_extra={"pattern": CHALLENGE})
+    """immediate: crash if BV cuts in now (published); recursive: backward induction; my.py:function: your own"""
+    epsilon: float = Field(0.1, ge=1e-6, le=1.0)
+    """share of natural driving in every importance function; at 0 what no surrogate crashes on would never be drawn,
+    and the rate be too low"""
     alpha: dict[SurrogateName, Probability] | None = None
     """weight of each surrogate, summing to 1; none: equal"""
     defensive_share: float = Field(0.1, gt=0.0, lt=1.0, description="share of forced cut-ins in the episode mixture")
@@ -233,16 +221,11 @@ class Stop(Section):
     episodes: Whole = Field(100_000, ge=1, le=10**10, description="most tests to run")
     rhw: float | None = Field(None, gt=0.0, lt=10.0)
     """stop at this half-width of the interval over the rate; not for step_mixture"""
-    below_reference: float | None = Field(
-        None,
-        gt=0.0,
-        le=1e6,
-        description="with rhw and shells: stop, too, once the rate is known to be below so many times that of the "
-        "library's first reference driver; not where --set says rhw alone",
-    )
-    each_family: bool = Field(
-        False, description="with several scenarios: rhw is asked of each one's rate, not of the sum"
-    )
+    below_reference: float | None = Field(None, gt=0.0, le=1e6)
+    """with rhw and shells: stop, too, once the rate is known to be below so many times that of the library's first
+    reference driver; not where --set says rhw alone"""
+    each_family: bool = False
+    """with several scenarios: rhw is asked of each one's rate, not of the sum"""
     confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = None
     """crashes needed before rhw may stop the campaign; none: 100, with shells 1"""

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from harness.campaign.drivers import PARAMETERS, BuiltInParameters, ModelName, Parameters, Reaction, schema_by_model
-from harness.campaign.problems import broken_rule
+from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import Positive, Section, StepTime, Whole, listed
 
 AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
@@ -218,3 +218,13 @@ class AutomatedVehicle(Section):
             mend = "Your own driver has its own delays: leave av.reaction out."
             raise broken_rule("reaction", f"a reaction {beside}", "a reaction only of a built-in model", mend)
         return self
+
+
+class Panel(Section):
+    """Automated vehicles by name: ``av`` sections that experiments, tests and tables share."""
+
+    format: Literal["av-panel"]
+    version: Literal[1]
+    description: str = ""
+    avs: dict[Annotated[str, Field(pattern=NAME_PATTERN)], AutomatedVehicle] = Field(min_length=1)
+    """av sections by name"""

@@ -7,35 +7,15 @@ import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 import harness
-from harness.commands.options import (
-    CAMPAIGN,
-    FOLDER,
-    RUNS,
-    accepting,
-    av_option,
-    examples,
-    executor_option,
-    json_option,
-    junit_option,
-    of_scenario,
-    one_scenario,
-    progress_bar,
-    run_folder,
-    scenario_option,
-    set_option,
-    workers_option,
-)
-from harness.commands.printing import answer_lines, print_either, print_json, print_table, prints_kept_in, say
+from harness.commands import options
+from harness.commands.options import CAMPAIGN, FOLDER, examples, progress_bar
+from harness.commands.printing import print_either, print_json, print_table, prints_kept_in, say
 from harness.numbers import leaves, words
 from harness.processes import start_server
-
-if TYPE_CHECKING:
-    from harness.runner.families import Hours
 
 
 @click.command(
@@ -46,10 +26,10 @@ if TYPE_CHECKING:
     ),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
-@av_option
-@scenario_option
-@set_option
-@json_option
+@options.av_option
+@options.scenario_option
+@options.set_option
+@options.json_option
 def check(
     campaign_file: Path, *, overrides: Sequence[str], av: str | None, scenario: str | None, as_json: bool
 ) -> None:
@@ -57,9 +37,9 @@ def check(
 
     No test is run, nothing is written.
     """
-    campaign = harness.load_campaign(campaign_file, [*(of_scenario(scenario) if scenario else ()), *overrides], av=av)
-    from harness.campaign.files import dump_campaign  # noqa: PLC0415 - keeps --help fast
-    from harness.resolved import require_ready  # noqa: PLC0415 - slow to import: only once the campaign is right
+    campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario), *overrides], av=av)
+    from harness.campaign.files import dump_campaign
+    from harness.resolved import require_ready
 
     if campaign.scenarios is None:
         campaign = require_ready(campaign).campaign
@@ -88,26 +68,23 @@ def check(
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, help="Run folder; made if it is not there. Default: a new one in runs/.")
-@scenario_option
-@workers_option
-@executor_option
+@options.scenario_option
+@options.workers_option
+@options.executor_option
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
 @click.option(
-    "--accept",
-    metavar="RATE|DRIVER",
+    "--accept", metavar="RATE|DRIVER",
     help="Run until it is known whether the crash rate is below this limit: crashes per test, or the name of a "
     "reference driver such as r157-cc. Replaces stop.rhw.",
-)
+)  # fmt: skip
 @click.option(
-    "--independent",
-    type=click.IntRange(min=0, max=2**63 - 1),
-    metavar="N",
+    "--independent", type=click.IntRange(min=0, max=2**63 - 1), metavar="N",
     help="Repeat the run with other random numbers throughout: sets seed and pool.seed to N.",
-)
-@junit_option
-@av_option
-@set_option
-@json_option
+)  # fmt: skip
+@options.junit_option
+@options.av_option
+@options.set_option
+@options.json_option
 @click.pass_context
 def run(
     ctx: click.Context,
@@ -138,43 +115,29 @@ def run(
     Exit code 4: stop.episodes or the pool was used up before stop.rhw was reached or --accept decided; the results are
     written all the same. With --accept, 0 means accepted and 5 rejected.
     """
-    limit = [] if accept is None else accepting(accept)
+    limit = [] if accept is None else options.accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
     seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
-    scenarios = [] if scenario is None else of_scenario(scenario)
-    campaign = harness.load_campaign(campaign_file, [*scenarios, *seeds, *overrides, *limit, *where], av=av)
-    chosen, folder = folder is None, folder or run_folder(campaign.name, resume=resume)
+    given = [*options.of_scenario(scenario), *seeds, *overrides, *limit, *where]
+    campaign = harness.load_campaign(campaign_file, given, av=av)
+    chosen, folder = folder is None, folder or options.run_folder(campaign.name, resume=resume)
     if campaign.run.executor == "local":
         start_server()
     with named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
-    from harness.runner.run import RunResult  # noqa: PLC0415 - keeps --help fast
+    from harness.runner.run import RunResult
 
-    if not isinstance(result, RunResult):
-        _told_of_several(result, junit, as_json=as_json)
-        ctx.exit(result.exit_code)
-    of = result.shown.campaign, result.shown.manifest, result.estimates
+    content = result.estimates if isinstance(result, RunResult) else result.content
     if junit is not None:
-        from harness.report.junit import statement_case, write_junit  # noqa: PLC0415 - keeps --help fast
+        from harness.report.junit import Case, outcome_of, statement_case, write_junit
 
-        told = "\n".join(answer_lines(*of, timed=False))
-        case = statement_case(result.estimates, told, campaign.testing.shells.statement, result.exit_code)
+        if isinstance(result, RunResult):
+            case = statement_case(content, repr(result), campaign.testing.shells.statement, result.exit_code)
+        else:
+            case = Case("crashes per hour", repr(result), outcome_of(result.exit_code))
         write_junit(junit, campaign.name, case, [result.report])
-    print_either(result.estimates, answer_lines(*of, result.report), as_json=as_json)
+    print_either(content, [result], as_json=as_json)
     ctx.exit(result.exit_code)
-
-
-def _told_of_several(found: Hours, junit: Path | None, *, as_json: bool) -> None:
-    """Print the answer of several scenarios."""
-    from harness.report.hour_words import hour_lines  # noqa: PLC0415 - keeps --help fast
-
-    told = hour_lines(found.content, found.report)
-    if junit is not None:
-        from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
-
-        case = Case("crashes per hour", "\n".join(told), outcome_of(found.exit_code))
-        write_junit(junit, found.content["name"], case, [found.report])
-    print_either(found.content, told, as_json=as_json)
 
 
 @contextmanager
@@ -195,10 +158,10 @@ def named_if_written(folder: Path, *, chosen: bool) -> Iterator[None]:
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
 @click.option("--tests", "episodes", type=click.IntRange(min=2), default=48, show_default=True, help="Tests to run.")
-@scenario_option
-@av_option
-@set_option
-@json_option
+@options.scenario_option
+@options.av_option
+@options.set_option
+@options.json_option
 @click.pass_context
 def av_check(
     ctx: click.Context,
@@ -217,11 +180,12 @@ def av_check(
 
     Exit code 3: tests failed, were not reproduced, or ended the process; 2: campaign or controller are wrong.
     """
-    campaign = harness.load_campaign(campaign_file, [*one_scenario(scenario, "av-check"), *overrides], av=av)
-    from harness.report.av_check import rows, verdict  # noqa: PLC0415 - slow to import: only once the campaign is right
-    from harness.runner.look import check_av_apart  # noqa: PLC0415
+    campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario, "av-check"), *overrides], av=av)
+    from harness.controllers.find import run_apart
+    from harness.report.av_check import rows, verdict
+    from harness.runner.look import check_av
 
-    found = check_av_apart(campaign, episodes)
+    found = run_apart(campaign.av, check_av, campaign, episodes)
     if as_json:
         print_json(found.to_json())
     else:
@@ -250,12 +214,12 @@ def av_check(
     "--margin", type=click.FloatRange(min=0.0), metavar="R",
     help="Run until it is known whether B's crash rate is at most 1 + R times A's. Replaces the precision.",
 )  # fmt: skip
-@workers_option
-@junit_option
-@av_option
-@scenario_option
-@set_option
-@json_option
+@options.workers_option
+@options.junit_option
+@options.av_option
+@options.scenario_option
+@options.set_option
+@options.json_option
 @click.pass_context
 def compare(
     ctx: click.Context,
@@ -288,29 +252,28 @@ def compare(
         raise click.UsageError("Name a second campaign, or say with --against or --against-av how B differs.")
     stored = source_a if source_a.is_dir() else None
     file_a = source_a if stored is None else stored / "campaign.yaml"
-    overrides = [*one_scenario(scenario, "compare"), *overrides]
+    overrides = [*options.of_scenario(scenario, "compare"), *overrides]
     a = harness.load_campaign(file_a, overrides, av=av)
     b = harness.load_campaign(file_b or file_a, [*overrides, *against], av=against_av or av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
-    from harness.campaign.files import parse_override  # noqa: PLC0415 - keeps --help fast
+    from harness.campaign.files import parse_override
 
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     labels = (a.name, label_b) if a.name != label_b else (str(source_a), str(file_b))
     if chosen := folder is None:
-        folder = RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b.removeprefix(f'{a.name}, '))}"
+        folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b.removeprefix(f'{a.name}, '))}"
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
     with named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
         found = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )
-    told = repr(found).splitlines()
     if junit is not None:
-        from harness.report.junit import Case, outcome_of, write_junit  # noqa: PLC0415 - keeps --help fast
+        from harness.report.junit import Case, outcome_of, write_junit
 
-        case = Case("difference", "\n".join(told), outcome_of(found.exit_code))
+        case = Case("difference", repr(found), outcome_of(found.exit_code))
         write_junit(junit, " and ".join(labels), case, [found.report, folder / "compare.json"])
-    print_either(found.content, told, as_json=as_json)
+    print_either(found.content, [found], as_json=as_json)
     ctx.exit(found.exit_code)
 
 
@@ -319,9 +282,9 @@ def compare(
     epilog=examples("harness pool scenarios/smoke.yaml", "harness pool idm --set environment.cut_in_lead_s=0.5"),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
-@scenario_option
-@set_option
-@json_option
+@options.scenario_option
+@options.set_option
+@options.json_option
 def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str], as_json: bool) -> None:
     """Build the pool of events for the traffic and the surrogate library of CAMPAIGN, and show it.
 
@@ -329,10 +292,10 @@ def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str],
     surrogates from careful to careless, with their crash rates and the probabilities of their shells: the events on
     which a surrogate is the most careful to crash. A pool is built once and kept; `harness run` builds it, too.
     """
-    campaign = harness.load_campaign(campaign_file, [*one_scenario(scenario, "pool"), *overrides])
+    campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario, "pool"), *overrides])
     with progress_bar() as bar:
-        from harness.pool.build import campaign_pool  # noqa: PLC0415 - slow to import: the bar is there meanwhile
-        from harness.resolved import resolve  # noqa: PLC0415 - slow to import
+        from harness.pool.build import campaign_pool
+        from harness.resolved import resolve
 
         content = campaign_pool(resolve(campaign), bar).to_json()
     if as_json:
@@ -353,7 +316,7 @@ def schema() -> None:
 
     Let the first line of a campaign name the file: '# yaml-language-server: $schema=campaign.schema.json'.
     """
-    from harness.campaign.files import schema_text  # noqa: PLC0415 - keeps --help fast
+    from harness.campaign.files import schema_text
 
     click.echo(schema_text(), nl=False)
 
@@ -374,8 +337,8 @@ def setup(*, dry_run: bool) -> None:
 
     Exit code 2 says that they could not be installed; the message names the packages.
     """
-    from harness.runner.setup import compile_kernels  # noqa: PLC0415 - keeps --help fast
-    from harness.worlds.system_libraries import install, install_commands, missing_libraries, require_libsumo  # noqa: PLC0415 - keeps --help fast
+    from harness.runner.setup import compile_kernels
+    from harness.worlds.system_libraries import install, install_commands, missing_libraries, require_libsumo
 
     missing = missing_libraries()
     commands = install_commands(missing) if missing else []

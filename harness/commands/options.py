@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import count
+from itertools import chain, count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +33,7 @@ def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
             option, found = parameter.opts[0], f"a name that ends in '{value.suffix}'"
             mend = f"Write {option} {value.with_suffix(suffixes[0])}."
             raise HarnessError(f"{option} {value}", found, f"a name that ends in {' or '.join(suffixes)}", mend)
-        from harness.records.folder import require_place  # noqa: PLC0415 - keeps --help fast
+        from harness.records.folder import require_place
 
         require_place(value.parent)
         return value
@@ -42,33 +42,27 @@ def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
 
 
 set_option = click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="A.B=C",
+    "--set", "overrides", multiple=True, metavar="A.B=C",
     help="Replace a value of the campaign, e.g. --set stop.rhw=0.3. May be given several times. A path is relative "
     "to the campaign's file, as in the file itself.",
-)
+)  # fmt: skip
 av_option = click.option(
     "--av", "av", metavar="VEHICLE", help="Test this vehicle instead of the campaign's; named as for `harness run`."
 )
 workers_option = click.option(
-    "--workers",
-    type=click.IntRange(min=1),
+    "--workers", type=click.IntRange(min=1),
     help="Processes that simulate. Default: one per CPU that this process may use; with Ray, as many as the cluster "
     "has room for.",
-)
+)  # fmt: skip
 scenario_option = click.option(
-    "--scenario",
-    metavar="NAME",
+    "--scenario", metavar="NAME",
     help="What happens in the tests: cut_in, lead_brakes or cut_out. Several, with commas, or 'all' give one answer: "
     "crashes per hour of driving.",
-)
+)  # fmt: skip
 executor_option = click.option(
-    "--executor",
-    type=click.Choice(["local", "ray"]),
+    "--executor", type=click.Choice(["local", "ray"]),
     help="Where tests run: on this machine, or on a Ray cluster ($RAY_ADDRESS, or run.ray.address of the campaign).",
-)
+)  # fmt: skip
 quiet_option = click.option(
     "--quiet", is_flag=True, expose_value=False, callback=lambda ctx, _, value: ctx.meta.update(quiet=value),
     help="No progress: no bar on a terminal, no line every 30 s elsewhere.",
@@ -76,31 +70,26 @@ quiet_option = click.option(
 """Common to all commands: `progress_bar` asks for it."""
 
 
-def of_scenario(text: str) -> list[str]:
-    """What ``--scenario`` sets."""
-    from harness.families import R157, family_named  # noqa: PLC0415 - keeps --help fast
+def of_scenario(text: str | None, alone: str = "") -> list[str]:
+    """What ``--scenario`` sets; ``alone`` is a command that is about one of them."""
+    from harness.families import R157, family_named
 
+    if text is None:
+        return []
     names = R157 if text == "all" else tuple(name.strip() for name in text.split(","))
     for name in names:
         family_named(name, f"--scenario {text}")
     if len(names) == 1:
         return [f"scenario={names[0]}", "scenarios=null"]
-    return [f"scenarios=[{', '.join(names)}]"]
-
-
-def one_scenario(text: str | None, command: str) -> list[str]:
-    """The same, for a command that is about one alone."""
-    if text is None:
-        return []
-    if text == "all" or "," in text:
-        found, expected = f"several scenarios ({text})", f"one, as `harness {command}` looks at one pool of events"
+    if alone:
+        found, expected = f"several scenarios ({text})", f"one, as `harness {alone}` looks at one pool of events"
         raise HarnessError("--scenario", found, expected, "Name one of them, and ask again for each of the others.")
-    return of_scenario(text)
+    return [f"scenarios=[{', '.join(names)}]"]
 
 
 def progress_bar() -> Progress:
     """What a command shows of its work, unless it is to be quiet."""
-    from harness.progress import shown_progress  # noqa: PLC0415 - keeps --help fast
+    from harness.progress import shown_progress
 
     return shown_progress(quiet=click.get_current_context().meta.get("quiet", False))
 
@@ -128,9 +117,6 @@ def accepting(limit: str) -> list[str]:
 
 def run_folder(name: str, *, resume: bool) -> Path:
     """``runs/NAME``, or the first ``runs/NAME-2``, ``-3``, … that is not there; to resume, the last that is there."""
-    last, folder = None, RUNS / name
-    for number in count(2):
-        if not folder.exists():
-            return last if resume and last is not None else folder
-        last, folder = folder, RUNS / f"{name}-{number}"
-    raise AssertionError  # count() has no end
+    numbered = chain([RUNS / name], (RUNS / f"{name}-{number}" for number in count(2)))
+    there = list(takewhile(Path.exists, numbered))
+    return there[-1] if resume and there else RUNS / (f"{name}-{len(there) + 1}" if there else name)

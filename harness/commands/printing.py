@@ -10,16 +10,13 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TextIO
+from typing import Any, Literal, TextIO
 
 import click
 
 from harness.errors import HarnessError, printable
 from harness.numbers import count, half_width, interval, share, words
 from harness.processes import PRINTED, Kept, Printed
-
-if TYPE_CHECKING:
-    from harness.campaign.campaign import Campaign
 
 _WIDTH_OF_FILES = 140
 _PARTS = {"found": "found", "expected": "expected", "fix": "mend"}
@@ -133,8 +130,8 @@ def print_either(content: Any, lines: Iterable[object], *, as_json: bool) -> Non
 
 def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print mappings of the same keys as a table; numbers to four digits and flush right, and nothing is cut off."""
-    from rich.console import Console  # noqa: PLC0415 - keeps --help fast
-    from rich.table import Table  # noqa: PLC0415 - keeps --help fast
+    from rich.console import Console
+    from rich.table import Table
 
     table = Table(title=title)
     for heading, cell in rows[0].items():
@@ -150,7 +147,7 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
     """Print the estimators of ``estimates.json`` that are asked for as a table, with warnings and reasons below."""
-    from harness.report.notes import note_words  # noqa: PLC0415 - keeps --help fast
+    from harness.report.notes import note_words
 
     shown = {name: entry for name, entry in content["estimates"].items() if name in asked}
     rows = [
@@ -171,18 +168,3 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
     if shells := shown.get("shells", {}).get("details", {}).get("shells"):
         names = ("shell", "inside", "p", "n_episodes", "n_crashes", "contribution")
         print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])
-
-
-def answer_lines(
-    campaign: Campaign,
-    manifest: dict[str, Any],
-    content: dict[str, Any],
-    report: Path | None = None,
-    *,
-    timed: bool = True,
-) -> list[str]:
-    """The answer of a run in a few lines, with where its page is, and how long it took."""
-    from harness.report.lines import lines  # noqa: PLC0415 - keeps --help fast
-    from harness.report.words import answer_of  # noqa: PLC0415
-
-    return lines(answer_of(campaign, manifest, content), manifest.get("wall_time_s") if timed else None, report)

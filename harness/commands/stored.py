@@ -11,7 +11,7 @@ import click
 
 import harness
 from harness.commands.options import FILE, FOLDER, RUN_FOLDER, examples, json_option, progress_bar
-from harness.commands.printing import answer_lines, print_either, print_estimates, print_json, print_table, say
+from harness.commands.printing import print_either, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share, words
 from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
@@ -28,33 +28,23 @@ LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_tt
 )
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 @click.option(
-    "--estimator",
-    "-e",
-    "estimators",
-    metavar="NAME",
-    multiple=True,
+    "--estimator", "-e", "estimators", metavar="NAME", multiple=True,
     help=f"Only this one: {', '.join(ESTIMATORS)}, or your own, my.py:MyEstimator. May be given several times.",
-)
+)  # fmt: skip
 @click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
 @click.option(
-    "--environment",
-    metavar="NAME|FILE",
+    "--environment", metavar="NAME|FILE",
     help="Answer for other traffic from the same tests (testing.method shells): a shipped environment, or a file.",
-)
+)  # fmt: skip
 @click.option(
-    "--exposure",
-    "exposures",
-    metavar="SCENARIO=N",
-    multiple=True,
+    "--exposure", "exposures", metavar="SCENARIO=N", multiple=True,
     help="Events per hour of driving, where DIR holds several scenarios. May be given several times.",
-)
+)  # fmt: skip
 @click.option(
-    "--exposure-uncertainty",
-    "counts",
-    is_flag=True,
+    "--exposure-uncertainty", "counts", is_flag=True,
     help="Of several scenarios: let the interval include the error of counted exposures.",
-)
+)  # fmt: skip
 @json_option
 @click.pass_context
 def estimate(
@@ -98,13 +88,13 @@ def estimate(
                 folder, environment, confidence=confidence, own=write, progress=bar
             )
     else:
-        from harness.estimators.own import asked_for  # noqa: PLC0415 - keeps --help fast
+        from harness.estimators.own import asked_for
 
         asked = asked_for(estimators, "--estimator")
         estimators = list(map(str, asked))
         content = harness.estimate(folder, estimators=asked or None, confidence=confidence)
     if write:
-        from harness.records.folder import write_sealed  # noqa: PLC0415 - keeps --help fast
+        from harness.records.folder import write_sealed
 
         write_sealed(folder / "estimates.json", content)
     if as_json:
@@ -112,13 +102,14 @@ def estimate(
     elif estimators:
         print_estimates(content, estimators)
     else:
-        page = folder / "report.html"  # of the run's own traffic
-        from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
-        from harness.records.reader import read_campaign  # noqa: PLC0415
+        from harness.records.folder import read_manifest
+        from harness.records.reader import read_campaign
+        from harness.report.lines import lines
+        from harness.report.words import answer_of
 
-        manifest = read_manifest(folder)
-        shown = page if environment is None and page.is_file() else None
-        say(*answer_lines(read_campaign(folder, manifest), manifest, content, shown))
+        manifest, page = read_manifest(folder), folder / "report.html"  # of the run's own traffic
+        answer = answer_of(read_campaign(folder, manifest), manifest, content)
+        say(*lines(answer, manifest.get("wall_time_s"), page if environment is None and page.is_file() else None))
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
 
@@ -127,11 +118,10 @@ def _estimate_hours(
     folder: Path, exposures: Sequence[str], confidence: float | None, *, counts: bool, write: bool, as_json: bool
 ) -> None:
     """What stored tests of several scenarios say, with other exposures."""
-    from harness.campaign.files import parse_override  # noqa: PLC0415 - keeps --help fast
-    from harness.report.hour_words import hour_lines  # noqa: PLC0415
-    from harness.runner.families import estimate_families, require_families  # noqa: PLC0415
+    from harness.campaign.files import parse_override
+    from harness.report.hour_words import hour_lines
+    from harness.runner.families import estimate_families
 
-    require_families(folder)
     given = {}
     for each in exposures:
         value = (read := parse_override(each)).value
@@ -141,8 +131,8 @@ def _estimate_hours(
         given[".".join(read.path)] = float(value)
     content, page = estimate_families(folder, given, confidence, counts=counts), None
     if write:
-        from harness.records.folder import write_sealed  # noqa: PLC0415 - keeps --help fast
-        from harness.report.page import write_hours  # noqa: PLC0415
+        from harness.records.folder import write_sealed
+        from harness.report.page import write_hours
 
         write_sealed(folder / FAMILIES, content)
         page = write_hours(folder, content)
@@ -152,16 +142,16 @@ def _estimate_hours(
 def _compared_elsewhere(folder: Path, environment: str, confidence: float | None, *, as_json: bool) -> None:
     """What two vehicles' stored tests say of other traffic."""
     with progress_bar() as bar:
-        from harness.runner.other_traffic import compare_in_other_traffic  # noqa: PLC0415 - keeps --help fast
+        from harness.runner.other_traffic import compare_in_other_traffic
 
         content = compare_in_other_traffic(folder, environment, confidence=confidence, progress=bar)
     if as_json:
         print_json(content)
     else:
-        from pydantic import TypeAdapter  # noqa: PLC0415 - keeps --help fast
+        from pydantic import TypeAdapter
 
-        from harness.estimators.traffic import TrafficError  # noqa: PLC0415 - keeps --help fast
-        from harness.report.traffic_words import traffic_rows  # noqa: PLC0415 - keeps --help fast
+        from harness.estimators.traffic import TrafficError
+        from harness.report.traffic_words import traffic_rows
 
         traffic = content["traffic"]
         rows = traffic_rows(TypeAdapter(TrafficError).validate_python(traffic))
@@ -215,7 +205,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
 
 
 def _bar(bar: dict[str, Any]) -> dict[str, str]:
-    from harness.report.traffic_words import bar_note  # noqa: PLC0415 - keeps --help fast
+    from harness.report.traffic_words import bar_note
 
     def ends(of: list[float | None]) -> str:
         return "× " + " … ".join(number(end, 3) for end in of)
@@ -235,22 +225,6 @@ def report(folder: Path) -> None:
     say(harness.write_report(folder))
 
 
-def _motion_files(_ctx: click.Context, _parameter: click.Parameter, files: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Files that can be written, before anything is simulated for them."""
-    if files:
-        from harness.records.folder import require_place  # noqa: PLC0415 - keeps --help fast
-        from harness.report.motion import writer_of  # noqa: PLC0415
-
-        for file in files:
-            writer_of(file)
-            require_place(file.parent)
-    return files
-
-
-def _sumo_files(ctx: click.Context, parameter: click.Parameter, folder: Path | None) -> tuple[Path, ...]:
-    return _motion_files(ctx, parameter, () if folder is None else (folder / "test.sumocfg",))
-
-
 @click.command(
     short_help="Simulate one test of a run again, bit for bit; watch or write it.",
     epilog=examples(
@@ -264,14 +238,14 @@ def _sumo_files(ctx: click.Context, parameter: click.Parameter, folder: Path | N
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
 @click.argument("episode", metavar="TEST", type=click.IntRange(min=0))
 @click.option(
-    "--out", "files", metavar="FILE", type=FILE, multiple=True, callback=_motion_files,
+    "--out", "files", metavar="FILE", type=FILE, multiple=True,
     help="Write the motion. The suffix says how: .html, a page that plays it; .csv, a row for each vehicle and step; "
     ".xosc, OpenSCENARIO XML 1.2 and its road (.xodr; extra 'export'); .xml, SUMO's floating car data. May be given "
     "several times.",
 )  # fmt: skip
 @click.option("--gui", is_flag=True, help="Show it in sumo-gui, halted at the onset (extra 'sumo').")
 @click.option(
-    "--sumo", "sumo_files", metavar="DIR", type=FOLDER, callback=_sumo_files,
+    "--sumo", "sumo_folder", metavar="DIR", type=FOLDER,
     help="Write what SUMO needs to repeat it: DIR/test.sumocfg, which sumo and sumo-gui run (-c), and its files.",
 )  # fmt: skip
 @click.option(
@@ -285,7 +259,7 @@ def replay(
     *,
     files: Sequence[Path],
     gui: bool,
-    sumo_files: Sequence[Path],
+    sumo_folder: Path | None,
     stored: bool,
     trust: bool,
     as_json: bool,
@@ -300,16 +274,21 @@ def replay(
     A vehicle of your own is code that DIR names; the replay runs it and says which. If DIR was not made by you on this
     machine, that takes --trust.
     """
-    from harness.records.folder import read_manifest  # noqa: PLC0415 - keeps --help fast
-    from harness.records.origin import code_of  # noqa: PLC0415
-    from harness.records.reader import read_campaign  # noqa: PLC0415
-    from harness.report.sumo_files import gui_program, watch  # noqa: PLC0415
+    from harness.records.folder import read_manifest, require_place
+    from harness.records.origin import code_of
+    from harness.records.reader import read_campaign
+    from harness.report.motion import writer_of
+    from harness.report.sumo_files import gui_program, watch
 
+    files = [*files, *([] if sumo_folder is None else [sumo_folder / "test.sumocfg"])]
+    for file in files:  # can be written, before anything is simulated for them
+        writer_of(file)
+        require_place(file.parent)
     if not stored and (code := code_of(read_campaign(folder, read_manifest(folder)).av)) is not None:
         say(f"The vehicle is {code}.", err=True)
     program = gui_program() if gui else None
     result = harness.replay(folder, episode, stored=stored, trust=trust)
-    written = [each for file in (*files, *sumo_files) for each in harness.write_motion(result, file)]
+    written = [each for file in files for each in harness.write_motion(result, file)]
     content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
     content |= {"files": [str(file) for file in written]}
     content |= {name: result.row[name] for name in LATERAL if name in result.row}

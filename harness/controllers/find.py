@@ -240,10 +240,12 @@ def has_foreign_code(av: AutomatedVehicle) -> bool:
 
 
 def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
-    """``work(*arguments)``, which runs an AV, in a process of its own.
+    """``work(*arguments)``, which runs an AV, in a process of its own where that `has_foreign_code`.
 
     Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process.
     """
+    if not has_foreign_code(av):
+        return work(*arguments)
     child = Child(tell, partial(work, *arguments))
     try:
         answer = first_to_answer([child]).answer()

@@ -36,15 +36,11 @@ class Asked(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """What a family has found: ``files`` to write, the environment's first, and what a terminal and JSON say of it.
-
-    ``fit`` is the fit itself, in the family's own terms.
-    """
+    """What a family has found: ``files`` to write, the environment's first, and what a terminal and JSON say of it."""
 
     files: Mapping[Path, bytes]
     told: tuple[str, ...]
     facts: Mapping[str, Any]
-    fit: Any
 
 
 class Fitter(Protocol):

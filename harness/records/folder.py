@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -45,14 +44,15 @@ ROWS_FOR_THREADS = 10_000
 NO_RUN = "Give a folder that `harness run` has written."
 
 
-def require_place(folder: Path, *, mend: str = "Choose another place, or change its permissions.") -> None:
+def require_place(folder: Path) -> None:
     """Refuse a folder in which nothing can be written, before work is spent on it; leaves it as it was."""
     try:
         with _made(folder):
             tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        found = f"a place where nothing can be written ({error.strerror})"
-        raise RunFolderError(str(folder), found, "a folder, or a place where one can be made", mend) from error
+        found, expected = f"a place where nothing can be written ({error.strerror})", "a folder, or a place for one"
+        mend = "Choose another place, or change its permissions."
+        raise RunFolderError(str(folder), found, expected, mend) from error
 
 
 @contextmanager
@@ -93,11 +93,6 @@ def write_bytes(path: Path, content: bytes) -> None:
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically."""
-    write_bytes(path, text.encode("utf-8"))
-
-
 def write_together(contents: Mapping[Path, bytes]) -> None:
     """Write files atomically, the first one last; none is put in place before all of them are written."""
     (path, content), *others = contents.items()
@@ -112,7 +107,8 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON atomically."""
-    write_text(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    write_bytes(path, f"{text}\n".encode())
 
 
 def write_sealed(path: Path, content: Mapping[str, Any]) -> None:
@@ -160,14 +156,9 @@ def remove_unlisted(folder: Path, parts: Iterable[Part]) -> None:
 
 
 def read_table(
-    path: Path,
-    columns: list[str] | None = None,
-    rows: pc.Expression | None = None,
-    *,
-    crc32: int | None = None,
-    mend: str = MEND_PART,
+    path: Path, columns: list[str] | None = None, *, crc32: int | None = None, mend: str = MEND_PART
 ) -> pa.Table:
-    """Read one Parquet file of a run, all ``rows`` by default.
+    """Read one Parquet file of a run.
 
     It must have the checksum ``crc32``; where there is none yet its pages are held against their own. It is opened
     once: what is decoded is what the checksum is of.
@@ -175,11 +166,8 @@ def read_table(
     try:
         content = path.read_bytes()
         require_sum(path, crc32, content, mend)
-        source = pa.BufferReader(content)
-        if rows is not None:
-            return pq.read_table(source, columns=columns, filters=rows, partitioning=None)
         # Faster than read_table by a millisecond.
-        with pq.ParquetFile(source, page_checksum_verification=crc32 is None) as file:
+        with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=crc32 is None) as file:
             table = file.read(columns, use_threads=file.metadata.num_rows > ROWS_FOR_THREADS)
     except (OSError, pa.ArrowException, KeyError, UnicodeDecodeError) as error:
         raise damaged(path, error, mend) from error
@@ -188,13 +176,11 @@ def read_table(
     return table
 
 
-def read_kept(
-    folder: Path, part: Part, table: str, columns: list[str] | None = None, rows: pc.Expression | None = None
-) -> pa.Table:
-    """One table of a part, with as many rows as the manifest says, unless ``rows`` are asked for; see `read_table`."""
+def read_kept(folder: Path, part: Part, table: str, columns: list[str] | None = None) -> pa.Table:
+    """One table of a part, with as many rows as the manifest says; see `read_table`."""
     file = part.files[table]
-    found = read_table(folder / file.path, columns, rows, crc32=file.crc32)
-    if rows is None and found.num_rows != file.n_rows:
+    found = read_table(folder / file.path, columns, crc32=file.crc32)
+    if found.num_rows != file.n_rows:
         expected = f"{file.n_rows} rows (manifest.json)"
         raise RunFolderError(str(folder / file.path), f"{found.num_rows} rows", expected, MEND_PART)
     return found

@@ -90,14 +90,12 @@ def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment |
 
 def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) -> pa.Table | None:
     """Trace rows of a few episodes; None where none of them was traced."""
-    wanted = pc.field("episode").isin(sorted(episodes))
-    tables = [
-        read_kept(folder, part, "traces", rows=wanted)
-        for part in parts
-        if "traces" in part.files and any(part.first_episode <= episode < part.end for episode in episodes)
-    ]
-    found = [table for table in tables if table.num_rows]
-    return concatenated(found, folder) if found else None
+    found = []
+    for part in parts:
+        if "traces" in part.files and any(part.first_episode <= episode < part.end for episode in episodes):
+            table = read_kept(folder, part, "traces")
+            found.append(table.filter(pc.is_in(table["episode"], pa.array(sorted(episodes)))))
+    return concatenated(found, folder) if any(table.num_rows for table in found) else None
 
 
 @dataclass(frozen=True)
@@ -156,24 +154,20 @@ class StoredRun:
         if not parts:
             mend = f"Run it into another folder with --set records.{name}=all."
             raise RunFolderError(str(self.folder), f"no {name}", f"a run whose campaign kept {name}", mend)
-        weighed, read = name == "episodes", partial(read_kept, self.folder, table=name)
-        asked = None if columns is None else [column for column in columns if not (weighed and column == _WEIGHT.name)]
-        kept = set(read(parts[0]).column_names)
-        if unknown := sorted(set(asked or ()) - kept):
+        read = partial(read_kept, self.folder, table=name)
+        made, of = ((_WEIGHT.name,), ("log_weight", "component")) if name == "episodes" else ((), ())
+        kept = read(parts[0]).column_names
+        shown = list(dict.fromkeys([*(kept if columns is None else columns), *made]))
+        needed = [column for column in dict.fromkeys([*shown, *of]) if column not in made]
+        if unknown := sorted({*needed} - {*kept}):
             found = f"no column {unknown[0]!r} in {name}"
             raise RunFolderError(str(self.folder), found, f"one of {', '.join(sorted(kept))}", "Correct its name.")
-        of_weight = ["log_weight", "component"] if weighed else []
-        needed = None if asked is None else list(dict.fromkeys([*asked, *of_weight]))
         per_shell = None
-        if weighed and (self.folder / SHELLS).is_file():
+        if made and (self.folder / SHELLS).is_file():
             components = (read(part, columns=["component"])["component"] for part in parts)
             per_shell = np.sum([np.bincount(shells, minlength=_MOST_SHELLS) for shells in components], axis=0)
         for piece in made_ahead(partial(read, columns=needed), parts, N_READERS):
-            if not weighed:
-                yield piece
-                continue
-            shown = list(dict.fromkeys([*(piece.column_names if columns is None else columns), _WEIGHT.name]))
-            yield piece.append_column(_WEIGHT, _weights(piece, per_shell)).select(shown)
+            yield (piece.append_column(_WEIGHT, _weights(piece, per_shell)) if made else piece).select(shown)
 
 
 def _weights(episodes: pa.Table, per_shell: IntArray | None) -> pa.Array:

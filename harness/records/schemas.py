@@ -331,15 +331,11 @@ def traces_table(shard: Shard) -> pa.Table:
     x, v, a, lane = np.concatenate([shard.traces[each].reshape(-1, 4) for each in rows]).T
     over = _came_over(shard.episode[row], step, scenario.sideways_m)
     columns = {
-        "episode": shard.first_episode + row,
-        "step": step,
-        "vehicle": _names(vehicle, scenario.vehicles),
-        "lane": lane.astype(np.int8),
-        "x_m": x,
-        "v_mps": v,
+        "episode": shard.first_episode + row, "step": step, "vehicle": _names(vehicle, scenario.vehicles),
+        "lane": lane.astype(np.int8), "x_m": x, "v_mps": v,
         "a_mps2": np.where(vehicle == n_vehicles - 1, a, np.round(a, 9)),  # the others are told speeds
         "lateral_m": np.where(vehicle == scenario.principal, over, 0.0),
-    }
+    }  # fmt: skip
     return _table(schema, columns)
 
 

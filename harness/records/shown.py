@@ -70,12 +70,12 @@ class ShownTests:
         """All tests of the run in a folder."""
         if not parts:
             raise no_episodes(folder)
-        outcomes, causes = Counter[str](), Counter[str]()
-        for part in parts:
-            outcomes.update(part.outcomes)
-            causes.update(part.causes)
-        rows, crashes = ([vars(part)[name] for part in parts] for name in ("rows", "crashes"))
-        return cls(outcomes, causes, concatenated(rows, folder), concatenated(crashes, folder))
+        return cls(
+            sum((part.outcomes for part in parts), Counter[str]()),
+            sum((part.causes for part in parts), Counter[str]()),
+            concatenated([part.rows for part in parts], folder),
+            concatenated([part.crashes for part in parts], folder),
+        )
 
 
 def _columns(family: Family, *, sees: bool) -> tuple[list[str], list[str]]:

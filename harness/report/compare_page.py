@@ -20,12 +20,12 @@ from harness.report.drawing import Plot
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
 from harness.report.player import Scene, Scenes, beside_other
 from harness.report.plots import WHO, pairs_plot
-from harness.report.summary import RunFolder, floats, read_run_folder
+from harness.report.summary import RunFolder, read_run_folder, summarise
 from harness.report.templates import write_page
 from harness.report.words import short_answer
 from harness.runner.stored import replay_episode
 from harness.strata import weight_of_a_test
-from harness.vocabulary import COMPARISON, FloatArray, IntArray
+from harness.vocabulary import COMPARISON, CRASH, FAILED, FloatArray, IntArray
 
 MEND = "Run `harness compare` again with the same --out."
 
@@ -92,23 +92,17 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
     axes = family_named(runs[0].campaign.scenario).maps[0]
     n_pairs, found = [shell["n_pairs"] for shell in shells], []
     for run in runs:
-        rows = run.tests.rows
-        component = rows["component"].to_numpy()
-        first = [np.flatnonzero(component == s)[:n] for s, n in enumerate(n_pairs)]
+        rows = summarise(run).rows
+        first = [np.flatnonzero(rows["component"] == s)[:n] for s, n in enumerate(n_pairs)]
         if [each.size for each in first] != n_pairs:
             raise RunFolderError(str(run.path), "fewer tests than pairs", f"those of {COMPARISON}", MEND)
-        tests, outcome = rows.take(np.concatenate(first)), rows["outcome"].cast(pa.string())
-        outcome = outcome.take(np.concatenate(first)).to_numpy()
-        values = {name: floats(tests[name]) for name in tests.column_names if name not in ("outcome", "contact")}
-        above = run.campaign.crash.counts_above_mps  # what is no harder is none here, as in the rates
-        hard = (values["impact_speed_mps"] > above) | (above == 0.0)
-        episode = np.where(outcome == "failed", -1.0, values["episode"])
-        found.append({**values, "episode": episode, "crash": (outcome == "crash") & hard})
-    a, b = (each["crash"] for each in found)
-    weight = np.repeat(weight_of_a_test(np.array([shell["p"] for shell in shells]), np.array(n_pairs)), n_pairs)
+        found.append({name: column[np.concatenate(first)] for name, column in rows.items()})
+    a, b = (each["outcome"] == CRASH for each in found)
     kept = a | b
     of_map = np.stack([np.where(a, axis.of(found[0]), axis.of(found[1]))[kept] for axis in axes])
-    episode, impact = (np.stack([of[name][kept] for of in found]) for name in ("episode", "impact_speed_mps"))
+    episode = np.stack([np.where(each["outcome"] == FAILED, -1.0, each["episode"])[kept] for each in found])
+    impact = np.stack([each["impact_speed_mps"][kept] for each in found])
+    weight = np.repeat(weight_of_a_test(np.array([shell["p"] for shell in shells]), np.array(n_pairs)), n_pairs)
     who = np.where(a & b, 0, np.where(a, 1, 2))[kept]
     return Pairs(who, weight[kept], of_map, episode.astype(np.int64), impact)
 

@@ -9,6 +9,7 @@ from typing import Any
 from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
+from harness.report.rows import decided
 from harness.report.words import ENDED, milder_words, scope_words
 
 
@@ -22,21 +23,12 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
     n, engine = count(content["n_episodes"]), "SUMO" if content["engine"] == "sumo" else "SUMO’s twin"
     scenarios = f"{len(content['families'])} scenarios"
     head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", duration(content["wall_time_s"])]
-    rows = [row for row in (decided(content), *sum_rows(content), *(reading_rows(content) if readings else ())) if row]
+    verdict = [] if content["decision"] is None else [decided(content["decision"]).texts]
+    rows = [*verdict, *sum_rows(content), *(reading_rows(content) if readings else ())]
     ends = [] if report is None else [f"  report  {report}"]
     parts = columns([(row[1], f"{row[2]} of all", *row[3:]) for row in family_rows(content)])
     under = wrapped([*milder(content), exposures(content), scope(content)])
     return [" · ".join(head), *columns(rows), *parts, *under, *ends]
-
-
-def decided(content: Mapping[str, Any]) -> tuple[str, ...]:
-    """The verdict on a limit; empty where none was asked."""
-    if (decision := content["decision"]) is None:
-        return ()
-    limit = f"{plain(decision['limit'])} × {content['beside']['reference']}"
-    where = {"accepted": f"below {limit}", "rejected": f"above {limit}"}.get(decision["verdict"], f"limit {limit}")
-    low, high = ratio(decision["low"]), ratio(decision["high"])
-    return decision["verdict"].upper(), where, f"{low} to {high}", f"confidence {plain(decision['confidence'])}"
 
 
 def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
-from harness.records.folder import write_text
+from harness.records.folder import write_bytes
 from harness.report.rows import within
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
@@ -62,4 +62,5 @@ def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path])
         ET.SubElement(element, case.outcome, message=told.pop(0))
     ET.SubElement(element, "system-out").text = "\n".join([*told, *attached, ""])
     ET.indent(root)
-    write_text(path, printable(ET.tostring(root, encoding="unicode", xml_declaration=True)) + "\n")
+    text = printable(ET.tostring(root, encoding="unicode", xml_declaration=True))
+    write_bytes(path, f"{text}\n".encode())

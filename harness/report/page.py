@@ -16,8 +16,9 @@ from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.report.crashes import crash_gallery, shown_of
 from harness.report.drawing import Plot
-from harness.report.hour_words import called, decided, exposures, family_rows, milder, reading_rows, scope, sum_rows
+from harness.report.hour_words import called, exposures, family_rows, milder, reading_rows, scope, sum_rows
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
+from harness.report.rows import decided
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
 from harness.report.templates import write_page
 from harness.report.words import short_answer
@@ -74,12 +75,12 @@ def write_page_of(run: RunFolder) -> Path:
 
 def write_hours(folder: Path, content: dict[str, Any]) -> Path:
     """Write the page of several scenarios: the sum, each one's part of it, and the way to each one's own page."""
-    rows = list(family_rows(content))
-    sizes = [content["families"][row[0]] for row in rows]
+    decision = content["decision"]
     return write_page(
         folder / "report.html", "hours.html.j2",
-        content=content, sums=[*sum_rows(content), *reading_rows(content)], verdict=decided(content),
-        rows=list(zip(rows, sizes, strict=True)),
+        content=content, sums=[*sum_rows(content), *reading_rows(content)],
+        verdict=None if decision is None else decided(decision).texts,
+        rows=[(row, content["families"][row[0]]) for row in family_rows(content)],
         warnings=list(milder(content)), exposures=exposures(content), scope=scope(content), called=called,
     )  # fmt: skip
 

@@ -44,7 +44,7 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) ->
     """All but those of the traffic's replicates."""
     best, decision, assumed, distance_km = told.best, told.decision, told.assumed, told.distance_per_test_km
     if decision is not None:
-        yield _decided(decision)
+        yield decided(decision)
     from_mps, high = campaign.crash.counts_above_mps, best.ci_high if best.n_crashes else best.upper_bound
     counted, wide = f"crash rate > {plain(from_mps)} m/s" if from_mps else "crash rate", best.is_wide
     from_below = wide and (best.is_open_above or (decision is not None and decision["verdict"] == "rejected"))
@@ -110,7 +110,8 @@ def _share_within(value: float, limits: tuple[float, float] | None, of: str) -> 
     return "" if high - low > ANY_SHARE else f"{share(value)} ({100.0 * low:.0f}–{100.0 * high:.0f} %){of}"
 
 
-def _decided(decision: Mapping[str, Any]) -> Row:
+def decided(decision: Mapping[str, Any]) -> Row:
+    """The verdict on a limit, of one scenario or of several."""
     driver, verdict = decision.get("driver"), decision["verdict"]
     limit = f"{plain(decision['limit'])} × {driver}" if driver else f"{plain(decision['limit'])} per test"
     low, high = (ratio(decision[end]) if driver else number(decision[end]) for end in ("low", "high"))

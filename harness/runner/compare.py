@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -20,9 +20,9 @@ from pydantic import Field
 
 from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
-from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.files import campaign_of
 from harness.campaign.sections import MOST_EVENTS
+from harness.campaign.vehicle import Limits
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
 from harness.estimators.answer import ended_by
 from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
@@ -35,9 +35,9 @@ from harness.records.folder import CAMPAIGN, read_manifest, sole_use, write_seal
 from harness.records.origin import code_of, require_trust
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import Earlier, require_own_folder
-from harness.runner.run import begun, finish, show, workers_of
+from harness.runner.run import begun
 from harness.sampling.protocol import ShardRequest
-from harness.sampling.shells import PairRounds, Shells, round_requests
+from harness.sampling.shells import PairRounds, Shells
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import COMPARISON
 
@@ -149,22 +149,14 @@ def compare_campaigns(
     rule = PairRule(sides[0].campaign, margin, rhw)
     rounds, pairs, shown = _compared(sides, folders, rule, workers, progress or Progress())
     found = paired_estimate(pairs, a.stop.confidence)
-    labels = labels or (a.name, b.name)
+    told = zip(SIDES, labels or (a.name, b.name), sides, strict=True)
+    campaigns = {name: {"label": label, "campaign_hash": side.content_hash} for name, label, side in told}
     content = {
-        "format": 1,
-        "method": a.testing.method,
-        "seed": a.seed,
-        "campaigns": {
-            name: {"label": label, "campaign_hash": side.content_hash}
-            for name, label, side in zip(SIDES, labels, sides, strict=True)
-        },
-        **found,
-        "decision": asdict(rule.decision),
-        "to_decide": _to_decide(sides[0].campaign, rounds, pairs),
+        "format": 1, "method": a.testing.method, "seed": a.seed, "campaigns": campaigns, **found,
+        "decision": asdict(rule.decision), "to_decide": _to_decide(sides[0].campaign, rounds, pairs),
         "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
-        "ended": ended_by(a, rule, found["n_pairs"]),
-        "unseen": sides[0].parameters.unseen,
-    }
+        "ended": ended_by(a, rule, found["n_pairs"]), "unseen": sides[0].parameters.unseen,
+    }  # fmt: skip
     code = EXIT_DONE if rule.look.stopped else EXIT_BUDGET_SPENT
     if margin is not None:
         code = EXIT_OF[rule.decision.verdict]
@@ -184,46 +176,31 @@ def _compared(
             held.enter_context(sole_use(folder))
         both = list(zip(folders, sides, strict=True))
         earlier = [require_own_folder(*each, resume=True) for each in both]  # both, before either is touched
-        crews = [working.enter_context(closing(workers_of(side, workers, n_runs=2))) for side in sides]
-        runs = [begun(*each, found, crew, progress) for each, found, crew in zip(both, earlier, crews, strict=True)]
-        source = runs[0].source  # the other's is the same: one environment and one library make one pool
-        if not isinstance(source, Shells):
-            raise TypeError("the campaigns do not draw from shells")
+        begins = [begun(*each, found, workers, progress, 2) for each, found in zip(both, earlier, strict=True)]
+        runs = [working.enter_context(each) for each in begins]
+        source = runs[0].run.source  # the other's is the same: one environment and one library make one pool
+        assert isinstance(source, Shells)
         design, available = source.prescribed.design, source.prescribed.available
         rounds, pairs = PairRounds(campaign, design, available, rule), PairedShells(design)
-
-        def drive(side: int, requests: Sequence[ShardRequest]) -> None:
-            for shard in crews[side].run(iter(requests), runs[side].known):
-                runs[side] = runs[side].with_shard(shard)
+        progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
+        for side, each in enumerate(runs):
+            for shard in each.drive(stored_requests(each.run.earlier), rule):
                 pairs.add(side, shard.block)
-                show(runs[side], shard, rule, progress)
-
-        try:
-            progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
-            for side, run in enumerate(runs):
-                for request in stored_requests(run.earlier):
-                    drive(side, [request])
-            n_pairs = np.zeros_like(pairs.tests(0))
+        n_pairs = np.zeros_like(pairs.tests(0))
+        counts = pairs.first(n_pairs)
+        while (added := rounds.next_round(counts)).any():
+            n_pairs = n_pairs + added
+            for side, each in enumerate(runs):  # what is missing of the first events of each stratum
+                tested = pairs.tests(side)
+                for shard in each.drive_added(tested, np.maximum(n_pairs - tested, 0), rule):
+                    pairs.add(side, shard.block)
             counts = pairs.first(n_pairs)
-            while (added := rounds.next_round(counts)).any():
-                n_pairs = n_pairs + added
-                for side, run in enumerate(runs):  # what is missing of the first events of each stratum
-                    tested = pairs.tests(side)
-                    if (missing := np.maximum(n_pairs - tested, 0)).any():
-                        places = len(run.blocks), run.n_episodes, campaign.run.smallest_shard
-                        drive(side, round_requests(tested, missing, *places))
-                counts = pairs.first(n_pairs)
-                if rule.observe(counts):
-                    break
-            for run in runs:
-                run.require_few_failed()
-        except BaseException:
-            for run in runs:
-                run.written("interrupted")
-            raise
+            if rule.observe(counts):
+                break
+        for each in runs:
+            each.run.require_few_failed()
         working.close()
-        done = zip(runs, crews, strict=True)
-        return rounds, counts, [finish(run, rule, crew.cpus(), progress).shown for run, crew in done]
+        return rounds, counts, [each.finish(rule).shown for each in runs]
 
 
 def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: PairCounts) -> dict[str, Any] | None:
@@ -304,15 +281,14 @@ def require_same_shells(sides: Both, stored: str | Path | None = None) -> None:
 def _limit_both(sides: Both, harder: int, stored: str | Path | None) -> str:
     """How to compare vehicles of which the ``harder`` side accelerates beyond the envelope of the library."""
     av, envelope = sides[harder].campaign.av, sides[harder].library.envelope_mps2
-    built_in = isinstance(av.parameters, BuiltInParameters)
-    if not built_in and av.controller is None and av.fmu is None:
+    if av.source in ("sumo", "traci"):
         return "Nothing in the harness limits a vehicle that SUMO or a program drives: compare it with another such."
-    key = f"av.{'parameters' if built_in else 'limits'}.max_acceleration_mps2"
-    if stored is not None and harder:
-        return f"Add --against {key}={envelope:g}, which limits B."
-    mend = f"Add --set {key}={envelope:g}, which limits both."
-    if not built_in and "max_acceleration_mps2" not in av.limits.model_fields_set:
-        mend += f" Nobody has limited {SIDES[harder].upper()}: its limit is the default."
-    if stored is not None:
-        mend += f" The run in {stored} had none: name A's vehicle or campaign instead, so that it is run again."
-    return mend
+    section, default = "parameters", ""
+    if av.model is None:
+        section, default = "limits", f" (by default {Limits().max_acceleration_mps2:g})"
+    limit = f"av.{section}.max_acceleration_mps2={envelope:g}"
+    if stored is None:
+        return f"Add --set {limit}, which limits both{default}."
+    if harder:
+        return f"Add --against {limit}, which limits B."
+    return f"Name A's vehicle or campaign, not {stored}, so that it is run again with --set {limit}."

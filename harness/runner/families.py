@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,20 +24,23 @@ from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import HourRule
 from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
+from harness.pool.shells import PrescribedEpisodes
 from harness.processes import PRINTED
 from harness.progress import Progress
-from harness.records.folder import read_as, read_manifest, require_place, sole_use, write_sealed
+from harness.records.folder import read_as, read_manifest, sole_use, write_sealed
 from harness.records.reader import read_campaign
 from harness.resolved import Resolved, require_ready, resolve
-from harness.runner.kept import Run, require_no_fewer, require_own_folder
-from harness.runner.run import ESTIMATES, EXIT_OF, RunResult, begun, finish, show, with_baseline, workers_of
+from harness.runner.kept import require_no_fewer, require_own_folder
+from harness.runner.run import ESTIMATES, EXIT_OF, RunResult, Underway, begun
 from harness.runner.stored import stored_blocks
 from harness.sampling.hours import HourRounds
 from harness.sampling.milder import beyond_scope
-from harness.sampling.shells import Shells, round_requests
+from harness.sampling.shells import Shells
 from harness.vocabulary import FAMILIES
 
 MEND = "Run the campaign again into the same folder with --resume."
+_SHOWN = ("families", "per_hour", "beside", "readings", "milder", "decision")
+"""Keys of ``families.json`` without which nothing can be shown."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +68,19 @@ def run_families(
 ) -> Hours:
     """Run the scenarios of a campaign until their sum is known; see `harness.run`."""
     names, progress, began = campaign.scenarios or [], progress or Progress(), time.monotonic()
-    require_no_other(out, names)
     ready = {name: require_ready(campaign.of_family(name)) for name in names}
     require_same_driver(campaign, ready)
     rule = HourRule(campaign)
     with ExitStack() as held:
         held.enter_context(sole_use(out))
-        folders = {name: out / name for name in names}
-        for folder in folders.values():
-            held.enter_context(sole_use(folder))
-        earlier = {name: require_own_folder(folders[name], ready[name], resume=resume) for name in names}
-        hour, results = _run(campaign, ready, folders, earlier, rule, workers, progress)
+        require_no_other(out, names)
+        for name in names:
+            held.enter_context(sole_use(out / name))
+        earlier = {name: require_own_folder(out / name, ready[name], resume=resume) for name in names}
+        begins = {
+            name: begun(out / name, each, earlier[name], workers, progress, len(names)) for name, each in ready.items()
+        }
+        hour, results = _run(campaign, begins, rule, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     milder = {name: of for name, each in results.items() if (of := each.estimates.get("milder"))}
@@ -83,84 +88,60 @@ def run_families(
     if (decision := rule.look.decision) is not None:
         decision = replace(decision, n_milder=beyond)
         code = EXIT_OF[decision.verdict]
+    from harness.report.page import write_hours  # noqa: PLC0415 - draws
+    from harness.report.words import vehicle_words  # noqa: PLC0415
+
     asked = {
         "format": 1, "name": campaign.name, "seed": campaign.seed, "engine": campaign.world.engine,
         "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
         "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
-        "milder": milder, "vehicle": vehicle_name(campaign), "wall_time_s": round(time.monotonic() - began, 3),
+        "milder": milder, "vehicle": vehicle_words(campaign.av)[0], "wall_time_s": round(time.monotonic() - began, 3),
     }  # fmt: skip
     impacts = {name: _median_impact(each.estimates) for name, each in results.items()}
     content = finite_json({**asked, **_answer(hour, ready, impacts, campaign.stop.confidence)})
     write_sealed(out / FAMILIES, content)
-    from harness.report.page import write_hours  # noqa: PLC0415 - draws
-
     return Hours(out, content, write_hours(out, content), results, code)
 
 
 def _run(
-    campaign: Campaign,
-    ready: Mapping[str, Resolved],
-    folders: Mapping[str, Path],
-    earlier: Mapping[str, dict[str, Any]],
-    rule: HourRule,
-    workers: int | None,
-    progress: Progress,
+    campaign: Campaign, begins: Mapping[str, AbstractContextManager[Underway]], rule: HourRule, progress: Progress
 ) -> tuple[PerHour, dict[str, RunResult]]:
-    names = list(ready)
+    runs: dict[str, Underway] = {}
     with ExitStack() as working:
-        crews = {
-            name: working.enter_context(closing(workers_of(ready[name], workers, n_runs=len(names)))) for name in names
-        }
-        runs: dict[str, Run] = {}
-        try:
-            for name in names:
-                progress.remark = f" ({name.replace('_', ' ')})"
-                run = begun(folders[name], ready[name], earlier[name], crews[name], progress)
-                runs[name] = with_baseline(run, crews[name], progress)
-            progress.remark = ""
-            hour = _empty(campaign, runs)
-            available = [_source(runs[name]).prescribed.available for name in names]
-            rounds = HourRounds(campaign, hour, available, rule)
-            progress.stage("tests of all scenarios", None, done=sum(run.earlier.n_episodes for run in runs.values()))
-            while np.concatenate(added_to := rounds.next_round(hour)).any():
-                for of, added in zip(hour.families, added_to, strict=True):
-                    run = runs[of.family]
-                    places = len(run.blocks), run.n_episodes, campaign.run.smallest_shard
-                    requests = round_requests(of.tally.tests, added, *places) if added.any() else []
-                    for shard in crews[of.family].run(iter(requests), run.known):
-                        run = runs[of.family] = run.with_shard(shard)
-                        of.seen.add(shard.block)
-                        show(run, shard, rule, progress)
-                if rule.observe(hour) and all(run.n_episodes >= run.earlier.n_episodes for run in runs.values()):
-                    break
-            for run in runs.values():
-                run.require_few_failed()
-                require_no_fewer(run.folder, earlier[run.resolved.campaign.scenario], run.n_episodes)
-        except BaseException:
-            for run in runs.values():
-                run.written("interrupted")
-            raise
-        working.close()
-        of_all, rule.look = rule.look, replace(rule.look, decision=None)  # which is about the sum
-        results = {name: finish(runs[name], rule, crews[name].cpus(), progress, of_sum=True) for name in names}
-        rule.look = of_all
-        return hour, results
+        for name, each in begins.items():
+            progress.remark = f" ({name.replace('_', ' ')})"
+            runs[name] = working.enter_context(each)
+            runs[name].drive_before_tests()
+        progress.remark = ""
+        hour = PerHour([_no_test_yet(underway, campaign.exposure) for underway in runs.values()])
+        rounds = HourRounds(campaign, hour, [_drawn(underway).available for underway in runs.values()], rule)
+        n_held = {name: underway.run.earlier.n_episodes for name, underway in runs.items()}
+        progress.stage("tests of all scenarios", None, done=sum(n_held.values()))
+        while np.concatenate(added_to := rounds.next_round(hour)).any():
+            for of, added in zip(hour.families, added_to, strict=True):
+                for shard in runs[of.family].drive_added(of.tally.tests, added, rule):
+                    of.seen.add(shard.block)
+            if rule.observe(hour) and all(runs[name].run.n_episodes >= n for name, n in n_held.items()):
+                break
+        for underway in runs.values():
+            underway.run.require_few_failed()
+            require_no_fewer(underway.run.folder, underway.run.earlier.n_episodes, underway.run.n_episodes)
+    of_all, rule.look = rule.look, replace(rule.look, decision=None)  # which is about the sum
+    results = {name: underway.finish(rule, of_sum=True) for name, underway in runs.items()}
+    rule.look = of_all
+    return hour, results
 
 
-def _source(run: Run) -> Shells:
-    if not isinstance(run.source, Shells):
-        raise TypeError("the scenarios do not draw from shells")
-    return run.source
+def _drawn(underway: Underway) -> PrescribedEpisodes:
+    """The tests of one of several scenarios, which are of shells (`REFUSED`)."""
+    assert isinstance(underway.run.source, Shells)
+    return underway.run.source.prescribed
 
 
-def _empty(campaign: Campaign, runs: Mapping[str, Run]) -> PerHour:
-    """Of no test yet."""
-    families = []
-    for name, run in runs.items():
-        seen, design = SeenShells(), _source(run).prescribed.design
-        seen.count(design, empty_tally(design.cell_p.size))
-        families.append(OfFamily(name, _exposure(run.resolved, campaign.exposure), seen))
-    return PerHour(families)
+def _no_test_yet(underway: Underway, exposures: Mapping[str, float]) -> OfFamily:
+    resolved, design, seen = underway.run.resolved, _drawn(underway).design, SeenShells()
+    seen.count(design, empty_tally(design.cell_p.size))
+    return OfFamily(resolved.campaign.scenario, _exposure(resolved, exposures), seen)
 
 
 def _answer(
@@ -185,8 +166,15 @@ def _median_impact(estimates: Mapping[str, Any]) -> float | None:
 
 
 def read_families(folder: Path) -> dict[str, Any]:
-    """``families.json`` of a folder; a `RunFolderError` where it is missing or damaged."""
-    return read_as(dict[str, Any], folder / FAMILIES, mend=MEND)
+    """``families.json`` of a folder; a `RunFolderError` where it is missing, damaged, or another version's."""
+    if not (folder / FAMILIES).is_file():
+        found, expected = "a run of one scenario", "a folder of several, which has families.json"
+        raise RunFolderError(str(folder), found, expected, "Leave out --exposure: one scenario has no rate per hour.")
+    content = read_as(dict[str, Any], folder / FAMILIES, mend=MEND)
+    if missing := [key for key in _SHOWN if key not in content]:
+        expected = "an answer as this version of the harness writes it"
+        raise RunFolderError(str(folder / FAMILIES), f"no key {missing[0]}", expected, MEND)
+    return content
 
 
 @checked("harness.estimate_families")
@@ -250,24 +238,7 @@ def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> No
 
 def require_no_other(out: Path, names: Sequence[str]) -> None:
     """Refuse (`RunFolderError`) a folder that holds something else than runs of these scenarios."""
-    require_place(out)
     known = {*names, FAMILIES, PRINTED, "report.html"}
-    if out.exists() and (
-        other := sorted(each.name for each in out.iterdir() if each.name[0] != "." and each.name not in known)
-    ):
+    if other := sorted(each.name for each in out.iterdir() if each.name[0] != "." and each.name not in known):
         expected = "a new or empty folder, or one of the same scenarios"
         raise RunFolderError(str(out), f"a folder with {other[0]}", expected, "Choose another folder with --out.")
-
-
-def vehicle_name(campaign: Campaign) -> str:
-    """Of the vehicle, as answers have it."""
-    from harness.report.words import vehicle_words  # noqa: PLC0415 - draws
-
-    return vehicle_words(campaign.av)[0]
-
-
-def require_families(folder: Path) -> None:
-    """Refuse (`RunFolderError`) a folder of one scenario."""
-    if not (folder / FAMILIES).is_file():
-        found, expected = "a run of one scenario", "a folder of several, which has families.json"
-        raise RunFolderError(str(folder), found, expected, "Leave out --exposure: one scenario has no rate per hour.")

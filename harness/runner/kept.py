@@ -37,7 +37,6 @@ from harness.records.folder import (
     read_kept,
     read_manifest,
     remove_unlisted,
-    require_place,
     write_bytes,
     write_part,
     write_sealed,
@@ -76,15 +75,12 @@ class Earlier:
         found = [self._tables(part) for part in self.parts if part.first_episode < first + n and part.end > first]
         if first + n > self.n_episodes or not found or None in found:
             return None
-        tables: dict[str, pa.Table | None] = dict.fromkeys(TABLES)
-        for name in TABLES:
-            for part in found:
-                if part is not None and name in part:
-                    index = part[name].column("episode").to_numpy()
-                    low, high = np.searchsorted(index, (first, first + n)).tolist()
-                    rows = part[name].slice(low, high - low)
-                    tables[name] = rows if tables[name] is None else pa.concat_tables([tables[name], rows])
-        return ShardTables(**tables)
+        rows: dict[str, list[pa.Table]] = {name: [] for name in TABLES}
+        for part in found:
+            for name, table in (part or {}).items():
+                low, high = np.searchsorted(table.column("episode").to_numpy(), (first, first + n)).tolist()
+                rows[name].append(table.slice(low, high - low))
+        return ShardTables(*(pa.concat_tables(rows[name]) if rows[name] else None for name in TABLES))
 
     def _tables(self, part: Part) -> dict[str, pa.Table] | None:
         if self._read is None or self._read[0] is not part:
@@ -160,7 +156,7 @@ class Run:
             n_rows=self.n_rows + sum(table.num_rows for table in shard.tables if table is not None),
             n_crashes=self.n_crashes + int(shard.block.crash.sum()),
             failures=self.failures + shard.failures,
-            repeated=self.repeated or shard.repeated,
+            repeated=shard.repeated or self.repeated,
         )
         run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
         if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or run.n_rows >= PART_ROWS:
@@ -229,18 +225,12 @@ class Run:
         repeated, campaign = self.repeated, self.resolved.campaign
         return {
             **self.facts,
-            "status": status,
-            "stopped_by": None,
-            "unmet": [],
-            "wall_time_s": self.took_s,
-            **of_the_end,
+            "status": status, "stopped_by": None, "unmet": [], "wall_time_s": self.took_s, **of_the_end,
             "reproducible": campaign.av.reproducible and not (repeated and repeated.differing),
             "repeated": None if repeated is None else asdict(repeated),
-            "n_episodes": self.n_episodes,
-            "parts": self.parts,
-            "before": self.parts_before,
+            "n_episodes": self.n_episodes, "parts": self.parts, "before": self.parts_before,
             **({"shadow_runs": _counted(self.before[SHADOW])} if SHADOW in self.before else {}),
-        }
+        }  # fmt: skip
 
 
 def take_over(
@@ -250,23 +240,18 @@ def take_over(
     campaign = resolved.campaign
     yaml = dump_campaign(campaign).encode()
     of_run = {
-        "format": 1,
-        "name": campaign.name,
-        "campaign_hash": resolved.content_hash,
-        "campaign_crc32": zlib.crc32(yaml),
-        "signature": signature(yaml),
+        "format": 1, "name": campaign.name, "campaign_hash": resolved.content_hash,
+        "campaign_crc32": zlib.crc32(yaml), "signature": signature(yaml),
         "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
-        "seed": campaign.seed,
-        "engine": campaign.world.engine,
-        "versions": versions(),
-        "cpu": cpu_name(),
-        "controller_sha256": resolved.controller_sha256,
-        **facts,
-    }
+        "seed": campaign.seed, "engine": campaign.world.engine, "versions": versions(), "cpu": cpu_name(),
+        "controller_sha256": resolved.controller_sha256, **facts,
+    }  # fmt: skip
     began -= float(earlier.get("wall_time_s") or 0.0)
     listed = earlier["before"].items()
     there = {name: part for name, part in listed if (folder / part.files[name].path).exists()}
-    return Run(folder, resolved, source, Earlier(folder, earlier), began, of_run, parts_before=there).written()
+    repeated = Repeated(**known) if (known := earlier.get("repeated")) else None
+    held = Earlier(folder, earlier)
+    return Run(folder, resolved, source, held, began, of_run, repeated=repeated, parts_before=there).written()
 
 
 def _counted(tables: Sequence[pa.Table]) -> dict[str, int]:
@@ -294,29 +279,25 @@ def require_few_failed(
     """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
     if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in by_kind(causes).most_common(1))
-        unbound = "Add --set av.traci_style.decel_mps2=4.5 --set av.traci_style.accel_mps2=2.6 (SUMO's own). "
-        raise TooManyFailedError(
-            "run.max_failed_share",
-            f"{causes.total()} of {n} {what} failed{cause}",
-            f"a share of at most {most:g}",
-            (unbound if "av.traci_style.decel_mps2" in cause else "")
-            + "Fix the AV (`harness av-check` looks at it in seconds), or raise the share to go on. All causes "
-            f"are in the column 'failure' of {where}.",
-        )
+        mend = "Fix the AV (`harness av-check` looks at it in seconds), or raise the share to go on."
+        if "av.traci_style.decel_mps2" in cause:
+            mend = f"Add --set av.traci_style.decel_mps2=4.5 --set av.traci_style.accel_mps2=2.6 (SUMO's own). {mend}"
+        found, expected = f"{causes.total()} of {n} {what} failed{cause}", f"a share of at most {most:g}"
+        mend += f" All causes are in the column 'failure' of {where}."
+        raise TooManyFailedError("run.max_failed_share", found, expected, mend)
 
 
 def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:
     """Refuse a folder that holds something else; return the manifest of a run to be continued, or one without tests.
 
-    Raises `RunFolderError`: the folder cannot be written to, holds another campaign, this one without ``--resume`` or
-    with another controller (one file may not mix two versions of it), or files that are no run.
+    Raises `RunFolderError`: the folder holds another campaign, this one without ``--resume`` or with another controller
+    (one file may not mix two versions of it), or files that are no run.
     """
 
     def refusal(found: str, expected: str, mend: str) -> RunFolderError:
         return RunFolderError(str(folder), found, expected, mend)
 
-    require_place(folder)
-    if not folder.exists() or not any(folder.iterdir()):
+    if not any(folder.iterdir()):
         return {"n_episodes": 0, "parts": [], "before": {}}
     elsewhere = "Choose another folder with --out."
     if not (folder / MANIFEST).exists():
@@ -324,26 +305,22 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         raise refusal("a folder with other files", expected, elsewhere)
     manifest = read_manifest(folder, mend=elsewhere)
     if manifest["campaign_hash"] != resolved.content_hash:
-        raise refusal(
-            f"another campaign ({manifest.get('name')}, {manifest['campaign_hash']})",
-            f"a folder for this one ({resolved.content_hash})",
-            "Choose another folder with --out, or run the campaign.yaml that it holds.",
-        )
+        found = f"another campaign ({manifest.get('name')}, {manifest['campaign_hash']})"
+        mend = "Choose another folder with --out, or run the campaign.yaml that it holds."
+        raise refusal(found, f"a folder for this one ({resolved.content_hash})", mend)
     if not resume:
         mend = "Continue it with --resume, or choose another folder with --out."
         raise refusal("this campaign, already begun", "a new or empty folder", mend)
     if manifest.get("controller_sha256") != resolved.controller_sha256:
-        raise refusal(
-            "tests of this campaign whose controller's source file has been changed since",
-            "the same controller for all tests of a run",
-            "Restore the file, or test the new controller in another folder with --out.",
-        )
+        found = "tests of this campaign whose controller's source file has been changed since"
+        mend = "Restore the file, or test the new controller in another folder with --out."
+        raise refusal(found, "the same controller for all tests of a run", mend)
     return manifest
 
 
-def require_no_fewer(folder: Path, earlier: dict[str, Any], n_episodes: int) -> None:
+def require_no_fewer(folder: Path, held: int, n_episodes: int) -> None:
     """Refuse (`RunFolderError`) to throw away finished tests, which the stop rule asked for now would not keep."""
-    if n_episodes < (held := earlier["n_episodes"]):
+    if n_episodes < held:
         found = f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n_episodes:,}"
         expected = "a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there"
         mend = "Repeat the --set options of the earlier run or ask for more; `harness estimate` reads what is there."

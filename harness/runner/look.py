@@ -18,7 +18,7 @@ from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.find import build_host, has_foreign_code, run_apart
+from harness.controllers.find import build_host, has_foreign_code
 from harness.controllers.hosts import ControllerHost, Failures
 from harness.controllers.protocol import BatchObservation
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
@@ -174,35 +174,15 @@ def check_av(campaign: Campaign | str | Path, n_episodes: Annotated[int, Field(g
     family = source.resolved.family
     early = tested.av.acts_before_event or family.follows
     return AvCheck(
-        source=tested.av.source,
-        engine=tested.world.engine,
-        method=tested.testing.method,
-        shows=source.scenario.shows,
-        n_episodes=n_episodes,
-        failures=dict(by_kind(Counter(first.failures.values()))),
-        differing=differing,
-        likely_cause=cause,
-        clock_read_at=clock_read_at,
-        limits_mps2=limits,
+        source=tested.av.source, engine=tested.world.engine, method=tested.testing.method,
+        shows=source.scenario.shows, n_episodes=n_episodes, failures=dict(by_kind(Counter(first.failures.values()))),
+        differing=differing, likely_cause=cause, clock_read_at=clock_read_at, limits_mps2=limits,
         moved_mps2={} if family.follows else _moved_by_warm_up(source, min(n_episodes, WARM_UP_EPISODES)),
-        behaviour=_behaviour(first, limits, early=early),
-        idm_behaviour=_behaviour(of_idm, limits, early=early),
-        speed=own_speed,
-        idm_speed=idm_speed,
-        events=family.words.events,
+        behaviour=_behaviour(first, limits, early=early), idm_behaviour=_behaviour(of_idm, limits, early=early),
+        speed=own_speed, idm_speed=idm_speed, events=family.words.events,
         follows=_follows(first) if family.follows else None,
         idm_follows=_follows(of_idm) if family.follows else None,
-    )
-
-
-def check_av_apart(campaign: Campaign, n_episodes: int = EPISODES) -> AvCheck:
-    """`check_av` in a process of its own where the AV is a user's code.
-
-    If that ends the process, the `AvEndedProcessError` names its last call.
-    """
-    if not has_foreign_code(campaign.av):
-        return check_av(campaign, n_episodes)
-    return run_apart(campaign.av, check_av, campaign, n_episodes)
+    )  # fmt: skip
 
 
 def _as_checked(campaign: Campaign) -> Campaign:

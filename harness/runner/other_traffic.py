@@ -16,8 +16,7 @@ import numpy as np
 
 from harness.arguments import Confidence, checked
 from harness.errors import CampaignError
-from harness.estimators.answer import CARRIES, estimate_blocks
-from harness.estimators.answer import Elsewhere as OfOtherTraffic
+from harness.estimators.answer import CARRIES, Elsewhere, estimate_blocks
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
 from harness.estimators.traffic import ONE_LAW, Ends, TrafficError, Uncertain, Unseen, uncertain
@@ -26,7 +25,7 @@ from harness.families.replicates import read_replicates
 from harness.pool.moved import assumed
 from harness.progress import Progress
 from harness.resolved import resolve
-from harness.runner.stored_shells import ELSEWHERE, OPTION, Elsewhere, Nearby, StoredShells, moved_to, require_shares
+from harness.runner.stored_shells import ELSEWHERE, OPTION, Nearby, StoredShells, moved_to, require_shares
 from harness.vocabulary import EstimatorName, FloatArray
 
 
@@ -81,24 +80,24 @@ def estimate_in_other_traffic(
     if not moved.is_same:
         drivers = tuple(each.name for each in tested.design.references)
         was, now = (Path(each).stem for each in (campaign.environment.parameters, environment))
-        content |= finite_json({"elsewhere": OfOtherTraffic(was, now, drivers, moved.reference_error())})
+        content |= finite_json({"elsewhere": Elsewhere(was, now, drivers, moved.reference_error())})
     return content | finite_json({"traffic": traffic_error(moved, content, progress)})
 
 
-def traffic_error(moved: Elsewhere, content: Mapping[str, Any], progress: Progress) -> TrafficError | None:
+def traffic_error(moved: StoredShells, content: Mapping[str, Any], progress: Progress) -> TrafficError | None:
     """What the replicates of its traffic leave open of an answer; None where it has none.
 
     Raises `HarnessError`: their file is missing or wrong.
     """
-    tested, estimate = moved.tested, content["estimates"]["shells"]
+    estimate = content["estimates"]["shells"]
     if (found := _replicated([moved], content["confidence"], progress)) is None:
         return None
-    sampling, held = (estimate["ci_low"], estimate["ci_high"]), tested.holds
+    sampling, held = (estimate["ci_low"], estimate["ci_high"]), moved.holds
     if not estimate["n_crashes"] or not held:
         sampling = 0.0, estimate["upper_bound"]
     times, from_below = found.times(0), found.unseen is None and held
     rate = found.uncertain(estimate["crash_rate"], sampling, times, from_below=from_below, held=held)
-    drivers, ratios = [each.name for each in tested.design.references], {}
+    drivers, ratios = [each.name for each in moved.design.references], {}
     for each in estimate["details"]["references"]:
         moves = times / np.array([one.references[drivers.index(each["reference"])] for one in found.near[0]])
         ratios[each["reference"]] = found.uncertain(
@@ -124,7 +123,7 @@ def compare_in_other_traffic(
     moved = [moved_to(side, there, environment, progress) for side in sides]
     pairs = PairedShells(moved[0].design)
     for side, of in enumerate(moved):
-        for block in of.tested.blocks:
+        for block in of.blocks:
             pairs.add(side, of.block(block))
     confidence = confidence or there.campaign.stop.confidence
     told = paired_estimate(pairs.first(np.minimum(pairs.tests(0), pairs.tests(1))), confidence)
@@ -170,7 +169,7 @@ class Replicated:
         return TrafficError(self.environment, self.confidence, n, self.n_refused, off, rate, ratios, self.unseen)
 
 
-def _replicated(sides: Sequence[Elsewhere], confidence: float, progress: Progress) -> Replicated | None:
+def _replicated(sides: Sequence[StoredShells], confidence: float, progress: Progress) -> Replicated | None:
     """Answers of stored runs in the replicates of one traffic; None without any."""
     settings = sides[0].traffic.campaign.environment
     parameters = sides[0].traffic.parameters
@@ -188,7 +187,7 @@ def _replicated(sides: Sequence[Elsewhere], confidence: float, progress: Progres
     return Replicated(name, confidence, near, len(values) - len(kept), unseen)
 
 
-def _unseen(moved: Elsewhere, parameters: Parameters, progress: Progress) -> Unseen | None:
+def _unseen(moved: StoredShells, parameters: Parameters, progress: Progress) -> Unseen | None:
     """Steps in which no event was seen, of those that carry a notable part of the rate.
 
     What a step carries is what its share of the events moves: a rate is linear in it.

@@ -27,10 +27,10 @@ from harness.campaign.sections import RaySettings
 from harness.compiled import source_hash
 from harness.controllers.find import require_controller
 from harness.errors import CampaignError, HarnessError
-from harness.processes import WorkerDeath, fit_to_travel, usable_cpus
+from harness.processes import Child, WorkerDeath, fit_to_travel, usable_cpus
 from harness.resolved import Resolved
 from harness.runner.kept import cpu_name
-from harness.runner.workers import CLOSING_S, LocalWorkers, Result, WorkerLostError, WorkerProcess, Workers
+from harness.runner.workers import CLOSING_S, LocalWorkers, Result, WorkerLostError, Workers
 from harness.sampling import source_of
 from harness.signals import handlers_restored
 
@@ -68,7 +68,7 @@ class OnMachine:
     def __init__(self, resolved: Resolved) -> None:
         self._resolved = resolved
         self._workers = LocalWorkers(resolved, 1)
-        self._worker: WorkerProcess | None = None
+        self._worker: Child | None = None
         self._follows = False
 
     def begin(self, cached: Files) -> tuple[dict[str, str | None], str] | Exception:
@@ -107,7 +107,7 @@ class OnMachine:
 
 
 class RayWorker:
-    """An actor, seen from the run as a `WorkerProcess`; ``pending`` is what it is asked for."""
+    """An actor, seen from the run as a `Child`; ``pending`` is what it is asked for."""
 
     def __init__(self, actor: Any, pending: ray.ObjectRef[Any], workers: RayWorkers) -> None:
         self._actor, self.pending, self._workers = actor, pending, workers
@@ -222,23 +222,17 @@ class RayWorkers(Workers):
         if machine is None:
             self._lost_at_start += 1
             if self._lost_at_start == STARTS:
-                raise WorkerLostError(
-                    "run.executor",
-                    f"{STARTS} workers in a row that were lost while they began",
-                    "machines on which the harness starts",
-                    "Install the same harness on all of them, and look at Ray's logs there (/tmp/ray).",
-                )
+                found, expected = f"{STARTS} workers in a row, lost while they began", "machines on which it starts"
+                mend = "Install the same harness on all of them, and look at Ray's logs there (/tmp/ray)."
+                raise WorkerLostError("run.executor", found, expected, mend)
             return
         made_of, cpu = machine
         for what, here in self._here.items():
             if (there := made_of.get(what)) != here:
-                raise HarnessError(
-                    "run.executor",
-                    f"a machine with {what} {there}",
-                    f"{here}, as here: all must run the same code",
-                    "Install the same versions everywhere; bring a controller along in run.ray.runtime_env "
-                    "(working_dir), or install its package on all machines.",
-                )
+                expected = f"{here}, as here: all must run the same code"
+                mend = "Install the same versions everywhere; bring a controller along in run.ray.runtime_env "
+                mend += "(working_dir), or install its package on all machines."
+                raise HarnessError("run.executor", f"a machine with {what} {there}", expected, mend)
         self._lost_at_start = 0
         self._cpus.add(cpu)
         self.ready.append(worker)
@@ -271,12 +265,8 @@ def _runtime_env(settings: RaySettings) -> dict[str, Any] | None:
 
 
 def _wrong_environment(error: Exception) -> CampaignError:
-    return CampaignError(
-        "run.ray.runtime_env",
-        f"an environment that Ray cannot set up: {error}",
-        "what ray.init takes as runtime_env",
-        "Correct it; docs/installation.md has an example.",
-    )
+    found, mend = f"an environment that Ray cannot set up: {error}", "Correct it; docs/installation.md has an example."
+    return CampaignError("run.ray.runtime_env", found, "what ray.init takes as runtime_env", mend)
 
 
 def _connect(address: str, environment: dict[str, Any] | None) -> None:
@@ -291,14 +281,9 @@ def _connect(address: str, environment: dict[str, Any] | None) -> None:
     except SystemExit as error:  # Ray's own answer to SIGTERM, while it connects
         ended_by = int(error.code or 0)
     except (RayError, OSError, RuntimeError, ValueError) as error:
-        raise HarnessError(
-            "run.ray.address",
-            f"{address}: {error}",
-            "the address of a Ray cluster whose machines have the same versions of Ray and Python, and "
-            "the same RAY_AUTH_MODE and RAY_AUTH_TOKEN",
-            "Start it with `ray start --head` and give its address, such as 10.0.0.1:6379, or none for a cluster "
-            "of this machine.",
-        ) from error
+        expected = "a Ray cluster of the same versions of Ray and Python, RAY_AUTH_MODE and RAY_AUTH_TOKEN"
+        mend = "Start it with `ray start --head` and give its address, such as 10.0.0.1:6379, or none for this machine."
+        raise HarnessError("run.ray.address", f"{address}: {error}", expected, mend) from error
     if ended_by is not None:
         signal.raise_signal(ended_by)
 
@@ -316,12 +301,9 @@ def _room(settings: RaySettings) -> int:
     room = [have.get(name, 0.0) / n for name, n in (("CPU", want.cpus), ("GPU", want.gpus)) if n > 0.0]
     n = int(min(room, default=float(usable_cpus())))
     if n == 0:
-        raise HarnessError(
-            "run.ray.resources",
-            f"a cluster of {_words(have)}",
-            f"room for one worker: {want.cpus:g} CPUs and {want.gpus:g} GPUs on one machine",
-            "Ask for less, or give --workers if machines are to come later.",
-        )
+        expected = f"room for one worker: {want.cpus:g} CPUs and {want.gpus:g} GPUs on one machine"
+        mend = "Ask for less, or give --workers if machines are to come later."
+        raise HarnessError("run.ray.resources", f"a cluster of {_words(have)}", expected, mend)
     return n
 
 

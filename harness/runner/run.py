@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,8 +40,10 @@ from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
 from harness.sampling.baseline import IN_WORDS, begin, milder_requests, stored_baseline, stored_table
 from harness.sampling.milder import beyond_scope, milder_of, milder_tests
-from harness.sampling.protocol import Rounds, ShardRequest
+from harness.sampling.protocol import ShardRequest
+from harness.sampling.shells import round_requests
 from harness.strata import STORED_DESIGN
+from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
     from harness.report.summary import RunFolder
@@ -129,140 +132,142 @@ def run_campaign(
 
             return run_families(campaign, Path(out), workers=workers, resume=resume, progress=progress)
     resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign)
-    out, progress = Path(out), progress or Progress()
+    out = Path(out)
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)
-        require_no_fewer(out, earlier, resolved.campaign.stop.episodes)
-        with closing(workers_of(resolved, workers)) as crew:
-            run = begun(out, resolved, earlier, crew, progress)
-            run = with_baseline(run, crew, progress)
-            stop = resolved.campaign.stop
-            # Until a precision or a decision nobody knows how many.
-            most = stop.episodes if resolved.campaign.accept is None and stop.rhw is None else None
-            progress.stage(f"tests{crew.where}", most, done=run.earlier.n_episodes)
-            rounds = run.source.rounds(run.earlier.n_episodes)
-            run = tested(run, rounds, crew, progress)
-        require_no_fewer(out, earlier, run.n_episodes)
-        return finish(run, rounds.rule, crew.cpus(), progress)
+        require_no_fewer(out, earlier["n_episodes"], resolved.campaign.stop.episodes)
+        with begun(out, resolved, earlier, workers, progress or Progress()) as underway:
+            underway.drive_before_tests()
+            rule = underway.drive_tests()
+        require_no_fewer(out, earlier["n_episodes"], underway.run.n_episodes)
+        return underway.finish(rule)
 
 
-def begun(out: Path, resolved: Resolved, earlier: dict[str, Any], crew: Workers, progress: Progress) -> Run:
-    """What tests are drawn from, and a folder that says so."""
-    began = time.monotonic()
-    remove_unfinished(out.rglob(".*.part"))
-    source = prepare(resolved, progress)
-    facts = {
-        "workers": crew.n_workers,
-        "events_show": resolved.family.shows(resolved.environment),
-        "distance_per_test_m": resolved.family.mean_distance_m(resolved.environment),
-    }
-    run = take_over(out, resolved, source, earlier, began, **facts)
-    try:
-        keep_design(run)
-        return run.noting(assumed=assumed_in(resolved, source.pool, source.design, progress))
-    except BaseException:
-        run.written("interrupted")
-        raise
+@dataclass
+class Underway:
+    """A run with the workers that drive it, and who is told how far it is."""
 
+    run: Run
+    crew: Workers
+    progress: Progress
 
-def tested(run: Run, rounds: Rounds, crew: Workers, progress: Progress) -> Run:
-    """The run with all its tests; the folder can be read wherever it is interrupted."""
-    try:
-        for requests in rounds:
-            for shard in crew.run(requests, run.known):
-                run = run.with_shard(shard)
-                enough = rounds.enough(shard.block)
-                show(run, shard, rounds.rule, progress)
-                if enough:
-                    run.require_few_failed()
-                    return run
-        run.require_few_failed()
-    except BaseException:
-        run.written("interrupted")
-        raise
-    return run
+    def keep_design(self) -> None:
+        """Write the strata, without which nothing can be estimated, where the folder has no others."""
+        require_same_pool(self.run.folder, self.run.source)
+        if self.run.source.design is not None:
+            write_sealed(self.run.folder / SHELLS, STORED_DESIGN.dump_python(self.run.source.design, mode="json"))
 
+    def drive_before_tests(self) -> None:
+        """Drive the vehicle along all paths without an event, if tests follow from some.
 
-def show(run: Run, shard: ShardResult, rule: Rule, progress: Progress) -> None:
-    """Say how far it is."""
-    progress.advance(min(max(run.n_episodes - run.earlier.n_episodes, 0), shard.request.n_episodes))
-    progress.status(crashes=run.n_crashes, rhw=rule.look.rhw)
-
-
-def with_baseline(run: Run, crew: Workers, progress: Progress) -> Run:
-    """Drive the vehicle along all paths without a cut-in, if tests follow from some.
-
-    Where there are events too mild to count, it meets a few of them.
-    """
-    paths, mild = run.source.baseline_paths, milder_tests(run.resolved)
-
-    def drive(name: str, requests: Sequence[ShardRequest]) -> pa.Table:
-        """What comes before tests that count, but for what an earlier run has done of it."""
-        nonlocal run
-        n, what, causes = sum(each.n_episodes for each in requests), IN_WORDS[name], Counter[str]()
-        progress.stage(f"{what}{crew.where}", n)
-        known = partial(stored_baseline, stored_table(run.folder, run.parts_before, name), paths)
-        for result in crew.run(iter(requests), known):
-            run = run.with_baseline(name, result)
-            causes += result.failures
-            progress.advance(result.request.n_episodes)
-        if name != MILDER:  # one of few that fails is told, as if it had crashed
-            require_few_failed(causes, n, run.resolved.campaign, what, f"the run folder's {name}/ table")
-        return pa.concat_tables(run.before[name])
-
-    try:
-        if mild is not None:
-            driven = drive(MILDER, list(milder_requests(mild)))
-            run = run.noting(milder=milder_of(run.resolved, driven))
+        Where there are events too mild to count, it meets a few of them.
+        """
+        run, paths = self.run, self.run.source.baseline_paths
+        if (mild := milder_tests(run.resolved)) is not None:
+            driven = self._before(MILDER, list(milder_requests(mild)))
+            self.run = self.run.noting(milder=milder_of(run.resolved, driven))
         if paths is None:
-            return run
-        table, runs = begin(run.source, drive)
-    except BaseException:
-        run.written("interrupted")
-        raise
-    crew.follow_from(parquet(table))
-    run = run.noting(distance_per_test_m=runs.mean_distance_m(paths.weight)).written()
-    keep_design(run)
-    return run
+            return
+        table, runs = begin(run.source, self._before)
+        self.crew.follow_from(parquet(table))
+        self.run = self.run.noting(distance_per_test_m=runs.mean_distance_m(paths.weight)).written()
+        self.keep_design()
+
+    def _before(self, name: str, requests: Sequence[ShardRequest]) -> pa.Table:
+        """What comes before tests that count, but for what an earlier run has done of it."""
+        n, what, causes = sum(each.n_episodes for each in requests), IN_WORDS[name], Counter[str]()
+        self.progress.stage(f"{what}{self.crew.where}", n)
+        stored = stored_table(self.run.folder, self.run.parts_before, name)
+        for result in self.crew.run(iter(requests), partial(stored_baseline, stored, self.run.source.baseline_paths)):
+            self.run = self.run.with_baseline(name, result)
+            causes += result.failures
+            self.progress.advance(result.request.n_episodes)
+        if name != MILDER:  # one of few that fails is told, as if it had crashed
+            require_few_failed(causes, n, self.run.resolved.campaign, what, f"the run folder's {name}/ table")
+        return pa.concat_tables(self.run.before[name])
+
+    def drive_tests(self) -> Rule:
+        """Drive round after round until it is enough; returns the rule that says why."""
+        campaign, n_held = self.run.resolved.campaign, self.run.earlier.n_episodes
+        # Until a precision or a decision nobody knows how many.
+        most = campaign.stop.episodes if campaign.accept is None and campaign.stop.rhw is None else None
+        self.progress.stage(f"tests{self.crew.where}", most, done=n_held)
+        rounds = self.run.source.rounds(n_held)
+        for shard in chain.from_iterable(self.drive(requests, rounds.rule) for requests in rounds):
+            if rounds.enough(shard.block):
+                break
+        self.run.require_few_failed()
+        return rounds.rule
+
+    def drive(self, requests: Iterable[ShardRequest], rule: Rule) -> Iterator[ShardResult]:
+        """Shards in order, each part of the run by the time that it is handed out."""
+        for shard in self.crew.run(iter(requests), self.run.known):
+            self.run = self.run.with_shard(shard)
+            n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
+            self.progress.advance(min(n_new, shard.request.n_episodes))
+            self.progress.status(crashes=self.run.n_crashes, rhw=rule.look.rhw)
+            yield shard
+
+    def drive_added(self, tested: IntArray, added: IntArray, rule: Rule) -> Iterator[ShardResult]:
+        """The same of ``added`` tests per stratum, (S,), of which so many are ``tested``."""
+        run = self.run
+        places = len(run.blocks), run.n_episodes, run.resolved.campaign.run.smallest_shard
+        return self.drive(round_requests(tested, added, *places) if added.any() else (), rule)
+
+    def finish(self, rule: Rule, *, of_sum: bool = False) -> RunResult:
+        """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left.
+
+        Of one of several scenarios the rule is about their sum.
+        """
+        run, campaign, decision, decided = self.run, self.run.resolved.campaign, rule.look.decision, dict[str, Any]()
+        stopped_by: StoppedBy = "sum" if of_sum else ended_by(campaign, rule, run.n_episodes)
+        missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
+        code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
+        if decision is not None:
+            decision = replace(decision, n_milder=beyond_scope(run.facts.get("milder")))
+            code = EXIT_OF[decision.verdict]
+            decided["decision"] = decision.to_json()
+        decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
+        decided["remedy"] = pool_remedy(rule, campaign, stopped_by) or None
+        if cpus := self.crew.cpus():  # bits may have come from any of them
+            run = run.noting(cpu=", ".join(sorted({cpu_name(), *cpus})))
+        ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
+        ended["wall_time_s"] = run.took_s  # told as it is written
+        run = run.written("done", **ended)
+        self.progress.stage("writing estimates and report", None)
+        manifest = run.content("done", **ended)
+        estimates = estimate_blocks(even(run.blocks), campaign, manifest)
+        write_sealed(run.folder / ESTIMATES, estimates)
+        from harness.report.page import write_page_of  # noqa: PLC0415 - draws
+        from harness.report.summary import RunFolder  # noqa: PLC0415
+
+        tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
+        shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
+        return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
 
 
-def keep_design(run: Run) -> None:
-    """Write the strata, without which nothing can be estimated, where the folder has no others."""
-    require_same_pool(run.folder, run.source)
-    if run.source.design is not None:
-        write_sealed(run.folder / SHELLS, STORED_DESIGN.dump_python(run.source.design, mode="json"))
+@contextmanager
+def begun(
+    out: Path, resolved: Resolved, earlier: dict[str, Any], workers: int | None, progress: Progress, n_runs: int = 1
+) -> Iterator[Underway]:
+    """A run that begins in a folder, or goes on there; the folder can be read wherever it is interrupted.
 
-
-def finish(run: Run, rule: Rule, cpus: set[str], progress: Progress, *, of_sum: bool = False) -> RunResult:
-    """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left.
-
-    Of one of several scenarios the rule is about their sum.
+    Its workers end with it; those of ``n_runs`` take turns.
     """
-    campaign, decision, decided = run.resolved.campaign, rule.look.decision, dict[str, Any]()
-    stopped_by: StoppedBy = "sum" if of_sum else ended_by(campaign, rule, run.n_episodes)
-    missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
-    code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
-    if decision is not None:
-        decision = replace(decision, n_milder=beyond_scope(run.facts.get("milder")))
-        code = EXIT_OF[decision.verdict]
-        decided["decision"] = decision.to_json()
-    decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
-    decided["remedy"] = pool_remedy(rule, campaign, stopped_by) or None
-    if cpus:  # bits may have come from any of them
-        run = run.noting(cpu=", ".join(sorted({cpu_name(), *cpus})))
-    ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
-    ended["wall_time_s"] = run.took_s  # told as it is written
-    run = run.written("done", **ended)
-    progress.stage("writing estimates and report", None)
-    manifest = run.content("done", **ended)
-    estimates = estimate_blocks(even(run.blocks), campaign, manifest)
-    write_sealed(run.folder / ESTIMATES, estimates)
-    from harness.report.page import write_page_of  # noqa: PLC0415 - draws
-    from harness.report.summary import RunFolder  # noqa: PLC0415
-
-    tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
-    shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
-    return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
+    with closing(workers_of(resolved, workers, n_runs=n_runs)) as crew:
+        began = time.monotonic()
+        remove_unfinished(out.rglob(".*.part"))
+        source, family, environment = prepare(resolved, progress), resolved.family, resolved.environment
+        shows, distance_m = family.shows(environment), family.mean_distance_m(environment)
+        facts = {"workers": crew.n_workers, "events_show": shows, "distance_per_test_m": distance_m}
+        underway = Underway(take_over(out, resolved, source, earlier, began, **facts), crew, progress)
+        try:
+            underway.keep_design()
+            underway.run = underway.run.noting(assumed=assumed_in(resolved, source.pool, source.design, progress))
+            yield underway
+        except BaseException:
+            underway.run.written("interrupted")
+            raise
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:
@@ -277,10 +282,6 @@ def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) ->
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise
-        raise CampaignError(
-            "run.executor",
-            "ray, but no package ray",
-            "the extra for clusters",
-            "Install it in the harness's folder, on all machines: pip install -c requirements.lock -e '.[ray]'.",
-        ) from error
+        mend = "Install it in the harness's folder, on all machines: pip install -c requirements.lock -e '.[ray]'."
+        raise CampaignError("run.executor", "ray, but no package ray", "the extra for clusters", mend) from error
     return RayWorkers(resolved, n_workers, n_runs=n_runs)

@@ -25,7 +25,7 @@ from harness.families.protocol import Parameters
 from harness.families.replicates import read_replicates
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
-from harness.runner.stored_shells import Elsewhere, Nearby, StoredShells, require_shares
+from harness.runner.stored_shells import Nearby, StoredShells, require_shares
 
 N_REPLICATES = 50
 CONFIDENCE, QUANTILE = 0.9, 1.645
@@ -69,8 +69,7 @@ def sensitivity(
         found = f"{settings.parameters}, of which no number has a standard error (se) or a range"
         mend = "State one, e.g. --range cut_in.ignore_share=0.001:0.08."
         raise CampaignError(_OPTION, found, "numbers that are said to be uncertain", mend)
-    itself = Elsewhere(tested, tested.here, tested.design)
-    results = itself.nearby([each for move in asked for each in move.settings], progress)
+    results = tested.nearby([each for move in asked for each in move.settings], progress)
     bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
     driver = next((each.name for each in tested.design.references), "")
     ordered, traffic = tuple(sorted(bars, key=lambda bar: -bar.span)), Path(settings.parameters).stem

@@ -6,11 +6,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness import cache
-from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
 from harness.compiled import KERNELS
 from harness.progress import Progress
 from harness.runner.run import run_campaign
 
+_SMALL = [
+    "world.engine=twin", "pool.relative_error=0.2", "pool.events_per_shell=100", "stop.rhw=null", "stop.episodes=200",
+]  # fmt: skip
 _CONTROLLER = """class Holds:
     def step(self, seen):
         return 0.0
@@ -28,14 +31,7 @@ def compile_kernels(progress: Progress | None = None) -> bool:
     with TemporaryDirectory() as folder:
         controller = Path(folder) / "holds.py"
         controller.write_text(_CONTROLLER)
-        for number, av in enumerate(({}, {"controller": f"{controller}:Holds"})):
-            content = {
-                "name": "setup",
-                "av": av,
-                "world": {"engine": "twin"},
-                "pool": {"relative_error": 0.2, "events_per_shell": 100},
-                "stop": {"episodes": 200},
-            }
-            run_campaign(Campaign.model_validate(content), Path(folder) / str(number), workers=1, progress=progress)
+        for number, vehicle in enumerate(("idm", f"{controller}:Holds")):
+            run_campaign(load_campaign(vehicle, _SMALL), Path(folder) / str(number), workers=1, progress=progress)
     cache.keep(done, b"")
     return True

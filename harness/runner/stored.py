@@ -14,7 +14,7 @@ from pydantic import Field
 
 from harness.arguments import Confidence, Episode, checked
 from harness.campaign.campaign import Campaign
-from harness.controllers.find import has_foreign_code, require_controller, run_apart
+from harness.controllers.find import require_controller, run_apart
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables, joined
@@ -242,8 +242,7 @@ def _simulated(
     resolved = resolve(campaign)
     require_campaign(folder / CAMPAIGN, resolved.content_hash, manifest)
     require_world(campaign)
-    replay = partial(run_apart, campaign.av, _replay) if has_foreign_code(campaign.av) else _replay
-    again = replay(resolved, folder, episode, stored["episodes"])
+    again = run_apart(campaign.av, _replay, resolved, folder, episode, stored["episodes"])
     compared = tuple(name for name in again if name in stored and stored[name].num_rows)
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
     why = None if bit_equal is not False else suspects(manifest, campaign)
@@ -285,16 +284,12 @@ def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
 def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:
     if campaign.av.reproducible and manifest.get("reproducible", True):
         return
-    repeated = manifest.get("repeated")
-    if repeated:
-        raise CampaignError(
-            "av",
-            f"a run that is not reproducible: {len(repeated['differing'])} of the {repeated['n_episodes']} tests "
-            "that it ran twice differed",
-            "an AV that does the same again, given the same observations and the same random stream",
-            "Draw only from the generator handed over in start, ask no clock, and keep nothing from one test to the "
-            "next (`harness av-check` finds the cause). The kept traces (--stored) are what happened.",
-        )
+    if repeated := manifest.get("repeated"):
+        differing, n = len(repeated["differing"]), repeated["n_episodes"]
+        found = f"a run that is not reproducible: {differing} of the {n} tests that it ran twice differed"
+        mend = "Draw only from the generator handed over in start, ask no clock, and keep nothing from one test to the "
+        mend += "next (`harness av-check` finds the cause). The kept traces (--stored) are what happened."
+        raise CampaignError("av", found, "an AV that does the same again on the same observations and stream", mend)
     found = "a run that is not reproducible: a program outside of the harness drove the AV"
     mend = "Look at the traces that the run has kept (--stored; records.traces: crash), or let the program write a log."
     raise CampaignError("av.traci", found, "an AV that does the same again: model, controller, sumo or fmu", mend)

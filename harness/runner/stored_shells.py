@@ -10,7 +10,7 @@ there are upper limits alone, in traffic close by; of traffic with events that n
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -54,16 +54,19 @@ ELSEWHERE = "Run the campaign in that environment, into another folder."
 
 @dataclass(frozen=True, eq=False)
 class StoredShells:
-    """A stored run of shells: the traffic ``here`` that it was tested in, its strata, and their pool.
+    """A stored run of shells as it answers for some ``traffic``, by the ``design``: its strata with their p there.
 
-    ``manifest`` is the run's.
+    It was ``tested`` in the traffic ``here`` with the ``pool`` of that; ``manifest`` and ``blocks`` are the run's.
     """
 
     folder: Path
     manifest: Mapping[str, Any]
+    blocks: Sequence[Block]
     here: Resolved
-    design: ShellDesign
+    tested: ShellDesign
     pool: Pool
+    traffic: Resolved
+    design: ShellDesign
 
     @classmethod
     def of(cls, folder: str | Path, progress: Progress, option: str = OPTION) -> StoredShells:
@@ -83,17 +86,13 @@ class StoredShells:
             expected = f"shells as those of pool {pool.key}"
             mend = "Use the version of the harness (manifest.json) and the surrogate library that it was made with."
             raise RunFolderError(str(folder), f"tests of pool {design.pool}", expected, mend)
-        return cls(folder, manifest, here, design, pool)
+        blocks = list(stored_blocks(folder, moments=False))
+        return cls(folder, manifest, blocks, here, design, pool, here, design)
 
     @property
     def limit_mps2(self) -> float:
         """Hardest acceleration of the vehicle."""
         return acceleration_limit(self.here.campaign.av)
-
-    @cached_property
-    def blocks(self) -> list[Block]:
-        """Its tests."""
-        return list(stored_blocks(self.folder, moments=False))
 
     @cached_property
     def seen(self) -> SeenShells:
@@ -109,7 +108,7 @@ class StoredShells:
 
         1 without a crash, where the answer is a limit that rests on what was tested, not on what crashed.
         """
-        share, p = self.seen.tally.share, self.design.p
+        share, p = self.seen.tally.share, self.tested.p
         return float(p @ share**2 / (p @ share)) if share.any() else 1.0
 
     @property
@@ -128,6 +127,56 @@ class StoredShells:
         few = at_worst & (worst.crashes > 0) & (worst.crashes < LEAST_SHARE * worst.tests)
         crashes = np.where(few, worst.tests, worst.crashes)
         return likelihood_limit(p, crashes, worst.tests, Level.two_sided(0.9), 1.0)
+
+    @property
+    def is_same(self) -> bool:
+        """Whether the traffic is that of the tests."""
+        return self.design is self.tested
+
+    def block(self, block: Block) -> Block:
+        """Tests as they count there: a path's probability of events is taken to change as that of all paths."""
+        if self.is_same:
+            return block
+        old, new = self.tested.cell_p, self.design.cell_p
+        times = np.divide(new, old, out=np.zeros_like(new), where=old > 0.0)
+        columns = {**block.columns, "cell_mass": block.cell_mass * times}
+        with np.errstate(divide="ignore"):
+            log_weight = np.log(self.design.p[block.stratum])
+        return replace(block, columns=columns, drawn=replace(block.drawn, shells=self.design), log_weight=log_weight)
+
+    def reference_error(self) -> float:
+        """By how much the rate of a reference driver comes out wrong at most, by its shares of strata."""
+        told, known = self.design.p @ reference_shares(self.tested), self.design.reference_rate
+        return float(np.max(np.abs(told[known > 0.0] / known[known > 0.0] - 1.0), initial=0.0))
+
+    def nearby(self, rows: Iterable[Mapping[str, float]], progress: Progress) -> Iterator[Nearby | None]:
+        """The same traffic with other numbers, by few paths; None where they give no laws.
+
+        Of a vehicle whose shares may change with it, the factor is that of its upper limit.
+        """
+        traffic = [environment_with(self.traffic, row) for row in rows]
+        known = [each for each in traffic if each is not None]
+        progress.stage("other traffic", len(known))
+        p, shares = self.design.p, reference_shares(self.tested)
+        paths = FewPaths(self.traffic, self.pool, self.tested, self.limit_mps2, progress)
+        (base,), found = paths.of([self.traffic.environment]), paths.of(known)
+        crash_share = self.seen.tally.share if self.seen.tally.crashes.any() else np.ones_like(p)
+
+        def moved(to: OnPaths) -> Nearby:
+            now, references = p * ratio_of(to.p, base.p), ratio_of(to.references, base.references)
+            crashing = now * crash_share
+            # Ends of a sample are not those of a law.
+            new = _share(to.beyond, to.p) - _share(base.beyond, base.p)
+            with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+                off = np.expm1(np.abs(np.log(ratio_of(now @ shares, p @ shares) / references)))
+                beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum() + to.untested / to.p.sum())
+            rate = self.rate(now) / self.rate(p)
+            if not self.holds:
+                rate = self.limit(now, at_worst=True) / self.limit(p)
+            return Nearby(now, rate, references, float(np.max(off, initial=0.0)), beyond)
+
+        for each in traffic:
+            yield None if each is None else moved(next(found))
 
 
 @dataclass(frozen=True)
@@ -156,69 +205,10 @@ class Nearby:
         return not (self.off <= FAR_OFF and self.beyond <= MOST_BEYOND)
 
 
-@dataclass(frozen=True, eq=False)
-class Elsewhere:
-    """A stored run as it answers for some ``traffic``: the strata as tested, with their probabilities there."""
-
-    tested: StoredShells
-    traffic: Resolved
-    design: ShellDesign
-
-    @property
-    def is_same(self) -> bool:
-        """Whether the traffic is that of the tests."""
-        return self.design is self.tested.design
-
-    def block(self, block: Block) -> Block:
-        """Tests as they count there: a path's probability of events is taken to change as that of all paths."""
-        if self.is_same:
-            return block
-        old, new = self.tested.design.cell_p, self.design.cell_p
-        times = np.divide(new, old, out=np.zeros_like(new), where=old > 0.0)
-        columns = {**block.columns, "cell_mass": block.cell_mass * times}
-        with np.errstate(divide="ignore"):
-            log_weight = np.log(self.design.p[block.stratum])
-        return replace(block, columns=columns, drawn=replace(block.drawn, shells=self.design), log_weight=log_weight)
-
-    def reference_error(self) -> float:
-        """By how much the rate of a reference driver comes out wrong at most, by its shares of strata."""
-        told, known = self.design.p @ reference_shares(self.tested.design), self.design.reference_rate
-        return float(np.max(np.abs(told[known > 0.0] / known[known > 0.0] - 1.0), initial=0.0))
-
-    def nearby(self, rows: Iterable[Mapping[str, float]], progress: Progress) -> Iterator[Nearby | None]:
-        """The same traffic with other numbers, by few paths; None where they give no laws.
-
-        Of a vehicle whose shares may change with it, the factor is that of its upper limit.
-        """
-        traffic = [environment_with(self.traffic, row) for row in rows]
-        known = [each for each in traffic if each is not None]
-        progress.stage("other traffic", len(known))
-        tested, p, shares = self.tested, self.design.p, reference_shares(self.tested.design)
-        paths = FewPaths(self.traffic, tested.pool, tested.design, tested.limit_mps2, progress)
-        (base,), found = paths.of([self.traffic.environment]), paths.of(known)
-        crash_share = tested.seen.tally.share if tested.seen.tally.crashes.any() else np.ones_like(p)
-
-        def moved(to: OnPaths) -> Nearby:
-            now, references = p * ratio_of(to.p, base.p), ratio_of(to.references, base.references)
-            crashing = now * crash_share
-            # Ends of a sample are not those of a law.
-            new = _share(to.beyond, to.p) - _share(base.beyond, base.p)
-            with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-                off = np.expm1(np.abs(np.log(ratio_of(now @ shares, p @ shares) / references)))
-                beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum() + to.untested / to.p.sum())
-            rate = tested.rate(now) / tested.rate(p)
-            if not tested.holds:
-                rate = tested.limit(now, at_worst=True) / tested.limit(p)
-            return Nearby(now, rate, references, float(np.max(off, initial=0.0)), beyond)
-
-        for each in traffic:
-            yield None if each is None else moved(next(found))
-
-
-def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progress) -> Elsewhere:
+def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progress) -> StoredShells:
     """The strata with the probabilities of other traffic; refused where the tests say nothing of it."""
     if there.family.digest(there.environment) == tested.pool.environment:
-        return Elsewhere(tested, there, tested.design)
+        return replace(tested, traffic=there)
     was, now = ("take time" if each.scenario.shows else "are one step" for each in (tested.here, there))
     if was != now:  # nobody sees those of one step beforehand: shells mean something else there
         expected = f"traffic as that of the tests, in which they {was}"
@@ -226,7 +216,8 @@ def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progres
     require_shares(tested)
     progress.stage("pool of the other traffic", None)
     elsewhere = campaign_pool(there, progress, order=tested.pool.names)
-    moved = Elsewhere(tested, there, moved_design(tested.design, design_shells(elsewhere, tested.limit_mps2), name))
+    design = moved_design(tested.tested, design_shells(elsewhere, tested.limit_mps2), name)
+    moved = replace(tested, traffic=there, design=design)
     off, beyond = moved.reference_error(), _share_beyond(tested, elsewhere)
     if beyond > MOST_BEYOND or off > MOST_OFF:
         found = f"traffic where {share(beyond)} of the crashes are in events unlike any that was tested"
@@ -264,16 +255,8 @@ def moved_design(tested: ShellDesign, new: ShellDesign, environment: str) -> She
             found = f"{environment}, whose shell {stratum} was never tested (probability {of_cell:.3g})"
             raise CampaignError(OPTION, found, f"shells among {', '.join(tested.strata)}", ELSEWHERE)
         p[min(alike)[2]] += of_cell
-    return replace(
-        tested,
-        pool=new.pool,
-        cell_p=p,
-        n_paths=new.n_paths,
-        p_event=new.p_event,
-        p_unreachable=new.p_unreachable,
-        reference_rate=new.reference_rate,
-        reference_square=new.reference_square,
-    )
+    of_new = ("pool", "n_paths", "p_event", "p_unreachable", "reference_rate", "reference_square")
+    return replace(tested, cell_p=p, **{name: getattr(new, name) for name in of_new})
 
 
 def _keys(design: ShellDesign) -> list[tuple[str, int]]:

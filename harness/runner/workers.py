@@ -5,13 +5,12 @@ Here workers are processes of this machine; `harness.runner.ray` makes those of 
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection
@@ -44,8 +43,6 @@ SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, None)
 """Ends that an operator or a shortage of memory brings: a controller is blamed only when its test is hit again."""
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
-REPEATED = b"harness.repeated"
-"""Key in the metadata of an episodes file: what repeating showed is there with the shard, or not at all."""
 
 
 @dataclass(frozen=True)
@@ -56,17 +53,13 @@ class ShardResult:
     tables: ShardTables
     block: Block
     is_new: bool = True
+    repeated: Repeated | None = None
+    """What tests have shown that were run twice: some of the first shard, or none."""
 
     @property
     def failures(self) -> Counter[str]:
         """Causes of failures."""
         return Counter(self.tables.episodes.column("failure").drop_null().to_pylist())
-
-    @property
-    def repeated(self) -> Repeated | None:
-        """What tests have shown that were run twice: some of the first shard, or none."""
-        found = (self.tables.episodes.schema.metadata or {}).get(REPEATED)
-        return None if found is None else Repeated(**json.loads(found))
 
 
 Result = ShardResult | BaselineResult
@@ -134,33 +127,15 @@ class ShardRunner:
         keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
-        if request.index == 0 and campaign.av.model is None and campaign.av.traci is None:
-            shown = {REPEATED: json.dumps(asdict(repeat(self._loop, source, shard)))}
-            told = {**(tables.episodes.schema.metadata or {}), **shown}
-            tables = tables._replace(episodes=tables.episodes.replace_schema_metadata(told))
-        return ShardResult(request, tables, source.block(tables))
+        shows = request.index == 0 and campaign.av.model is None and campaign.av.traci is None
+        repeated = repeat(self._loop, source, shard) if shows else None
+        return ShardResult(request, tables, source.block(tables), repeated=repeated)
 
 
 class WorkerLostError(HarnessError):
     """Workers die again and again, on the same shard or before they have one."""
 
     exit_code = 3
-
-
-class WorkerProcess(Child):
-    """A process that runs one shard after another: what any worker is, also one on another machine."""
-
-    def give(self, *work: Any) -> bool:
-        """Give it a shard to run, see `serve`; False if it is dead."""
-        try:
-            self.connection.send(work)
-        except OSError:
-            return False
-        return True
-
-    def dismiss(self) -> None:
-        """Tell it, when it is idle, that nothing more comes: it releases its controllers."""
-        self.connection.close()
 
 
 @dataclass
@@ -285,12 +260,9 @@ class Workers:
         if exit_code not in SENT_FROM_OUTSIDE and has_foreign_code(self._campaign.av):
             how = f"because {death_cause(exit_code, self._campaign.av.limits)}"
             mend = "Fix the controller: look for os._exit or a crash of compiled code (`harness av-check`)."
-        raise WorkerLostError(
-            f"shard {job.request.index} (from test {job.request.first_episode})",
-            f"{ATTEMPTS} worker processes that died, the last {how}",
-            "a worker that finishes the shard",
-            mend,
-        )
+        where = f"shard {job.request.index} (from test {job.request.first_episode})"
+        found = f"{ATTEMPTS} worker processes that died, the last {how}"
+        raise WorkerLostError(where, found, "a worker that finishes the shard", mend)
 
     def _require_few_deaths(self, job: _Job) -> None:
         """Each death costs a new process: a controller that dies too often is not run to the end of its shard."""
@@ -298,13 +270,10 @@ class Workers:
         episode, cause = next(reversed(fatal.items()))
         n_begun = max(fatal) - job.request.first_episode + 1
         if float(bdtrc(len(fatal) - 1, n_begun, share)) < SURELY_TOO_MANY:
-            raise TooManyFailedError(
-                "run.max_failed_share",
-                f"{len(fatal)} of the first {n_begun} tests of shard {job.request.index} ended their worker "
-                f"process, the last of them test {episode}: {cause}",
-                f"a share of at most {share:g}",
-                "Fix the controller (`harness av-check` looks at it in seconds), or raise the share to go on.",
-            )
+            found = f"{len(fatal)} of the first {n_begun} tests of shard {job.request.index} ended their worker process"
+            found += f", the last of them test {episode}: {cause}"
+            mend = "Fix the controller (`harness av-check` looks at it in seconds), or raise the share to go on."
+            raise TooManyFailedError("run.max_failed_share", found, f"a share of at most {share:g}", mend)
 
 
 class LocalWorkers(Workers):
@@ -318,11 +287,11 @@ class LocalWorkers(Workers):
         start_server()
         self._resolved, self._baseline = resolved, SharedFile()
 
-    def new_worker(self) -> WorkerProcess:
-        return WorkerProcess(serve, self._resolved, self._baseline.path)
+    def new_worker(self) -> Child:
+        return Child(serve, self._resolved, self._baseline.path)
 
     def follow_from(self, baseline: bytes) -> None:
         self._baseline.path.write_bytes(baseline)
 
-    def first_to_answer(self, busy: Sequence[WorkerProcess]) -> WorkerProcess:
+    def first_to_answer(self, busy: Sequence[Child]) -> Child:
         return first_to_answer(busy)

@@ -11,13 +11,15 @@ import pytest
 from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.errors import HarnessError, TrajectoryError
-from harness.families.cut_in.fitting.hazard import FREE_TTC_S
-from harness.families.cut_in.fitting.laws import LAWS, FittedLaw
+from harness.families.cut_in.fitting.hazard import FREE_TTC_S, fit_hazard
+from harness.families.cut_in.fitting.laws import LAWS, FittedLaw, Traffic
 from harness.families.cut_in.fitting.maximum import Maximum
+from harness.families.cut_in.fitting.observations import observe
 from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.families.replicates import read_replicates
 from harness.fitting.files import fit_files
+from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
 
 
@@ -50,14 +52,14 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
 def test_a_hazard_above_what_a_second_allows_is_fitted(tmp_path):
     """Where BV nearly always cuts in within a second, the likelihood once had a bend, at which no maximum was found."""
     overtaking(2.0).assign(length_m=4.5).to_parquet(tmp_path / "rows.parquet", index=False)
-    found = fit_files([tmp_path / "rows.parquet"], tmp_path / "mine.yaml", n_replicates=2).families["cut_in"].fit
-    risk = found.traffic.at_risk[found.traffic.at_risk["ttc_s"] > FREE_TTC_S]
-    wished = float(found.hazard.rate(risk) @ risk["duration_s"])
+    traffic = Traffic.of(map(observe, recordings([tmp_path / "rows.parquet"], load_mapping())))
+    risk = traffic.at_risk[traffic.at_risk["ttc_s"] > FREE_TTC_S]
+    wished = float(fit_hazard(traffic).rate(risk) @ risk["duration_s"])
     assert wished == pytest.approx(risk["changes"].sum(), rel=0.1)
 
 
 def test_a_law_with_a_number_that_no_environment_allows_is_named(tmp_path, monkeypatch):
-    found = Maximum(np.array([1e-4]), np.full((24, 1), 1e-5), np.zeros((1, 1)), np.ones(1, np.bool_))
+    found = Maximum(np.array([1e-4]), np.full((24, 1), 1e-5), np.zeros((1, 1)))
     law = FittedLaw(("initial_state__v_scale_mps",), lambda theta: theta, found)
     monkeypatch.setitem(LAWS, "speed", (lambda *_: law, "speeds of BV"))
     overtaking(2.0).to_parquet(tmp_path / "rows.parquet", index=False)

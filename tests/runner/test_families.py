@@ -11,7 +11,8 @@ import harness
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.pool import moved
-from harness.records.folder import read_manifest
+from harness.processes import PRINTED
+from harness.records.folder import read_manifest, write_sealed
 from harness.resolved import resolve
 from harness.runner.families import estimate_families
 
@@ -74,6 +75,7 @@ def test_workers_and_interruptions_change_no_bit(run, tmp_path):
     harness.run(campaign("stop.rhw=2.0"), stopped, workers=1)
     held = json.loads((stopped / "families.json").read_text())["n_episodes"]
     assert held < run.content["n_episodes"]
+    (stopped / PRINTED).write_text("what a vehicle has printed")
     harness.run(campaign(), stopped, workers=1, resume=True)
     assert bits(stopped) == bits(run.folder)
     with pytest.raises(RunFolderError, match="already begun"):
@@ -143,6 +145,13 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path):
     with pytest.raises(RunFolderError, match=r"mine\.txt"):
         harness.run(campaign(), tmp_path)
     assert [each.name for each in Path(tmp_path).iterdir()] == ["mine.txt"]
+
+
+def test_an_answer_of_another_version_is_refused(run, tmp_path, capsys):
+    older = {key: value for key, value in run.content.items() if key != "readings"}
+    write_sealed(tmp_path / "families.json", older)
+    assert main(["report", str(tmp_path)]) == 2
+    assert "no key readings" in capsys.readouterr().err
 
 
 def test_what_the_answer_of_one_scenario_depends_on(run, monkeypatch):

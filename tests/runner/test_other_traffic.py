@@ -14,7 +14,7 @@ from harness.pool.moved import OnPaths
 from harness.progress import Progress
 from harness.runner import stored_shells
 from harness.runner.other_traffic import estimate_in_other_traffic
-from harness.runner.stored_shells import Elsewhere, StoredShells
+from harness.runner.stored_shells import StoredShells
 from tests.stored_runs import answer as words
 from tests.stored_runs import estimates, golden
 
@@ -84,7 +84,7 @@ def test_a_reference_driver_told_too_low_is_as_far_off_as_one_told_too_high(stor
     n_drivers, nothing = len(tested.design.references), np.zeros_like(tested.design.p)
     found = [OnPaths(tested.design.p, np.full(n_drivers, rate), nothing, np.zeros(())) for rate in (1.0, times)]
     monkeypatch.setattr(stored_shells.FewPaths, "of", lambda *_: iter([found.pop(0)]))
-    (near,) = Elsewhere(tested, tested.here, tested.design).nearby([{}], Progress())
+    (near,) = tested.nearby([{}], Progress())
     assert (near.rate, near.off) == (1.0, pytest.approx(1.0))
     assert near.references == pytest.approx(times)
 

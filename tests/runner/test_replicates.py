@@ -22,7 +22,7 @@ from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
 from harness.runner.other_traffic import estimate_in_other_traffic
-from harness.runner.stored_shells import Elsewhere, StoredShells
+from harness.runner.stored_shells import StoredShells
 from tests.golden.campaigns import COMPARED
 from tests.in_process import one_process, without_page
 from tests.stored_runs import answer, copy_of, estimates, golden
@@ -58,7 +58,7 @@ def test_of_a_vehicle_whose_shares_may_change_there_is_an_upper_limit_alone(stor
     """All cut-ins of the shells that it crashes in may crash."""
     folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.01, 0.02]})
     tested = StoredShells.of(folder, Progress())
-    (near,) = Elsewhere(tested, tested.here, tested.design).nearby([{LOOK: 0.02}], Progress())
+    (near,) = tested.nearby([{LOOK: 0.02}], Progress())
     monkeypatch.setattr(stored_shells, "LEAST_SHARE", 1.1)
     content = estimate_in_other_traffic(folder, mine)
     estimate, traffic = content["estimates"]["shells"], content["traffic"]

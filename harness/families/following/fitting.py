@@ -110,7 +110,7 @@ class FollowingFitter:
         [file] = self.marks(asked.out)
         text = environment_text(head, {"like": base, **content})
         facts = {self.family.name: {"events": events.size, "hours": hours, **content}}
-        return Fitted({file: text.encode()}, (told, *more), facts, content)
+        return Fitted({file: text.encode()}, (told, *more), facts)
 
     def _exposure(self, n: int, hours: float) -> tuple[Numbers, str]:
         """The rate of n events, where they are enough, and in words."""

@@ -56,7 +56,7 @@ class CutInFitter:
         told = [line for each in others.values() for line in each.told]
         shows = page(fit, tally, noise_mps2, rows, out.name, asked.files, told)
         files = {out: text.encode(), shown: shows.encode(), beside: drawn}
-        return Fitted(files, _told(fit, tally, asked.n_replicates), _facts(fit, tally), fit)
+        return Fitted(files, _told(fit, tally, asked.n_replicates), _facts(fit, tally))
 
 
 def _text(fit: Fit, tally: Tally, asked: Asked) -> str:

@@ -64,14 +64,13 @@ class Maximum:
     """The maximum of a likelihood.
 
     ``theta`` (p,); ``influence`` (clusters, p): how far it moves if a cluster is seen once more, to first order;
-    ``noise`` (p, m): the same for a standard normal change of each pseudo-observation. ``told`` (p,): numbers that the
-    data determine; the others keep the prior's centre and do not move.
+    ``noise`` (p, m): the same for a standard normal change of each pseudo-observation. Numbers that the data do not
+    determine keep the prior's centre and do not move.
     """
 
     theta: FloatArray
     influence: FloatArray
     noise: FloatArray
-    told: BoolArray
 
     def covariance(self) -> FloatArray:
         """Sandwich covariance by clusters, (p, p)."""
@@ -119,7 +118,7 @@ def maximise(
             moves *= ~kept / (1.0 - leverage[:, None])
             influence = np.zeros((int(clusters.max()) + 1, theta.size))
             np.add.at(influence, clusters, moves)
-            return Maximum(theta, influence, (inverse @ weights.T) * ~kept[:, None], ~kept)
+            return Maximum(theta, influence, (inverse @ weights.T) * ~kept[:, None])
         kept, best = kept | silent, simpler
     return None
 
