@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,19 +70,20 @@ def estimate(
     says how far the rate may be off because the fit is uncertain; --write puts that into estimates.json and the page.
     DIR may be the folder of a comparison, too.
     """
-    if exposures or counts or (folder / FAMILIES).is_file():
-        if estimators or environment is not None:
-            raise click.UsageError("-e and --environment are for the folder of one scenario, such as DIR/cut_in.")
+    several = exposures or counts or (folder / FAMILIES).is_file()
+    if several and (estimators or environment is not None):
+        raise click.UsageError("-e and --environment are for the folder of one scenario, such as DIR/cut_in.")
+    if estimators and environment is not None:
+        raise click.UsageError("--environment does not go with -e: tests of shells alone can be moved.")
+    if several:
         _estimate_hours(folder, exposures, confidence, counts=counts, write=write, as_json=as_json)
         return
+    if environment is not None and (folder / COMPARISON).is_file():
+        if write:
+            raise click.UsageError("--write does not go with the folder of a comparison.")
+        _compared_elsewhere(folder, environment, confidence, as_json=as_json)
+        return
     if environment is not None:
-        if estimators:
-            raise click.UsageError("--environment does not go with -e: tests of shells alone can be moved.")
-        if (folder / COMPARISON).is_file():
-            if write:
-                raise click.UsageError("--write does not go with the folder of a comparison.")
-            _compared_elsewhere(folder, environment, confidence, as_json=as_json)
-            return
         with progress_bar() as bar:
             content = harness.estimate_in_other_traffic(
                 folder, environment, confidence=confidence, own=write, progress=bar
@@ -102,16 +103,21 @@ def estimate(
     elif estimators:
         print_estimates(content, estimators)
     else:
-        from harness.records.folder import read_manifest
-        from harness.records.reader import read_campaign
-        from harness.report.lines import lines
-        from harness.report.words import answer_of
-
-        manifest, page = read_manifest(folder), folder / "report.html"  # of the run's own traffic
-        answer = answer_of(read_campaign(folder, manifest), manifest, content)
-        say(*lines(answer, manifest.get("wall_time_s"), page if environment is None and page.is_file() else None))
+        _print_answer(folder, content, folder / "report.html" if environment is None else None)
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
+
+
+def _print_answer(folder: Path, content: Mapping[str, Any], page: Path | None) -> None:
+    """Print the short answer, and where its page is, if there is one."""
+    from harness.records.folder import read_manifest
+    from harness.records.reader import read_campaign
+    from harness.report.lines import lines
+    from harness.report.words import answer_of
+
+    manifest = read_manifest(folder)
+    answer = answer_of(read_campaign(folder, manifest), manifest, content)
+    say(*lines(answer, manifest.get("wall_time_s"), page if page is not None and page.is_file() else None))
 
 
 def _estimate_hours(

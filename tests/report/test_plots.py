@@ -71,17 +71,8 @@ def test_the_plot_shows_contributions_and_half_widths(runs):
 # -- counts, weights, rankings and bins against the whole table --
 
 
-@pytest.fixture(scope="module")
-def table(folders):
-    return pq.read_table(folders["weighted"] / "episodes").to_pandas().sort_values("episode", ignore_index=True)
-
-
-@pytest.fixture(scope="module")
-def summary(runs):
-    return summarise(runs["weighted"])
-
-
-def test_counts_and_weights_by_outcome(summary, table):
+def test_counts_and_weights_by_outcome(folders, runs):
+    summary, table = summarise(runs["weighted"]), pq.read_table(folders["weighted"] / "episodes").to_pandas()
     for k, outcome in enumerate(OUTCOMES):
         rows = table[table.outcome == outcome]
         assert summary.count[k] == len(rows)

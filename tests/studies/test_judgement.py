@@ -7,18 +7,8 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.strata import ShellDesign
+from studies.replication import populations
 from studies.replication.judgement import Row, Subject, corrected, holm, judge
-from studies.replication.populations import (
-    CONDITIONAL_DIFFERENCE,
-    DIFFERENCE,
-    RATE,
-    Known,
-    SuperPopulation,
-    of_vehicle,
-    preventable_by,
-    ratio_of,
-    ratio_to,
-)
 from studies.replication.shells import DrawnPool, PairedCampaign
 from tests.stored_runs import SCENARIOS
 
@@ -36,7 +26,7 @@ def test_holm_as_in_a_worked_example():
 def test_normal_estimates_are_judged_right():
     rates = np.random.default_rng(1).normal(1.0, 0.1, 4000)
     right, narrow, wide = (
-        judge(Subject(str(h), Known.exactly(1.0)), "x", rows(rates, h), 0.9) for h in (0.16449, 0.13, 0.3)
+        judge(Subject(str(h), populations.Known.exactly(1.0)), "x", rows(rates, h), 0.9) for h in (0.16449, 0.13, 0.3)
     )
     assert abs(right["bias"]) < 4.0 * right["bias_std_error"]
     assert right["true_relvar"] == pytest.approx(0.01, rel=0.1)
@@ -50,7 +40,7 @@ def test_normal_estimates_are_judged_right():
 
 
 def test_a_difference_of_nothing_is_judged_relative_to_the_rates():
-    subject = Subject("equal", Known(2.0, 0.0, 2.0), {"x": Known(0.0, 0.0, 2.0)})
+    subject = Subject("equal", populations.Known(2.0, 0.0, 2.0), {"x": populations.Known(0.0, 0.0, 2.0)})
     errors = np.random.default_rng(2).normal(0.0, 0.2, 2000)
     found = judge(subject, "x", rows(errors, 0.329), 0.9)
     assert found["truth"] == 0.0
@@ -62,7 +52,7 @@ def test_a_difference_of_nothing_is_judged_relative_to_the_rates():
 
 
 def test_a_refusal_counts_as_covered_and_says_nothing_else():
-    subject = Subject("a", Known.exactly(1.0))
+    subject = Subject("a", populations.Known.exactly(1.0))
     refused = [Row("x", k, 100, 5, math.nan, math.inf, 0.0, math.inf, False, refused=True) for k in range(4)]
     found = judge(subject, "x", rows([1.1] * 6, 0.2) + refused, 0.9)
     assert (found["covered"], found["refused"]) == (10, 0.4)
@@ -73,20 +63,20 @@ def test_a_refusal_counts_as_covered_and_says_nothing_else():
 def test_a_vehicle_beside_a_reference():
     """The reference crashes on 1 + 3 + 4, the vehicle on 1 + 2 + 3, of four paths."""
     cut_in, path, mass = np.full(4, 8.0), np.array([0, 0, 1, 3]), np.array([1.0, 2.0, 3.0, 4.0])
-    population = SuperPopulation(cut_in, path, mass, np.array([0b011, 0b110, 0b011, 0b101]))
-    known = of_vehicle(population, mass * population.crashes(1), {"cc": 0})
-    assert known[RATE].value == known[RATE].scale == 6.0 / 4.0
-    assert known[RATE].std_error == pytest.approx(np.std([3.0, 3.0, 0.0, 0.0]) / 2.0)
-    assert known[ratio_to("cc")].value == pytest.approx(6.0 / 8.0)
-    assert known[preventable_by("cc")].value == pytest.approx(2.0 / 6.0)
-    assert known[preventable_by("cc")].scale == 1.0
+    population = populations.SuperPopulation(cut_in, path, mass, np.array([0b011, 0b110, 0b011, 0b101]))
+    known = populations.of_vehicle(population, mass * population.crashes(1), {"cc": 0})
+    assert known[populations.RATE].value == known[populations.RATE].scale == 6.0 / 4.0
+    assert known[populations.RATE].std_error == pytest.approx(np.std([3.0, 3.0, 0.0, 0.0]) / 2.0)
+    assert known[populations.ratio_to("cc")].value == pytest.approx(6.0 / 8.0)
+    assert known[populations.preventable_by("cc")].value == pytest.approx(2.0 / 6.0)
+    assert known[populations.preventable_by("cc")].scale == 1.0
 
 
 def test_the_error_of_a_ratio_is_that_of_repeated_samples():
     rng = np.random.default_rng(1)
     below = rng.gamma(2.0, 1.0, (2000, 400))
     above = below * rng.gamma(2.0, 0.5, below.shape)
-    found = [ratio_of(a, b) for a, b in zip(above, below, strict=True)]
+    found = [populations.ratio_of(a, b) for a, b in zip(above, below, strict=True)]
     spread = np.std([each.value for each in found])
     assert np.mean([each.std_error for each in found]) == pytest.approx(spread, rel=0.08)
 
@@ -123,7 +113,10 @@ def test_intervals_cover_at_the_stop_and_conditional_ones_do_not_where_vehicles_
         SCENARIOS / "overtaking_shells.yaml", ["world.engine=twin", "stop.rhw=0.5", "testing.shells.first_tests=12"]
     )
     found = PairedCampaign(campaign, known_pool, seed=3).run(range(REPLICATIONS))
-    free, inside = ([row for row in found if row.result == name] for name in (DIFFERENCE, CONDITIONAL_DIFFERENCE))
+    free, inside = (
+        [row for row in found if row.result == name]
+        for name in (populations.DIFFERENCE, populations.CONDITIONAL_DIFFERENCE)
+    )
     assert len(free) == REPLICATIONS
     assert all(row.reached for row in free)
     assert covered(free) >= 0.818

@@ -9,29 +9,20 @@ import pytest
 from harness.estimators.block import joined
 from harness.estimators.scv import Scv
 from harness.runner.stored import stored_blocks
+from studies import rnot
 from studies.__main__ import main
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
-from studies.rnot import (
-    SCV_REMARK,
-    Procedure,
-    RequiredTests,
-    acceleration,
-    plain_rhw,
-    required_tests,
-    scv_rhw,
-    shuffled,
-)
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 GRID = np.array([10, 20, 30, 40, 50])
-QUICK = Procedure(rhw=0.6, n_shuffles=5, ratio=1.3, seed=3)
+QUICK = rnot.Procedure(rhw=0.6, n_shuffles=5, ratio=1.3, seed=3)
 
 
-def read(*rhw: float) -> RequiredTests:
-    return required_tests(np.array([rhw]), GRID, 0.3)
+def read(*rhw: float) -> rnot.RequiredTests:
+    return rnot.required_tests(np.array([rhw]), GRID, 0.3)
 
 
 @pytest.mark.parametrize(
@@ -55,38 +46,38 @@ def test_the_required_number_is_the_first_look_from_which_on_the_width_stays_bel
 def test_the_acceleration_says_on_which_side_of_the_truth_it_is():
     slow, fast = read(0.9, 0.9, 0.9, 0.1, 0.1), read(0.9, 0.1, 0.1, 0.1, 0.1)
     never = read(0.9, 0.9, 0.9, 0.9, 0.9)
-    assert acceleration(slow, fast) == (2.0, "equal")
-    assert acceleration(never, fast) == (2.5, "at least")
-    assert acceleration(fast, never) == (0.4, "at most")
-    assert acceleration(never, never)[1] == "unknown"
+    assert rnot.acceleration(slow, fast) == (2.0, "equal")
+    assert rnot.acceleration(never, fast) == (2.5, "at least")
+    assert rnot.acceleration(fast, never) == (0.4, "at most")
+    assert rnot.acceleration(never, never)[1] == "unknown"
 
 
 def test_the_grid_rises_to_the_total():
-    assert Procedure(first=10, ratio=2.0).grid(100).tolist() == [10, 20, 40, 80, 100]
-    assert Procedure(first=10, ratio=1.01, total=13).grid(100).tolist() == [10, 11, 12, 13]
-    assert Procedure(first=10).grid(4).tolist() == [4]
+    assert rnot.Procedure(first=10, ratio=2.0).grid(100).tolist() == [10, 20, 40, 80, 100]
+    assert rnot.Procedure(first=10, ratio=1.01, total=13).grid(100).tolist() == [10, 11, 12, 13]
+    assert rnot.Procedure(first=10).grid(4).tolist() == [4]
 
 
 def test_the_width_on_a_prefix_is_that_of_its_mean_and_sample_variance():
     tests = next(iter(blocks(CHAIN, "step_mixture", [800], SEED)))
     procedure = replace(QUICK, first=2)
     grid = procedure.grid(800)
-    rhw = plain_rhw(tests.weighted_crashes()[tests.crash], 800, procedure)
+    rhw = rnot.plain_rhw(tests.weighted_crashes()[tests.crash], 800, procedure)
     for shuffle in range(procedure.n_shuffles):
-        y = tests.weighted_crashes()[shuffled(procedure.seed, shuffle, tests.crash)]
+        y = tests.weighted_crashes()[rnot.shuffled(procedure.seed, shuffle, tests.crash)]
         for at, n in enumerate(grid):
             mean, error = np.mean(y[:n]), np.std(y[:n], ddof=1) / np.sqrt(n)
             expected = procedure.z * error / mean if mean else np.inf
             assert rhw[shuffle, at] == pytest.approx(expected, rel=1e-9)
-        assert sorted(shuffled(procedure.seed, shuffle, tests.crash)) == list(range(800))
+        assert sorted(rnot.shuffled(procedure.seed, shuffle, tests.crash)) == list(range(800))
 
 
 def test_algorithm_1_grown_look_by_look_is_algorithm_1_on_each_prefix():
     (tests,) = blocks(CHAIN, "step_mixture", [3_000], SEED)
     procedure = replace(QUICK, ratio=3.0, n_shuffles=2)
-    grown = scv_rhw(tests, procedure)
+    grown = rnot.scv_rhw(tests, procedure)
     for shuffle in range(2):
-        order = shuffled(procedure.seed, shuffle, tests.crash)
+        order = rnot.shuffled(procedure.seed, shuffle, tests.crash)
         for at, n in enumerate(procedure.grid(3_000)):
             anew = fed(Scv(), [tests.chosen(order[:n])])
             assert grown[shuffle, at] == anew.result(procedure.confidence).rhw
@@ -99,10 +90,10 @@ def test_a_stored_run_gives_what_its_blocks_give(stored_run, capsys):
     rows = json.loads(capsys.readouterr().out)["rows"]
     tests = joined(list(stored_blocks(folder, moments=True)))
     grid = QUICK.grid(240)
-    nade = required_tests(plain_rhw(tests.weighted_crashes()[tests.crash], 240, QUICK), grid, QUICK.rhw)
-    scv = required_tests(scv_rhw(tests, QUICK), grid, QUICK.rhw)
+    nade = rnot.required_tests(rnot.plain_rhw(tests.weighted_crashes()[tests.crash], 240, QUICK), grid, QUICK.rhw)
+    scv = rnot.required_tests(rnot.scv_rhw(tests, QUICK), grid, QUICK.rhw)
     assert [row["mean"] for row in rows] == [nade.mean, scv.mean]
-    assert (SCV_REMARK in rows[1]["remarks"], SCV_REMARK in rows[0]["remarks"]) == (True, False)
+    assert (rnot.SCV_REMARK in rows[1]["remarks"], rnot.SCV_REMARK in rows[0]["remarks"]) == (True, False)
     assert rows[0]["grid"] == f"10 to 240 by 0.3 n ({len(grid)} looks)"
 
 

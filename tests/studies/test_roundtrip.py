@@ -15,25 +15,7 @@ from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
 from harness.vocabulary import FloatArray
-from studies.roundtrip import (
-    ESTIMATE,
-    FITTED,
-    REPLICATE,
-    STATES,
-    TRAFFIC,
-    coverage,
-    data_set,
-    fit_data_sets,
-    judge_numbers,
-    kept_data_sets,
-    log_hazard,
-    on_common_knots,
-    parameters_of,
-    simulated,
-    true_hazard,
-    true_shares,
-    truth,
-)
+from studies import roundtrip
 from studies.trajectories import simulate, write
 
 pytestmark = pytest.mark.slow
@@ -46,15 +28,18 @@ def test_traffic_is_fitted_whose_speed_differences_are_as_wide_as_on_motorways_a
 
     What was never seen is not taken from the base where the data exclude it.
     """
-    environment = load_environment(TRAFFIC)
+    environment = load_environment(roundtrip.TRAFFIC)
     numbers = environment.numbers.copy()
     numbers["initial_state__r1dot_log_scale"] = 1.2
     numbers["free_driving__brake_logit"] = -12.0
     write(simulate(environment._replace(numbers=numbers), 5.0, 1), tmp_path / "wide.parquet")
     traffic = Traffic.of(map(observe, recordings([tmp_path / "wide.parquet"], load_mapping())))
-    fit = fit_traffic(traffic, load_parameters(FITTED), FITTED.parameters, "wide", Progress())
+    fit = fit_traffic(traffic, load_parameters(roundtrip.FITTED), roundtrip.FITTED.parameters, "wide", Progress())
     found = fit.environment.values()
-    assert found["free_driving__brake_logit"] < load_parameters(FITTED).values()["free_driving__brake_logit"] - 1.0
+    assert (
+        found["free_driving__brake_logit"]
+        < load_parameters(roundtrip.FITTED).values()["free_driving__brake_logit"] - 1.0
+    )
     df = found["initial_state__r1dot_df"]
     assert df in HEAVIEST_TAILS[2:]
     assert df == pytest.approx(fit.laws["rate"].estimate["initial_state__r1dot_df"])
@@ -80,35 +65,37 @@ def test_shares_of_one_step_do_not_lean_on_those_of_others() -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One data set of 10 vehicle-hours."""
     made = tmp_path_factory.mktemp("roundtrip")
-    fit_data_sets(made, 10.0, 1, 40, Progress())
+    roundtrip.fit_data_sets(made, 10.0, 1, 40, Progress())
     return made
 
 
 def test_a_data_set_is_fitted_once_and_near_what_was_put_in(folder: Path) -> None:
-    fit_data_sets(folder, 10.0, 1, 40, Progress())
-    (rows,) = kept_data_sets(folder, 10.0)
-    assert rows.index.value_counts()[REPLICATE] == 40
-    estimate = rows.loc[[ESTIMATE]]
-    for state in STATES:  # within four standard errors, which are 0.2 to 0.5
-        off = log_hazard(estimate, state)[0] - np.log(true_hazard(state))
-        assert abs(off) < 4.0 * log_hazard(rows.loc[[REPLICATE]], state).std()
-    mean = on_common_knots(estimate)
-    assert log_hazard(pd.DataFrame([mean]), (30.0, 30.0, -2.0)) == pytest.approx(
-        log_hazard(estimate, (30, 30, -2)), abs=0.1
+    roundtrip.fit_data_sets(folder, 10.0, 1, 40, Progress())
+    (rows,) = roundtrip.kept_data_sets(folder, 10.0)
+    assert rows.index.value_counts()[roundtrip.REPLICATE] == 40
+    estimate = rows.loc[[roundtrip.ESTIMATE]]
+    for state in roundtrip.STATES:  # within four standard errors, which are 0.2 to 0.5
+        off = roundtrip.log_hazard(estimate, state)[0] - np.log(roundtrip.true_hazard(state))
+        assert abs(off) < 4.0 * roundtrip.log_hazard(rows.loc[[roundtrip.REPLICATE]], state).std()
+    mean = roundtrip.on_common_knots(estimate)
+    assert roundtrip.log_hazard(pd.DataFrame([mean]), (30.0, 30.0, -2.0)) == pytest.approx(
+        roundtrip.log_hazard(estimate, (30, 30, -2)), abs=0.1
     )
-    kept = parameters_of({str(name): value for name, value in estimate.iloc[0].items()})
+    kept = roundtrip.parameters_of({str(name): value for name, value in estimate.iloc[0].items()})
     assert kept.values() == pytest.approx({name: estimate[name].iloc[0] for name in kept.values()})
-    judged = {row["number"]: row for row in judge_numbers([rows, rows * 1.5], truth().values(), mean)}
+    judged = {
+        row["number"]: row for row in roundtrip.judge_numbers([rows, rows * 1.5], roundtrip.truth().values(), mean)
+    }
     gap = judged["car_following__gain_rate_per_s"]["mean_law_by_se"]
     assert (gap["n"], gap["coverage"]) == (2, 0.5)  # the second set is off by half
 
 
 def test_sets_of_a_part_share_no_recording_and_shares_are_those_put_in(folder: Path) -> None:
-    pool = simulated(folder, 1, Progress())
-    assert data_set(pool, 10.0, 0).at_risk.size == pool.at_risk.size
-    small = data_set(pool, 5.0, 3)
+    pool = roundtrip.simulated(folder, 1, Progress())
+    assert roundtrip.data_set(pool, 10.0, 0).at_risk.size == pool.at_risk.size
+    small = roundtrip.data_set(pool, 5.0, 3)
     assert np.unique(small.recording).size == 10
-    found = list(true_shares(pool).values())
+    found = list(roundtrip.true_shares(pool).values())
     assert found[:3] == pytest.approx([0.1] * 3, abs=0.01)
     assert found[3] < found[4] < found[5]
     assert found[5] == pytest.approx(1.0, abs=0.01)
@@ -116,6 +103,6 @@ def test_sets_of_a_part_share_no_recording_and_shares_are_those_put_in(folder: P
 
 @pytest.mark.parametrize(("n_covered", "refused"), [(200, False), (180, False), (160, True)])
 def test_coverage_is_too_low_where_chance_does_not_explain_it(n_covered: int, refused: bool) -> None:
-    found = coverage(np.arange(200) < n_covered)
+    found = roundtrip.coverage(np.arange(200) < n_covered)
     assert found["coverage"] == n_covered / 200
     assert (found["p_value"] < 0.001) == refused

@@ -44,7 +44,8 @@ STEP = "acceptance_steps__share__"
 ONE_SIDED = 0.95
 """Quantile of a step's share that no replicate has drawn."""
 _SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
-_AXES = (("v_mps", "v_log"), ("r1_m", "r1_log"), ("r1dot_mps", "r1dot_log"))
+HAZARD_OF = {"v_mps": "v_log", "r1_m": "r1_log", "r1dot_mps": "r1dot_log"}
+"""What the hazard of cut-ins depends on, and the names of its effects."""
 
 
 class Scenario(Section):
@@ -182,11 +183,11 @@ class HazardTable(Section):
     r1dot_mps: Knots
     r1dot_log: LogHazards
 
-    _one_value_per_knot = _one_each(*((logs, knots) for knots, logs in _AXES))
+    _one_value_per_knot = _one_each(*((logs, knots) for knots, logs in HAZARD_OF.items()))
 
     def wish(self) -> Wish:
         """As kernels read it."""
-        return Wish(*(np.column_stack([_values(getattr(self, name)) for name in axis]) for axis in _AXES))
+        return Wish(*(np.column_stack([_values(getattr(self, name)) for name in axis]) for axis in HAZARD_OF.items()))
 
 
 class AcceptanceSteps(Section):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -62,12 +62,7 @@ class CutOutParameters(FollowingParameters):
     version: Literal[1]
     leaving: Leaving
 
-    folder: ClassVar[Path] = Path(__file__).parent
-    blocks: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "speed and headway": ("initial_state",),
-        "approach": ("approach", "free_driving"),
-        "cut-out": ("leaving",),
-    }
+    folder, blocks = Path(__file__).parent, {**FollowingParameters.blocks, "cut-out": ("leaving",)}
 
     @model_validator(mode="after")
     def _happens_in_tests(self) -> Self:

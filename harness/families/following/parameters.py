@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -93,6 +94,10 @@ class FollowingParameters(ParameterFile):
     exposure: Counted
 
     replicates: ClassVar[None] = None
+    blocks: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "speed and headway": ("initial_state",),
+        "approach": ("approach", "free_driving"),
+    }
 
     @model_validator(mode="after")
     def _fits_the_road(self) -> Self:

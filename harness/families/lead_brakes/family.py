@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -47,12 +47,7 @@ class LeadBrakesParameters(FollowingParameters):
     version: Literal[1]
     braking: Braking
 
-    folder: ClassVar[Path] = Path(__file__).parent
-    blocks: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "speed and headway": ("initial_state",),
-        "approach": ("approach", "free_driving"),
-        "peak": ("braking",),
-    }
+    folder, blocks = Path(__file__).parent, {**FollowingParameters.blocks, "peak": ("braking",)}
 
     def grid(self) -> tuple[RecordArray, FloatArray]:
         """Peaks exponential above the lowest, in bins, the tail in the last; log-normal times; two jerks."""

@@ -17,11 +17,11 @@ import numpy as np
 from harness.campaign.files import Places, validated
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
-from harness.families.cut_in.fitting.hazard import FREE_TTC_S, HAZARD_OF, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
+from harness.families.cut_in.fitting.hazard import FREE_TTC_S, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
 from harness.families.cut_in.fitting.laws import LAWS, FittedLaw, Traffic, fit_rate
 from harness.families.cut_in.loading import load_environment, require_sound_laws
 from harness.families.cut_in.parameters import EnvironmentParameters
-from harness.families.cut_in.sections import REPLACED
+from harness.families.cut_in.sections import HAZARD_OF, REPLACED
 from harness.progress import Progress
 from harness.vocabulary import FloatArray
 

@@ -15,7 +15,7 @@ from scipy import linalg
 
 from harness.families.cut_in.fitting.laws import FittedLaw, Traffic
 from harness.families.cut_in.fitting.maximum import Prior, maximise
-from harness.families.cut_in.sections import SMALLEST_SHARE
+from harness.families.cut_in.sections import HAZARD_OF, SMALLEST_SHARE
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 FREE_TTC_S = 8.0
@@ -24,8 +24,6 @@ KNOTS = np.array([0.02, 0.2, 0.5, 0.8, 0.98])
 """Quantiles (means of those at lane changes and at risk) between which the log-hazard is straight."""
 SMOOTH = 1.0, 3.0
 """Prior standard deviations of the log-hazard's bends (change over a quarter of the range) and steps [assumed]."""
-HAZARD_OF = {"v_mps": "v_log", "r1_m": "r1_log", "r1dot_mps": "r1dot_log"}
-"""What the hazard depends on, and the names of its effects."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,12 +15,13 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.errors import printable
 from harness.estimators.limits import garwood
 from harness.families.cut_in.fitting.fit import Fit
-from harness.families.cut_in.fitting.hazard import HAZARD_OF, TTC_EDGES_S
+from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
 from harness.families.cut_in.fitting.laws import bins
 from harness.families.cut_in.fitting.observations import Tally
 from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
+from harness.families.cut_in.sections import HAZARD_OF
 from harness.numbers import number
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.templates import templates
