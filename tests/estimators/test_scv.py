@@ -10,6 +10,7 @@ from harness.estimators.likelihood import Level
 from harness.estimators.limits import skewed_distances
 from harness.estimators.scv import CHUNK_ROWS, MixtureCv, Scv, Stratum, n_columns, steps_used
 from harness.estimators.weighted import Nade
+from harness.report.notes import note_words
 from studies.chains.chain import DECISIVE, PANEL, overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
@@ -183,3 +184,20 @@ def test_the_tolerance_of_ranks_is_the_documented_one(times, rank):
     stratum = Stratum(1)
     stratum.add(ratios, np.zeros(n))
     assert stratum.fit().rank == rank
+
+
+def test_saturated_strata_are_warned_of_and_deficient_ones_named():
+    parts = list(blocks(LONG, "step_mixture", [200], SEED))
+    estimate = fed(Scv(), parts).result(0.9)
+    gain = estimate.details["gain"]
+    expected = [s["n_control_steps"] for s in estimate.details["strata"] if 0 < s["rank"] >= s["n"] - 1]
+    assert gain["saturated"] == expected != []
+    assert any("saturated (l = " in note_words(warning) for warning in estimate.warnings)
+    short = [s for s in estimate.details["strata"] if s["rank"] < min(s["columns"], s["n"] - 1)]
+    assert gain["rank_deficient"] == [s["n_control_steps"] for s in short]
+    assert gain["claimed"] == pytest.approx(estimate.details["var_y"] / estimate.details["var_z"], rel=1e-9)
+
+
+def test_fewer_tests_than_columns_claim_no_precision():
+    one = blocks(MANY, "episode_mixture", [1], SEED)
+    assert fed(MixtureCv(), one).result(0.9).std_error == np.inf

@@ -10,7 +10,7 @@ import pytest
 from elftools.elf.elffile import ELFFile
 
 from harness.cli import main
-from harness.errors import EXIT_BAD_INPUT
+from harness.errors import EXIT_BAD_INPUT, HarnessError
 from harness.worlds import system_libraries
 from harness.worlds.system_libraries import LIBRARIES, SystemLibrary
 from tests.stored_runs import SCENARIOS
@@ -162,3 +162,20 @@ def test_where_it_cannot_install_is_the_line_for_an_administrator(user, calls, w
     assert main(["setup"]) == EXIT_BAD_INPUT
     assert len(programs.calls()) == calls
     assert words in capsys.readouterr().err
+
+
+def test_a_libsumo_of_the_right_version_is_taken_from_another_place_and_that_is_said(tmp_path, monkeypatch, capsys):
+    (tmp_path / "libsumo.py").write_text(f"def getVersion():\n    return 22, 'SUMO {system_libraries.SUMO_VERSION}'")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "libsumo", raising=False)
+    system_libraries.require_libraries()
+    assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_a_libsumo_that_does_not_load_for_another_reason_is_told_too(monkeypatch, open_world):
+    monkeypatch.setitem(sys.modules, "libsumo", None)
+    with pytest.raises(HarnessError, match="libsumo: found that it cannot be imported"):
+        open_world(1)
+    monkeypatch.setattr(sys, "executable", "/bin/false")  # setup looks whether it loads in the end
+    with pytest.raises(HarnessError, match="cannot be imported: exit code 1"):
+        system_libraries.require_libsumo()
