@@ -16,7 +16,7 @@ import click
 
 from harness.errors import HarnessError, printable
 from harness.numbers import count, half_width, interval, share, words
-from harness.processes import PRINTED, Kept, Printed
+from harness.printed import PRINTED, Kept, Printed
 
 _WIDTH_OF_FILES = 140
 _PARTS = {"found": "found", "expected": "expected", "fix": "mend"}

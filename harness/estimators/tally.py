@@ -68,8 +68,7 @@ class Tally(NamedTuple):
     @classmethod
     def counted(cls, tests: IntArray, crashes: Counts, failed: Counts) -> Tally:
         """Counts (S,) alone, of tests whose paths nobody has looked at."""
-        no_mass = np.zeros((tests.size, tests.size))
-        return cls(tests, crashes, failed, no_mass, no_mass)
+        return cls(tests, crashes, failed, *np.zeros((2, tests.size, tests.size)))  # which may be added to, each
 
     def part(self, strata: slice) -> Tally:
         """That of some strata."""

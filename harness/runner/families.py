@@ -25,7 +25,7 @@ from harness.estimators.stopping import HourRule
 from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
 from harness.pool.shells import PrescribedEpisodes
-from harness.processes import PRINTED
+from harness.printed import PRINTED
 from harness.progress import Progress
 from harness.records.folder import read_as, read_manifest, sole_use, write_sealed
 from harness.records.reader import read_campaign

@@ -88,7 +88,7 @@ def main() -> None:
         for name, rows in seen.items():
             with tempfile.TemporaryDirectory() as folder:
                 rows.append(one(name, seed, Path(folder) / "run"))
-        sys.stderr.write(f"{seed}\n")
+            sys.stderr.write(f"{seed} {name}: {rows[-1]}, truth {truth[name][0]:.4g}\n")
     print("| vehicle | truth per hour | held | mean rate / truth | tests, median |\n| --- | --- | --- | --- | --- |")  # noqa: T201
     for name, rows in seen.items():
         rate, low, high, n = np.array(rows).T

@@ -11,7 +11,7 @@ from benchmarks.kills import orphans
 from harness.cli import main
 from harness.controllers.find import build_host
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
-from harness.processes import PRINTED
+from harness.printed import PRINTED
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
 from tests.stored_runs import sets, stored_table

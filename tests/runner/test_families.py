@@ -11,7 +11,7 @@ import harness
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.pool import moved
-from harness.processes import PRINTED
+from harness.printed import PRINTED
 from harness.records.folder import read_manifest, write_sealed
 from harness.resolved import resolve
 from harness.runner.families import estimate_families

@@ -74,7 +74,7 @@ def test_the_folder_keeps_the_answer_of_its_own_traffic_alone(stored_run, tmp_pa
     folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
     mine = fitted(tmp_path, **{LOOK: [0.005, 0.02]})
     assert main(["estimate", str(folder), "--environment", mine, "--write"]) == 0
-    assert "  traffic  " in capsys.readouterr().out
+    assert "  error of the fit  " in capsys.readouterr().out
     assert json.loads((folder / "estimates.json").read_text())["traffic"]["n_replicates"] == 2
     assert main(["report", str(folder)]) == 0
     assert "error of the fit" in (folder / "report.html").read_text()
