@@ -269,3 +269,9 @@ def test_every_command_can_be_quiet(monkeypatch):
         with pytest.raises(ZeroDivisionError):
             main(["pool", *CAMPAIGN, *["--quiet"] * quiet])
         assert shown.call_args.kwargs == {"quiet": quiet}
+
+
+def test_estimate_writes_only_when_asked(folder, capsys):
+    assert main(["estimate", str(folder), "--confidence", "0.5", "--write", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == estimates(folder)
+    assert estimates(folder)["confidence"] == 0.5

@@ -14,7 +14,7 @@ from harness.report.notes import note_words
 from studies.chains.chain import DECISIVE, PANEL, overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import fed
+from tests.estimators.small_blocks import block, fed
 
 SMALL = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)
 LONG = overtaking("long", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=12)
@@ -201,3 +201,11 @@ def test_saturated_strata_are_warned_of_and_deficient_ones_named():
 def test_fewer_tests_than_columns_claim_no_precision():
     one = blocks(MANY, "episode_mixture", [1], SEED)
     assert fed(MixtureCv(), one).result(0.9).std_error == np.inf
+
+
+def test_control_that_never_acted_leaves_the_plain_mean():
+    some = block([True, False, False, True], method="episode_mixture", weight_cap=1.0)
+    estimate = fed(MixtureCv(), [some]).result(0.9)
+    assert estimate.crash_rate == pytest.approx(0.5, rel=1e-14)
+    assert estimate.details["rank"] == 1
+    assert estimate.std_error == pytest.approx(np.std([1, 0, 0, 1], ddof=1) / 2.0, rel=1e-12)

@@ -19,7 +19,7 @@ import pytest
 
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
-from harness.records.folder import write_json, write_part, write_together
+from harness.records.folder import read_as, write_json, write_part, write_sealed, write_together
 from harness.records.reader import read
 from harness.records.schemas import ShardTables
 from harness.report.summary import read_run_folder, summarise
@@ -225,3 +225,17 @@ def test_the_campaign_of_another_run_is_refused(crc32, stored, stored_run):
     for reading in (estimate_run, read_run_folder):
         with pytest.raises(RunFolderError, match=r"campaign\.yaml"):
             reading(stored)
+
+
+def test_a_run_killed_while_it_replaces_its_campaign_can_be_read(stored):
+    """Its manifest tells of no checksum in between."""
+    edit(stored, campaign_crc32=None)
+    assert estimate_run(stored)
+
+
+def test_json_is_strict(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "file.json", {"rhw": float("inf")})
+    assert files_below(tmp_path) == set()
+    write_sealed(tmp_path / "file.json", {"rate": 0.1, "σ": [1, None]})
+    assert read_as(dict, tmp_path / "file.json", mend="").items() >= {"rate": 0.1, "σ": [1, None]}.items()

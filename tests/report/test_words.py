@@ -195,3 +195,13 @@ def test_every_family_but_cut_ins_speaks_of_no_cut_in():
         words = families()[name].words
         texts = [*(each for each in words if isinstance(each, str)), words.tests(False), words.rests(None, "1")]
         assert not [text for text in texts if "cut-in" in text or "cuts in" in text or "BV" in text]
+
+
+@pytest.mark.parametrize(("cut_off", "high", "warned"), [(0.19, 1.1, False), (0.3, 1.2, True), (0.3, 1.4, False)])
+def test_tests_whose_time_was_up_are_warned_of_where_the_interval_leaves_them_out(cut_off, high, warned, stored_run):
+    """They are many, and had they crashed the rate would be above its upper end."""
+    run = read_run_folder(stored_run("shells-twin"))
+    best, rate = run.estimates.best, run.estimates.best.crash_rate
+    severity = replace(run.estimates.severity, cut_off=cut_off * rate)
+    warnings = said(run, replace(best, ci_high=high * rate), severity=severity).warnings
+    assert any("still closing in" in each for each in warnings) == warned

@@ -17,7 +17,6 @@ from harness.estimators.traffic import ONE_LAW, uncertain
 from harness.pool import moved
 from harness.pool.moved import assumed
 from harness.progress import Progress
-from harness.report.traffic_words import too_few
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
@@ -206,10 +205,3 @@ def test_replicates_that_tests_cannot_answer_leave_the_interval_open(stored_run,
     (row,) = [row for row in answer["rows"] if row["key"].startswith("traffic")]
     assert (row["value"], row["remark"]) == ("no limit", "2 of 3 replicates unlike what was tested")
     assert "∞" not in f"{answer}"
-
-
-@pytest.mark.parametrize(("n", "said"), [(19, "needs at least 20"), (20, "20 replicates: "), (100, "")])
-def test_few_replicates_are_warned_of(n, said):
-    words = "".join(too_few(n, 0.9))
-    assert said in words
-    assert bool(words) == bool(said)

@@ -109,10 +109,3 @@ def test_each_end_of_a_number_is_off_by_its_own():
     near = [Nearby(np.ones(1), rate, np.ones(1), off, 0.0) for rate, off in ((0.5, 0.048), (1.5, 0.21))]
     bar = bar_of(Move("cut_in.ignore_share", "assumed", (0.0, 1.0), []), near)
     assert (bar.rate, bar.off) == ((0.5, 1.5), (0.048, 0.21))
-
-
-def test_a_number_whose_end_the_tests_say_nothing_of_has_one_end(folder):
-    """There the AV closes in faster than in any test."""
-    (bar,) = sensitivity(folder, ranges={"initial_state.r2dot_min_mps": (-16.0, -10.0)})["bars"]
-    assert bar["rate"] == [None, pytest.approx(1.0)]
-    assert bar_note(bar) == "unlike what was tested"
