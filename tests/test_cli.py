@@ -272,6 +272,9 @@ def test_every_command_can_be_quiet(monkeypatch):
 
 
 def test_estimate_writes_only_when_asked(folder, capsys):
-    assert main(["estimate", str(folder), "--confidence", "0.5", "--write", "--json"]) == 0
+    before, command = estimates(folder), ["estimate", str(folder), "--confidence", "0.5", "--json"]
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out) != before == estimates(folder)
+    assert main([*command, "--write"]) == 0
     assert json.loads(capsys.readouterr().out) == estimates(folder)
     assert estimates(folder)["confidence"] == 0.5

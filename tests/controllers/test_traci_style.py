@@ -179,16 +179,13 @@ def test_before_the_first_step_what_moves_is_not_known_and_all_else_is():
 
 def test_what_scripts_set_first_is_accepted_where_it_holds_anyway(traci):
     vehicle = traci.vehicle
-    for name, *values in (
-        ("setLaneChangeMode", 0, 256, 512),
-        ("setMinGap", 0.0),
-        ("setLength", 5.0),
-        ("setActionStepLength", 0.1),
-        ("setSpeedFactor", 1.0),
-        ("setColor", (255, 0, 0)),
-    ):
-        for value in values:
-            getattr(vehicle, name)("AV", value)
+    vehicle.setMinGap("AV", 0.0)
+    vehicle.setLength("AV", 5.0)
+    vehicle.setActionStepLength("AV", 0.1)
+    vehicle.setSpeedFactor("AV", 1.0)
+    vehicle.setLaneChangeMode("AV", 0)
+    vehicle.setLaneChangeMode("AV", 512)
+    vehicle.setColor("AV", (255, 0, 0))
     vehicle.setDecel("AV", 4.5)
     vehicle.setSpeed("AV", 10.0)
     for mode, asked in ((0, -100.0), (32, -100.0), (6, -4.5), (4, -4.5), (2, -100.0)):

@@ -1,7 +1,6 @@
 """Pairs within shells: their counts, limits both ways of failed tests, what the pool's error adds, and the verdict."""
 
 import json
-import math
 from itertools import pairwise
 
 import numpy as np
@@ -125,9 +124,3 @@ def test_the_ith_test_of_a_stratum_belongs_to_the_ith_of_the_other_whatever_the_
 def test_a_crash_of_either_outside_refutes_the_assumption():
     found = paired_estimate(pairs_of((30, 10, 2, 8), (0, 5, 0, 45), (0, 0, 1, 3999)), 0.9)
     assert found["conditional"]["refuted"] is True
-
-
-def test_more_pairs_that_end_as_often_say_the_same_with_less_doubt():
-    more = PAIRS.times(2.5)
-    assert more.rate(A_CRASHES) == pytest.approx(PAIRS.rate(A_CRASHES))
-    assert more.difference(LEVEL).half_width < PAIRS.difference(LEVEL).half_width / math.sqrt(2.0)

@@ -114,6 +114,15 @@ def test_the_variance_of_the_pool_is_not_too_small_for_any_vehicle():
         assert np.mean(found) >= 0.9 * true, name
 
 
+def test_crash_shares_and_moments_alone_would_be_too_small_for_the_heaviest_paths():
+    """What the variance was made of before, the sibling that must fail: Σ min(c_s, c_t) E[m_s m_t]."""
+    mass, vehicles, _ = made_up()
+    crashing = mass * vehicles["on the heaviest paths"]
+    rate, share = crashing.sum(1), crashing.mean(0) / mass.mean(0)
+    former = (np.minimum(share[:, None], share) * (mass.T @ mass / N_PATHS)).sum() - rate.mean() ** 2
+    assert former < 0.8 * rate.var()
+
+
 def test_failed_tests_outside_are_not_taken_for_safe_ones():
     estimate = shells_estimate((0, 8, 2, 0), (2, 0, 4, 396))
     conditional = within(estimate)

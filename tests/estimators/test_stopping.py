@@ -204,13 +204,10 @@ def test_tests_that_are_missing_are_those_that_would_do():
 )
 def test_a_limits_threshold_follows_from_the_crashes_that_it_makes_expected(tests, statement, driver, expected):
     """Ten times the tests where ten times as much lies outside: cut-ins that take time are no rarer decided."""
-    references = {"references": (Reference("r157-cc", "a driver"),), "reference_rate": np.array([2e-8])}
-    counted = SeenShells()
-    none = np.zeros(3, np.int64)
-    counted.count(
-        replace(DESIGN, **references, reference_square=np.array([1e-15])),
-        Tally(np.array(tests), none, none, np.zeros((3, 3)), np.zeros((3, 3))),
-    )
+    known = {"reference_rate": np.array([2e-8]), "reference_square": np.array([1e-15])}
+    design, counted = replace(DESIGN, references=(Reference("r157-cc", "a driver"),), **known), SeenShells()
+    none, of_pairs = np.zeros(3, np.int64), np.zeros((3, 3))
+    counted.count(design, Tally(np.array(tests), none, none, of_pairs, of_pairs))
     assert counted.expected(1e-7, driver, statement) == pytest.approx(expected)
 
 

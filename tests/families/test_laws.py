@@ -152,9 +152,3 @@ def test_a_file_that_says_what_was_counted_gives_a_counted_exposure_of_the_event
     assert told.counted[0] == 10
     assert told.counted[1] > 100 * 5.0  # few of them ask for braking
     assert told.per_hour == pytest.approx(10 / told.counted[1])
-
-
-def test_the_headway_of_lead_braking_is_the_gap_over_the_speed_of_the_av():
-    headway = family_named("lead_brakes").maps[0][0]
-    rows = {"event_gap_m": np.array([42.0]), "lead_speed_mps": np.array([30.0]), "event_rate_mps": np.array([2.0])}
-    assert headway.of(rows) == pytest.approx([42.0 / 28.0])

@@ -19,7 +19,7 @@ import pytest
 
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
-from harness.records.folder import read_as, write_json, write_part, write_sealed, write_together
+from harness.records.folder import write_json, write_part, write_together
 from harness.records.reader import read
 from harness.records.schemas import ShardTables
 from harness.report.summary import read_run_folder, summarise
@@ -237,5 +237,3 @@ def test_json_is_strict(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "file.json", {"rhw": float("inf")})
     assert files_below(tmp_path) == set()
-    write_sealed(tmp_path / "file.json", {"rate": 0.1, "σ": [1, None]})
-    assert read_as(dict, tmp_path / "file.json", mend="").items() >= {"rate": 0.1, "σ": [1, None]}.items()

@@ -148,6 +148,7 @@ def test_memory_of_a_worker_stays_within_ten_percent():
     assert late <= 1.1 * early
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_at_the_very_end(run_here, campaign, twin_run, tmp_path, monkeypatch):
     out = copy_of(twin_run, tmp_path / "run")
     (out / "estimates.json").unlink()

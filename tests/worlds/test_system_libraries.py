@@ -10,7 +10,7 @@ import pytest
 from elftools.elf.elffile import ELFFile
 
 from harness.cli import main
-from harness.errors import EXIT_BAD_INPUT, HarnessError
+from harness.errors import EXIT_BAD_INPUT
 from harness.worlds import system_libraries
 from harness.worlds.system_libraries import LIBRARIES, SystemLibrary
 from tests.stored_runs import SCENARIOS
@@ -170,12 +170,3 @@ def test_a_libsumo_of_the_right_version_is_taken_from_another_place_and_that_is_
     monkeypatch.delitem(sys.modules, "libsumo", raising=False)
     system_libraries.require_libraries()
     assert str(tmp_path) in capsys.readouterr().err
-
-
-def test_a_libsumo_that_does_not_load_for_another_reason_is_told_too(monkeypatch, open_world):
-    monkeypatch.setitem(sys.modules, "libsumo", None)
-    with pytest.raises(HarnessError, match="libsumo: found that it cannot be imported"):
-        open_world(1)
-    monkeypatch.setattr(sys, "executable", "/bin/false")  # setup looks whether it loads in the end
-    with pytest.raises(HarnessError, match="cannot be imported: exit code 1"):
-        system_libraries.require_libsumo()
