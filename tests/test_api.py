@@ -87,6 +87,7 @@ RUN = "shells-twin"
         (lambda _: harness.run("idm", "out", worker=2), "harness.run:", "Did you mean 'workers'?"),
         (lambda _: harness.run("idm"), "harness.run:", "'out'"),
         (lambda _: harness.load_campaign("smoke.yaml", "stop.rhw=.1"), "(overrides=", "Write ['stop.rhw=.1']."),
+        (lambda _: harness.load_campaign(None), "harness.load_campaign(path=", "nothing (null)"),
         (lambda _: harness.load_campaign("idm", av=3), "harness.load_campaign(av=", "expected text"),
         (lambda run: harness.estimate(run, estimators=["snis"]), "(estimators=", "'nde', 'nade', 'mixture_cv'"),
         (lambda run: harness.estimate(run, estimators=[]), "(estimators=", "one at least"),

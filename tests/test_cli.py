@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import signal
 import sys
 from contextlib import suppress
@@ -14,7 +15,7 @@ import click
 import pytest
 
 from harness.campaign.files import load_campaign
-from harness.cli import main
+from harness.cli import cli, main
 from harness.commands.options import run_folder
 from harness.commands.printing import say
 from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
@@ -247,3 +248,33 @@ def test_a_run_without_a_folder_gets_a_new_one_and_resumes_the_last(tmp_path, mo
             Path("runs", fresh),
             Path("runs", resumed),
         )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others have no DISPLAY")
+def test_without_a_desktop_a_replay_names_an_option_that_it_has(stored_run, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr("harness.report.sumo_files.sumo_program", lambda *_: "sumo-gui")
+    assert main(["replay", str(stored_run("shells-twin")), "3", "--gui"]) == 2
+    options = {name for each in cli.commands["replay"].params for name in each.opts}
+    assert re.search(r"(--\w+) FILE", capsys.readouterr().err)[1] in options
+
+
+def test_every_command_can_be_quiet(monkeypatch):
+    """And those that show progress ask for it."""
+    for command in cli.commands.values():
+        assert "--quiet" in {name for each in command.params for name in each.opts}
+    shown = Mock(side_effect=ZeroDivisionError)
+    monkeypatch.setattr("harness.progress.shown_progress", shown)
+    for quiet in (True, False):
+        with pytest.raises(ZeroDivisionError):
+            main(["pool", *CAMPAIGN, *["--quiet"] * quiet])
+        assert shown.call_args.kwargs == {"quiet": quiet}
+
+
+def test_estimate_writes_only_when_asked(folder, capsys):
+    before, command = estimates(folder), ["estimate", str(folder), "--confidence", "0.5", "--json"]
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out) != before == estimates(folder)
+    assert main([*command, "--write"]) == 0
+    assert json.loads(capsys.readouterr().out) == estimates(folder)
+    assert estimates(folder)["confidence"] == 0.5

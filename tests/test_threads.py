@@ -28,6 +28,7 @@ def test_results_come_in_the_order_of_the_items_and_errors_where_they_are_raised
         ("0::/a/b\n", {"a/cpu.max": "150000 100000", "a/b/cpu.max": "max 100000"}, 2),
         ("0::/named/as/outside\n", {"cpu.max": "50000 100000"}, 1),
         ("3:cpu,cpuacct:/x\n1:memory:/y\n", {"cpu/x/cpu.cfs_quota_us": "3000", "cpu/x/cpu.cfs_period_us": "1000"}, 3),
+        ("0::/a\n", {"a/cpu.max": "1600000 100000"}, 8),
         ("3:cpu:/outside\n0::/\n", {"cpu/cpu.cfs_quota_us": "4000", "cpu/cpu.cfs_period_us": "1000"}, 4),
     ],
 )

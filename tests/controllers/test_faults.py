@@ -146,12 +146,14 @@ def test_what_is_no_fault_of_an_episode_changes_none(av, tmp_path, undisturbed):
 
 
 @pytest.mark.slow
-def test_too_many_failures_end_a_campaign_halfway(tmp_path, capsys):
-    sizes = "stop.episodes=400", "run.shard_size=200", "run.max_failed_share=0.005"
+@pytest.mark.parametrize(("episodes", "n", "share"), [(400, 200, 0.005), (40, 40, 0.04)])
+def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
+    """They end a campaign halfway; one with fewer tests than that takes has no answer either."""
+    sizes = f"stop.episodes={episodes}", "run.shard_size=200", f"run.max_failed_share={share}"
     assert _run(tmp_path, _misbehaving({5: "raises", 6: "raises"}), *sizes) == EXIT_TOO_MANY_FAILED
     err = capsys.readouterr().err
     assert "run.max_failed_share" in err
-    assert "2 of 200 tests failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
+    assert f"2 of {n} tests failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
     assert not (tmp_path / "run/estimates.json").exists()
 
 

@@ -175,3 +175,19 @@ def test_before_the_first_step_what_moves_is_not_known_and_all_else_is():
     for name in ("getSpeed", "getAcceleration", "getPosition", "getLeader"):
         with pytest.raises(traci_vehicle.TraCIException, match="not known before the first step"):
             getattr(vehicle, name)("AV")
+
+
+def test_what_scripts_set_first_is_accepted_where_it_holds_anyway(traci):
+    vehicle = traci.vehicle
+    vehicle.setMinGap("AV", 0.0)
+    vehicle.setLength("AV", 5.0)
+    vehicle.setActionStepLength("AV", 0.1)
+    vehicle.setSpeedFactor("AV", 1.0)
+    vehicle.setLaneChangeMode("AV", 0)
+    vehicle.setLaneChangeMode("AV", 512)
+    vehicle.setColor("AV", (255, 0, 0))
+    vehicle.setDecel("AV", 4.5)
+    vehicle.setSpeed("AV", 10.0)
+    for mode, asked in ((0, -100.0), (32, -100.0), (6, -4.5), (4, -4.5), (2, -100.0)):
+        vehicle.setSpeedMode("AV", mode)
+        assert (vehicle.getSpeedMode("AV"), vehicle.next_acceleration()) == (mode, pytest.approx(asked))

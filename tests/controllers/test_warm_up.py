@@ -75,6 +75,18 @@ class DelayedScript(TraciStyleController):
         traci.vehicle.setAcceleration(veh_id, a, 0.1)
 
 
+class SlowsDownOnce(TraciStyleController):
+    """Begins, in its first call, to drive 3 m/s slower within 10 s."""
+
+    def on_start(self, random):
+        self._told = False
+
+    def on_step(self, traci, veh_id, time):
+        if not self._told:
+            traci.vehicle.slowDown(veh_id, traci.vehicle.getSpeed(veh_id) - 3.0, 10.0)
+        self._told = True
+
+
 class Notes(IDM):
     """Writes down what it is shown of the last episode that begins; what it answers meanwhile is nonsense."""
 
@@ -150,3 +162,12 @@ def seen(speed, gap, *, ahead=np.inf):
         "bv_speed_mps": np.full(2, 30.0),
     }
     return BatchObservation(**columns)
+
+
+def test_a_command_of_the_warm_up_begins_anew_at_the_hand_over():
+    runs = [drive(av("SlowsDownOnce", warm_up_s=s), "av.before_event=hold_speed", n=12) for s in (0.0, 2.0, 20.0)]
+    for row, trace in runs[0].traces.items():
+        onset = int(runs[0].episode["onset_step"][row])
+        assert trace[onset + 1, 2, 2] == pytest.approx(-0.3)
+    assert [run.failures for run in runs] == [{}] * 3
+    assert all(run.episode.tobytes() == runs[0].episode.tobytes() for run in runs[1:])

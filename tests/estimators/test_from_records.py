@@ -73,3 +73,11 @@ def test_ratios_are_those_of_the_first_nine_control_steps(tables):
 def test_damaged_tables_name_the_place(damage, text, tables):
     with pytest.raises(RunFolderError, match=text):
         read(*damage(*tables))
+
+
+def test_a_failed_episode_may_lack_its_weight_and_its_moments(tables):
+    episodes, moments = tables
+    failed = with_value(with_value(episodes, "outcome", 7, "failed"), "log_weight", 7, float("nan"))
+    found = read(failed, of_others(moments, 7))
+    assert (found.failed[7], found.log_weight[7]) == (True, 0.0)
+    assert np.all(found.first_ratios[7] == 1.0)

@@ -338,3 +338,8 @@ def test_the_preventable_share_is_held_often_enough_whatever_the_counts(share):
 
     assert covered(TWO_SIDED) >= 0.90
     assert covered(Level(0.3, 0.5)) < 0.85
+
+
+def test_an_error_of_the_weights_alone_gives_the_normal_interval():
+    limits = binomial([1.0], [10**12 // 4], [10**12], Level.two_sided(0.9), 0.01)
+    assert limits == pytest.approx((0.25 - 1.6449 * 0.1, 0.25 + 1.6449 * 0.1), abs=2e-3)

@@ -124,3 +124,28 @@ def test_lower_ends_without_upper_ends_with_the_failed_tests(name):
     assert found.details["crash_rate_if_failed_had_crashed"] == worst.crash_rate
     assert found.details["n_failed"] == sum(int(part.failed.sum()) for part in parts)
     assert "failed" in [warning.key for warning in found.warnings]
+
+
+def test_rates_are_per_test_and_per_distance_where_that_is_known():
+    (unknown, in_tests), (known, in_km) = (answered(drawn("forced"), distance_per_test_m=of) for of in (None, 400.0))
+    assert unknown["crash_rate_per_1e6_km"] is None
+    assert "km" not in in_tests["rows"][0]["remark"]
+    assert known["distance_per_test_km"] == 0.4
+    assert known["crash_rate_per_1e6_km"]["rate"] == pytest.approx(known["estimates"]["nade"]["crash_rate"] / 0.4 * 1e6)
+    assert "per million km" in in_km["rows"][0]["remark"]
+
+
+def test_unbounded_weights_lead_the_warnings_and_claim_no_precision():
+    content, told = answered(drawn("step_mixture"))
+    assert told["warnings"][0].startswith("the true rate may lie far above this interval: the weights")
+    for name, n_cautions in (("nade", 1), ("scv", 2)):
+        found = content["estimates"][name]
+        assert (found["rhw"], found["cautions"]) == (None, found["warnings"][:n_cautions])
+    assert {point["rhw"] for point in content["convergence"]} == {None}
+
+
+def test_a_failed_test_has_the_weight_that_it_had():
+    some = block([True, False, False], [-2.0, -1.0, 0.0], failed=[False, True, False])
+    assert one_pass([some], ("nade",)).headline_estimate.details["crash_rate_if_failed_had_crashed"] == pytest.approx(
+        (np.exp(-2.0) + np.exp(-1.0)) / 3.0
+    )

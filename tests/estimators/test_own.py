@@ -117,3 +117,10 @@ def test_an_installed_package_gives_one_a_name(file, monkeypatch):
     assert asked_for(["ratio"], "-e")[0].name == "ratio"
     with pytest.raises(HarnessError, match="Did you mean 'ratio'"):
         asked_for(["ratios"], "-e")
+
+
+def test_failed_tests_count_both_ways(file):
+    failed = block([True, False, False] * 40, failed=[False, True, False] * 40)
+    found = one_pass([failed], [one(file)]).estimates["mine.py:Mean"]
+    assert found.details["crash_rate_if_failed_had_crashed"] == pytest.approx(2 / 3)
+    assert found.ci_high > 2 / 3

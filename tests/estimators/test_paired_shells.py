@@ -119,3 +119,8 @@ def test_the_ith_test_of_a_stratum_belongs_to_the_ith_of_the_other_whatever_the_
         assert counted.ends[s, CRASH, NO_CRASH] == np.count_nonzero(a[first] & ~b[first])
         assert counted.ends[s, CRASH, CRASH] == np.count_nonzero(a[first] & b[first])
     assert counted.tests.tolist() == n.tolist()
+
+
+def test_a_crash_of_either_outside_refutes_the_assumption():
+    found = paired_estimate(pairs_of((30, 10, 2, 8), (0, 5, 0, 45), (0, 0, 1, 3999)), 0.9)
+    assert found["conditional"]["refuted"] is True

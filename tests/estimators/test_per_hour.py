@@ -160,3 +160,8 @@ def test_intervals_with_counted_exposures_cover():
         without += own.low <= truth <= own.high
     assert inside / 800 > 0.867
     assert without / 800 < 0.75
+
+
+def test_it_is_narrower_than_any_sum_of_limits():
+    found, own = PerHour(THREE).limits(LEVEL), [of.limits(LEVEL) for of in THREE]
+    assert sum(each.low for each in own) < found.low < found.rate < found.high < sum(each.high for each in own)

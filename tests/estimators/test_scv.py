@@ -10,10 +10,11 @@ from harness.estimators.likelihood import Level
 from harness.estimators.limits import skewed_distances
 from harness.estimators.scv import CHUNK_ROWS, MixtureCv, Scv, Stratum, n_columns, steps_used
 from harness.estimators.weighted import Nade
+from harness.report.notes import note_words
 from studies.chains.chain import DECISIVE, PANEL, overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import fed
+from tests.estimators.small_blocks import block, fed
 
 SMALL = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)
 LONG = overtaking("long", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=12)
@@ -183,3 +184,28 @@ def test_the_tolerance_of_ranks_is_the_documented_one(times, rank):
     stratum = Stratum(1)
     stratum.add(ratios, np.zeros(n))
     assert stratum.fit().rank == rank
+
+
+def test_saturated_strata_are_warned_of_and_deficient_ones_named():
+    parts = list(blocks(LONG, "step_mixture", [200], SEED))
+    estimate = fed(Scv(), parts).result(0.9)
+    gain = estimate.details["gain"]
+    expected = [s["n_control_steps"] for s in estimate.details["strata"] if 0 < s["rank"] >= s["n"] - 1]
+    assert gain["saturated"] == expected != []
+    assert any("saturated (l = " in note_words(warning) for warning in estimate.warnings)
+    short = [s for s in estimate.details["strata"] if s["rank"] < min(s["columns"], s["n"] - 1)]
+    assert gain["rank_deficient"] == [s["n_control_steps"] for s in short]
+    assert gain["claimed"] == pytest.approx(estimate.details["var_y"] / estimate.details["var_z"], rel=1e-9)
+
+
+def test_fewer_tests_than_columns_claim_no_precision():
+    one = blocks(MANY, "episode_mixture", [1], SEED)
+    assert fed(MixtureCv(), one).result(0.9).std_error == np.inf
+
+
+def test_control_that_never_acted_leaves_the_plain_mean():
+    some = block([True, False, False, True], method="episode_mixture", weight_cap=1.0)
+    estimate = fed(MixtureCv(), [some]).result(0.9)
+    assert estimate.crash_rate == pytest.approx(0.5, rel=1e-14)
+    assert estimate.details["rank"] == 1
+    assert estimate.std_error == pytest.approx(np.std([1, 0, 0, 1], ddof=1) / 2.0, rel=1e-12)

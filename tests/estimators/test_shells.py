@@ -114,6 +114,15 @@ def test_the_variance_of_the_pool_is_not_too_small_for_any_vehicle():
         assert np.mean(found) >= 0.9 * true, name
 
 
+def test_crash_shares_and_moments_alone_would_be_too_small_for_the_heaviest_paths():
+    """What the variance was made of before, the sibling that must fail: Σ min(c_s, c_t) E[m_s m_t]."""
+    mass, vehicles, _ = made_up()
+    crashing = mass * vehicles["on the heaviest paths"]
+    rate, share = crashing.sum(1), crashing.mean(0) / mass.mean(0)
+    former = (np.minimum(share[:, None], share) * (mass.T @ mass / N_PATHS)).sum() - rate.mean() ** 2
+    assert former < 0.8 * rate.var()
+
+
 def test_failed_tests_outside_are_not_taken_for_safe_ones():
     estimate = shells_estimate((0, 8, 2, 0), (2, 0, 4, 396))
     conditional = within(estimate)
@@ -260,3 +269,18 @@ def test_it_is_the_number_of_equal_paths_and_the_guard_tells_few_from_many(n_pat
     numbers = np.array([paths_that_count(np.ones(2), each) for each in drawn])
     assert np.mean(1.0 / numbers) == pytest.approx(1.0 / n_paths, rel=0.05)
     assert np.all((numbers < FEWEST_PATHS) == (n_paths < FEWEST_PATHS))
+
+
+def test_plain_means_do_not_know_what_to_do_with_shells():
+    found = one_pass([in_shells([0], [True])], ("nade", "nde")).estimates
+    assert [found[name].why.key for name in ("nade", "nde")] == ["needs_nade", "needs_nde"]
+
+
+def test_failed_tests_are_of_runs_like_crashed_ones():
+    place = CrashedTests(*np.array([[1, 1, 2], [3, 4, 3], [1, 2, 4], [0, 2, 3]]))  # the second and third have failed
+    one, none = np.array([1, 0]), np.zeros((2, 2))
+    found = Tally(np.array([9, 9]), one, np.array([1, 1]), none, none, OnRuns.of(10, 2, place))
+    whole = np.array([1.0, 1.0])
+    assert found.runs.square(whole, found) == 1.0
+    assert found.failed_as_crashes(np.array([True, False])).runs.n_pairs(whole > 0.0) == 1.0
+    assert found.failed_as_crashes().runs.own.tolist() == [3.0, 4.0, 0.0, 0.0]

@@ -12,6 +12,7 @@ from scipy.stats import binomtest
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Run, Stop
+from harness.estimators.answer import ended_by, expected_for
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import accumulator
 from harness.estimators.pairs import CRASH, NO_CRASH, no_pairs
@@ -190,3 +191,46 @@ def test_tests_that_are_missing_are_those_that_would_do():
             seen(*(np.rint(each * k).astype(np.int64) for each in (tests, crashes))) for k in (times, times / 1.2)
         )
         assert enough.limits_of(ASSUMPTION_FREE, level).rhw <= 1.02 * target < few.limits_of(ASSUMPTION_FREE, level).rhw
+
+
+@pytest.mark.parametrize(
+    ("tests", "statement", "driver", "expected"),
+    [
+        ([100, 100, 800], ASSUMPTION_FREE, None, 1_000 * 1e-7 / 3.2e-5),
+        ([100, 100, 80_000], ASSUMPTION_FREE, None, 80_200 * 1e-7 / 3.2e-5),
+        ([100, 100, 800], "library", None, 200 * 1e-7 / 1.2e-5),
+        ([100, 100, 800], ASSUMPTION_FREE, "r157-cc", 1_000 * 1e-7 * 2e-8 / 3.2e-5),
+    ],
+)
+def test_a_limits_threshold_follows_from_the_crashes_that_it_makes_expected(tests, statement, driver, expected):
+    """Ten times the tests where ten times as much lies outside: cut-ins that take time are no rarer decided."""
+    known = {"reference_rate": np.array([2e-8]), "reference_square": np.array([1e-15])}
+    design, counted = replace(DESIGN, references=(Reference("r157-cc", "a driver"),), **known), SeenShells()
+    none, of_pairs = np.zeros(3, np.int64), np.zeros((3, 3))
+    counted.count(design, Tally(np.array(tests), none, none, of_pairs, of_pairs))
+    assert counted.expected(1e-7, driver, statement) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("from_pool", "outside", "runs"), [(0.1, 400, 500), (0.4, 400, 1_800), (math.inf, 400, None), (0.1, 0, None)]
+)
+def test_what_is_missing_is_counted(from_pool, outside, runs):
+    av = {"controller": "examples.acting:Holds", "before_event": "controller", "limits": {"max_acceleration_mps2": 2}}
+    content = {"name": "x", "testing": {"method": "shells"}, "stop": {"rhw": 0.3, "episodes": 500}, "av": av}
+    campaign = Campaign.model_validate(content)
+    looking = RoundRule(campaign)
+    looking.observe(seen(np.array([40, 60, outside]), np.array([30, 10, 0])))
+    looking.look = replace(looking.look, rhw_from_pool=from_pool)
+    assert ended_by(campaign, looking, 500) == "episodes"
+    needed = expected_for(looking, campaign, 500)
+    assert (needed and needed["runs"]) == runs
+    assert needed is None or needed["tests"] > 500
+
+
+def test_every_round_is_looked_at_whatever_the_folder_holds():
+    """So that the looks of a run are those of one with a larger budget; and none waits for the next e-fold."""
+    for held in (0, 500):
+        deciding = rule(1e-9, held)
+        for n in range(30, 600, 10):
+            deciding.observe(seen(np.array([n - 20, 10, 10]), np.array([0, 0, 0])))
+            assert deciding.look.decision.n_episodes == n

@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
+import harness
 from harness.cli import main
 from harness.families import family_named
 from harness.families.following.approach import starts_from
@@ -15,6 +16,7 @@ from harness.families.following.family import MILDEST_MPS2, N_SPEEDS
 from harness.families.protocol import Paths
 from harness.records.folder import read_manifest
 from harness.runner.stored import estimate_run
+from harness.sampling.milder import beyond_scope
 from tests.families.roads import SETTINGS, traffic_of
 from tests.families.test_same_bits import SMALL
 
@@ -32,6 +34,12 @@ class MyAV:
             return cruise
         closes = 0.23 * (seen.gap_m - 5.0 - 1.1 * seen.speed_mps) + 0.07 * (seen.lead_speed_mps - seen.speed_mps)
         return max(-3.0, min(closes, cruise, 2.0))
+
+
+class Fails(MyAV):
+    def start(self, episode):
+        if episode.episode == 3:
+            raise RuntimeError("no")
 """
 
 
@@ -90,3 +98,14 @@ def test_one_that_does_not_is_not_told_of_them(tmp_path, capsys):
     assert code == 0
     assert "MILDER" not in capsys.readouterr().out
     assert json.loads((out / "estimates.json").read_text())["milder"]["n_crashes"] == 0
+
+
+def test_one_that_fails_is_told_and_the_run_goes_on(tmp_path):
+    """A thirty-sixth is more than may fail of tests that count; here it speaks against the vehicle as a crash does."""
+    (tmp_path / "my_av.py").write_text(AV)
+    asked = (*SMALL, "scenario=cut_out", "world.engine=twin", "stop.rhw=null", "stop.episodes=300")
+    run = harness.run(harness.load_campaign(f"{tmp_path}/my_av.py:Fails", [*asked]), tmp_path / "run", workers=1)
+    milder = run.estimates["milder"]
+    assert milder["n_failed"] == 1
+    assert beyond_scope(milder) == milder["n_crashes"] + 1
+    assert f"{beyond_scope(milder)} of 36 MILDER cut-outs end in a crash or FAIL" in " ".join(repr(run).split())

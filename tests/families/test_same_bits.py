@@ -102,3 +102,16 @@ def test_a_driver_crashes_as_the_av_where_the_pool_says_that_it_does(name, drive
         assert trace[:, -1, :2].tobytes() == np.ascontiguousarray(driven.motion[0, : steps + 1]).tobytes()
         principal = trace[:, resolved.family.principal, :2]
         assert principal.tobytes() == np.ascontiguousarray(driven.ahead[: steps + 1]).tobytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LADDERS)
+def test_sumo_and_the_twin_have_the_same_bits_in_many_tests(name):
+    """Of all events of other paths, a tenth of them in which nothing happens."""
+    resolved, n = resolved_of(name, CARELESS[name], "testing.method=forced", "world.cells=64"), 2000
+    source, crashes = prepare(resolved), 0
+    for first in range(0, 200_000, n):
+        shards = [run(world, resolved, source.tests(first, n)) for world in (SumoWorld, TwinWorld)]
+        assert shards[0].episode.tobytes() == shards[1].episode.tobytes()
+        crashes += (shards[0].episode["outcome"] == CRASH).sum()
+    assert crashes > 20

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from harness.campaign.drivers import IDMParameters, Reflexes
+from harness.campaign.drivers import CarefulCompetentParameters, IDMParameters, Reflexes
 from harness.families.cut_in.nade import challenge
 from harness.vehicles.drivers import driver_records
 from harness.vehicles.kinematics import CONTACT_M
@@ -200,3 +200,11 @@ def test_a_surrogate_that_lags_is_late_after_the_cut_in_alone():
         late, reacted = (challenge.hold_period(*state, 0.0, driver[0], 10, first) for first in (0, challenge.LONG))
         assert reacted == challenge.hold_period(*state, 0.0, driver[1], 10, 0)
         assert late[1] < reacted[1]
+
+
+def test_the_careful_and_competent_driver_brakes_sooner_once_it_has_reacted():
+    cc = driver_records([CarefulCompetentParameters()]).view(np.recarray)[0]
+    state = (20.0, 15.0, -9.0)  # a time to collision below two seconds
+    late, reacted = (challenge.hold_period(*state, 0.0, cc, 10, first) for first in (0, challenge.LONG))
+    assert state[1] - 9.0 < late[1] < reacted[1]
+    assert reacted[2] - state[2] == pytest.approx(7.59294, abs=0.01)

@@ -5,7 +5,7 @@ import pytest
 
 import harness
 from harness.campaign.drivers import IDMParameters
-from harness.errors import CampaignError
+from harness.errors import CampaignError, RunFolderError
 from harness.families.cut_in.nade.challenge import LEVELS
 from harness.families.cut_in.nade.grid import AFTER, points_of
 from harness.families.cut_in.nade.own import own_challenge
@@ -13,6 +13,7 @@ from harness.resolved import resolve
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import ACCELERATIONS_MPS2
 from tests.kernels import environment
+from tests.stored_runs import edit
 
 DRIVER = driver_records([IDMParameters(min_acceleration_mps2=-5.0)])
 FORMULA = "np.clip((gap < 20 + a) * (rate < -5) * (1 - s / 24) * v / 45 + d.min_acceleration_mps2 / 100, 0, 1)"
@@ -67,3 +68,14 @@ def test_its_file_s_content_is_part_of_the_hash_and_its_place_is_not(tmp_path):
     first, same, other = (resolve(campaign(name)) for name in names)
     assert (first.content_hash, first.challenge) == (same.content_hash, same.challenge)
     assert first.content_hash != other.content_hash
+
+
+@pytest.mark.slow
+def test_a_folder_from_elsewhere_runs_it_only_if_trusted(tmp_path):
+    name = own(tmp_path)
+    harness.run(campaign(name), tmp_path / "run", workers=1)
+    assert harness.replay(tmp_path / "run", 3).bit_equal
+    edit(tmp_path / "run", signature="of another user")
+    with pytest.raises(RunFolderError, match=r"my\.py:mine, which would be run"):
+        harness.replay(tmp_path / "run", 3)
+    assert harness.replay(tmp_path / "run", 3, trust=True).bit_equal

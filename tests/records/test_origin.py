@@ -1,12 +1,14 @@
 """A folder that this user has not made on this machine runs no code unless asked to; to look at it takes none."""
 
 import json
+import pwd
 
 import pytest
 
 import harness
 from harness.campaign.files import dump_campaign
 from harness.cli import main
+from harness.records.origin import signature
 from harness.report.compare_page import motion_of
 from harness.report.summary import read_run_folder
 from harness.resolved import resolve
@@ -119,3 +121,17 @@ def test_a_seal_that_is_missing_is_damage(file, seal, stored_run, tmp_path):
     (folder / file).write_text(json.dumps(content if seal is None else {**content, "crc32": seal}))
     with pytest.raises(harness.HarnessError, match=rf"{file}.*checksum"):
         harness.write_report(folder)
+
+
+def test_a_user_without_a_home_signs_nothing_and_leaves_nothing(tmp_path, monkeypatch):
+    """Neither by its environment nor by the system, as a user of a container that nobody has made."""
+
+    def unknown(_uid):
+        raise KeyError
+
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    for name in ("HOME", "XDG_CONFIG_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert signature(b"campaign") is None
+    assert list(tmp_path.iterdir()) == []

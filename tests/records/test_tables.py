@@ -11,6 +11,7 @@ import pytest
 import harness
 from harness.errors import RunFolderError
 from harness.families.cut_in.family import CUT_IN, STATE_FACTS
+from harness.loop.loop import hash_of_index
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
 from harness.records.shown import by_kind
 from harness.vocabulary import AV
@@ -58,6 +59,21 @@ def test_records_kept_change_nothing_else(stored_run, tmp_path):
     columns = ["episode", "step", "p"]
     assert len(first) < len(everything)
     assert first[columns].to_numpy().tolist() == expected[columns].to_numpy().tolist()
+
+
+TRACED = {"shells-twin": "all", "mixture-twin": "share", "step-immediate-twin": "critical"}
+
+
+@pytest.mark.parametrize(("name", "policy"), TRACED.items())
+def test_the_policy_says_which_are_traced(name, policy, stored_run):
+    rows = stored_table(stored_run(name), "episodes").to_pandas()
+    wanted = (rows.outcome == "crash") | (policy == "all")
+    if policy == "critical":
+        wanted |= rows.n_control_steps > 0
+    elif policy == "share":
+        wanted |= hash_of_index(golden(name).seed, rows.episode.to_numpy()) < golden(name).records.trace_share
+    assert set(stored_table(stored_run(name), "traces")["episode"].to_pylist()) == set(rows.episode[wanted])
+    assert wanted.all() == (policy == "all")
 
 
 def test_a_trace_tells_the_same_story_as_its_row(stored_run):

@@ -6,9 +6,10 @@ from dataclasses import replace
 import pytest
 
 from harness.estimators.answer import estimate_blocks
+from harness.families import families
 from harness.records.folder import read_manifest
 from harness.report.lines import LINES, WIDTH, lines
-from harness.report.pair_words import pair_words
+from harness.report.pair_words import deciding_words, pair_words
 from harness.report.summary import read_run_folder
 from harness.report.words import answer_of, short_answer
 from harness.runner.stored import stored_blocks
@@ -156,3 +157,51 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
     assert rate["remark"].endswith(" per million km")
     assert not rows["ratio"]["value"].startswith("≥")
     assert (rows["unavoidable"]["what"] == "unavoidable so far") == untested
+
+
+@pytest.mark.parametrize(
+    ("verdict", "needed", "said"),
+    [
+        ("proven", None, None),
+        ("open", None, "too alike"),
+        ("open", {"pairs": 1000, "settings": {}, "new_folder": True}, "--margin 0 and a new --out: some 1,000"),
+    ],
+)
+def test_what_would_decide(verdict, needed, said):
+    told = deciding_words({"decision": {"verdict": verdict, "margin": 0.0}, "to_decide": needed, "n_pairs": 900})
+    assert told is None if said is None else said in told
+
+
+@pytest.mark.parametrize(("verdict", "untested"), [("rejected", False), ("rejected", True), ("accepted", True)])
+def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
+    """Where a limit is rejected, or the upper end is what has not been tested: the lower end alone says something."""
+    run = read_run_folder(stored_run("shells-accepted"))
+    decision, details = {**run.manifest["decision"], "verdict": verdict}, run.estimates.best.details
+    shells = [{**each, "n_episodes": each["n_episodes"] * (not untested)} for each in details["shells"]]
+    beside = {**details["references"][0], "ratio": 3.98, "ratio_low": 2.0, "ratio_high": 980.0}
+    rate = {"crash_rate": 2e-7, "ci_low": 1e-7, "ci_high": 5e-5, "rhw": 100.0}
+    best = replace(run.estimates.best, **rate, details={**details, "references": [beside], "shells": shells})
+    limits = {"limits_above_5_mps": (0.0, 1.0), "limits_below_1_mps": (0.001, 0.41)}
+    severity = replace(run.estimates.severity, **limits, share_below_1_mps=0.0)
+    rows = said(run, best, severity=severity, decision=decision).rows
+    found = {row.key: row.texts[1:] for row in rows}
+    assert found["rate"][:2] == ("> 1.00 × 10⁻⁷ per test", "estimate 2.00 × 10⁻⁷")
+    assert found["ratio"][:2] == ("> 2.00 (crashes more)", "estimate 3.98")
+    assert found["impact"][1:] == ("", "0 % (0–41 %) below 1 m/s")
+
+
+def test_every_family_but_cut_ins_speaks_of_no_cut_in():
+    for name in families().keys() - {"cut_in"}:
+        words = families()[name].words
+        texts = [*(each for each in words if isinstance(each, str)), words.tests(False), words.rests(None, "1")]
+        assert not [text for text in texts if "cut-in" in text or "cuts in" in text or "BV" in text]
+
+
+@pytest.mark.parametrize(("cut_off", "high", "warned"), [(0.19, 1.1, False), (0.3, 1.2, True), (0.3, 1.4, False)])
+def test_tests_whose_time_was_up_are_warned_of_where_the_interval_leaves_them_out(cut_off, high, warned, stored_run):
+    """They are many, and had they crashed the rate would be above its upper end."""
+    run = read_run_folder(stored_run("shells-twin"))
+    best, rate = run.estimates.best, run.estimates.best.crash_rate
+    severity = replace(run.estimates.severity, cut_off=cut_off * rate)
+    warnings = said(run, replace(best, ci_high=high * rate), severity=severity).warnings
+    assert any("still closing in" in each for each in warnings) == warned

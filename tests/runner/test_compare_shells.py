@@ -155,6 +155,11 @@ def test_what_cannot_be_compared_is_refused(campaign, tmp_path, shared, other, s
     assert not (tmp_path / "out" / "a").exists()
 
 
+def test_one_end_is_asked_for(campaigns, tmp_path):
+    with pytest.raises(CampaignError, match=r"--margin: found stop\.rhw=0\.1 beside it"):
+        compare_campaigns(*campaigns, tmp_path / "out", margin=0.1, rhw=0.1)
+
+
 def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
     copy = Path(done.folder) / "a"
     call = ["compare", str(copy), "--against", HARDER, "--out", str(tmp_path / "out"), "--workers", "1"]

@@ -122,6 +122,7 @@ def written(file: str, text: str | None):
         (lambda run: edit(run, n_episodes=500), READERS[:1], "240 tests"),
         (lambda run: edit(run, parts=manifest(run)["parts"][::2]), READERS[:1], "begins at test 160"),
         (lambda run: edit(run, campaign_hash="0" * 16), READERS[2:], "campaign.yaml"),
+        (lambda run: truncate(run / "manifest.json"), READERS[:1], "manifest.json"),
         *((written("manifest.json", text), READERS[:1], "manifest.json") for text in (None, '{"parts": 5}')),
         *((written("campaign.yaml", text), READERS[:1], "campaign.yaml") for text in (None, "{}")),
     ],

@@ -192,3 +192,16 @@ def test_both_errors_add_as_squares_of_distances_on_a_logarithmic_scale():
     assert (only.times[0], only.both[0]) == (0.0, 0.0)
     wider = uncertain(2e-7, ends, factors, exact + 0.1, 0, 0.9).times
     assert wider == pytest.approx((found.times[0] / 1.1, found.times[1] * 1.1))
+
+
+@pytest.mark.slow
+def test_replicates_that_tests_cannot_answer_leave_the_interval_open(stored_run, tmp_path):
+    """One in which the AV closes in faster than in any test, one whose laws are none."""
+    columns = {"initial_state__r2dot_min_mps": [-10.0, -16.0, -10.0], "cut_in__intercept": [-8.7, -8.7, 900.0]}
+    content = estimate_in_other_traffic(stored_run("shells-twin"), fitted(tmp_path, **columns))
+    traffic, answer = content["traffic"], told(content)
+    assert (traffic["n_replicates"], traffic["n_refused"]) == (3, 2)
+    assert traffic["rate"]["times"] == [0.0, None]
+    (row,) = [row for row in answer["rows"] if row["key"].startswith("traffic")]
+    assert (row["value"], row["remark"]) == ("no limit", "2 of 3 replicates unlike what was tested")
+    assert "∞" not in f"{answer}"

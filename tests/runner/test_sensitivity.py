@@ -103,3 +103,9 @@ def test_a_block_shows_what_is_answered_and_how_much_is_not(n, ends, off):
     assert [None if math.isnan(end) else pytest.approx(end) for end in bar.rate] == ends
     assert [None if math.isnan(end) else pytest.approx(end) for end in bar.off] == off
     assert bar_note(asdict(bar)) == f"{n} of 5: unlike what was tested"
+
+
+def test_each_end_of_a_number_is_off_by_its_own():
+    near = [Nearby(np.ones(1), rate, np.ones(1), off, 0.0) for rate, off in ((0.5, 0.048), (1.5, 0.21))]
+    bar = bar_of(Move("cut_in.ignore_share", "assumed", (0.0, 1.0), []), near)
+    assert (bar.rate, bar.off) == ((0.5, 1.5), (0.048, 0.21))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from collections.abc import Callable
 
 import libsumo
@@ -20,7 +21,9 @@ from harness.sampling import prepare
 from harness.vehicles.drivers import Followers
 from harness.vehicles.library import load_library
 from harness.vocabulary import BV, CONTACT, CRASH, LV, STATE_DTYPE, TIMEOUT, VEHICLES
+from harness.worlds import sumo
 from harness.worlds.shim import open_shim, shim_library
+from harness.worlds.sumo import committed_file
 from harness.worlds.twin import TwinWorld
 from studies.alarm import replay_surrogates, stored_paths
 from tests.episode.test_lateral import BESIDE, at_once, beside
@@ -237,3 +240,10 @@ def test_sumo_flags_vehicles_beside_each_other_by_the_rule_of_the_first_overlap(
     assert episode["sumo"].tobytes() == episode["twin"].tobytes()
     for row, (_, outcome) in zip(episode["sumo"], BESIDE, strict=True):
         assert (row["n_steps"] > 1) if outcome is None else (row["outcome"], row["n_steps"]) == (outcome, 1)
+
+
+def test_sumo_reads_its_files_from_an_installation_in_a_folder_of_any_name(driving, tmp_path, monkeypatch):
+    folder = tmp_path / "a,b ${HOME}"
+    shutil.copytree(committed_file("vehicles.add.xml").parent, folder)
+    monkeypatch.setattr(sumo, "committed_file", lambda name: folder / name)
+    drive(driving(2))

@@ -162,3 +162,11 @@ def test_where_it_cannot_install_is_the_line_for_an_administrator(user, calls, w
     assert main(["setup"]) == EXIT_BAD_INPUT
     assert len(programs.calls()) == calls
     assert words in capsys.readouterr().err
+
+
+def test_a_libsumo_of_the_right_version_is_taken_from_another_place_and_that_is_said(tmp_path, monkeypatch, capsys):
+    (tmp_path / "libsumo.py").write_text(f"def getVersion():\n    return 22, 'SUMO {system_libraries.SUMO_VERSION}'")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "libsumo", raising=False)
+    system_libraries.require_libraries()
+    assert str(tmp_path) in capsys.readouterr().err
