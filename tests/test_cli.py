@@ -271,6 +271,17 @@ def test_every_command_can_be_quiet(monkeypatch):
         assert shown.call_args.kwargs == {"quiet": quiet}
 
 
+@pytest.mark.parametrize(("asked", "at_most"), [("r157-cc", 1.0), ("0.5*r157-cc", 0.5)])
+def test_a_limit_by_hand_replaces_that_of_the_campaign_and_says_so(asked, at_most, tmp_path, monkeypatch, capsys):
+    run = Mock(side_effect=ZeroDivisionError)
+    monkeypatch.setattr("harness.run", run)
+    own = "accept={times_reference: {driver: r157-cc, at_most: 0.1}}"
+    with pytest.raises(ZeroDivisionError):
+        main(["run", "idm", "--out", str(tmp_path / "run"), "--set", own, "--accept", asked])
+    assert run.call_args.args[0].accept.times_reference.at_most == at_most
+    assert f"--accept {asked} replaces the limit of idm: {{'times_reference'" in capsys.readouterr().err
+
+
 def test_estimate_writes_only_when_asked(folder, capsys):
     before, command = estimates(folder), ["estimate", str(folder), "--confidence", "0.5", "--json"]
     assert main(command) == 0

@@ -74,8 +74,8 @@ def check(
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
 @click.option(
     "--accept", metavar="RATE|DRIVER",
-    help="Run until it is known whether the crash rate is below this limit: crashes per test, or the name of a "
-    "reference driver such as r157-cc. Replaces stop.rhw.",
+    help="Run until it is known whether the crash rate is below this limit: crashes per test, or that of a reference "
+    "driver, r157-cc or 0.5*r157-cc. Replaces stop.rhw, and `accept` of the campaign.",
 )  # fmt: skip
 @click.option(
     "--independent", type=click.IntRange(min=0, max=2**63 - 1), metavar="N",
@@ -118,8 +118,11 @@ def run(
     limit = [] if accept is None else options.accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
     seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
-    given = [*options.of_scenario(scenario), *seeds, *overrides, *limit, *where]
-    campaign = harness.load_campaign(campaign_file, given, av=av)
+    given = [*options.of_scenario(scenario), *seeds, *overrides]
+    if limit and (own := harness.load_campaign(campaign_file, given, av=av).accept) is not None:
+        asked = own.model_dump(exclude_defaults=True)
+        say(f"note: --accept {accept} replaces the limit of {campaign_file}: {asked}", err=True)
+    campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
     chosen, folder = folder is None, folder or options.run_folder(campaign.name, resume=resume)
     if campaign.run.executor == "local":
         start_server()
@@ -185,7 +188,8 @@ def av_check(
     from harness.report.av_check import rows, verdict
     from harness.runner.look import check_av
 
-    found = run_apart(campaign.av, check_av, campaign, episodes)
+    with prints_kept_in():
+        found = run_apart(campaign.av, check_av, campaign, episodes)
     if as_json:
         print_json(found.to_json())
     else:

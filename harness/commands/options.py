@@ -56,8 +56,8 @@ workers_option = click.option(
 )  # fmt: skip
 scenario_option = click.option(
     "--scenario", metavar="NAME",
-    help="What happens in the tests: cut_in, lead_brakes or cut_out. Several, with commas, or 'all' give one answer: "
-    "crashes per hour of driving.",
+    help="What happens in the tests: cut_in (default), lead_brakes or cut_out. `harness run` also takes several, with "
+    "commas, or 'all': their answer is crashes per hour of driving.",
 )  # fmt: skip
 executor_option = click.option(
     "--executor", type=click.Choice(["local", "ray"]),
@@ -107,11 +107,12 @@ def examples(*lines: str, heading: str = "Examples:") -> str:
 
 
 def accepting(limit: str) -> list[str]:
-    """What ``--accept`` sets: crashes per test, or a reference driver by its name."""
+    """What ``--accept`` sets: crashes per test, or a reference driver by its name, as in 0.5*r157-cc."""
     try:
         keys, value = ("crash_rate_below", "times_reference"), f"{float(limit)!r}"
     except ValueError:
-        keys, value = ("times_reference", "crash_rate_below"), f"{{driver: {limit}}}"
+        times, _, driver = limit.rpartition("*")
+        keys, value = ("times_reference", "crash_rate_below"), f"{{driver: {driver}, at_most: {times or 1}}}"
     return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
 
 

@@ -35,22 +35,27 @@ def say(*lines: object, err: bool = False) -> None:
 
 
 @contextmanager
-def prints_kept_in(folder: Path) -> Iterator[None]:
-    """Let what is printed in workers be a file of the run folder, and say so; to stderr where nothing was run there."""
+def prints_kept_in(folder: Path | None = None) -> Iterator[None]:
+    """Let what is printed in workers be a file of the run folder, and say so; to stderr where nothing was run there.
+
+    Without a folder only how much it was is said.
+    """
     began, before, Printed.kept = time.time(), Printed.kept, (kept := Kept())
     try:
         yield
     finally:
         Printed.kept = before
         with suppress(OSError):  # what ends the command is told first of all
-            manifests = *folder.glob("manifest.json"), *folder.glob("*/manifest.json")
-            if not any(each.stat().st_mtime >= began for each in manifests):
+            manifests = () if folder is None else (*folder.glob("manifest.json"), *folder.glob("*/manifest.json"))
+            if folder is not None and not any(each.stat().st_mtime >= began for each in manifests):
                 os.write(2, kept.text)
             elif first := kept.text.strip().partition(b"\n")[0].decode(errors="replace"):
-                with (folder / PRINTED).open("ab") as file:
-                    file.write(kept.text)
-                by = f"{count(kept.n_lines)} lines printed by the vehicle (or SUMO)"
-                say(f"{by}: {folder / PRINTED}", f"  the first: {first[:80]}", err=True)
+                told = f"{count(kept.n_lines)} lines printed by the vehicle (or SUMO)"
+                if folder is not None:
+                    with (folder / PRINTED).open("ab") as file:
+                        file.write(kept.text)
+                    told += f": {folder / PRINTED}"
+                say(told, f"  the first: {first[:80]}", err=True)
 
 
 def go_on_unread(stream: TextIO) -> None:

@@ -227,7 +227,7 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     with guard:
         controller, wrong = guard.call(make, makes=True)
     if wrong is not None:
-        mend = "Fix its constructor, or what it needs (av.parameters; av.limits.construction_time_s, if that is time)."
+        mend = "Fix it, or give what it needs: --set av.parameters.NAME=…, or time by av.limits.construction_time_s."
         raise CampaignError("av.controller", f"{name}, whose constructor failed: {wrong}", "a controller", mend)
     guard.require_untouched()
     _require_controller(controller, name)

@@ -38,6 +38,7 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         raise CampaignError("av.controller", found, "a TraCI script", f"Fix it: {place}.") from error
     os.environ.setdefault("SUMO_HOME", sumo_data.__path__[0])  # as libsumo does: scripts look for it
     ego = style.ego
+    late: Any = None
     if ego is None:
         with guard:
             answer, late = guard.call(_found, script, makes=True)
@@ -46,7 +47,9 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         wrong = f"calls its vehicle {ego}, as one of the others is called" if ego in OTHERS else ""
     if wrong or ego is None:
         found = f"{name}, which {wrong}"
-        mend = "Fix the script, or name its vehicle: --set av.traci_style.ego=NAME."
+        mend = "Name its vehicle: --set av.traci_style.ego=NAME."
+        if late:
+            mend = "Fix the script in that line; “How it differs from TraCI” in docs/controllers.md has the calls."
         raise CampaignError("av.controller", found, "a script that commands one vehicle", mend)
 
     guard.hint = "; bound commands as its vehicle type does: av.traci_style.decel_mps2, accel_mps2"

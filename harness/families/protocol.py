@@ -209,8 +209,12 @@ class Family(Protocol):
         """The same with events that are too mild to count, of which some are driven all the same; None without any."""
         return None
 
-    def mean_distance_m(self, traffic: Environment) -> float:
-        """Mean distance (m) that an AV which keeps its speed drives where nothing happens."""
+    def mean_distance_m(self, traffic: Environment) -> float | None:  # noqa: ARG002
+        """Mean distance (m) that an AV which keeps its speed drives where nothing happens.
+
+        None where a test is an event that happens for certain: between two of them lies no distance that tests know.
+        """
+        return None
 
     def mean_speed_mps(self, traffic: Environment) -> float:
         """Mean speed (m/s) of the AV on the road that its exposure is of."""

@@ -65,10 +65,11 @@ def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimate
     """The answer by a campaign's own estimate, with what the ``manifest`` of the run says besides."""
     vehicle, parameters = vehicle_words(campaign.av)
     engine = "SUMO" if campaign.world.engine == "sumo" else "SUMO’s twin"
+    scenario = family_named(campaign.scenario).words.called
     return ShortAnswer(
         vehicle=vehicle,
         parameters=tuple(parameters),
-        tests=f"{count(told.n_episodes)} tests in {engine}",
+        tests=f"{count(told.n_episodes)} tests in {engine}, {scenario}",
         rows=tuple(with_traffic(list(rows_of(campaign, manifest, told)), told.traffic)),
         warnings=(
             *_warnings(campaign, manifest, told),

@@ -313,7 +313,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         raise refusal("this campaign, already begun", "a new or empty folder", mend)
     if manifest.get("controller_sha256") != resolved.controller_sha256:
         found = "tests of this campaign whose controller's source file has been changed since"
-        mend = "Restore the file, or test the new controller in another folder with --out."
+        mend = "Restore the file; or run the new controller by itself (`harness run my_av.py:MyAV`), into a new folder."
         raise refusal(found, "the same controller for all tests of a run", mend)
     return manifest
 

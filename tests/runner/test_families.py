@@ -65,6 +65,9 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
     assert (letter["reference"], at_once["reference"]) == ("r157-cc-letter", "r157-cc-at-once")
     assert letter["ratio"] < told["beside"]["ratio"] < at_once["ratio"]
     assert "× r157-cc-letter" in (run.folder / "report.html").read_text()
+    # Of an event that happens for certain no test knows how far apart two are.
+    assert read_manifest(run.folder / "cut_in")["distance_per_test_m"] > 100.0
+    assert read_manifest(run.folder / "lead_brakes")["distance_per_test_m"] is None
 
 
 @pytest.mark.slow

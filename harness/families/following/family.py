@@ -93,9 +93,6 @@ class FollowingFamily(Family):
     def sideways_m(self, traffic: Following) -> float:
         return float(np.nan_to_num(traffic.numbers["clear_m"]))
 
-    def mean_distance_m(self, traffic: Following) -> float:
-        return self.mean_speed_mps(traffic) * int(traffic.numbers["max_steps"]) * STEP_S
-
     def mean_speed_mps(self, traffic: Following) -> float:
         """Of the vehicle ahead, as it approaches."""
         nothing = self.choose(traffic, 0, _usual_paths(traffic), np.full(N_SPEEDS, -1))
