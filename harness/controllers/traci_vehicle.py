@@ -24,7 +24,7 @@ _CHANGES_LANE = 0b1100_1111_1111
 """Bits of a lane change mode that let SUMO change lanes, but for how much room it leaves."""
 _DEFAULT_VARIABLES, _VEHICLES = (0x50, 0x56), 0xA4
 
-_WOULD_MOVE = "it would change vehicles behind the harness’s back, and the crash rate would be wrong"
+_WOULD_MOVE = "it would change vehicles unknown to the harness, and the crash rate would be wrong"
 _STEPS = "the harness itself starts, steps and ends the simulation"
 _REFUSED = {
     **dict.fromkeys(("start", "init", "connect", "switch", "setOrder", "close", "load", "loadState"), _STEPS),

@@ -117,7 +117,7 @@ def test_a_command_that_the_av_does_not_follow_waits_until_it_does(traci, comman
     assert speeds == pytest.approx([20.0 + 0.1 * answer * min(i + 1, n) for i in range(n + 1)])
 
 
-NAN, RATIOS, UNKNOWN = float("nan"), "invalidate the likelihood ratios", "'AV7' is not known"
+NAN, RATIOS, UNKNOWN = float("nan"), "the crash rate would be wrong", "'AV7' is not known"
 COMMANDS = {"setSpeed": (3.0,), "setAcceleration": (1.0, 1.0), "slowDown": (1.0, 1.0), "setDecel": (1.0,)}
 MOVES = ("moveTo", "changeLane", "remove", "setRoute")
 IMPOSSIBLE = {"slowDown": [(-1.0, 1.0), (1.0, -1.0)], "setAcceleration": [(1.0, -1.0), (NAN, 1.0)]}
