@@ -196,12 +196,12 @@ def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False
 
     >>> import harness
     >>> harness.replay("runs/idm", 17)
-    episode 17: timeout
-      BV cuts in    3.1 s: 26.2 m ahead and 10.1 m/s slower
-      AV brakes     3.2 s, 0.1 s after the cut-in: at up to 4.0 m/s²
-      AV            avoids it, 12.1 m at the closest
-      r157-cc       a careful and competent driver: avoids it, 9.1 m at the closest
-      brakes-8      braking at once, at up to 8 m/s²: avoids it, 18.7 m at the closest
+    test 17: timeout
+      BV enters the lane 3.1 s: 26.2 m ahead and 10.1 m/s slower
+      AV brakes          3.2 s, 0.1 s after BV entered the lane: at up to 4.0 m/s²
+      AV                 avoids it, 12.1 m at the closest
+      r157-cc            a careful and competent driver: avoids it, 9.1 m at the closest
+      brakes-8           braking at once, at up to 8 m/s²: avoids it, 18.7 m at the closest
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
