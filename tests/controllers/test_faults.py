@@ -269,6 +269,11 @@ def test_what_a_controller_prints_does_not_reach_stdout(tmp_path, capfd):
     printed = capfd.readouterr()
     assert json.loads(printed.out)["bit_equal"] is True
     assert "started, below Python" in printed.err
+    assert _main("av-check --tests 4 --json", tmp_path, _of("Prints")) == EXIT_DONE
+    printed = capfd.readouterr()
+    json.loads(printed.out)
+    assert re.search(r"^[\d,]+ lines printed by the vehicle.*\n  the first: .+$", printed.err, re.MULTILINE)
+    assert len(printed.err.splitlines()) < 10
 
 
 @pytest.mark.slow
