@@ -65,7 +65,8 @@ class Estimates:
     """Content of ``estimates.json``, as it is written here and the page reads it; without a crash no severity.
 
     ``unmet`` are the conditions of the stop rule that were met last, or not at all; ``traffic`` is what replicates
-    leave open, ``milder`` what `harness.sampling.milder` says.
+    leave open, ``milder`` what `harness.sampling.milder` says; ``cut_off`` is the rate of tests that ended with the AV
+    about to crash (`Block`).
     """
 
     campaign: str
@@ -81,6 +82,7 @@ class Estimates:
     diagnostics: dict[str, Any]
     convergence: tuple[Point, ...]
     severity: Severity | None = None
+    cut_off: float = 0.0
     assumed: AssumedOfRate | None = None
     stopped_by: StoppedBy | None = None
     unmet: tuple[Note, ...] = ()
@@ -124,7 +126,7 @@ def estimate_blocks(
         crash_rate_per_1e6_km=None if distance_km is None else _per_1e6_km(best, distance_km),
         estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in done.estimates.items()},
         diagnostics=done.diagnostics.result(), convergence=tuple(done.convergence),
-        severity=done.severity,
+        severity=done.severity, cut_off=done.cut_off,
         assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
         stopped_by=manifest.get("stopped_by"), unmet=tuple(Note(**each) for each in manifest.get("unmet", ())),
         decision=manifest.get("decision"), milder=manifest.get("milder"),

@@ -169,6 +169,10 @@ class Block:
         """
         return self.ending(self.failed, CRASH)
 
+    def cut_off_as_failed(self) -> Block:
+        """The same episodes, where it is unknown how those would have ended whose time was up before a collision."""
+        return self.ending(self.cut_off, FAILED)
+
     def take(self, rows: slice) -> Block:
         """Cut out the block of some consecutive rows, a slice with step 1."""
         start, stop, _ = rows.indices(len(self))

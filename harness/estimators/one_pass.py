@@ -103,7 +103,8 @@ class PassResult:
     """What one pass over a campaign's blocks gives.
 
     ``estimates`` begin with the ``headline``, the campaign's own, asked for or not; ``convergence`` is that on growing
-    prefixes, for plots: block boundaries at least 1 % apart; ``severity`` is how hard its crashes are.
+    prefixes, for plots: block boundaries at least 1 % apart; ``severity`` is how hard its crashes are, ``cut_off`` the
+    rate of tests that ended with the AV about to crash.
     """
 
     estimates: dict[str, Estimate | Unavailable]
@@ -112,6 +113,7 @@ class PassResult:
     diagnostics: Diagnostics
     convergence: list[Point]
     severity: Severity | None
+    cut_off: float
 
 
 def one_pass(
@@ -150,8 +152,8 @@ def one_pass(
     if convergence[-1].n != n:
         convergence.append(_point(results[own]))
     estimates = {name: results[name] if why is None else Unavailable(why) for name, why in refusals.items()}
-    severity = None if impacts is None else impacts.result(confidence)
-    return PassResult(estimates, own, results[own], diagnostics, convergence, severity)
+    severity, cut_off = (None, 0.0) if impacts is None else (impacts.result(confidence), impacts.cut_off())
+    return PassResult(estimates, own, results[own], diagnostics, convergence, severity, cut_off)
 
 
 def _point(of: Estimate) -> Point:

@@ -45,7 +45,7 @@ class Severity:
 
     ``median_mps`` and ``p95_mps`` are quantiles of the speed, ``share_below_1_mps`` and ``share_above_5_mps`` shares of
     the rate; ``exceedance`` has a row for each of `SPEEDS_MPS` above what is counted. Of shells there are ``limits`` of
-    the shares, and ``unavoidable``. ``cut_off`` is the rate of tests that ended with the AV about to crash (`Block`).
+    the shares, and ``unavoidable``.
     """
 
     median_mps: float
@@ -56,7 +56,6 @@ class Severity:
     unavoidable: Unavoidable | None
     limits_below_1_mps: tuple[float, float] | None = None
     limits_above_5_mps: tuple[float, float] | None = None
-    cut_off: float = 0.0
 
 
 class Impacts:
@@ -84,24 +83,29 @@ class Impacts:
         impact, weight = (np.concatenate(column) for column in zip(*self._crashes, strict=True))
         if not impact.size:
             return None
-        every, of_careful, cut_off = self._above[self._first], None, np.concatenate(self._cut_off)
+        every, of_careful = self._above[self._first], None
         limits: list[tuple[float, float] | None] = [None, None]
         if isinstance(every, SeenShells):
             level, each = Level.two_sided(confidence), every.weight_of_a_crash()
-            weight, cut_off = each[weight.astype(np.int64)], each[cut_off.astype(np.int64)]
+            weight = each[weight.astype(np.int64)]
             of_careful = unavoidable(every.design, every.cells, level)
             for k, (speed, softer) in enumerate(((TOUCH_MPS, True), (HARD_MPS, False))):
                 if isinstance(harder := self._above.get(speed), SeenShells):
                     limits[k] = share_of_crashes(every.design, every.tally, harder.tally, level, of_the_others=softer)
-        else:
-            cut_off = cut_off / self._n
         if not weight.any():  # too small for a number
             return None
         total, median, high = float(weight.sum()), *weighted_quantiles(impact, weight, (0.5, 0.95))
         below, above = (float(weight[rows].sum()) / total for rows in (impact <= TOUCH_MPS, impact > HARD_MPS))
         rows = tuple(_exceedance(speed, state, confidence) for speed, state in self._above.items())
         of_all = median, high, below, above, rows, of_careful
-        return Severity(*of_all, limits[0], limits[1], float(cut_off.sum()))
+        return Severity(*of_all, limits[0], limits[1])
+
+    def cut_off(self) -> float:
+        """Rate of tests that ended with the AV about to crash (`Block`), whether or not any has crashed."""
+        every, weight = self._above[self._first], np.concatenate(self._cut_off)
+        if isinstance(every, SeenShells):
+            return float(every.weight_of_a_crash()[weight.astype(np.int64)].sum())
+        return float(weight.sum()) / self._n
 
 
 def _exceedance(speed: float, state: Accumulator, confidence: float) -> Exceedance:

@@ -9,6 +9,7 @@ reference drivers is in `harness.estimators.beside`.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -129,6 +130,14 @@ class SeenShells:
         """From counts by stratum, which say nothing about reference drivers."""
         shells = cls()
         shells.count(design.without_references(), tally)
+        return shells
+
+    @classmethod
+    def of_blocks(cls, blocks: Iterable[Block]) -> SeenShells:
+        """All tests of some blocks."""
+        shells = cls()
+        for block in blocks:
+            shells.add(block)
         return shells
 
     def count(self, design: ShellDesign, cells: Tally, on_runs: CrashedTests | None = None) -> None:

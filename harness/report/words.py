@@ -142,9 +142,10 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
     on_rate = told.decision is not None and not told.decision.get("driver")
     if on_rate and assumed is not None and assumed.no_lower_limit:
         yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; use --accept r157-cc"
-    worst = best.crash_rate + (0.0 if severity is None else severity.cut_off)
+    worst = best.crash_rate + told.cut_off
     if worst > max((1.0 + CUT_OFF_SHARE) * best.crash_rate, best.ci_high):
-        yield f"some tests ended while the vehicle was still closing in; had all crashed: {number(worst)} per test"
+        but = "" if told.decision is None else ", as ACCEPTED would have to allow for"
+        yield f"some tests ended while the vehicle was still closing in; had all crashed: {number(worst)} per test{but}"
     if (level := campaign.environment.lane_change_level) != 1.0:
         yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
 

@@ -120,7 +120,7 @@ def _run(
         while np.concatenate(added_to := rounds.next_round(hour)).any():
             for of, added in zip(hour.families, added_to, strict=True):
                 for shard in runs[of.family].drive_added(of.tally.tests, added, rule):
-                    of.seen.add(shard.block)
+                    of.seen.add(shard.block if campaign.accept is None else shard.block.cut_off_as_failed())
             if rule.observe(hour) and all(runs[name].run.n_episodes >= n for name, n in n_held.items()):
                 break
         for underway in runs.values():
@@ -129,6 +129,9 @@ def _run(
     of_all, rule.look = rule.look, replace(rule.look, decision=None)  # which is about the sum
     results = {name: underway.finish(rule, of_sum=True) for name, underway in runs.items()}
     rule.look = of_all
+    if campaign.accept is not None:  # tests that were cut off count as crashes in its decision alone
+        seen = {name: SeenShells.of_blocks(underway.run.blocks) for name, underway in runs.items()}
+        hour = PerHour([of._replace(seen=seen[of.family]) for of in hour.families])
     return hour, results
 
 
@@ -209,9 +212,7 @@ def estimate_families(
     given = {**stored["exposure"], **exposures}
     for name in names:
         of = folder / name
-        campaign, seen = read_campaign(of, read_manifest(of)), SeenShells()
-        for block in stored_blocks(of, moments=False):
-            seen.add(block)
+        campaign, seen = read_campaign(of, read_manifest(of)), SeenShells.of_blocks(stored_blocks(of, moments=False))
         resolved = ready[name] = resolve(campaign)
         families.append(OfFamily(name, _exposure(resolved, given), seen))
         impacts[name] = _median_impact(read_as(dict[str, Any], of / ESTIMATES, mend=MEND))

@@ -97,10 +97,7 @@ class StoredShells:
     @cached_property
     def seen(self) -> SeenShells:
         """Its tests, counted."""
-        seen = SeenShells()
-        for block in self.blocks:
-            seen.add(block)
-        return seen
+        return SeenShells.of_blocks(self.blocks)
 
     @property
     def mean_share(self) -> float:

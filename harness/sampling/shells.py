@@ -101,7 +101,8 @@ class Shells(Source):
 class ShellRounds(Rounds):
     """Fed with finished tests of shells in order; says what is tested next, and when it is enough.
 
-    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests.
+    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests, of
+    which those that were cut off may have crashed wherever a limit is decided.
     """
 
     rule: RoundRule
@@ -134,7 +135,7 @@ class ShellRounds(Rounds):
         return added
 
     def enough(self, block: Block) -> bool:
-        self.seen.add(block)
+        self.seen.add(block if self._campaign.accept is None else block.cut_off_as_failed())
         return self.enough_after(len(block))
 
     def enough_after(self, n: int) -> bool:

@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 
 from harness import estimate, replay
+from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.report.notes import note_words
 from harness.runner.kept import Run
 from harness.sampling.allocation import Allocation, first_tests
+from harness.sampling.shells import ShellRounds
 from tests.estimators.small_blocks import RARE as DESIGN
+from tests.estimators.small_blocks import SHELLS as SAFE
+from tests.estimators.small_blocks import in_shells
 from tests.estimators.small_blocks import tally as counted
 from tests.in_process import run_here as run_golden
 from tests.runner.conftest import SHELLS
@@ -43,6 +47,19 @@ def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
     scope = answer_in(fresh.folder)["scope"]
     assert re.search(r"; lower pool\.relative_error to 0\.0\d+(?: and [^;]+)?$", scope)
     assert "pool." not in "".join(map(note_words, found["warnings"]))
+
+
+@pytest.mark.parametrize(("cut_off", "verdict"), [(0.0, "accepted"), (0.02, "undecided")])
+def test_no_limit_is_accepted_that_holds_only_if_tests_that_were_cut_off_had_not_crashed(cut_off, verdict):
+    """Nobody knows how they would have ended: 2 % of the tests that crash nowhere, for a limit of 0.1 %."""
+    limit = {"accept": {"crash_rate_below": 1e-3 * float(SAFE.p.sum())}, "stop": {"episodes": 20_000}}
+    campaign = Campaign.model_validate({"name": "x", "testing": {"method": "shells"}, **limit})
+    rounds, rng = ShellRounds(campaign, SAFE, np.full(SAFE.p.size, 20_000)), np.random.default_rng(7)
+    while (added := rounds.next_round()).any():
+        tests = in_shells(np.repeat(np.arange(added.size), added).tolist(), [False] * int(added.sum()))
+        if rounds.enough(replace(tests, columns={**tests.columns, "cut_off": rng.random(len(tests)) < cut_off})):
+            break
+    assert rounds.rule.look.decision.verdict == verdict
 
 
 SPENT, MORE = "stop.episodes=150", "stop.episodes=400"
