@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from harness.campaign.campaign import Campaign
+from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
 from harness.report.words import ENDED, ShortAnswer, scope_words
@@ -66,9 +68,12 @@ def wrapped(texts: Iterable[str]) -> Iterator[str]:
 
 
 def pair_lines(
-    content: Mapping[str, Any], counts_above_mps: float, report: Path, s_per_pair: float | None = None
+    content: Mapping[str, Any], campaign: Campaign, report: Path, s_per_pair: float | None = None
 ) -> list[str]:
-    """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is what a pair takes."""
+    """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is what a pair takes.
+
+    Of the ``campaign`` it says which scenario was driven, and which crashes count.
+    """
     asked = pair_asked(content)
     rows = []
     for name in "AB":
@@ -88,8 +93,9 @@ def pair_lines(
         given = f"A / B and A − B assume that both crash only where {asked['boundary']} of the library does"
         remarks.insert(0, given)
     scope = scope_words(content["confidence"], ENDED.get(content.get("ended", ""), "interrupted"))
-    counted = f" above {plain(counts_above_mps)} m/s" if counts_above_mps else ""
-    pairs = f"{count(content['n_pairs'])} pairs of tests"
+    above = campaign.crash.counts_above_mps
+    counted = f" above {plain(above)} m/s" if above else ""
+    pairs = f"{count(content['n_pairs'])} pairs of tests, {family_named(campaign.scenario).words.called}"
     head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per test"
     last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
     return [head, *columns(rows), *wrapped([*remarks[: 3 - len(last)], *last]), f"  report  {report}"]

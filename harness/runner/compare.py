@@ -71,7 +71,7 @@ class Comparison:
 
         last = self.shown[1]
         s_per_pair = last.manifest["wall_time_s"] / self.content["n_pairs"]
-        return "\n".join(pair_lines(self.content, last.campaign.crash.counts_above_mps, self.report, s_per_pair))
+        return "\n".join(pair_lines(self.content, last.campaign, self.report, s_per_pair))
 
     def _repr_html_(self) -> str:
         """The short answer, and the map of events on which one of them crashes, as a notebook shows them."""
@@ -124,7 +124,7 @@ def compare_campaigns(
     >>> fast = ["world.engine=twin", "environment.parameters=ndd-overtaking-1", "pool.relative_error=0.1"]
     >>> idm, late = (harness.load_campaign(av, [*fast, "stop.episodes=2000"]) for av in ("idm", "late-600ms"))
     >>> harness.compare(idm, late, "runs/late")
-    B crashes more often than A · 1,054 pairs of tests · crashes per test
+    B crashes more often than A · 1,054 pairs of tests, cut-in · crashes per test
       A idm         1.32 × 10⁻⁷   (0.99 to 2.04) × 10⁻⁷    17 crashes
       B late-600ms  2.38 × 10⁻⁷   (2.03 to 3.11) × 10⁻⁷    57 crashes
       A / B         0.56          0.41 to 0.86
