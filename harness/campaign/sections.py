@@ -32,6 +32,9 @@ def whole(value: Any) -> Any:
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
+EXPOSURES = 1e-9, 1e6
+"""Least and most events of a kind per hour of driving."""
+EventsPerHour = Annotated[float, Field(ge=EXPOSURES[0], le=EXPOSURES[1])]
 Whole = Annotated[int, BeforeValidator(whole)]
 SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
 

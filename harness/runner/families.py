@@ -16,6 +16,7 @@ import numpy as np
 
 from harness.arguments import Confidence, checked
 from harness.campaign.campaign import Campaign
+from harness.campaign.sections import EventsPerHour
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
@@ -180,7 +181,7 @@ def read_families(folder: Path) -> dict[str, Any]:
 @checked("harness.estimate_families")
 def estimate_families(
     folder: str | Path,
-    exposures: Mapping[str, float] | None = None,
+    exposures: Mapping[str, EventsPerHour] | None = None,
     confidence: Confidence | None = None,
     *,
     counts: bool = False,

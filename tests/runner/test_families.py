@@ -8,11 +8,14 @@ from pathlib import Path
 import pytest
 
 import harness
+from harness.campaign.sections import EXPOSURES
 from harness.cli import main
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import CampaignError, HarnessError, RunFolderError
+from harness.numbers import plain
 from harness.pool import moved
 from harness.printed import PRINTED
 from harness.records.folder import read_manifest, write_sealed
+from harness.report.hour_words import hour_lines
 from harness.resolved import resolve
 from harness.runner.families import estimate_families
 
@@ -112,6 +115,24 @@ def test_other_exposures_need_no_new_tests(run, capsys):
     assert "families.json" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("wrong", ["1e300", "1e-320", "nan", "x", ""])
+def test_exposures_out_of_all_bounds_are_refused(wrong, run, capsys):
+    assert main(["estimate", str(run.folder), "--exposure", "cut_in=1", "--exposure", f"cut_in={wrong}"]) == 2
+    assert f"found:    {wrong or 'nothing'}, of cut_in" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", [0.0, 1e300, float("nan"), True, "1"])
+def test_exposures_are_checked_from_python(wrong, run):
+    with pytest.raises(HarnessError, match="exposures"):
+        estimate_families(run.folder, {"cut_in": wrong})
+
+
+@pytest.mark.parametrize("end", EXPOSURES)
+def test_exposures_at_the_bounds_are_shown(end, run):
+    shown = hour_lines(estimate_families(run.folder, dict.fromkeys(NAMES, end), counts=True), None)
+    assert any(f"given: cut-in {plain(end)}" in line for line in shown)
+
+
 @pytest.mark.parametrize(
     ("overrides", "where"),
     [
@@ -121,6 +142,7 @@ def test_other_exposures_need_no_new_tests(run, capsys):
         (["testing.shells.statement=library"], "testing.shells.statement"),
         (["accept={times_reference: {driver: r157-fsm}}", "stop.rhw=null"], "accept.times_reference.driver"),
         (["exposure.cut_inn=1"], "exposure"),
+        (["exposure.cut_in=1e300"], "exposure.cut_in"),
         (["environments.cut_in=ndd-overtaking-1"], "environments"),
         (["scenarios=[cut_in, lead_breaks]"], "scenario"),
     ],
