@@ -217,7 +217,8 @@ def estimate_families(
         families.append(OfFamily(name, _exposure(resolved, given), seen))
         impacts[name] = _median_impact(read_as(dict[str, Any], of / ESTIMATES, mend=MEND))
     answer = _answer(PerHour(families), ready, impacts, confidence or stored["confidence"], counts=counts)
-    return finite_json({**stored, "exposure": given, **answer})
+    decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
+    return finite_json({**stored, "exposure": given, "decision": decision, **answer})
 
 
 def _exposure(resolved: Resolved, given: Mapping[str, float]) -> Exposure:

@@ -115,6 +115,15 @@ def test_other_exposures_need_no_new_tests(run, capsys):
     assert "families.json" in capsys.readouterr().err
 
 
+def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
+    asked = {"times_reference": {"driver": "r157-cc"}}
+    run = harness.run(campaign(f"accept={asked}", "stop.rhw=null"), tmp_path / "run", workers=1)
+    verdict = run.content["decision"]
+    assert verdict["verdict"] == "rejected"
+    assert estimate_families(run.folder, confidence=0.5)["decision"] == verdict
+    assert estimate_families(run.folder, {"lead_brakes": 1e-6})["decision"] is None
+
+
 @pytest.mark.parametrize("wrong", ["1e300", "1e-320", "nan", "x", ""])
 def test_exposures_out_of_all_bounds_are_refused(wrong, run, capsys):
     assert main(["estimate", str(run.folder), "--exposure", "cut_in=1", "--exposure", f"cut_in={wrong}"]) == 2
