@@ -31,7 +31,7 @@ LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_tt
     "--estimator", "-e", "estimators", metavar="NAME", multiple=True,
     help=f"Only this one: {', '.join(ESTIMATORS)}, or your own, my.py:MyEstimator. May be given several times.",
 )  # fmt: skip
-@click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
+@click.option("--confidence", type=click.FloatRange(0.01, 0.999999999), help="Level of intervals.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
 @click.option(
     "--environment", metavar="NAME|FILE",

@@ -115,6 +115,13 @@ def test_other_exposures_need_no_new_tests(run, capsys):
     assert "families.json" in capsys.readouterr().err
 
 
+def test_a_budget_that_leaves_a_scenario_without_tests_is_refused_and_may_be_raised(run, tmp_path):
+    with pytest.raises(CampaignError, match=r"stop\.episodes: found 5, spent before a test of"):
+        harness.run(campaign("stop.episodes=5"), tmp_path / "run", workers=1)
+    again = harness.run(campaign(), tmp_path / "run", workers=1, resume=True)
+    assert bits(again.folder) == bits(run.folder)
+
+
 def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
     asked = {"times_reference": {"driver": "r157-cc"}}
     run = harness.run(campaign(f"accept={asked}", "stop.rhw=null"), tmp_path / "run", workers=1)
