@@ -26,7 +26,6 @@ R = TypeVar("R")
 
 AtLeastOne = Annotated[int, Field(ge=1)]
 Episode = Annotated[int, Field(ge=0)]
-Confidence = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 _PLAIN = (int, float, bool, str, NoneType)
 _CONFIG = ConfigDict(strict=True, arbitrary_types_allowed=True)

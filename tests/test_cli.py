@@ -82,6 +82,7 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
         ["pool", SMOKE, "--quite"],
         ["check", SMOKE, "--nothing"],
         ["estimate", ".", "--confidence", "1"],
+        ["estimate", ".", "--confidence", "1e-16"],
         [],
     ],
 )

@@ -23,8 +23,8 @@ from harness.campaign.sections import (
     Accept,
     CrashSettings,
     EnvironmentSettings,
+    EventsPerHour,
     PoolSettings,
-    Positive,
     Records,
     Run,
     Section,
@@ -70,7 +70,9 @@ class Campaign(Section):
     """kind of events that are tested: cut_in, or one that a package brings"""
     scenarios: Annotated[list[str], Field(min_length=1)] | None = None
     """several kinds of events in one answer per hour, in place of scenario"""
-    exposure: dict[str, Positive] = Field(default_factory=dict, description="events per hour of driving, by scenario")
+    exposure: dict[str, EventsPerHour] = Field(
+        default_factory=dict, description="events per hour of driving, by scenario"
+    )
     environment: EnvironmentSettings = EnvironmentSettings()
     environments: dict[str, str] = Field(default_factory=dict)
     """parameter files of the other scenarios, beside cut_in's environment: {lead_brakes: mine.lead_brakes.yaml}"""

@@ -32,6 +32,10 @@ def whole(value: Any) -> Any:
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
+EXPOSURES = 1e-9, 1e6
+"""Least and most events of a kind per hour of driving."""
+EventsPerHour = Annotated[float, Field(ge=EXPOSURES[0], le=EXPOSURES[1])]
+Confidence = Annotated[float, Field(ge=0.01, le=0.999999999)]
 Whole = Annotated[int, BeforeValidator(whole)]
 SurrogateName = Annotated[str, Field(pattern=SURROGATE_PATTERN)]
 
@@ -219,14 +223,14 @@ class Stop(Section):
     """When the campaign is long enough."""
 
     episodes: Whole = Field(100_000, ge=1, le=10**10, description="most tests to run")
-    rhw: float | None = Field(None, gt=0.0, lt=10.0)
+    rhw: float | None = Field(None, ge=1e-4, lt=10.0)
     """stop at this half-width of the interval over the rate; not for step_mixture"""
     below_reference: float | None = Field(None, gt=0.0, le=1e6)
     """with rhw and shells: stop, too, once the rate is known to be below so many times that of the library's first
     reference driver; not where --set says rhw alone"""
     each_family: bool = False
     """with several scenarios: rhw is asked of each one's rate, not of the sum"""
-    confidence: float = Field(0.9, gt=0.0, lt=1.0, description="level of every interval")
+    confidence: Confidence = Field(0.9, description="level of every interval")
     min_crashes: Annotated[int, Field(ge=1), BeforeValidator(whole)] | None = None
     """crashes needed before rhw may stop the campaign; none: 100, with shells 1"""
 

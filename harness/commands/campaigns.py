@@ -215,7 +215,7 @@ def av_check(
 )  # fmt: skip
 @click.option("--against-av", metavar="VEHICLE", help="Vehicle of B; with it B may be left out.")
 @click.option(
-    "--margin", type=click.FloatRange(min=0.0), metavar="R",
+    "--margin", type=click.FloatRange(0.0, 1e6), metavar="R",
     help="Run until it is known whether B's crash rate is at most 1 + R times A's. Replaces the precision.",
 )  # fmt: skip
 @options.workers_option

@@ -13,7 +13,7 @@ import harness
 from harness.commands.options import FILE, FOLDER, RUN_FOLDER, examples, json_option, progress_bar
 from harness.commands.printing import print_either, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
-from harness.numbers import number, plain, share, words
+from harness.numbers import number, plain, share
 from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 
 LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_ttc_s", "contact")
@@ -31,7 +31,7 @@ LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_tt
     "--estimator", "-e", "estimators", metavar="NAME", multiple=True,
     help=f"Only this one: {', '.join(ESTIMATORS)}, or your own, my.py:MyEstimator. May be given several times.",
 )  # fmt: skip
-@click.option("--confidence", type=click.FloatRange(0, 1, min_open=True, max_open=True), help="Level of intervals.")
+@click.option("--confidence", type=click.FloatRange(0.01, 0.999999999), help="Level of intervals.")
 @click.option("--write", is_flag=True, help="Replace DIR/estimates.json by the result.")
 @click.option(
     "--environment", metavar="NAME|FILE",
@@ -124,17 +124,21 @@ def _estimate_hours(
     folder: Path, exposures: Sequence[str], confidence: float | None, *, counts: bool, write: bool, as_json: bool
 ) -> None:
     """What stored tests of several scenarios say, with other exposures."""
-    from harness.campaign.files import parse_override
+    from harness.campaign.sections import EXPOSURES
     from harness.report.hour_words import hour_lines
     from harness.runner.families import estimate_families
 
     given = {}
     for each in exposures:
-        value = (read := parse_override(each)).value
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
-            found = f"{words(value)}, of {read.path[0]}"
-            raise HarnessError("--exposure", found, "events per hour, above 0", "Write --exposure lead_brakes=0.3.")
-        given[".".join(read.path)] = float(value)
+        name, _, value = each.partition("=")
+        try:
+            given[name] = float(value)
+        except ValueError:
+            given[name] = math.nan
+        if not EXPOSURES[0] <= given[name] <= EXPOSURES[1]:
+            expected = "events per hour, from {:g} to {:g}".format(*EXPOSURES)
+            mend = "Write --exposure lead_brakes=0.3."
+            raise HarnessError("--exposure", f"{value or 'nothing'}, of {name}", expected, mend)
     content, page = estimate_families(folder, given, confidence, counts=counts), None
     if write:
         from harness.records.folder import write_sealed

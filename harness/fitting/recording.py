@@ -29,6 +29,8 @@ MEDIANS = (
     ("length_m", 2.5, 10.0, "Give units in a mapping (units: {length_m: ft}); or is it the width of vehicles?"),
 )
 """What medians lie between; in feet they do not."""
+MOST_APART_M = 7.0
+"""Between the middles of lanes side by side [assumed]; in feet they are 12 apart."""
 OF_STEP = 0.05
 """Largest relative difference between speeds and the change of positions."""
 ANOTHER_VEHICLE_S = 60.0
@@ -242,6 +244,11 @@ def _check_motion(recording: Recording, rows: pd.DataFrame) -> None:
             raise TrajectoryError(recording.place, found, f"{low:g} to {high:g}", mend)
     for rule in NEAR:
         require(rule, rows, recording.where)
+    beside = rows.groupby(["road", "lane"]).lateral_m.median().reset_index().diff()
+    apart_m = float(beside.lateral_m[(beside.road == 0) & (beside.lane == 1)].abs().median())
+    if apart_m > MOST_APART_M:
+        found, mend = f"lanes {apart_m:.3g} m apart in lateral_m", "Give units in a mapping (units: {lateral_m: ft})."
+        raise TrajectoryError(recording.place, found, f"at most {MOST_APART_M:g} m", mend)
     step = np.flatnonzero(np.diff(vehicle) == 0)
     dt = (frame[step + 1] - frame[step]) / rate
     off = np.abs(np.diff(v))[step] > JUMP_MPS + HARDEST_MPS2 * dt

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +24,7 @@ from pydantic import Field
 from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.problems import did_you_mean
 from harness.campaign.sections import Section
-from harness.errors import TrajectoryError
+from harness.errors import TrajectoryError, printable
 from harness.fitting.recording import NAMES, NO_LENGTH, NUMBERS, UNITS, Recording, Unit, recording_of, require
 
 Needed = Literal["vehicle_id", "time_s", "s_m", "speed_mps", "lane", "length_m"]
@@ -132,7 +133,7 @@ def _reading(path: Path) -> Iterator[None]:
         meant = did_you_mean(path.name, [each.name for each in path.parent.glob("*")])
         mend = meant or "Check the spelling and the current folder."
         raise TrajectoryError(str(path), "no such file", expected, mend) from None
-    except (pa.ArrowException, OSError, ValueError) as error:
+    except (pa.ArrowException, csv.Error, OSError, ValueError) as error:
         first = str(error).splitlines()[0]
         mend = "Is it complete, of the type that its name says, and text in UTF-8? Copy or write it again."
         if "columns, got" in first:
@@ -178,15 +179,20 @@ class _Text(NamedTuple):
     def of(cls, path: Path, mapping: Mapping) -> _Text:
         """Find out how a file is written; what is packed is unpacked as it is read."""
         sample = pa.input_stream(str(path)).read(SAMPLE)
-        for first, kind in FOREIGN.items():
-            if sample.startswith(first):
-                mend = "Write it as CSV in UTF-8 (packed by gzip: .csv.gz), or as Parquet."
-                raise TrajectoryError(str(path), kind, "a CSV or Parquet file", mend)
+        kinds = [kind for first, kind in FOREIGN.items() if sample.startswith(first)]
+        if kinds or b"\0" in sample:
+            mend, kinds = "Write it as CSV in UTF-8 (packed by gzip: .csv.gz), or as Parquet.", [*kinds, "zero bytes"]
+            raise TrajectoryError(str(path), kinds[0], "a CSV or Parquet file", mend)
         content = pa.input_stream(str(path))
         text = sample.decode("utf-8-sig", errors="replace")
         head = text.lstrip("\r\n").partition("\n")[0].strip()
         if not head:
             raise TrajectoryError(str(path), "an empty file", "a header and rows", "Is it the right file?")
+        if isinstance(content, pa.OSFile):  # of what is packed the end is known
+            content.seek(content.size() - 1)
+            if content.read() not in (b"\n", b"\r"):
+                sys.stderr.write(f"note: {printable(str(path))} has no line end after its last row: is it complete?\n")
+            content.seek(0)
         delimiter = max(",;\t", key=head.count)
         if delimiter not in head and " " in head:  # columns of a fixed width, as NGSIM's
             delimiter, lines = " ", re.sub(rb"(?m)^ +| +(?=\r?$)", b"", content.read())

@@ -92,8 +92,8 @@ def compare_campaigns(
     progress: Progress | None = None,
     labels: tuple[str, str] | None = None,
     stored: str | Path | None = None,
-    margin: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None,
-    rhw: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None,
+    margin: Annotated[float, Field(ge=0.0, le=1e6)] | None = None,
+    rhw: Annotated[float, Field(ge=1e-4, allow_inf_nan=False)] | None = None,
 ) -> Comparison:
     """Drive two vehicles on the same events until it is known who crashes less often, or to half-width 0.1.
 

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from harness.arguments import Confidence, checked
+from harness.arguments import checked
 from harness.campaign.campaign import Campaign
+from harness.campaign.sections import Confidence, EventsPerHour
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
@@ -123,7 +124,14 @@ def _run(
                     of.seen.add(shard.block if campaign.accept is None else shard.block.cut_off_as_failed())
             if rule.observe(hour) and all(runs[name].run.n_episodes >= n for name, n in n_held.items()):
                 break
-        for underway in runs.values():
+        for name, underway in runs.items():
+            if not underway.run.n_episodes:
+                found, expected = (
+                    f"{campaign.stop.episodes}, spent before a test of {name}",
+                    "some tests of each scenario",
+                )
+                mend = "Raise it and go on with --resume, or lower testing.shells.first_tests."
+                raise CampaignError("stop.episodes", found, expected, mend)
             underway.run.require_few_failed()
             require_no_fewer(underway.run.folder, underway.run.earlier.n_episodes, underway.run.n_episodes)
     of_all, rule.look = rule.look, replace(rule.look, decision=None)  # which is about the sum
@@ -183,7 +191,7 @@ def read_families(folder: Path) -> dict[str, Any]:
 @checked("harness.estimate_families")
 def estimate_families(
     folder: str | Path,
-    exposures: Mapping[str, float] | None = None,
+    exposures: Mapping[str, EventsPerHour] | None = None,
     confidence: Confidence | None = None,
     *,
     counts: bool = False,
@@ -217,7 +225,8 @@ def estimate_families(
         families.append(OfFamily(name, _exposure(resolved, given), seen))
         impacts[name] = _median_impact(read_as(dict[str, Any], of / ESTIMATES, mend=MEND))
     answer = _answer(PerHour(families), ready, impacts, confidence or stored["confidence"], counts=counts)
-    return finite_json({**stored, "exposure": given, **answer})
+    decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
+    return finite_json({**stored, "exposure": given, "decision": decision, **answer})
 
 
 def _exposure(resolved: Resolved, given: Mapping[str, float]) -> Exposure:

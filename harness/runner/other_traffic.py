@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from harness.arguments import Confidence, checked
+from harness.arguments import checked
+from harness.campaign.sections import Confidence
 from harness.errors import CampaignError
 from harness.estimators.answer import CARRIES, Elsewhere, estimate_blocks
 from harness.estimators.estimate import finite_json

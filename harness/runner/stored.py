@@ -12,8 +12,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from pydantic import Field
 
-from harness.arguments import Confidence, Episode, checked
+from harness.arguments import Episode, checked
 from harness.campaign.campaign import Campaign
+from harness.campaign.sections import Confidence
 from harness.controllers.find import require_controller, run_apart
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks

@@ -36,6 +36,8 @@ MISTAKES = (
     ("testing: 5", "testing", 2, "a section with keys such as method"),
     ("world:", "world", 2, "delete the key for its default"),
     ("stop:\n  rhw: 10", "stop.rhw", 3, "less than 10, or null"),
+    ("stop:\n  rhw: 1e-320", "stop.rhw", 3, "0.0001, or null"),
+    ("stop:\n  confidence: 1e-16", "stop.confidence", 3, "0.01"),
     ("testing:\n  epsilon: 0", "testing.epsilon", 3, "what no surrogate crashes on would never be drawn"),
     ("testing:\n  method: ndee", "testing.method", 3, "Did you mean 'nde'?"),
     ("av:\n  model: fvdm\n  parameters: {time_headway_s: 1}", "av.parameters.time_headway_s", 4, "kappa_per_s"),

@@ -108,6 +108,8 @@ REFUSED = {
     "congested": (congested, "outside the fit range"),
     "nobody closes in": (lambda: ROWS[ROWS.vehicle_id != 2].query("vehicle_id < 2"), "beside it|closes? in"),
     "straight": (changed(lateral_m=first("lateral_m")), "or without lateral motion"),
+    "lateral feet": (changed(lateral_m=ROWS.lateral_m * FEET), r"lanes 11\.8 m apart.*units: \{lateral_m: ft\}"),
+    "no lateral number": (changed(lateral_m=ROWS.lateral_m * 1e300), r"lanes 3\.6e\+300 m apart"),
     "lanes' middles": (changed(lateral_m=3.5 * ROWS.lane), "in a jump"),
     "no length": (with_value(3, "length_m", 0.0), r"row 4 \(vehicle 0 of recording 0, t = 0\.3 s\): found no length"),
     "NaN": (with_value(9, "speed_mps", np.nan), "row 10, speed_mps: found no finite number"),
@@ -181,13 +183,24 @@ def test_missing_files(tmp_path):
         (b"PK\x03\x04" + bytes(40), "an Excel workbook"),
         (gzip.compress(b"vehicle_id,time_s\n1,0.1\n"), "does not end in .gz"),
         (b"PAR1" + bytes(40), "does not end in .parquet"),
+        (HEAD + b"1,0,0,30,0,5\n" + bytes(9), "zero bytes"),
+        (HEAD[:-1] + b"\r1,0,0,30,0,5\r", "cannot be read .*new-line"),
     ],
-    ids=["utf-16", "excel", "gzip", "parquet"],  # gzip's bytes hold the time of day
+    ids=["utf-16", "excel", "gzip", "parquet", "zeros", "carriage returns"],  # gzip's bytes hold the time of day
 )
 def test_what_is_no_text_is_called_by_its_kind(content, kind, tmp_path):
     (tmp_path / "rows.csv").write_bytes(content)
     with pytest.raises(TrajectoryError, match=kind):
         judged(tmp_path / "rows.csv")
+
+
+@pytest.mark.parametrize(("cut", "n"), [(0, 0), (1, 1), (3, 1)])
+def test_a_row_that_may_be_cut_is_told(cut, n, tmp_path, capsys):
+    """One that has lost a value is refused; of a shorter last value nothing else tells."""
+    content = ROWS.to_csv(index=False).encode()
+    (tmp_path / "rows.csv").write_bytes(content[: len(content) - cut])
+    judged(tmp_path / "rows.csv")
+    assert capsys.readouterr().err.count("rows.csv has no line end after its last row: is it complete?") == n
 
 
 def test_a_pipe_is_refused_at_once(tmp_path):

@@ -8,11 +8,14 @@ from pathlib import Path
 import pytest
 
 import harness
+from harness.campaign.sections import EXPOSURES
 from harness.cli import main
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import CampaignError, HarnessError, RunFolderError
+from harness.numbers import plain
 from harness.pool import moved
 from harness.printed import PRINTED
 from harness.records.folder import read_manifest, write_sealed
+from harness.report.hour_words import hour_lines
 from harness.resolved import resolve
 from harness.runner.families import estimate_families
 
@@ -112,6 +115,40 @@ def test_other_exposures_need_no_new_tests(run, capsys):
     assert "families.json" in capsys.readouterr().err
 
 
+def test_a_budget_that_leaves_a_scenario_without_tests_is_refused_and_may_be_raised(run, tmp_path):
+    with pytest.raises(CampaignError, match=r"stop\.episodes: found 5, spent before a test of"):
+        harness.run(campaign("stop.episodes=5"), tmp_path / "run", workers=1)
+    again = harness.run(campaign(), tmp_path / "run", workers=1, resume=True)
+    assert bits(again.folder) == bits(run.folder)
+
+
+def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
+    asked = {"times_reference": {"driver": "r157-cc"}}
+    run = harness.run(campaign(f"accept={asked}", "stop.rhw=null"), tmp_path / "run", workers=1)
+    verdict = run.content["decision"]
+    assert verdict["verdict"] == "rejected"
+    assert estimate_families(run.folder, confidence=0.5)["decision"] == verdict
+    assert estimate_families(run.folder, {"lead_brakes": 1e-6})["decision"] is None
+
+
+@pytest.mark.parametrize("wrong", ["1e300", "1e-320", "nan", "x", ""])
+def test_exposures_out_of_all_bounds_are_refused(wrong, run, capsys):
+    assert main(["estimate", str(run.folder), "--exposure", "cut_in=1", "--exposure", f"cut_in={wrong}"]) == 2
+    assert f"found:    {wrong or 'nothing'}, of cut_in" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", [0.0, 1e300, float("nan"), True, "1"])
+def test_exposures_are_checked_from_python(wrong, run):
+    with pytest.raises(HarnessError, match="exposures"):
+        estimate_families(run.folder, {"cut_in": wrong})
+
+
+@pytest.mark.parametrize("end", EXPOSURES)
+def test_exposures_at_the_bounds_are_shown(end, run):
+    shown = hour_lines(estimate_families(run.folder, dict.fromkeys(NAMES, end), counts=True), None)
+    assert any(f"given: cut-in {plain(end)}" in line for line in shown)
+
+
 @pytest.mark.parametrize(
     ("overrides", "where"),
     [
@@ -121,6 +158,7 @@ def test_other_exposures_need_no_new_tests(run, capsys):
         (["testing.shells.statement=library"], "testing.shells.statement"),
         (["accept={times_reference: {driver: r157-fsm}}", "stop.rhw=null"], "accept.times_reference.driver"),
         (["exposure.cut_inn=1"], "exposure"),
+        (["exposure.cut_in=1e300"], "exposure.cut_in"),
         (["environments.cut_in=ndd-overtaking-1"], "environments"),
         (["scenarios=[cut_in, lead_breaks]"], "scenario"),
     ],

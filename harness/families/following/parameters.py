@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from harness.campaign.problems import broken_rule
-from harness.campaign.sections import Section
+from harness.campaign.sections import EXPOSURES, Section
 from harness.families.numbers import (
     Acceleration,
     DegreesOfFreedom,
@@ -79,7 +79,7 @@ class Approach(Section):
 class Counted(Section):
     """How many events there are in an hour of driving: of ``events`` in ``hours``, where they were counted."""
 
-    per_hour: Annotated[Number, within(1e-9, 1e6)]
+    per_hour: Annotated[Number, within(*EXPOSURES)]
     events: Annotated[int, Field(ge=1)] | None = None
     hours: Annotated[float, Field(gt=0.0)] | None = None
 
