@@ -54,7 +54,7 @@ def script(name, more=""):
 
 @pytest.fixture(scope="module")
 def of_the_hook():
-    return motion(HOOK, n=60)
+    return motion(HOOK, n=30)
 
 
 def test_there_is_no_script_that_no_test_runs():
@@ -64,22 +64,22 @@ def test_there_is_no_script_that_no_test_runs():
 
 @pytest.mark.parametrize("name", sorted(NAMES))
 def test_a_script_leaves_the_bits_of_the_hook(name, of_the_hook):
-    assert motion(script(name), n=60) == of_the_hook
+    assert motion(script(name), n=30) == of_the_hook
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["main_guard.py", "with_main.py:main", "several/several.py"])
 def test_so_it_does_in_sumo(name, of_the_hook):
     with closing(SumoWorld(7)) as world:
-        assert motion(script(name), n=60, world=world) == of_the_hook
+        assert motion(script(name), n=30, world=world) == of_the_hook
 
 
 def test_one_that_acts_from_the_start_does_so_as_a_script():
     early = ", before_event: controller}", "testing={method: step_mixture}", "environment.lane_change_level=350"
     hook, *more = (HOOK[:-1] + early[0], *early[1:])
-    as_script = motion(script("plain.py")[:-1] + early[0], *more, n=60)
-    assert as_script == motion(hook, *more, n=60)
-    assert as_script != motion(script("plain.py"), *more, n=60)
+    as_script = motion(script("plain.py")[:-1] + early[0], *more, n=30)
+    assert as_script == motion(hook, *more, n=30)
+    assert as_script != motion(script("plain.py"), *more, n=30)
 
 
 def test_a_campaign_is_the_same_wherever_its_script_lies(tmp_path):

@@ -64,7 +64,8 @@ DIFFERENCE = np.array([0.0, 1.0, -1.0, 0.0])
 
 
 def both(weights, counts, level, variance=0.0):
-    return tuple(contrast_limit(np.array(weights, float), np.array(counts), level, side, variance) for side in (-1, 1))
+    w, k = np.array(weights, float, order="C"), np.array(counts, order="C")  # of one layout, for which all is compiled
+    return tuple(contrast_limit(w, k, level, side, variance) for side in (-1.0, 1.0))
 
 
 def binomial(weights, crashes, tests, level, variance=0.0):
@@ -138,7 +139,7 @@ def rates(p):
 
 
 def ratio(p, counts, level):
-    return ratio_limits(*rates(p), np.array(counts), level)
+    return ratio_limits(*rates(p), np.array(counts, order="C"), level)
 
 
 @given(STRATA)

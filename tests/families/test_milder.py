@@ -19,6 +19,7 @@ from harness.runner.stored import estimate_run
 from harness.sampling.milder import beyond_scope
 from tests.families.roads import SETTINGS, traffic_of
 from tests.families.test_same_bits import SMALL
+from tests.in_process import controllers_here, one_process, run_here
 
 CUT_OUT = family_named("cut_out")
 AV = """
@@ -72,7 +73,8 @@ def gate(tmp_path, vehicle):
     small = [f"--set={each}" for each in (*SMALL, "world.engine=twin", "stop.episodes=600")]
     out, junit = tmp_path / "run", tmp_path / "gate.xml"
     asked = ["--scenario", "cut_out", "--accept", "0.9", "--out", str(out), "--junit", str(junit)]
-    return out, junit, main(["run", vehicle, *asked, *small])
+    with one_process(), controllers_here():
+        return out, junit, main(["run", vehicle, *asked, *small])
 
 
 def test_a_vehicle_that_crashes_on_them_is_told_so_and_not_accepted(tmp_path, capsys):
@@ -104,7 +106,7 @@ def test_one_that_fails_is_told_and_the_run_goes_on(tmp_path):
     """A thirty-sixth is more than may fail of tests that count; here it speaks against the vehicle as a crash does."""
     (tmp_path / "my_av.py").write_text(AV)
     asked = (*SMALL, "scenario=cut_out", "world.engine=twin", "stop.rhw=null", "stop.episodes=300")
-    run = harness.run(harness.load_campaign(f"{tmp_path}/my_av.py:Fails", [*asked]), tmp_path / "run", workers=1)
+    run = run_here(harness.load_campaign(f"{tmp_path}/my_av.py:Fails", [*asked]), tmp_path / "run")
     milder = run.estimates["milder"]
     assert milder["n_failed"] == 1
     assert beyond_scope(milder) == milder["n_crashes"] + 1

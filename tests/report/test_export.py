@@ -119,7 +119,7 @@ def simulated(file: Path, tmp_path: Path) -> tuple[dict, list]:
 )
 def test_plain_sumo_repeats_the_motion_and_the_crash(name, scenario, crashing, stored_run, tmp_path, capsys):
     folder = stored_run(name) if name else crashing[scenario]
-    for episode in crashed(folder, 4):
+    for episode in crashed(folder, 2):
         place = tmp_path / "a, b" / f"{episode}"
         assert main(["replay", str(folder), str(episode), "--sumo", str(place)]) == 0
         assert {file.name for file in place.iterdir()} == FILES

@@ -18,10 +18,11 @@ from harness.records.folder import read_manifest, write_sealed
 from harness.report.hour_words import hour_lines
 from harness.resolved import resolve
 from harness.runner.families import estimate_families
+from tests.in_process import one_process
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
 QUICK = [
-    f"scenarios=[{', '.join(NAMES)}]", "world.engine=twin", "pool.relative_error=0.2", "pool.events_per_shell=400",
+    f"scenarios=[{', '.join(NAMES)}]", "world.engine=twin", "pool.relative_error=0.2", "pool.events_per_shell=200",
     "stop.below_reference=null", "stop.rhw=0.6",
 ]  # fmt: skip
 
@@ -32,7 +33,8 @@ def campaign(*overrides):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return harness.run(campaign(), tmp_path_factory.mktemp("hours") / "run", workers=1)
+    with one_process():
+        return harness.run(campaign(), tmp_path_factory.mktemp("hours") / "run", workers=1)
 
 
 def bits(folder):
@@ -195,6 +197,7 @@ def test_an_answer_of_another_version_is_refused(run, tmp_path, capsys):
     assert "no key readings" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_the_answer_of_one_scenario_depends_on(run, monkeypatch):
     """Harder peaks, or longer ones: twice, or three times as many crashes; per event, however many there are."""
     monkeypatch.setattr(moved, "N_PATHS", 256)  # of some ends these few do not tell

@@ -23,7 +23,7 @@ from harness.runner import run as running
 from harness.runner import workers
 from harness.runner.workers import WorkerLostError
 from harness.sampling.protocol import ShardRequest
-from tests.in_process import workers_alive
+from tests.in_process import one_process, workers_alive
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
 from tests.stored_runs import copy_of, golden, manifest, part_files, sets, unlike_columns
@@ -70,9 +70,8 @@ def test_a_full_disk_is_told_and_the_run_can_be_resumed(run_here, campaign, twin
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         return write(path, content)
 
-    with monkeypatch.context() as patch:
+    with one_process(), monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", write_or_fail)
-        patch.setattr("harness.runner.kept.PART_TESTS", 80)
         assert main(["run", str(MIXTURE_FILE), "--out", str(out), "--workers", "1", *sets(*SMALL, *TWIN)]) == 2
     complaint = capsys.readouterr().err
     assert "no space left" in complaint
