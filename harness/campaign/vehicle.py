@@ -87,9 +87,9 @@ class TraciStyle(Section):
 
     ego: str | None = Field(None, min_length=1)
     """name of the vehicle that it commands; none: found by trying it"""
-    accel_mps2: Positive | None = None
-    """bounds what its commands lead to, as accel of its vehicle type does"""
-    decel_mps2: Positive | None = None
+    accel_mps2: Positive = 2.6
+    """bounds what its commands lead to, as accel of its vehicle type does; by default that of SUMO's default type"""
+    decel_mps2: Positive = 4.5
     """the same of braking"""
 
 

@@ -38,7 +38,8 @@ def check(
     No test is run, nothing is written.
     """
     campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario), *overrides], av=av)
-    from harness.campaign.files import dump_campaign
+    from harness.campaign.files import dump_campaign, names_a_campaign
+    from harness.files import real_path
     from harness.resolved import require_ready
 
     if campaign.scenarios is None:
@@ -48,7 +49,8 @@ def check(
     if as_json:
         print_json(campaign.model_dump(mode="json"))
     else:
-        click.echo(dump_campaign(campaign))
+        folder = campaign_file.parent if names_a_campaign(campaign_file) else Path()
+        click.echo(dump_campaign(campaign).replace(f"{real_path(folder)}/", ""))  # it is written there, and may move
 
 
 @click.command(
@@ -123,6 +125,8 @@ def run(
         asked = own.model_dump(exclude_defaults=True)
         say(f"note: --accept {accept} replaces the limit of {campaign_file}: {asked}", err=True)
     campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
+    if junit is not None and campaign.accept is None:
+        say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)
     chosen, folder = folder is None, folder or options.run_folder(campaign.name, resume=resume)
     if campaign.run.executor == "local":
         start_server()

@@ -142,16 +142,16 @@ def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
     found = own_code(name)
     parameters = av.parameters if isinstance(av.parameters, dict) else {}
     make, handed = _as_class(found, name)
-    if "loaded" in handed:
-        make, parameters = _loaded_once(found, make, parameters)
     try:
+        if "loaded" in handed:
+            make, parameters = _loaded_once(found, make, parameters)
         _signature(found).bind(**handed, **parameters)
     except TypeError as error:
         loads = _signature(getattr(found, "load")).parameters if "loaded" in handed else {}  # noqa: B009 - has one
         takes = [each for each in {**loads, **_signature(found).parameters} if each not in handed]
         wrong = next((each for each in parameters if each not in takes), "")
-        what = f"{', '.join(parameters) or 'none'}, which {name} does not take ({error})"
-        mend = did_you_mean(wrong, takes) or "Correct av.parameters, or the constructor."
+        what = f"{', '.join(parameters) or 'none'}, with which {name} cannot be made ({error})"
+        mend = did_you_mean(wrong, takes) or "Give what it needs: --set av.parameters.NAME=…; or correct its code."
         expected = f"keyword arguments of the controller: {', '.join(takes) or 'it has none'}"
         raise CampaignError("av.parameters", what, expected, mend) from error
     return lambda: make(**deepcopy(parameters))
@@ -162,7 +162,9 @@ def _loaded_once(
 ) -> tuple[Callable[..., Any], dict[str, Any]]:
     """What makes controllers, each handed the one object that ``load`` returns; and the parameters left for them."""
     own, its = _signature(found).parameters, _signature(found.load).parameters
-    load = cache(partial(found.load, **deepcopy({key: value for key, value in parameters.items() if key in its})))
+    given = deepcopy({key: value for key, value in parameters.items() if key in its})
+    _signature(found.load).bind(**given)
+    load = cache(partial(found.load, **given))
     left = {key: value for key, value in parameters.items() if key in own or key not in its}
     if isinstance(make, partial):  # a listener, which is made anew in every test
         return lambda **each: StepListenerController(partial(found, loaded=load()), **each), left
@@ -227,8 +229,8 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     with guard:
         controller, wrong = guard.call(make, makes=True)
     if wrong is not None:
-        mend = "Fix it, or give what it needs: --set av.parameters.NAME=…, or time by av.limits.construction_time_s."
-        raise CampaignError("av.controller", f"{name}, whose constructor failed: {wrong}", "a controller", mend)
+        mend = "Fix it, or give what it needs: --set av.parameters.NAME=… (files relative to the current folder)."
+        raise CampaignError("av.controller", f"{name}, which cannot be made: {wrong}", "a controller", mend)
     guard.require_untouched()
     _require_controller(controller, name)
     return controller

@@ -123,8 +123,6 @@ class Guard:
     def __init__(self, limits: Limits) -> None:
         self._low, self._high = limits.min_acceleration_mps2, limits.max_acceleration_mps2
         self._limits = [time_limit(limits, makes=makes) for makes in (False, True)]
-        self.hint = ""
-        """What may help where an answer is outside of the limits."""
         self._makes = False
         """Of the call under way."""
         self._pid = os.getpid()
@@ -215,7 +213,7 @@ class Guard:
         if not math.isfinite(value):
             return value, f"returned {value}, expected a finite acceleration in m/s2"
         if not self._low <= value <= self._high:
-            return value, f"asked for {value:g} m/s2, outside of av.limits ({self._low:g} to {self._high:g}){self.hint}"
+            return value, f"asked for {value:g} m/s2, outside of av.limits ({self._low:g} to {self._high:g})"
         return value, None
 
     def outside(self, values: FloatArray) -> IntArray:

@@ -22,6 +22,7 @@ from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 OTHERS = "LV", "BV", "SV"
 SPEED_MPS = 25.0
+FAILS = "fails when it is tried before a cut-in"
 
 
 def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptController]:
@@ -42,23 +43,21 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
     if ego is None:
         with guard:
             answer, late = guard.call(_found, script, makes=True)
-        ego, wrong = answer or (None, f"fails when it is tried before a cut-in: {late}")
+        ego, wrong = answer or (None, f"{FAILS}: {late}")
     else:
         wrong = f"calls its vehicle {ego}, as one of the others is called" if ego in OTHERS else ""
     if wrong or ego is None:
         found = f"{name}, which {wrong}"
-        mend = "Name its vehicle: --set av.traci_style.ego=NAME."
-        if late:
-            mend = "Fix the script in that line; “How it differs from TraCI” in docs/controllers.md has the calls."
-        raise CampaignError("av.controller", found, "a script that commands one vehicle", mend)
-
-    guard.hint = "; bound commands as its vehicle type does: av.traci_style.decel_mps2, accel_mps2"
+        expected, mend = "a script that commands one vehicle", "Name its vehicle: --set av.traci_style.ego=NAME."
+        if wrong.startswith(FAILS):
+            expected = "a script of calls that docs/controllers.md has (“How it differs from TraCI”)"
+            mend = "Fix the script in that line. If it asks for other vehicles, add --set av.traci_style.ego=NAME."
+        raise CampaignError("av.controller", found, expected, mend)
 
     def vehicle(set_speed_mps: float, lv_name: str, bv_name: str) -> ScriptVehicles:
         made = ScriptVehicles(set_speed_mps, ego, lv_name, bv_name)
-        for bound, value in (made.setAccel, style.accel_mps2), (made.setDecel, style.decel_mps2):
-            if value is not None:
-                bound(ego, value)
+        made.setAccel(ego, style.accel_mps2)
+        made.setDecel(ego, style.decel_mps2)
         return made
 
     return partial(ScriptController, script, vehicle)
@@ -125,7 +124,7 @@ def _found(script: Script) -> tuple[str | None, str]:
             return None, f"commands {' and '.join(named)}"
         if named == [name] and not failed:
             return name, ""
-    return None, f"fails when it is tried before a cut-in: {wrong}" if wrong else "commands no vehicle before a cut-in"
+    return None, f"{FAILS}: {wrong}" if wrong else "commands no vehicle before a cut-in"
 
 
 def _commanded(script: Script, ego: str) -> tuple[list[str], str]:

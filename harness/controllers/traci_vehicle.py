@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, ClassVar, NoReturn
 
+from harness.campaign.problems import did_you_mean
 from harness.controllers.protocol import Observation
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
@@ -63,10 +64,10 @@ class Domain:
             raise AttributeError(name)
         why = _REFUSED.get(name, _WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None)
         if why is None:
-            public = [entry for entry in dir(self) if entry[0] != "_" and entry != "see"]
-            domains = [entry for entry in public if isinstance(getattr(self, entry), Domain)]
-            there = ", ".join(domains or public)
-            raise AttributeError(f"{self._path} has no {name} here; it has {there}")
+            public = [entry for entry in dir(type(self)) if entry[0] != "_" and entry != "see"]
+            domains = [entry for entry in vars(self) if isinstance(getattr(self, entry), Domain) and entry[0] != "_"]
+            there = "" if did_you_mean(name, public) else f"; it has {', '.join(domains or public)}"
+            raise AttributeError(f"{self._path} has no {name} here{there}", name=name, obj=self)
 
         def refused(*_arguments: Any, **_named: Any) -> NoReturn:
             raise RefusedError(f"{self._path}.{name} is refused: {why}.")

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened
 from harness.files import write_atomically
-from harness.vocabulary import FAMILIES
+from harness.vocabulary import COMPARISON, FAMILIES
 
 T = TypeVar("T")
 Tables = Mapping[str, pa.Table | None]
@@ -281,6 +281,8 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
         if (folder / FAMILIES).is_file():
             one = f"Name one of its scenarios, such as {next(folder.glob('*/' + MANIFEST)).parent}."
             raise RunFolderError(str(folder), "a run of several scenarios", "the run folder of one", one)
+        if (folder / COMPARISON).is_file():
+            raise RunFolderError(str(folder), "a comparison", expected, f"Name a run of it: {folder}/a or {folder}/b.")
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     found = read_as(StoredManifest, path, mend=mend)
     return {**found.model_dump(exclude_unset=True), "parts": found.parts, "before": found.before}

@@ -10,7 +10,7 @@ from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
 from harness.report.rows import decided
-from harness.report.words import ENDED, milder_words, scope_words
+from harness.report.words import ENDED, GO_ON, milder_words, scope_words
 
 
 def called(family: str) -> str:
@@ -108,5 +108,7 @@ def scope(content: Mapping[str, Any]) -> str:
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else f', at ± {share(rhw)}'} (asked: ± {share(target)})"
+    elif content["stopped_by"] == "episodes" and content["decision"] is not None:
+        ended += GO_ON
     counted = ", and that of counted events," if content["counts_in_interval"] else ""
     return scope_words(content["confidence"], ended, counted)

@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import BaseModel, TypeAdapter
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.python_files import is_script
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.answer import Elsewhere, Estimates
 from harness.estimators.severity import TOUCH_MPS
@@ -36,6 +37,8 @@ ENDED = {
     "sum": "with the sum of all scenarios",
 }
 """Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
+GO_ON = "; raise it and go on with --resume"
+"""What to do where a verdict is open."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,8 @@ def vehicle_words(av: AutomatedVehicle) -> tuple[str, list[tuple[str, str]]]:
     if av.sumo is not None:
         given |= av.sumo
         name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
+    elif av.controller and is_script(av.controller):  # SUMO would know its vehicle's type
+        given |= {"accel_mps2": av.traci_style.accel_mps2, "decel_mps2": av.traci_style.decel_mps2}
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
     elif av.fmu is not None:
@@ -174,8 +179,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
         ended += f"{reached} (asked: ± {share(target)}){remedy_words(manifest.get('remedy'))}"
-    elif stopped_by == "episodes" and campaign.accept is None:
-        ended = "all tests done"
+    elif stopped_by == "episodes":
+        ended = "all tests done" if campaign.accept is None else ended + GO_ON
     return scope_words(best.confidence, ended)
 
 

@@ -244,6 +244,7 @@ def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
         expected = f"one of A as it is to be compared ({resolved.content_hash})"
         mend = "Leave out --set and --av where they change more than the stop rule, or name A's campaign file."
         raise RunFolderError(str(stored), f"a run of campaign {manifest['campaign_hash']}", expected, mend)
+    require_own_folder(stored, resolved, resume=True)
     unfinished = folder.with_name(f".{folder.name}.part")
     with sole_use(unfinished):  # in which a call that was killed may have left a part
         try:

@@ -280,8 +280,6 @@ def require_few_failed(
     if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in by_kind(causes).most_common(1))
         mend = "Fix the AV (`harness av-check` looks at it in seconds), or raise the share to go on."
-        if "av.traci_style.decel_mps2" in cause:
-            mend = f"Add --set av.traci_style.decel_mps2=4.5 --set av.traci_style.accel_mps2=2.6 (SUMO's own). {mend}"
         found, expected = f"{causes.total()} of {n} {what} failed{cause}", f"a share of at most {most:g}"
         mend += f" All causes are in the column 'failure' of {where}."
         raise TooManyFailedError("run.max_failed_share", found, expected, mend)
@@ -313,7 +311,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         raise refusal("this campaign, already begun", "a new or empty folder", mend)
     if manifest.get("controller_sha256") != resolved.controller_sha256:
         found = "tests of this campaign whose controller's source file has been changed since"
-        mend = "Restore the file; or run the new controller by itself (`harness run my_av.py:MyAV`), into a new folder."
+        mend = "Restore the file; or drive the vehicle as it is now, into a new folder."
         raise refusal(found, "the same controller for all tests of a run", mend)
     return manifest
 
