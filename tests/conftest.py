@@ -25,12 +25,6 @@ settings.register_profile(
 )
 settings.load_profile("harness")
 
-TO_COMPILE = (
-    ("shells-sumo", "shells-acting-twin", "shells-lateral-sumo"),
-    ("nde-sumo", "step-immediate-sumo", "step-recursive-twin", "mixture-twin", "forced-lateral-sumo"),
-)
-"""Golden runs that need all kernels between them, for two processes that compile different ones."""
-
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_sessionstart(session: pytest.Session) -> None:
@@ -42,8 +36,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
     if cache.has(mark := f"{KERNELS}/compiled-for-tests"):
         return
-    command = [sys.executable, "-m", "tests.golden.record", "--digits", "1e-9", "--only"]
-    compiling = [subprocess.Popen([*command, *names]) for names in TO_COMPILE]
+    compiling = [subprocess.Popen([sys.executable, "-m", "tests.compiling", half]) for half in "01"]
     if not any([process.wait() for process in compiling]):  # noqa: C419 - wait for all
         cache.keep(mark, b"done")
 

@@ -26,8 +26,11 @@ from tests.golden.record import TABLES, tables_of
 ROOT = Path(__file__).parents[1]
 SCENARIOS = ROOT / "scenarios"
 MIXTURE_FILE = SCENARIOS / "overtaking_mixture.yaml"
-MORE = {"mixture-seven": (*RUNS["mixture-sumo"], "stop.episodes=560")}
-"""Further runs: of seven shards."""
+MORE = {
+    "mixture-seven": (*RUNS["mixture-sumo"], "stop.episodes=560"),
+    "step-seldom": (*RUNS["step-recursive-twin"], "testing.criticality_threshold=0.5"),
+}
+"""Further runs: of seven shards, and one in which most tests are not controlled."""
 
 
 def golden(name: str, *more: str) -> Campaign:

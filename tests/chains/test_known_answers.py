@@ -24,7 +24,7 @@ from studies.replication.populations import Known
 from tests.chains.seed import SEED
 from tests.estimators.small_blocks import fed
 
-SIZES = [5_000] * 12
+SIZES = [5_000] * 6
 METHODS = {
     "nde": {"nde", "nade"},
     "forced": {"nade"},
@@ -79,7 +79,7 @@ def test_a_dropped_ratio_is_caught(chain):
 # -- what the intervals are worth, by replication: mutants are caught --
 
 
-REPLICATIONS = 200
+REPLICATIONS = 100
 N = 2_000
 
 

@@ -4,7 +4,6 @@ Bit for bit in positions and speeds, with IDM, motion and clocks written out a s
 """
 
 import math
-from itertools import product
 
 import numpy as np
 import pytest
@@ -83,9 +82,17 @@ def replay(done, row, hold):
             return end.value
 
 
-@pytest.mark.parametrize(("method", "hold_s"), [*product(METHODS, [1.0, 0.1]), ("forced", 0.7)])
+HOLDS = [
+    *((method, 1.0) for method in METHODS),
+    *(("nde", 0.1), ("forced", 0.1), ("forced", 0.7), ("step_mixture", 0.5), ("episode_mixture", 0.5)),
+    *(pytest.param(method, 0.1, marks=pytest.mark.slow) for method in ("step_mixture", "episode_mixture")),
+]
+"""Tables for draws in every step take 12 s of a core, and as much for each surrogate."""
+
+
+@pytest.mark.parametrize(("method", "hold_s"), HOLDS)
 def test_replay_in_plain_python(method, hold_s):
-    surrogates = "default" if hold_s == 1.0 else "SM-I"  # tables for draws in every step take 12 s of a core each
+    surrogates = "default" if hold_s == 1.0 else "SM-I"
     done = run(method, n=N, traces="all", hold_s=hold_s, surrogates=surrogates, **METHODS[method])
     seen = set()
     for row in range(N):

@@ -60,7 +60,7 @@ def fully_recorded(done):
 @pytest.mark.parametrize(
     ("method", "challenge", "surrogates"),
     [
-        ("step_mixture", "immediate", "two"),
+        ("step_mixture", "immediate", "SM-I"),
         ("step_mixture", "recursive", "default"),
         ("episode_mixture", "recursive", "default"),
     ],
@@ -94,9 +94,9 @@ PREDICTED = [
 @pytest.mark.parametrize(("method", "challenge", "epsilon"), PREDICTED)
 def test_what_surrogates_predict_has_mean_zero_once_it_is_taken_off(method, challenge, epsilon):
     """And where a surrogate is the vehicle, hardly any spread is left."""
-    done = run(method, challenge, n=N, surrogates="two", epsilon=epsilon)
+    done = run(method, challenge, n=N, surrogates="SM-I" if challenge == "immediate" else "default", epsilon=epsilon)
     martingale = done.shard.traffic.drawn.martingale
-    for j in range(2):
+    for j in range(martingale.shape[1]):
         assert np.abs(martingale[:, j]).max() > 0.0
         assert Mean.of(martingale[:, j]).errors_from(0.0) < 4.0
     assert np.var(done.y - martingale[:, 0]) < 0.5 * np.var(done.y)
@@ -119,7 +119,7 @@ def test_martingale_sums_are_those_of_moments():
 @pytest.mark.slow
 def test_without_control_the_weight_is_exactly_one():
     assert (plain().log_weight == 0.0).all()
-    published = run("step_mixture", "immediate", n=4_000, moments="all", surrogates="two")
+    published = run("step_mixture", "immediate", n=4_000, moments="all", surrogates="SM-I")
     uncritical = published.episode["n_control_steps"] == 0
     assert uncritical.sum() > 20
     assert (published.log_weight[uncritical] == 0.0).all()
@@ -137,9 +137,9 @@ HARDLY_BRAKES = [(method, {"n": 20_000, "av": "SM-II"}) for method in ("forced",
 EVERY_STEP = {"n": 10_000, "hold_s": 0.1, "surrogates": "SM-I"}  # the paper's sentence taken literally
 PUBLISHED = {"challenge": "immediate", "n": 100_000, "surrogates": "brakes with 2 g"}
 RAISED_RUNS = [
-    ("forced", {"n": 40_000}),
-    ("step_mixture", {"n": 20_000}),
-    ("episode_mixture", {"n": 20_000}),
+    ("forced", {"n": 20_000}),
+    ("step_mixture", {"n": 10_000}),
+    ("episode_mixture", {"n": 10_000}),
     pytest.param("episode_mixture", {"n": 20_000, "av": "never_brakes"}, marks=pytest.mark.slow),
     *(pytest.param(*each, marks=pytest.mark.slow) for each in HARDLY_BRAKES),
     *(pytest.param(each, EVERY_STEP, marks=pytest.mark.slow) for each in ("forced", "step_mixture", "episode_mixture")),
@@ -148,7 +148,7 @@ RAISED_RUNS = [
 ]
 
 
-def plain(n=50_000, **settings):
+def plain(n=25_000, **settings):
     """Simulation without control of the same vehicle."""
     done = run("nde", level=RAISED, n=n, **settings)
     assert done.crash.sum() >= n / 50
@@ -168,11 +168,10 @@ def test_methods_agree_at_the_default_level():
 @pytest.mark.parametrize(("method", "settings"), RAISED_RUNS)
 def test_methods_agree_with_plain_simulation(method, settings):
     done = run(method, level=RAISED, **settings)
-    every_step = "hold_s" in settings
-    same = plain(25_000, hold_s=0.1) if every_step else plain(**({"av": settings["av"]} if "av" in settings else {}))
+    same = plain(**{name: settings[name] for name in ("hold_s", "av") if name in settings})
     assert done.rate.errors_from(same.rate) < 4.0
-    assert done.rate.std_error < (0.05 if every_step else 0.03) * done.rate.value
+    assert done.rate.std_error < 0.05 * done.rate.value
     if "av" in settings:
-        assert done.rate.errors_from(plain().rate) > 20.0
+        assert done.rate.errors_from(plain().rate) > 14.0
     if settings is PUBLISHED:
-        assert Mean.of(done.crash * 1.0).errors_from(same.rate) > 20.0  # the ratios are needed
+        assert Mean.of(done.crash * 1.0).errors_from(same.rate) > 14.0  # the ratios are needed

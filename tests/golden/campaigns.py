@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 BASE = Path(__file__).parent / "base.yaml"
 SHELLS = ("testing.method=shells", "environment.lane_change_level=1")
 SPEEDS = "{controller: 'tests.golden.vehicles:Speeds', before_event: controller, limits: {max_acceleration_mps2: 2}}"
@@ -53,6 +55,15 @@ RUNS = {
     **{name: (*sets, "world.engine=twin") for name, sets in IN_THE_TWIN.items()},
     **IN_SUMO,
 }
+LONG = {"mixture-hold-0.1", "step-immediate", "step-immediate-twin", "step-immediate-sumo"}
+"""For .ci/full: their tables take 40 and 50 s of a core."""
+
+
+def quick(names):
+    """Names for a test of each, those that take long marked as slow."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in names]
+
+
 COMPARED = (
     (*SHELLS, "world.engine=twin", "stop.rhw=0.2", "stop.episodes=1200"),
     "av.parameters.min_acceleration_mps2=-8",

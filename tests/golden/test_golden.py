@@ -9,7 +9,7 @@ import json
 import pytest
 
 from tests.golden import record
-from tests.golden.campaigns import BEGUN, CONTINUED, RUNS
+from tests.golden.campaigns import BEGUN, CONTINUED, RUNS, quick
 from tests.in_process import run_here
 from tests.stored_runs import golden
 
@@ -17,7 +17,7 @@ GOLDEN = json.loads(record.GOLDEN.read_text())
 DIGITS = 1e-9  # as docs/determinism.md promises
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", quick(RUNS))
 def test_a_run_gives_the_same_bits(name, stored_run):
     assert record.unlike(record.seen_in(stored_run(name)), GOLDEN["runs"][name], digits=DIGITS) == []
 

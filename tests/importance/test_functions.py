@@ -22,7 +22,7 @@ from harness.vocabulary import CUT_IN, STATE_COLUMNS, STAY
 from tests.episode.twin_runs import prepared, run
 from tests.kernels import accumulated, after_cut_in, before_event, drawn
 
-CHALLENGES = {"immediate": "two", "recursive": "default"}  # and the surrogates
+CHALLENGES = {"immediate": "SM-I", "recursive": "default"}  # and the surrogates
 EPSILONS = (0.0, 0.1, 1.0)
 settings = pytest.mark.parametrize(
     ("challenge", "epsilon"), [(challenge, epsilon) for challenge in CHALLENGES for epsilon in EPSILONS]

@@ -17,6 +17,8 @@ from tests.chains.seed import SEED
 from tests.stored_runs import MIXTURE_FILE
 
 SMALL_POOL = ("pool.relative_error=0.03", "pool.events_per_shell=1500")
+GOLDEN_POOL = ("pool.relative_error=0.05", "pool.events_per_shell=400")
+"""That of golden runs: paths for baseline runs, whose candidates take ten seconds, are those which there are."""
 
 
 @pytest.fixture(scope="session")

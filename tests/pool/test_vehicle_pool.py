@@ -23,14 +23,14 @@ from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
 from tests.kernels import cut_in_terms
-from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
+from tests.pool.conftest import GOLDEN_POOL, MIXTURE_FILE
 
 ACTING = "{{controller: 'tests.controllers.early:{}', before_event: controller, limits: {{max_acceleration_mps2: 2}}}}"
 
 
 def acting(name: str, *more: str):
     av = ACTING.format(name)
-    overrides = ["testing.method=shells", f"av={av}", "world.engine=twin", "pool.shadow_paths=120", *SMALL_POOL]
+    overrides = ["testing.method=shells", f"av={av}", "world.engine=twin", "pool.shadow_paths=120", *GOLDEN_POOL]
     return load_campaign(MIXTURE_FILE, [*overrides, *more])
 
 

@@ -48,20 +48,20 @@ def test_null_stands_for_what_there_is_none_of(name, stored_run):
 
 def test_records_kept_change_nothing_else(stored_run, tmp_path):
     """And of moments the first few are the first of all."""
-    name = "step-immediate-twin"
-    bare = run_here(golden(name, "records={moments: none, traces: none}"), tmp_path / "bare").folder
-    whole = run_here(golden(name, "records={moments: all, traces: none}"), tmp_path / "all").folder
+    name = "step-recursive-twin"
+    kept = {"bare": "{moments: none, traces: none}", "few": "{moments: first_9, traces: none}"}
+    bare, few = (run_here(golden(name, f"records={of}"), tmp_path / each).folder for each, of in kept.items())
     assert {path.name for path in bare.iterdir() if path.is_dir()} == {"episodes"}
-    for folder in (bare, whole):
+    for folder in (bare, few):
         assert stored_table(folder, "episodes").equals(stored_table(stored_run(name), "episodes"))
-    everything, first = (stored_table(folder, "moments").to_pandas() for folder in (whole, stored_run(name)))
+    everything, first = (stored_table(folder, "moments").to_pandas() for folder in (stored_run(name), few))
     expected = everything.groupby("episode", sort=False).head(9)
     columns = ["episode", "step", "p"]
     assert len(first) < len(everything)
     assert first[columns].to_numpy().tolist() == expected[columns].to_numpy().tolist()
 
 
-TRACED = {"shells-twin": "all", "mixture-twin": "share", "step-immediate-twin": "critical"}
+TRACED = {"shells-twin": "all", "mixture-twin": "share", "step-seldom": "critical"}
 
 
 @pytest.mark.parametrize(("name", "policy"), TRACED.items())

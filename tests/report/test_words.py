@@ -13,7 +13,7 @@ from harness.report.pair_words import deciding_words, pair_words
 from harness.report.summary import read_run_folder
 from harness.report.words import answer_of, short_answer
 from harness.runner.stored import stored_blocks
-from tests.golden.campaigns import RUNS
+from tests.golden.campaigns import RUNS, quick
 from tests.stored_runs import answer_in, estimates, golden
 
 SAID = {
@@ -31,7 +31,7 @@ SAID = {
 }
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", quick(RUNS))
 def test_it_is_short_and_says_what_changes_the_meaning(name, stored_run):
     run = read_run_folder(stored_run(name))
     text = lines(short_answer(run.campaign, run.manifest, run.estimates), 3.21, run.path / "report.html")

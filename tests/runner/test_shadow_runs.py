@@ -13,6 +13,7 @@ from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
 from harness.sampling.baseline import run_baseline
 from tests.in_process import run_here as run_golden
+from tests.pool.conftest import GOLDEN_POOL
 from tests.pool.test_vehicle_pool import ACTING
 from tests.runner.conftest import SHELLS
 from tests.stored_runs import (
@@ -27,7 +28,7 @@ from tests.stored_runs import (
     with_fewer_before,
 )
 
-SHADOWS, TWIN = "pool.shadow_paths=120", "world.engine=twin"
+SHADOWS, TWIN = ("pool.shadow_paths=120", *GOLDEN_POOL), "world.engine=twin"
 FORCED = ("testing.method=forced", "stop.episodes=600", "run.shard_size=100")
 
 
@@ -82,7 +83,7 @@ NOISY = "parameters: {noise_mps2: 0.2}"
     "method", [pytest.param(SHELLS, id="shells", marks=pytest.mark.slow), pytest.param(FORCED, id="forced")]
 )
 def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(method, campaign, run_here, tmp_path):
-    asked = (*method, SHADOWS, TWIN)
+    asked = (*method, *SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
         run_here(campaign(*asked, f"av={of('FreshNoise', NOISY)}"), tmp_path / "fresh")
     kept = (tmp_path / "fresh").glob("episodes/*.parquet")
@@ -95,7 +96,7 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
 
 def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp_path):
     """Three in 120 fail: refused at one per cent; with five they are a part of the upper limit that no test takes."""
-    breaks = (*SHELLS, SHADOWS, TWIN, f"av={of('Breaks')}")
+    breaks = (*SHELLS, *SHADOWS, TWIN, f"av={of('Breaks')}")
     with pytest.raises(TooManyFailedError, match="3 of 120 baseline runs failed, 3 of them with: step: RuntimeError"):
         run_here(campaign(*breaks), tmp_path / "run")
     assert manifest(tmp_path / "run")["status"] == "interrupted"
@@ -113,7 +114,7 @@ def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp
 @pytest.mark.slow
 def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_path):
     """A vehicle that gives way, but on three paths of 120: the run ends, and says that it knows too little."""
-    lonely = campaign(*SHELLS, SHADOWS, TWIN, f"av={of('YieldsMostly')}", "stop.rhw=0.3", "stop.episodes=20000")
+    lonely = campaign(*SHELLS, *SHADOWS, TWIN, f"av={of('YieldsMostly')}", "stop.rhw=0.3", "stop.episodes=20000")
     result = run_here(lonely, tmp_path / "run")
     shells = result.estimates["estimates"]["shells"]
     assert (result.exit_code, result.stopped_by) == (4, "pool_error")

@@ -190,6 +190,7 @@ def test_one_changed_value_is_seen(stored_run, column, value, named):
     assert named in retraced(with_value(table, column, crashed, value), resolve(golden("forced-twin")))
 
 
+@pytest.mark.slow
 def test_stored_forced_tests_can_be_asked_what_surrogates_would_have_done(tmp_path):
     lateral = ("pool.library=ladder-lateral-1", "environment.lane_change_level=1", "stop.episodes=800")
     run_here(golden("forced-lateral-twin", *lateral, "records.traces=none"), tmp_path / "run")

@@ -20,7 +20,7 @@ from harness.worlds import build_world, sumo_driven
 from harness.worlds.program import TraciWorld, own_addresses, require_neighbour
 from harness.worlds.sumo_driven import SumoAvWorld, recyclable
 from tests.in_process import run_here
-from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL
+from tests.pool.conftest import GOLDEN_POOL, MIXTURE_FILE
 from tests.stored_runs import manifest
 from tests.worlds.misbehaving_client import FAULT_STEP
 from tests.worlds.running import EXAMPLE, MISBEHAVING, bits, campaign, program, run, run_idm, run_in, smoke, sumo_av
@@ -242,7 +242,10 @@ QUICK = "SUMO's ACC", "TraCI style"
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in FORMS])
 def test_it_does_in_tests_what_it_did_in_its_baseline_runs(name):
-    av, sizes = f"av={FORMS[name]}, before_event: controller}}", ("world.cells=8", "pool.shadow_paths=120", *SMALL_POOL)
+    av, sizes = (
+        f"av={FORMS[name]}, before_event: controller}}",
+        ("world.cells=8", "pool.shadow_paths=120", *GOLDEN_POOL),
+    )
     campaign = load_campaign(MIXTURE_FILE, [av, "testing.method=shells", "world.engine=sumo", *sizes])
     ready = prepare(resolve(campaign))
     with closing(build_world(campaign)) as world, closing(ready.loop(world)) as loop:

@@ -27,7 +27,7 @@ from harness.sampling import prepare
 from harness.vehicles.kinematics import STEP_S, next_position
 from harness.vocabulary import AV, BV, CONTACT, CRASH, LV, PASSED, STATE_DTYPE, VEHICLES
 from harness.worlds.twin import TwinWorld
-from tests.episode.twin_runs import TWO
+from tests.episode.twin_runs import SM_I
 from tests.traffic.tables import tabled
 from tests.worlds.running import smoke
 
@@ -159,7 +159,7 @@ HOPELESS = np.array(
     STATE_DTYPE,
 )
 """Starts from which no braking of BV can avoid LV, which it runs into before AV is past."""
-PUBLISHED = (STEP, "testing.challenge=immediate", TWO, "av.parameters.min_acceleration_mps2=-1", "seed=7")
+PUBLISHED = (STEP, "testing.challenge=immediate", SM_I, "av.parameters.min_acceleration_mps2=-1", "seed=7")
 METHODS = {
     "mixture": Job((), 600, 64),
     "forced_without_shim": Job((FORCED,), 250, 64, shim=False),
