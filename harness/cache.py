@@ -39,16 +39,21 @@ def own_folder() -> Path | None:
     return None
 
 
+def temporary_folder() -> str:
+    """Where temporary files go; a `HarnessError` where none can be written, as in a container that may only be read."""
+    try:
+        return tempfile.gettempdir()
+    except FileNotFoundError as error:
+        mend = "Set TMPDIR to a folder that can be written to."
+        raise HarnessError("TMPDIR", "no place for temporary files", "a folder", mend) from error
+
+
 def _spare_folder(*, make: bool = False) -> Path:
     """Folder of this user for what cannot be written to the cache.
 
     Raises `HarnessError`: others may write there, and what they have put there may be anything; or an `OSError`.
     """
-    try:
-        folder = Path(tempfile.gettempdir()) / f"harness-{os.geteuid()}"
-    except FileNotFoundError as error:
-        mend = f"Set TMPDIR to a folder that can be written to, or {FOLDER}."
-        raise HarnessError("TMPDIR", "no place for temporary files", "a folder", mend) from error
+    folder = Path(temporary_folder()) / f"harness-{os.geteuid()}"
     if make:
         with suppress(FileExistsError):
             folder.mkdir(0o700)

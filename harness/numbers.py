@@ -21,7 +21,7 @@ def exponent_of(value: float) -> int:
     """Power of ten to factor out of a number: 0 where plain digits read better."""
     if value == 0.0 or not math.isfinite(value):
         return 0
-    exponent = math.floor(math.log10(abs(value)))
+    exponent = max(math.floor(math.log10(abs(value))), -323)  # 10.0**-324 is 0
     return exponent if exponent < -2 or exponent > 4 else 0
 
 
@@ -99,8 +99,8 @@ def plain(value: float | str) -> str:
     if isinstance(value, str):
         return value
     if 0.0 < abs(value) < 1e-4:
-        power = exponent_of(value * (1.0 + 1e-12))
-        return f"{plain(float(f'{value / 10.0**power:.10g}'))} × {power_of_ten(power)}"
+        digits, power = f"{value:.9e}".split("e")
+        return f"{plain(float(digits))} × {power_of_ten(int(power))}"
     return f"{value:,.10g}".replace("-", MINUS)
 
 

@@ -33,7 +33,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from weakref import finalize
 
-from harness.cache import SAID
+from harness.cache import SAID, temporary_folder
 from harness.printed import Printed
 
 if TYPE_CHECKING:
@@ -198,8 +198,9 @@ def start_server() -> None:
 def _server() -> Iterator[None]:
     """The fork server as workers need it: nobody's main script runs again, neither there nor in them."""
     forkserver.set_forkserver_preload([_PRELOADED])
+    short = _in_short(temporary_folder())
     main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
-    before, tempfile.tempdir = tempfile.tempdir, _in_short(tempfile.gettempdir())
+    before, tempfile.tempdir = tempfile.tempdir, short
     try:
         yield
     finally:

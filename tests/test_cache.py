@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from harness import cache
+from harness.cli import main
 from harness.errors import HarnessError, writing
 
 NAME, OTHER, CONTENT = "pools/one", "pools/other", bytes(range(256))
@@ -135,3 +136,13 @@ def test_a_full_disk_is_no_reason_to_go_elsewhere(spare):
         cache.put(NAME, fail)
     assert raised.value.filename.endswith(NAME)
     assert not spare.exists()
+
+
+def test_a_run_without_a_place_for_temporary_files_is_refused(tmp_path, monkeypatch, capsys):
+    def nowhere():
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "gettempdir", nowhere)
+    assert main(["run", "idm", "--out", str(tmp_path / "run")]) == 2
+    assert "error: TMPDIR" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

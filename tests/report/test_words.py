@@ -7,6 +7,7 @@ import pytest
 
 from harness.estimators.answer import estimate_blocks
 from harness.families import families
+from harness.numbers import number, plain
 from harness.records.folder import read_manifest
 from harness.report.lines import LINES, WIDTH, lines
 from harness.report.pair_words import deciding_words, pair_words
@@ -205,3 +206,12 @@ def test_tests_whose_time_was_up_are_warned_of_where_the_interval_leaves_them_ou
     for severity in (run.estimates.severity, None):  # a crash or none
         warnings = said(run, replace(best, ci_high=high * rate), severity=severity, cut_off=cut_off * rate).warnings
         assert any("still closing in" in each for each in warnings) == warned
+
+
+@pytest.mark.parametrize("value", [5e-324, 1e-320, 3e-7, -2e-9, 9.99999999999e-5, 2e6])
+def test_any_number_can_be_written(value):
+    """Those that are too small for a power of ten of their own, too."""
+    for text in (plain(value), number(value)):
+        digits, _, power = text.replace("−", "-").replace(",", "").partition(" × 10")
+        read = float(f"{digits}e{power.translate(str.maketrans('⁻⁰¹²³⁴⁵⁶⁷⁸⁹', '-0123456789')) or 0}")
+        assert read == pytest.approx(value, rel=1e-2, abs=1e-323)
