@@ -64,9 +64,8 @@ os.environ.setdefault("NUMBA_DISABLE_INTEL_SVML", "1")
 import numba  # noqa: E402  (its settings are read at import)
 import numpy as np  # noqa: E402
 from llvmlite import ir  # noqa: E402
-from numba import extending  # noqa: E402
-from numba.core import caching, cgutils, compiler, serialize, types  # noqa: E402
-from numba.core.registry import cpu_target  # noqa: E402
+from numba import extending, types  # noqa: E402
+from numba.core import caching, compiler, serialize  # noqa: E402
 from numba.core.typing.templates import AttributeTemplate  # noqa: E402
 
 _settings: Any = numba.config
@@ -114,9 +113,8 @@ class _KernelCache(caching.NullCache):
         return cache.has(f"{self._name}*")
 
 
-_SETTINGS: dict[str, Any] = {"fastmath": False, "error_model": "numpy", "no_cfunc_wrapper": True}
-_register: Any = extending.register_jitable
-"""Untyped, because ``_nrt`` is not among the options that numba's own types know."""
+_SETTINGS: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
+_extending: Any = extending
 
 
 def _njit(function: _Function, **settings: Any) -> _Function:
@@ -128,15 +126,14 @@ def _njit(function: _Function, **settings: Any) -> _Function:
 def compiled(function: _Function) -> _Function:
     """Compile a kernel to machine code (cached on disk), keeping its Python type for the type checker.
 
-    Kernels allocate nothing: scratch arrays come from the caller. So reference counts can be left out; counting those
-    of the arrays that travel in named tuples took two thirds of the time.
+    Kernels allocate nothing: scratch arrays come from the caller.
     """
-    return _njit(function, _nrt=False)
+    return _njit(function)
 
 
 def compiled_inline(function: _Function) -> _Function:
     """Let kernels inline a small function; elsewhere it is what it is, a function of Python."""
-    result: _Function = _register(forceinline=True, _nrt=False, **_SETTINGS)(function)
+    result: _Function = _extending.register_jitable(forceinline=True, **_SETTINGS)(function)
     return result
 
 
@@ -153,14 +150,12 @@ def is_cached(kernel: Callable[..., object]) -> bool:
 # -- named tuples that kernels are given as one pointer, because they have been taken apart before --
 #
 # A kernel that is called with named tuples of fifty arrays spends more time on reading Python's objects than on 96
-# cells. Here that is done once: the tuple is laid out, as compiled code would see it, in memory that Python keeps. In
-# kernels the fields of an `unboxed` tuple are read like those of the tuple itself; a tuple within it is a pointer
-# again, so that parts of kernels hand on one number each, and are compiled once whoever calls them.
+# cells. Here that is done once: the tuple is laid out in memory that Python keeps, word by word. In kernels the fields
+# of an `unboxed` tuple are read like those of the tuple itself; a tuple within it is a pointer again, so that parts of
+# kernels hand on one number each, and are compiled once whoever calls them.
 
 _Bundle = TypeVar("_Bundle", bound=tuple[Any, ...])
 _numba: Any = numba
-_extending: Any = extending
-_cgutils: Any = cgutils
 
 
 def unboxed(bundle: _Bundle) -> _Bundle:
@@ -173,22 +168,19 @@ def unboxed(bundle: _Bundle) -> _Bundle:
 
 
 class _Unboxed:
-    """Keeps a bundle and its native form; numba asks for ``_numba_type_``, and its unboxing below for ``address``."""
+    """Keeps a bundle and its words; numba asks for ``_numba_type_``, and its unboxing below for ``address``."""
 
     __slots__ = ("_bundle", "_memory", "_numba_type_", "_records", "address")
 
     def __init__(self, bundle: tuple[Any, ...]) -> None:
-        content, context = _numba.typeof(bundle), cpu_target.target_context
         self._bundle, self._records = bundle, list[np.ndarray]()
         self._memory = np.array(list(_words(bundle, self._records)), np.int64)
-        self._numba_type_ = _UnboxedType(content)
+        self._numba_type_ = _UnboxedType(_numba.typeof(bundle))
         self.address: int = self._memory.ctypes.data
-        if self._memory.nbytes != context.get_abi_sizeof(context.get_value_type(content)):
-            raise TypeError(f"{type(bundle).__name__} has fields that are not laid out as 8 bytes each")
 
 
 def _words(value: Any, records: list[np.ndarray]) -> Iterator[int]:
-    """A value as numba lays it out: an array is owner, parent, size, item size, address, shape and strides.
+    """A value in words of 8 bytes; an array is owner, parent, size, item size, address, shape and strides.
 
     A record by itself does not say where it is: a copy joins ``records``, for the caller to keep.
     """
@@ -202,8 +194,16 @@ def _words(value: Any, records: list[np.ndarray]) -> Iterator[int]:
         yield records[-1].ctypes.data
     elif isinstance(value, float):
         yield from struct.unpack("q", struct.pack("d", value))
-    else:
+    elif isinstance(value, int | np.integer | np.bool_):
         yield int(value)
+    else:
+        raise TypeError(f"a {type(value).__name__} in a named tuple for kernels")
+
+
+def _n_words(kind: Any) -> int:
+    if isinstance(kind, types.BaseTuple):
+        return sum(_n_words(each) for each in cast("Any", kind).types)
+    return 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
 
 
 class _UnboxedType(types.Type):
@@ -217,11 +217,6 @@ class _UnboxedType(types.Type):
     def key(self) -> Any:
         """What two equal types have in common."""
         return self.content
-
-
-class _PointerModel(extending.models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: _UnboxedType) -> None:
-        super().__init__(manager, kind, cgutils.voidptr_t)  # type: ignore[no-untyped-call]
 
 
 def _unbox(_kind: _UnboxedType, obj: Any, c: Any) -> Any:
@@ -239,33 +234,35 @@ class _Fields(AttributeTemplate):
         if name not in content.fields:
             return None
         field = content.types[content.fields.index(name)]
-        return _UnboxedType(field) if isinstance(field, types.BaseNamedTuple) else field
+        return _UnboxedType(field) if isinstance(field, types.BaseTuple) else field
 
 
 def _read_field(context: Any, builder: Any, kind: _UnboxedType, value: Any, name: str) -> Any:
-    content = kind.content
-    place = content.fields.index(name)
-    pointer = builder.bitcast(value, context.get_value_type(content).as_pointer())
-    field = _cgutils.gep_inbounds(builder, pointer, 0, place)
-    if isinstance(content.types[place], types.BaseNamedTuple):
-        return builder.bitcast(field, cgutils.voidptr_t)
-    return _load(builder, field)
+    place = kind.content.fields.index(name)
+    *before, field = kind.content.types[: place + 1]
+    pointer = builder.gep(value, [ir.IntType(64)(8 * sum(_n_words(each) for each in before))], inbounds=True)
+    if isinstance(field, types.BaseTuple):
+        return pointer
+    return _load(builder, pointer, context.get_value_type(field), owned=isinstance(field, types.Array))
 
 
-def _load(builder: Any, pointer: Any) -> Any:
-    """Load a value leaf by leaf: while a kernel runs nobody writes there, which the compiler is told of each leaf."""
-    kind = pointer.type.pointee
-    if not isinstance(kind, ir.Aggregate):
-        leaf = builder.load(pointer)
+def _load(builder: Any, pointer: Any, what: Any, *, owned: bool = False) -> Any:
+    """Load a value leaf by leaf: while a kernel runs nobody writes there, which the compiler is told of each leaf.
+
+    What is ``owned``, an array, gets owner and parent that the compiler knows to be none: so no reference is counted.
+    """
+    if not isinstance(what, ir.Aggregate):
+        leaf = builder.load(builder.bitcast(pointer, what.as_pointer()))
         leaf.set_metadata("invariant.load", builder.module.add_metadata([]))
         return leaf
-    value = ir.Constant(kind, ir.Undefined)
-    for i in range(len(kind)):
-        value = builder.insert_value(value, _load(builder, _cgutils.gep_inbounds(builder, pointer, 0, i)), i)
+    words, value = builder.bitcast(pointer, what.as_pointer()), ir.Constant(what, ir.Undefined)
+    for i, part in enumerate(what.elements):
+        at = builder.gep(words, [ir.IntType(32)(0), ir.IntType(32)(i)], inbounds=True)
+        value = builder.insert_value(value, part(None) if owned and i < 2 else _load(builder, at, part), i)
     return value
 
 
-_extending.register_model(_UnboxedType)(_PointerModel)
+_extending.register_model(_UnboxedType)(_extending.models.OpaqueModel)
 _extending.unbox(_UnboxedType)(_unbox)
 _extending.infer_getattr(_Fields)
 _extending.lower_getattr_generic(_UnboxedType)(_read_field)

@@ -28,7 +28,7 @@ def alone(part):
 
     Not cached: under its name stands what kernels inline, which cannot be called.
     """
-    return numba.njit(part, error_model="numpy", _nrt=False)
+    return numba.njit(part, error_model="numpy")
 
 
 # -- traffic --

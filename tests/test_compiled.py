@@ -154,13 +154,18 @@ def test_kernels_read_every_kind_of_field_also_of_a_record_that_owns_its_memory(
     assert len(others) == 1000
 
 
-def test_a_layout_of_other_than_8_bytes_is_refused():
-    class Flags(NamedTuple):
-        one: bool
-        other: bool
+def test_every_field_has_8_bytes_and_what_does_not_fit_is_refused():
+    class Two(NamedTuple):
+        one: Any
+        other: Any
 
-    with pytest.raises(TypeError, match="Flags"):
-        unboxed(Flags(True, False))
+    @compiled
+    def difference(two):
+        return two.one - two.other
+
+    assert difference(unboxed(Two(np.int32(-7), True))) == -8
+    with pytest.raises(TypeError, match="float32"):
+        unboxed(Two(np.float32(0.5), 1.0))
 
 
 # -- harness setup compiles what a first run needs --
