@@ -157,8 +157,8 @@ IN_A_TEST = {
     r"step: RefusedError: traci.vehicle.changeLane is refused: the AV stays.*\(my.py:8\)": text(
         "if leader:\n        try: traci.vehicle.changeLane('ego', 1, 5.0)\n        except traci.TraCIException: pass"
     ),
-    r"step: asked for -\d+\.?\d* m/s2, outside of av.limits .*bound commands as its vehicle type does": text(
-        "if leader: traci.vehicle.setSpeed('ego', 0.0)"
+    r"step: asked for -\d+\.?\d* m/s2, outside of av.limits ": text(
+        "if leader: traci.vehicle.setSpeedMode('ego', 0), traci.vehicle.setSpeed('ego', 0.0)"
     ),
 }
 
@@ -172,11 +172,13 @@ def test_what_it_does_wrong_in_a_test_fails_it_with_the_line_and_no_other(cause,
         assert re.match(cause, failure), failure
 
 
-def test_bounds_are_those_of_its_vehicle_type(tmp_path):
+@pytest.mark.parametrize(("given", "hardest"), [((), -4.5), (("av.traci_style.decel_mps2=6",), -6.0)])
+def test_bounds_are_those_of_its_vehicle_type(given, hardest, tmp_path):
+    """By default of SUMO's."""
     (tmp_path / "my.py").write_text(text("if leader: traci.vehicle.setSpeed('ego', 0.0)"), "utf-8")
-    shard = drive(f"av={{controller: '{tmp_path}/my.py'}}", "av.traci_style.decel_mps2=4.5", n=20)
+    shard = drive(f"av={{controller: '{tmp_path}/my.py'}}", *given, n=20)
     assert shard.failures == {}
-    assert min(shard.traces[row][:-1, 2, 2].min() for row in range(20)) == -4.5
+    assert min(shard.traces[row][:-1, 2, 2].min() for row in range(20)) == hardest
 
 
 def test_its_end_is_that_of_sumo(tmp_path, monkeypatch):
