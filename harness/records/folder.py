@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened
 from harness.files import write_atomically
-from harness.vocabulary import COMPARISON, FAMILIES
+from harness.vocabulary import FAMILIES
 
 T = TypeVar("T")
 Tables = Mapping[str, pa.Table | None]
@@ -278,11 +278,10 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     path = folder / MANIFEST
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
-        if (folder / FAMILIES).is_file():
-            one = f"Name one of its scenarios, such as {next(folder.glob('*/' + MANIFEST)).parent}."
-            raise RunFolderError(str(folder), "a run of several scenarios", "the run folder of one", one)
-        if (folder / COMPARISON).is_file():
-            raise RunFolderError(str(folder), "a comparison", expected, f"Name a run of it: {folder}/a or {folder}/b.")
+        if runs := sorted(folder.glob("*/" + MANIFEST)):
+            several = "a run of several scenarios" if (folder / FAMILIES).is_file() else "a folder of several runs"
+            one = f"Name one of them, such as {runs[0].parent}; one of all scenarios that is not done takes --resume."
+            raise RunFolderError(str(folder), several, "the run folder of one", one)
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     found = read_as(StoredManifest, path, mend=mend)
     return {**found.model_dump(exclude_unset=True), "parts": found.parts, "before": found.before}

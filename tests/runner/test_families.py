@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -115,6 +116,19 @@ def test_other_exposures_need_no_new_tests(run, capsys):
     assert "cut_in, lead_brakes, cut_out" in capsys.readouterr().err
     assert main(["estimate", str(run.folder / "cut_in"), "--exposure", "cut_in=0.3"]) == 2
     assert "families.json" in capsys.readouterr().err
+
+
+def test_a_folder_of_runs_that_is_not_whole_is_told(run, tmp_path, capsys):
+    folder = shutil.copytree(run.folder, tmp_path / "run")
+    (folder / "families.json").rename(tmp_path / "families.json")
+    for command in (["estimate", str(folder)], ["replay", str(folder), "1"]):
+        assert main(command) == 2
+        assert f"such as {folder}/cut_in; one of all scenarios that is not done" in capsys.readouterr().err
+    (tmp_path / "families.json").rename(folder / "families.json")
+    for name in NAMES:
+        (folder / name / "manifest.json").unlink()
+    assert main(["replay", str(folder), "1"]) == 2
+    assert "no run folder" in capsys.readouterr().err
 
 
 def test_a_budget_that_leaves_a_scenario_without_tests_is_refused_and_may_be_raised(run, tmp_path):
