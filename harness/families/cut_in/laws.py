@@ -87,7 +87,7 @@ class AccelerationLaw(NamedTuple):
     """P(A ≤ a_k) = (1 − b) T((e_k − mean) · inverse_scale) + b B_k for k < ``cap``, else 1; e_k is a bin's upper edge.
 
     ``mean`` in m/s², ``inverse_scale`` in s²/m; T and B are ``noise_t[noise]`` and ``brake_cumulative`` of the
-    environment, ``brake_share`` is b. Numbers alone: what is compiled without reference counts must not return arrays.
+    environment, ``brake_share`` is b.
     """
 
     noise: int
