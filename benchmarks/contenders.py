@@ -87,7 +87,10 @@ class Recorded(Contender):
     def run(self, first: int, n: int) -> Work:
         shard = self.loop.run(first, self.prepared.tests(first, n))
         self.write(shard)
-        written = sum(path.stat().st_size for path in self.folder.rglob("*.parquet"))
+        files = list(self.folder.rglob("*.parquet"))
+        written = sum(path.stat().st_size for path in files)
+        for path in files:
+            path.unlink()
         return Work(n, int(shard.episode["n_steps"].sum()), written)
 
     def write(self, shard: Shard) -> None:
