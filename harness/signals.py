@@ -54,6 +54,19 @@ def handlers_restored() -> Iterator[dict[signal.Signals, Any]]:
 
 
 @contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let what is inside come to its end before a signal interrupts: files, and who knows of them, belong together."""
+    came: list[tuple[int, FrameType | None]] = []
+    with handlers_restored() as before:
+        for number, handler in before.items():
+            if callable(handler):
+                signal.signal(number, lambda number, frame: came.append((number, frame)))
+        yield
+    for arrived, frame in came[:1]:
+        before[signal.Signals(arrived)](arrived, frame)
+
+
+@contextmanager
 def interruptible() -> Iterator[Interruption]:
     """Let signals interrupt what is inside."""
     interruption = Interruption()

@@ -42,6 +42,7 @@ from harness.sampling.baseline import IN_WORDS, begin, requests_before, stored_b
 from harness.sampling.milder import N_TESTS, beyond_scope, milder_of
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import round_requests
+from harness.signals import uninterrupted
 from harness.strata import STORED_DESIGN
 from harness.vocabulary import IntArray
 
@@ -180,7 +181,8 @@ class Underway:
         stored = stored_table(self.run.folder, self.run.parts_before, name)
         known = partial(stored_baseline, stored, self.run.source.baseline_paths)
         for result in self.crew.run(requests_before(name, n), known):
-            self.run = self.run.with_baseline(name, result)
+            with uninterrupted():
+                self.run = self.run.with_baseline(name, result)
             causes += result.failures
             self.progress.advance(result.request.n_episodes)
         if name != MILDER:  # one of few that fails is told, as if it had crashed
@@ -203,7 +205,8 @@ class Underway:
     def drive(self, requests: Iterable[ShardRequest], rule: Rule) -> Iterator[ShardResult]:
         """Shards in order, each part of the run by the time that it is handed out."""
         for shard in self.crew.run(iter(requests), self.run.known):
-            self.run = self.run.with_shard(shard)
+            with uninterrupted():
+                self.run = self.run.with_shard(shard)
             n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
             self.progress.advance(min(n_new, shard.request.n_episodes))
             self.progress.status(crashes=self.run.n_crashes, rhw=rule.look.rhw)

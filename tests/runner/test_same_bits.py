@@ -16,8 +16,10 @@ from harness.processes import Child, first_to_answer, start_server
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner import workers
+from harness.runner.kept import Run
 from tests.golden.campaigns import BASE, IN_BOTH_WORLDS, quick
-from tests.in_process import run_here, run_with_workers, workers_alive
+from tests.in_process import run_here as run_golden
+from tests.in_process import run_with_workers, workers_alive
 from tests.runner import bad_workers
 from tests.stored_runs import MORE, ROOT, golden, manifest, part_files, sets, stored_table, unlike_columns
 
@@ -38,13 +40,13 @@ def test_sumo_and_the_twin(name, stored_run):
     ],
 )
 def test_any_number_of_cells(name, cells, stored_run, tmp_path):
-    run_here(golden(name, f"world.cells={cells}"), tmp_path / "run")
+    run_golden(golden(name, f"world.cells={cells}"), tmp_path / "run")
     assert unlike_columns(stored_run(name), tmp_path / "run") == []
 
 
 @pytest.mark.parametrize(("name", "size"), [("nde-twin", 7), ("mixture-twin", 101)])
 def test_any_split_into_shards(name, size, stored_run, tmp_path):
-    run_here(golden(name, f"run.shard_size={size}"), tmp_path / "run")
+    run_golden(golden(name, f"run.shard_size={size}"), tmp_path / "run")
     assert set(unlike_columns(stored_run(name), tmp_path / "run")) <= {"estimates.json"}
 
 
@@ -105,7 +107,7 @@ def test_killed_while_it_writes_then_resumed(stored_run, tmp_path):
     assert manifest(out)["status"] != "done"
     assert (manifest(out)["n_episodes"], len(list(out.rglob("*.part")))) == (240, 1)
 
-    run_here(golden(SEVEN), out, resume=True)
+    run_golden(golden(SEVEN), out, resume=True)
     assert manifest(out)["status"] == "done"
     assert stored_table(out, "episodes")["episode"].to_pylist() == list(range(560))
     assert unlike_columns(stored_run(SEVEN), out) == []
@@ -152,8 +154,7 @@ def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in
         stderr=subprocess.PIPE,
         text=True,
     )
-    # An interruption within the first write of all leaves none of its tests.
-    wait_for(process, lambda: part_files(out) and manifest(out)["n_episodes"])
+    wait_for(process, lambda: part_files(out))
     os.killpg(process.pid, signal.SIGHUP)
     n = manifest(out)["n_episodes"]
     wait_for(process, lambda: manifest(out)["n_episodes"] > n)
@@ -165,6 +166,20 @@ def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in
     assert manifest(out)["status"] == "interrupted"
     assert manifest(out)["n_episodes"] >= 500
     assert not list(out.rglob(".*"))
+
+
+def test_an_interruption_as_tests_are_written_loses_none_of_them(campaign, run_here, tmp_path, monkeypatch):
+    add, out = Run.with_shard, tmp_path / "run"
+
+    def add_and_interrupt(run, shard):
+        run = add(run, shard).written()
+        signal.raise_signal(signal.SIGINT)
+        return run
+
+    monkeypatch.setattr(Run, "with_shard", add_and_interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run_here(campaign("world.engine=twin", "stop.episodes=400", "run.shard_size=200"), out)
+    assert (manifest(out)["status"], manifest(out)["n_episodes"]) == ("interrupted", 200)
 
 
 ABANDONED = """
