@@ -19,8 +19,7 @@ class Words(NamedTuple):
     ``unlikely`` why probabilities of events do not add up to 1. ``shows`` and ``happens`` are a vehicle each and what
     it does at the onset and at the event; the same where they are one. ``tests`` says of which kind tests are, by
     whether events show themselves, and ``rests`` what a rate scales with, by the traffic (None where it is not known)
-    and the level of lane changing. ``limits`` explains the lines of a map, and ``milder`` says what to set so
-    that milder events count, too.
+    and the level of lane changing. ``limits`` explains the lines of a map.
     """
 
     called: str
@@ -39,7 +38,6 @@ class Words(NamedTuple):
     tests: Callable[[bool], str]
     rests: Callable[[Any, str], str]
     limits: str = ""
-    milder: str = ""
 
 
 class Shown(NamedTuple):

@@ -119,9 +119,8 @@ def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[st
         ends = "end in a crash or FAIL" if milder["n_failed"] else "end in a crash"
         rate = number(milder["per_hour"] * found / milder["n_tests"], 2)
         yield (
-            f"{n} of {of} MILDER {words.events} {ends}, too: some {rate} an hour, which this rate leaves out; to count "
-            f"them, say {words.milder} in a file, and name that as environment.parameters, or of several scenarios as "
-            f"environments.{scenario}"
+            f"{n} of {of} MILDER {words.events} {ends}, too: some {rate} an hour, which this rate leaves out "
+            f"(docs/families.md says how to count them)"
         )
 
 

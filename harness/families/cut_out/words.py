@@ -20,7 +20,6 @@ WORDS = words_of(
     then="leaves the lane and reveals a slower one",
     depend="how slow the vehicle is that is revealed, and how late",
     unlikely="Cut-outs that ask for little braking of anybody are not among them.",
-    milder="like: cut-out-1 and leaving: {scope_mps2: {value: 0.5, source: user}}",
 )
 CLOSING = Shown(
     "closing speed of the one that leaves",
