@@ -120,7 +120,7 @@ def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[st
         rate = number(milder["per_hour"] * found / milder["n_tests"], 2)
         yield (
             f"{n} of {of} MILDER {words.events} {ends}, too: some {rate} an hour, which this rate leaves out "
-            f"(docs/families.md says how to count them)"
+            "(docs/families.md says how to count them)"
         )
 
 
