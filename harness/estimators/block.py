@@ -38,16 +38,13 @@ MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
 EPISODE_COLUMNS = (
     "episode", "outcome", "event_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_event",
-    "n_steps", "min_ttc_s", "took_over_step", "asked_to_speed_up",
+    "n_steps", "end_ttc_s", "took_over_step", "asked_to_speed_up",
 )  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass")
 BASELINE_COLUMNS = ("shadow", "event_mass")
 """Of vehicles that act before the event, where `ShellDesign.candidates` says that they are on record."""
-CUT_OFF_STEPS, DANGER_TTC_S = 40, 4.0
-"""A test whose time was up so soon after an event, and closer to a collision (s), was cut off.
-
-A driver who brakes with 3 m/s² after half a second stays clear from there at closing speeds up to 21 m/s; the fastest
-events of `ndd-overtaking-1` close with 16."""
+DANGER_TTC_S = 4.0
+"""A test whose time was up with less to a collision (s), had the AV kept its acceleration, was cut off."""
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 Column = NDArray[Any]
 
@@ -90,7 +87,7 @@ class Block:
 
     ``outcome`` (n,) are places in `OUTCOMES`: a failed episode is a row like any other and never a crash.
     ``log_weight`` (n,) is log p(x_c) - log q_sampled(x_c), exactly 0 without control. ``columns``, also as attributes,
-    are what else the method records, a row for each episode: bool (n,) ``happened``, ``cut_off`` (`CUT_OFF_STEPS`),
+    are what else the method records, a row for each episode: bool (n,) ``happened``, ``cut_off`` (`DANGER_TTC_S`),
     ``took_over_early`` (the AV did something before BV was on its lane) and ``asked_to_speed_up`` (or that in vain);
     ``impact_mps`` (n,), closing speed at contact, NaN without a crash; ``n_control_steps`` (n,). ``log_q`` (n, M) is,
     per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode;
@@ -214,8 +211,7 @@ def block_from_tables(
         raise _damaged(f"episodes, row {at + 1}", f"episode {index[at + 1]} after episode {index[at]}", expected)
     outcome = outcome_places(episodes.column("outcome"), "episodes")
     failed, n_control_steps = outcome == FAILED, _integers(episodes, "n_control_steps")
-    left = pc.subtract(episodes["n_steps"], episodes["event_step"])
-    close = pc.and_(pc.less(left, CUT_OFF_STEPS), pc.less(episodes["min_ttc_s"], DANGER_TTC_S))
+    close = pc.less(episodes["end_ttc_s"], DANGER_TTC_S)
     early = pc.less_equal(episodes["took_over_step"], episodes["event_step"])
     columns: dict[str, Column] = {
         "happened": _known(episodes, "event_step"),

@@ -39,7 +39,7 @@ NEVER = 2**62
 
 _STEPS = "n_steps", "event_step", "lead_steps", "onset_step", "took_over_step", "n_control_steps"
 _AT_EVENT = "event_gap_m", "event_rate_mps", "onset_gap_m", "onset_rate_mps"
-_AT_END = "crash_time_s", "impact_speed_mps", "min_ttc_s", "av_distance_m", "log_weight", "log_p_event"
+_AT_END = "crash_time_s", "impact_speed_mps", "min_ttc_s", "end_ttc_s", "av_distance_m", "log_weight", "log_p_event"
 EPISODE_DTYPE = np.dtype(
     [(name, np.int8) for name in ("outcome", "component", "asked_to_speed_up")]
     + [(name, np.int16) for name in _STEPS]

@@ -101,16 +101,36 @@ def outcome_of(k: int, kernel: KernelState) -> int:
 @compiled_inline
 def both_stand(k: int, kernel: KernelState) -> bool:
     """Whether the AV and the vehicle ahead of it stand, after the onset: nothing more happens."""
-    x, v, lane, av = kernel.x, kernel.v, kernel.cells.lane, kernel.x.shape[1] - 1
-    onset = kernel.cells.cell[k].onset_step
-    if v[k, av] != 0.0 or not 0 <= onset < kernel.cells.cell[k].step:
+    v, onset = kernel.v, kernel.cells.cell[k].onset_step
+    if v[k, v.shape[1] - 1] != 0.0 or not 0 <= onset < kernel.cells.cell[k].step:
         return False
-    leader = -1
+    leader = leader_now(k, kernel)
+    return leader >= 0 and v[k, leader] == 0.0
+
+
+@compiled_inline
+def leader_now(k: int, kernel: KernelState) -> int:
+    """The nearest vehicle ahead on the AV's lane; -1 for none."""
+    x, lane, av, leader = kernel.x, kernel.cells.lane, kernel.x.shape[1] - 1, -1
     for other in range(av):
         ahead = lane[k, other] == lane[k, av] and x[k, other] > x[k, av]
         if ahead and (leader < 0 or x[k, other] < x[k, leader]):
             leader = other
-    return leader >= 0 and v[k, leader] == 0.0
+    return leader
+
+
+@compiled_inline
+def time_to_collision(k: int, kernel: KernelState) -> float:
+    """Time (s) until an AV that closes in hits the vehicle ahead, each at its present acceleration and speed; else inf.
+
+    Of d = w t + a t²/2 it is the smaller root, d being the gap, w the closing speed and a the AV's acceleration.
+    """
+    v, leader, av = kernel.v, leader_now(k, kernel), kernel.x.shape[1] - 1
+    if leader < 0 or v[k, av] <= v[k, leader]:
+        return math.inf
+    closing, left = v[k, av] - v[k, leader], gap(kernel.x[k, leader], kernel.x[k, av])
+    square = closing * closing + 2.0 * kernel.cells.acceleration[k] * left
+    return 2.0 * left / (closing + math.sqrt(square)) if square >= 0.0 else math.inf
 
 
 @compiled_inline
@@ -144,6 +164,8 @@ def end_test(k: int, outcome: int, n: int, kernel: KernelState) -> None:
     if outcome == CRASH:
         row.crash_time_s = cell.step * STEP_S
         row.impact_speed_mps = v[k, av] - v[k, touched_by(k, av, kernel)]
+    if outcome == TIMEOUT:
+        row.end_ttc_s = time_to_collision(k, kernel)
     row.av_distance_m = kernel.x[k, av] - kernel.script.x[cell.row, av]
     if kernel.keep_traces:
         for vehicle in range(av + 1):

@@ -80,7 +80,7 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     cell.cruises, told = kernel.av_cruises if cell.acts_from > 0 else 0, script.set_speed_mps[row]
     cell.set_speed = kernel.v[k, av] if math.isnan(told) else told
     cell.announced_index = script.announced_index[row] if script.announced_index[row] >= 0 else episode
-    cell.danger = test.min_ttc_s = math.inf
+    cell.danger = test.min_ttc_s = test.end_ttc_s = math.inf
     test.took_over_step, test.component = -1, script.stratum[row]
     test.log_weight, test.log_p_event = script.log_weight[row], script.log_p_event[row]
     test.event_gap_m = test.event_rate_mps = test.onset_gap_m = test.onset_rate_mps = math.nan

@@ -61,6 +61,27 @@ def test_records_kept_change_nothing_else(stored_run, tmp_path):
     assert first[columns].to_numpy().tolist() == expected[columns].to_numpy().tolist()
 
 
+def test_where_a_test_ends_is_told_how_near_a_collision_was(stored_run):
+    """By the motion that was kept: the AV goes on as it did in the last step, the one ahead at its speed."""
+    folder, near = stored_run("shells-twin"), 0
+    traces = dict(list(stored_table(folder, "traces").to_pandas().groupby("episode")))
+    for row in stored_table(folder, "episodes").to_pandas().itertuples():
+        end = traces[row.episode][lambda rows: rows.step >= rows.step.max() - 1].set_index(["step", "vehicle"])
+        last = end.loc[end.index.levels[0].max()]
+        av, ahead = last.loc["AV"], last[(last.lane == last.lane["AV"]) & (last.x_m > last.x_m["AV"])]
+        times = np.linspace(0.0, 60.0, 60_001)
+        acceleration, hit = end.a_mps2[end.index.levels[0].max() - 1, "AV"], np.zeros(1)
+        if row.outcome == "timeout" and len(ahead) and av.v_mps > (lead := ahead.loc[ahead.x_m.idxmin()]).v_mps:
+            apart = lead.x_m - 5.0 - av.x_m - (av.v_mps - lead.v_mps) * times - acceleration * times**2 / 2.0
+            hit = times[apart <= 0.0]
+        if np.isnan(row.end_ttc_s):
+            assert hit.size == 0 or row.outcome != "timeout" or hit[0] == 0.0 or hit[0] > 59.0
+        elif row.end_ttc_s < 59.0:
+            near += 1
+            assert hit[0] == pytest.approx(row.end_ttc_s, abs=2e-3)
+    assert near > 10
+
+
 TRACED = {"shells-twin": "all", "mixture-twin": "share", "step-seldom": "critical"}
 
 
