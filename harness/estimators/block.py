@@ -43,8 +43,10 @@ EPISODE_COLUMNS = (
 SHELL_COLUMNS = ("component", "cell", "cell_mass")
 BASELINE_COLUMNS = ("shadow", "event_mass")
 """Of vehicles that act before the event, where `ShellDesign.candidates` says that they are on record."""
-DANGER_TTC_S = 4.0
-"""A test whose time was up with less to a collision (s), had the AV kept its acceleration, was cut off."""
+DANGER_TTC_S = 2.0
+"""A test whose time was up with less to a collision (s), had the AV kept its acceleration, was cut off [assumed].
+
+A driver who is going to react has begun to brake by then; with 4 s many were counted that stay clear."""
 MOMENT_COLUMNS = ("episode", "q_sampled", "q")
 Column = NDArray[Any]
 

@@ -49,7 +49,7 @@ def test_it_is_the_rate_of_harder_crashes_by_the_same_estimator(name, stored_run
     order = np.argsort(crashes.impact_speed_mps.to_numpy())
     impact, share = crashes.impact_speed_mps.to_numpy()[order], np.cumsum(weight[order]) / weight.sum()
     severity = content["severity"]
-    late = (rows.outcome == "timeout") & (rows.end_ttc_s < 4.0)
+    late = (rows.outcome == "timeout") & (rows.end_ttc_s < 2.0)
     tests = rows.groupby("component").size()[rows.component].to_numpy() if own == "shells" else len(rows)
     assert content["cut_off"] == pytest.approx((np.exp(rows.log_weight) / tests)[late].sum(), rel=1e-12)
     assert severity["median_mps"] == impact[np.searchsorted(share, 0.5)]
