@@ -17,6 +17,7 @@ from typing import Any, TypeVar, get_type_hints
 from harness.campaign.problems import did_you_mean
 from harness.campaign.python_files import in_python_file, is_script
 from harness.campaign.vehicle import AutomatedVehicle
+from harness.controllers.from_source import FromSource, import_from
 from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Guard, VehicleHost, cause_of, death_cause
 from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
@@ -43,8 +44,7 @@ def own_code(name: str, where: str = "av.controller", what: str = _A_CONTROLLER)
     """
     module_name, _, class_name = name.rpartition(":")
     is_file = module_name.endswith(".py")
-    if (here := str(real_path(Path(module_name).parent) if is_file else Path.cwd())) not in sys.path:
-        sys.path.insert(0, here)
+    import_from(real_path(Path(module_name).parent) if is_file else Path.cwd())
     try:
         module = _of_file(Path(module_name)) if is_file else importlib.import_module(module_name)
     except (Exception, SystemExit) as error:
@@ -76,12 +76,12 @@ def _of_file(file: Path) -> ModuleType:
     """The module that a file makes; its name is not that of another file, or of an installed module, of this name."""
     name = f"{file.stem}_{hashlib.sha256(bytes(real_path(file))).hexdigest()[:8]}"
     if name not in sys.modules:
-        spec = spec_from_file_location(name, file)
-        if spec is None or spec.loader is None:
-            raise ImportError(f"{file} is no Python file")
+        loader = FromSource(name, str(file))
+        spec = spec_from_file_location(name, file, loader=loader)
+        assert spec is not None
         sys.modules[name] = module_from_spec(spec)
         try:
-            spec.loader.exec_module(sys.modules[name])
+            loader.exec_module(sys.modules[name])
         except BaseException:
             del sys.modules[name]
             raise

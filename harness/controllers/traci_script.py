@@ -21,6 +21,7 @@ from typing import Any, NoReturn
 from greenlet import GreenletExit, getcurrent, greenlet
 
 from harness.campaign.python_files import TRACI_MODULES
+from harness.controllers.from_source import FromSource
 from harness.controllers.protocol import EpisodeStart, Observation
 from harness.controllers.traci_style import SimulationDomain, Traci
 from harness.controllers.traci_vehicle import Domain, FatalTraCIError, RefusedError, VehicleDomain
@@ -203,12 +204,12 @@ def _hand_over() -> None:
     harness.switch()
 
 
-class _Beside(SourceFileLoader):
+class _Beside(FromSource):
     """Loads a module that lies beside the script, for one run."""
 
     imports: _Imports
 
-    def get_code(self, fullname: str) -> CodeType | None:
+    def get_code(self, fullname: str) -> CodeType:
         if fullname not in self.imports.codes:
             self.imports.codes[fullname] = super().get_code(fullname)
         return self.imports.codes[fullname]
@@ -221,9 +222,7 @@ class _Beside(SourceFileLoader):
 class _Imports:
     """What one run imports: the facade, random numbers of its own, and copies of its own of modules beside it."""
 
-    def __init__(
-        self, folder: str, codes: dict[str, CodeType | None], traci: ScriptTraci, seed: Callable[[], int]
-    ) -> None:
+    def __init__(self, folder: str, codes: dict[str, CodeType], traci: ScriptTraci, seed: Callable[[], int]) -> None:
         self._folder, self.codes, self._traci, self._seed = folder, codes, traci, seed
         self._random: Any = None
         self._own: dict[str, ModuleType] = {}
@@ -259,7 +258,7 @@ class _Imports:
         if (top := name.partition(".")[0]) in sys.modules and top not in self._names:
             return None
         spec = PathFinder.find_spec(name, [self._folder] if path is None else path)
-        if spec is None or type(spec.loader) is not SourceFileLoader:
+        if spec is None or not isinstance(spec.loader, SourceFileLoader):
             return None
         self._names.add(name)
         spec.loader = loader = _Beside(name, spec.loader.path)
@@ -279,7 +278,7 @@ class Script:
         self._parameters = parameters
         options = [f"--{key}" if value is True else f"--{key}={value}" for key, value in parameters.items()]
         self.argv = [str(self._file), *([] if colon else options)]
-        self._codes: dict[str, CodeType | None] = {}
+        self._codes: dict[str, CodeType] = {}
         """Of the modules beside it, by name."""
         self._code: CodeType = compile(self._file.read_bytes(), self._file, "exec")
 

@@ -1,0 +1,66 @@
+"""A vehicle's code is that of its files, as they are now."""
+
+from __future__ import annotations
+
+import os
+import py_compile
+import sys
+
+import pytest
+
+from harness.controllers.find import own_code
+from harness.controllers.from_source import FromSource
+from tests.worlds.running import drive
+
+
+@pytest.fixture
+def rewritten(tmp_path, monkeypatch):
+    """Writes a file that Python has compiled when it said something else, of the same size in the same second."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+
+    def write(name: str, before: str, now: str):
+        file = tmp_path / name
+        for text in (before, now):
+            assert len(before) == len(now)
+            file.write_text(text, "utf-8")
+            os.utime(file, (1.7e9, 1.7e9))
+            if text is before:
+                py_compile.compile(str(file))
+        return file
+
+    return write
+
+
+VEHICLE = """
+from {beside} import HARDEST
+class Brakes:
+    hardest = HARDEST, {own}
+    def step(self, seen): return 0.0
+"""
+
+
+def test_what_python_has_kept_of_other_versions_is_not_run(rewritten):
+    rewritten("beside_of_brakes.py", "HARDEST = 4", "HARDEST = 7")
+    before, now = (VEHICLE.format(beside="beside_of_brakes", own=own) for own in (4, 7))
+    file = rewritten("brakes.py", before, now)
+    assert own_code(f"{file}:Brakes").hardest == (7, 7)
+
+
+def test_pythons_own_loader_runs_it(rewritten, monkeypatch):
+    monkeypatch.delattr(FromSource, "get_code")
+    rewritten("beside_of_others.py", "HARDEST = 4", "HARDEST = 7")
+    before, now = (VEHICLE.format(beside="beside_of_others", own=own) for own in (4, 7))
+    file = rewritten("others.py", before, now)
+    assert own_code(f"{file}:Brakes").hardest == (4, 4)
+
+
+def test_nor_of_what_lies_beside_a_script(rewritten):
+    rewritten("beside_of_script.py", "HARDEST = 1", "HARDEST = 2")
+    script = (
+        "import traci\nfrom beside_of_script import HARDEST\ntraci.start([])\nwhile True:\n    traci.simulationStep()\n"
+        "    traci.vehicle.setAcceleration('ego', -HARDEST, 0.1)\n"
+    )
+    file = rewritten("script.py", script, script)
+    shard = drive(f"av={{controller: '{file}'}}", n=4)
+    assert shard.failures == {}
+    assert min(trace[:-1, 2, 2].min() for trace in shard.traces.values()) == -2.0
