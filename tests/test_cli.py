@@ -245,10 +245,24 @@ def test_a_run_without_a_folder_gets_a_new_one_and_resumes_the_last(tmp_path, mo
     for held, fresh, resumed in ((None, "mine", "mine"), ("mine", "mine-2", "mine"), ("mine-2", "mine-3", "mine-2")):
         if held is not None:
             Path("runs", held).mkdir(parents=True)
-        assert (run_folder("mine", resume=False), run_folder("mine", resume=True)) == (
-            Path("runs", fresh),
-            Path("runs", resumed),
-        )
+        folders = [run_folder("mine", ["cut_in"], resume=resume) for resume in (False, True)]
+        assert folders == [Path("runs", fresh), Path("runs", resumed)]
+
+
+def test_a_run_resumes_the_last_of_its_scenarios(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    several = [(f"mine-3/{name}", name) for name in ("cut_in", "cut_out")]
+    for held, scenarios in (("mine", "cut_in"), ("mine-2", "lead_brakes"), *several):
+        Path("runs", held).mkdir(parents=True)
+        Path("runs", held, "campaign.yaml").write_text(f"name: mine\nscenario: {scenarios}\n", "utf-8")
+    asked = (
+        (["cut_in"], "mine"),
+        (["lead_brakes"], "mine-2"),
+        (["cut_in", "cut_out"], "mine-3"),
+        (["cut_out"], "mine-3"),
+    )
+    for scenarios, resumed in asked:
+        assert run_folder("mine", scenarios, resume=True) == Path("runs", resumed)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others have no DISPLAY")

@@ -18,7 +18,7 @@ from pydantic_core import CoreSchema, core_schema
 from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import ModelName, default_surrogates
-from harness.campaign.problems import MOST_SHOWN, describe_found, did_you_mean, in_words
+from harness.campaign.problems import MOST_SHOWN, describe_found, did_you_mean, file_meant, in_words
 from harness.campaign.python_files import in_python_file, is_script
 from harness.campaign.sections import DEFAULT, Section
 from harness.campaign.vehicle import AV_SOURCES, Panel, with_another_driver
@@ -96,9 +96,7 @@ def _with_real_paths(campaign: Campaign, place: Places, folder: Path, *, check_f
         if not Path(file).exists() and place(where).startswith("--set"):
             file = _absolute(name, Path.cwd())
         if check_files and not Path(file).is_file():
-            beside = Path(file).parent.glob("*" + Path(name).suffix)
-            meant = did_you_mean(Path(name).name, [each.name for each in beside])
-            mend = meant or "Correct the path; it is relative to the folder of the campaign file."
+            mend = file_meant(Path(file)) or "Correct the path; it is relative to the folder of the campaign file."
             raise CampaignError(place(where), f"no file {file}", expected, mend)
         campaign = campaign.replaced(where, f"{file}:{end}" if end else file)
     return campaign

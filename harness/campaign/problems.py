@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -108,6 +109,13 @@ def did_you_mean(word: object, words: Sequence[str]) -> str:
     asked = str(word)[:_LONGEST]
     cutoff = 0.75 if len(asked) > 4 else 0.6  # of three letters a wrong one leaves 0.67
     return next((f"Did you mean '{close}'?" for close in difflib.get_close_matches(asked, words, 1, cutoff)), "")
+
+
+def file_meant(file: Path) -> str:
+    """The same of the files beside one that is not there, by their names without the suffix."""
+    beside = sorted(each.name for each in file.parent.glob(f"*{file.suffix}"))
+    meant = did_you_mean(file.stem, [Path(name).stem for name in beside])
+    return meant.replace("'?", f"{file.suffix}'?")
 
 
 def describe_found(value: Any) -> str:

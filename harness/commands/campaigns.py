@@ -127,7 +127,10 @@ def run(
     campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)
-    chosen, folder = folder is None, folder or options.run_folder(campaign.name, resume=resume)
+    chosen, folder = (
+        folder is None,
+        folder or options.run_folder(campaign.name, sorted(campaign.scenarios or [campaign.scenario]), resume=resume),
+    )
     if campaign.run.executor == "local":
         start_server()
     with named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:

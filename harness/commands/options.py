@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import chain, count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,7 +44,7 @@ def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
 set_option = click.option(
     "--set", "overrides", multiple=True, metavar="A.B=C",
     help="Replace a value of the campaign, e.g. --set stop.rhw=0.3. May be given several times. A path is relative "
-    "to the campaign's file, as in the file itself.",
+    "to the campaign's file, as in the file itself; else to the current folder.",
 )  # fmt: skip
 av_option = click.option(
     "--av", "av", metavar="VEHICLE", help="Test this vehicle instead of the campaign's; named as for `harness run`."
@@ -116,8 +116,23 @@ def accepting(limit: str) -> list[str]:
     return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
 
 
-def run_folder(name: str, *, resume: bool) -> Path:
-    """``runs/NAME``, or the first ``runs/NAME-2``, ``-3``, … that is not there; to resume, the last that is there."""
+def run_folder(name: str, scenarios: Sequence[str], *, resume: bool) -> Path:
+    """``runs/NAME``, or the first new ``runs/NAME-2``, ``-3``, …; to resume, the last of these scenarios."""
     numbered = chain([RUNS / name], (RUNS / f"{name}-{number}" for number in count(2)))
     there = list(takewhile(Path.exists, numbered))
-    return there[-1] if resume and there else RUNS / (f"{name}-{len(there) + 1}" if there else name)
+    if not resume or not there:
+        return RUNS / (f"{name}-{len(there) + 1}" if there else name)
+    return next((each for each in reversed(there) if _scenarios_of(each) == list(scenarios)), there[-1])
+
+
+def _scenarios_of(folder: Path) -> list[str]:
+    """Which scenarios a run is of; none where that cannot be read."""
+    from harness.campaign.files import load_campaign
+    from harness.records.folder import CAMPAIGN
+
+    if not (stored := folder / CAMPAIGN).exists():
+        return sorted(each.parent.name for each in folder.glob(f"*/{CAMPAIGN}"))
+    try:
+        return [load_campaign(stored, check_files=False).scenario]
+    except HarnessError:
+        return []

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from pydantic import Field
 
 from harness.campaign.files import read_model, shipped_or_own
-from harness.campaign.problems import did_you_mean
+from harness.campaign.problems import did_you_mean, file_meant
 from harness.campaign.sections import Section
 from harness.errors import TrajectoryError, printable
 from harness.fitting.recording import NAMES, NO_LENGTH, NUMBERS, UNITS, Recording, Unit, recording_of, require
@@ -130,8 +130,7 @@ def _reading(path: Path) -> Iterator[None]:
             raise TrajectoryError(str(path), "a pipe or a device", expected, "Write its content into a file first.")
         yield
     except FileNotFoundError:
-        meant = did_you_mean(path.name, [each.name for each in path.parent.glob("*")])
-        mend = meant or "Check the spelling and the current folder."
+        mend = file_meant(path) or "Check the spelling and the current folder."
         raise TrajectoryError(str(path), "no such file", expected, mend) from None
     except (pa.ArrowException, csv.Error, OSError, ValueError) as error:
         first = str(error).splitlines()[0]

@@ -133,7 +133,7 @@ def read_run_folder(path: Path) -> RunFolder:
 
 
 def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:
-    path, again = folder / "estimates.json", f"Make it again with `harness estimate {folder} --write`."
+    path, again = folder / "estimates.json", f"Make it with `harness estimate {folder} --write`."
     estimates = read_as(Estimates, path, mend=again)
     if estimates.campaign_hash != campaign_hash:
         expected = f"those of campaign {campaign_hash} (manifest.json)"
