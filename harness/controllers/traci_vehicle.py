@@ -108,8 +108,7 @@ _QUESTIONS: dict[str, tuple[int, Callable[[Seen], Any]]] = {
     "getLateralLanePosition": (0xB8, lambda of: of.sideways),
 }
 """Questions about a vehicle: their numbers in ``traci.constants``, and what answers them. Front bumpers count."""
-_VARIABLES = {number: name for name, (number, _) in _QUESTIONS.items()}
-_VARIABLES |= {0x68: "getLeader", 0x78: "getFollower"}
+_VARIABLES = {number: name for name, (number, _) in _QUESTIONS.items()} | {0x68: "getLeader", 0x78: "getFollower"}
 """What can be subscribed to, by number."""
 _OF_THE_AV = {"getSpeedMode": "_speed_mode", "getAccel": "_accel", "getDecel": "_decel"}
 """What has been set of it, and where that is kept: bounds of its commands (m/s²) are infinite without."""
