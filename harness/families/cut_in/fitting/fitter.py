@@ -75,8 +75,8 @@ def _told(fit: Fit, tally: Tally, n_replicates: int) -> tuple[str, ...]:
     traffic, steps, unseen = fit.traffic, fit.acceptance, fit.environment.unseen
     limited = f"! no lane change seen at {unseen}: rates of crashes that begin there have only an upper limit"
     return (
-        f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h; "
-        f"{tally.used:,} lane changes used of {tally.changes:,}",
+        f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the "
+        f"target lane; {tally.used:,} lane changes used of {tally.changes:,}",
         f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
         f"{steps.exposure[:-1].sum():.1f} expected if nobody minded it",
         *(f"kept as in {fit.base_name}: {what} ({why})" for what, why in fit.kept.items()),
