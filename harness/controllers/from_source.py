@@ -10,9 +10,10 @@ import os
 import sys
 from importlib.machinery import EXTENSION_SUFFIXES, SOURCE_SUFFIXES, ExtensionFileLoader, FileFinder, SourceFileLoader
 from pathlib import Path
+from sysconfig import get_path
 from types import CodeType
 
-_PACKAGE = str(Path(__file__).parents[1])
+_NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), get_path("platstdlib")
 _folders = set[str]()
 
 
@@ -42,6 +43,7 @@ def _finder(path: str) -> FileFinder:
     """As a hook of ``sys.path_hooks``."""
     path = path or os.getcwd()  # noqa: PTH109 - as Python's own
     ours = any(path == each or path.startswith(each.rstrip(os.sep) + os.sep) for each in _folders)
-    if not ours or "site-packages" in path or path.startswith(_PACKAGE) or not os.path.isdir(path):  # noqa: PTH112
+    installed = "-packages" in path or path.startswith(_NOT_THE_USERS)
+    if not ours or installed or not os.path.isdir(path):  # noqa: PTH112
         raise ImportError(path)
     return FileFinder(path, (ExtensionFileLoader, EXTENSION_SUFFIXES), (FromSource, SOURCE_SUFFIXES))
