@@ -75,7 +75,7 @@ def episodes_schema(
             _or_null("crash_time_s", _F8, "s", "time of the crash"),
             _or_null("impact_speed_mps", _F8, "m/s", "v_AV - v_BV at the crash"),
             _or_null("min_ttc_s", _F8, "s", "smallest R2/-R2dot after the cut-in while closing"),
-            _or_null("end_ttc_s", _F8, "s", "of a timeout: to a collision as it closes in, at its acceleration then"),
+            _or_null("end_ttc_s", _F8, "s", "of a timeout: to a collision as it then accelerates (a program: at its speed)"),
             _field("av_distance_m", _F8, "m", "distance that the AV drove in the test"),
             _field("n_control_steps", _I2, "1", "stratum l: steps drawn from an importance function"),
             _field("component", _I1, "1", "importance function drawn (episode mixture), or shell, else -1"),
