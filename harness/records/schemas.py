@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.families.protocol import Chosen, Column, Family
+from harness.families.protocol import Chosen, Column, Family, list_of
 from harness.loop.loop import Shard
 from harness.vocabulary import CRASH, OUTCOMES, FloatArray, Int8Array, IntArray, RecordArray
 
 _F8, _I1, _I2, _I8 = pa.float64(), pa.int8(), pa.int16(), pa.int64()
-_NAME, _MOTION = pa.dictionary(_I1, pa.string()), pa.list_(_F8)
+_NAME, _MOTION = pa.dictionary(_I1, pa.string()), list_of(_F8)
 
 
 def _field(name: str, kind: pa.DataType, unit: str, doc: str, *, nullable: bool = False) -> pa.Field:
@@ -34,7 +34,7 @@ def _facts(columns: Sequence[Column]) -> list[pa.Field]:
 
 def _per(n: int) -> pa.DataType:
     """List of one float64 per importance function or surrogate; Parquet has no fixed-size list of zero."""
-    return pa.list_(_F8, n) if n else pa.list_(_F8)
+    return list_of(_F8, n or -1)
 
 
 def episodes_schema(
@@ -75,7 +75,7 @@ def episodes_schema(
             _or_null("crash_time_s", _F8, "s", "time of the crash"),
             _or_null("impact_speed_mps", _F8, "m/s", "v_AV - v_BV at the crash"),
             _or_null("min_ttc_s", _F8, "s", "smallest R2/-R2dot after the cut-in while closing"),
-            _or_null("end_ttc_s", _F8, "s", "of a timeout: to a collision as it then accelerates (a program: at its speed)"),
+            _or_null("end_ttc_s", _F8, "s", "of a timeout: to a collision as it accelerates (a program: at its speed)"),
             _field("av_distance_m", _F8, "m", "distance that the AV drove in the test"),
             _field("n_control_steps", _I2, "1", "stratum l: steps drawn from an importance function"),
             _field("component", _I1, "1", "importance function drawn (episode mixture), or shell, else -1"),
