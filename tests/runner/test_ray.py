@@ -58,7 +58,7 @@ def test_a_run_begun_here_goes_on_there_with_the_same_records(run, run_here, cam
 
 
 def test_shadow_runs_come_to_the_machines(run, campaign, tmp_path):
-    settings = (*SHELLS, *SHADOWS, f"av={of('Speeds')}", TWIN)
+    settings = (*SHELLS, *SHADOWS, f"av={of('Speeds')}", TWIN[0])
     a = run(campaign(*settings), tmp_path / "local", workers=2)
     b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
     assert unlike_columns(a.folder, b.folder) == []
