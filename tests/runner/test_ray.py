@@ -91,7 +91,7 @@ def test_what_a_controller_starts_ends_with_the_run_and_no_file_is_left(struck, 
     monkeypatch.chdir(ROOT)
     note, out, left = tmp_path / "started", tmp_path / "ray", set(Path(tempfile.gettempdir()).glob("harness-*"))
     acting = f"{{controller: 'tests.controllers.misbehaving:StartsPrograms', parameters: {{note: {note}}}, {EARLY}}}"
-    settings = (*FORCED, SHADOWS, TWIN[0], f"av={acting}", "world.cells=8", "stop.episodes=3000")
+    settings = (*FORCED, *SHADOWS, TWIN[0], f"av={acting}", "world.cells=8", "stop.episodes=3000")
 
     def strike() -> None:
         while len(part_files(out)) < 2:
