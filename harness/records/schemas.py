@@ -193,7 +193,7 @@ def rows(values: np.ndarray) -> pa.Array:
     n, width = values.shape
     flat = pa.array(np.ascontiguousarray(values).ravel())
     if width:
-        return pa.FixedSizeListArray.from_arrays(flat, width)
+        return pa.FixedSizeListArray.from_arrays(flat, type=list_of(flat.type, width))
     return pa.ListArray.from_arrays(pa.array(np.zeros(n + 1, np.int32)), flat)
 
 
