@@ -29,9 +29,7 @@ def is_script(name: str) -> bool:
     file, colon, function = name.partition(".py:")
     if (tree := _parsed(f"{file}.py" if colon else name)) is None:
         return False
-    imported = [each.module or "" for each in ast.walk(tree) if isinstance(each, ast.ImportFrom)]
-    imported += [alias.name for each in ast.walk(tree) if isinstance(each, ast.Import) for alias in each.names]
-    if tree.body and not any(each.partition(".")[0] in TRACI_MODULES for each in imported):
+    if tree.body and not any(each.partition(".")[0] in TRACI_MODULES for each in _imports(tree)):
         return False
     for each in tree.body:
         if isinstance(each, ast.FunctionDef) and each.name == function:
@@ -39,6 +37,31 @@ def is_script(name: str) -> bool:
             required = len(given.posonlyargs) + len(given.args) - len(given.defaults) + given.kw_defaults.count(None)
             return required == 0 and (makes is None or ast.unparse(makes) == "None")
     return not colon
+
+
+def _imports(tree: ast.Module) -> set[str]:
+    """Modules that are imported anywhere, and what is taken from them, which may be modules; first a dot a level."""
+    found = {alias.name for each in ast.walk(tree) if isinstance(each, ast.Import) for alias in each.names}
+    for each in ast.walk(tree):
+        if isinstance(each, ast.ImportFrom):
+            start = "." * each.level + (f"{each.module}." if each.module else "")
+            found.update(start + alias.name for alias in each.names)
+    return found
+
+
+def files_imported(file: Path, root: Path) -> set[Path]:
+    """A Python file, and those below ``root``, a folder that is importable, that it and these import."""
+    found, new = set[Path](), {file}
+    while new:
+        found.add(at := new.pop())
+        for name in _imports(_parsed(str(at)) or ast.Module([], [])):
+            path = name.lstrip(".")
+            below = [root, *at.parents][len(name) - len(path)].joinpath(*path.split("."))
+            for each in (below, *below.parents):
+                if not each.is_relative_to(root) or each in (root, root / "harness"):
+                    break
+                new |= {it for it in (each.with_suffix(".py"), each / "__init__.py") if it.is_file()} - found
+    return found
 
 
 def in_python_file(text: str) -> str:

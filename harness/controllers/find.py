@@ -15,9 +15,9 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar, get_type_hints
 
 from harness.campaign.problems import did_you_mean
-from harness.campaign.python_files import in_python_file, is_script
+from harness.campaign.python_files import files_imported, in_python_file, is_script
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.from_source import FromSource, import_from
+from harness.controllers.from_source import FromSource, import_from, is_users
 from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Guard, VehicleHost, cause_of, death_cause
 from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
@@ -263,24 +263,37 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
 def require_controller(av: AutomatedVehicle) -> str | None:
     """Find and make an AV's controller once, before anything is written, in a process of its own.
 
-    Returns the SHA-256 of the source file of its class; None for an AV without one, or without a source. Raises a
-    `CampaignError` if it cannot be found or made, or is of neither kind.
+    Returns a SHA-256 of what it is made of: its file, modules of the user's that this imports, and files that
+    ``av.parameters`` names; None for an AV without a source. Raises a `CampaignError` if it cannot be found or made, or
+    is of neither kind.
     """
     if not has_foreign_code(av):
         return None
     try:
-        return run_apart(av, _source_of_made, av)
+        return run_apart(av, _sources_of_made, av)
     except AvEndedProcessError as error:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
 
 
-def _source_of_made(av: AutomatedVehicle) -> str | None:
+def _sources_of_made(av: AutomatedVehicle) -> str | None:
     build_host(av, n_cells=1, seed=0)  # what it holds ends with the process
     if av.controller is None:
         return None
     if is_script(av.controller):
-        file = Path(av.controller.removesuffix(":" + av.controller.rpartition(":")[2]))
+        file, above = av.controller.removesuffix(":" + av.controller.rpartition(":")[2]), 0
     else:
-        module = sys.modules.get(getattr(own_code(av.controller), "__module__", ""))
-        file = Path(getattr(module, "__file__", None) or "")
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None
+        name = getattr(own_code(av.controller), "__module__", "")
+        file, above = getattr(sys.modules.get(name), "__file__", None) or "", name.count(".")
+    given = av.parameters.values() if isinstance(av.parameters, dict) else ()
+    files = {str(real_path(file)), *(value for value in given if isinstance(value, str))}
+    if is_users(root := str(real_path(file).parents[above])):
+        files |= {str(each) for each in files_imported(real_path(file), Path(root))}
+    contents = sorted(hashlib.sha256(Path(each).read_bytes()).hexdigest() for each in files if _is_file(each))
+    return hashlib.sha256("".join(contents).encode()).hexdigest() if contents else None
+
+
+def _is_file(name: str) -> bool:
+    try:
+        return Path(name).is_file()
+    except (OSError, ValueError):  # a parameter that is no path: too long, or with a zero in it
+        return False

@@ -14,7 +14,6 @@ from sysconfig import get_path
 from types import CodeType
 
 _NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), get_path("platstdlib")
-_folders = set[str]()
 
 
 class FromSource(SourceFileLoader):
@@ -27,23 +26,23 @@ class FromSource(SourceFileLoader):
         return code
 
 
+def is_users(folder: str) -> bool:
+    """Whether what lies in a folder is neither installed there nor the harness itself."""
+    return "-packages" not in folder and not folder.startswith(_NOT_THE_USERS)
+
+
 def import_from(folder: Path) -> None:
-    """Let modules of a folder be imported, and those below it, but for what is installed there, from their sources."""
-    here = str(folder)
-    if here not in _folders:
-        _folders.add(here)
-        if _finder not in sys.path_hooks:
-            sys.path_hooks.insert(0, _finder)
+    """Let modules of a folder be imported; from here on all that are not installed are, from their sources."""
+    if _finder not in sys.path_hooks:
+        sys.path_hooks.insert(0, _finder)
         sys.path_importer_cache.clear()
-    if here not in sys.path:
+    if (here := str(folder)) not in sys.path:
         sys.path.insert(0, here)
 
 
 def _finder(path: str) -> FileFinder:
     """As a hook of ``sys.path_hooks``."""
     path = path or os.getcwd()  # noqa: PTH109 - as Python's own
-    ours = any(path == each or path.startswith(each.rstrip(os.sep) + os.sep) for each in _folders)
-    installed = "-packages" in path or path.startswith(_NOT_THE_USERS)
-    if not ours or installed or not os.path.isdir(path):  # noqa: PTH112
+    if not is_users(path) or not os.path.isdir(path):  # noqa: PTH112
         raise ImportError(path)
     return FileFinder(path, (ExtensionFileLoader, EXTENSION_SUFFIXES), (FromSource, SOURCE_SUFFIXES))

@@ -30,11 +30,6 @@ Parameters: TypeAlias = ParameterFile
 """Its numbers, each with its provenance."""
 
 
-def list_of(kind: pa.DataType, n: int = -1) -> pa.DataType:
-    """Lists, of ``n`` values each; named as Parquet reads them back, so that a file written on is that of one run."""
-    return pa.list_(pa.field("element", kind), n)
-
-
 class Column(NamedTuple):
     """A fact of each test that records keep: a field of the family's facts, and of the table of tests.
 

@@ -129,7 +129,17 @@ def require_sum(path: Path, crc32: int | None, content: bytes, mend: str) -> Non
 
 
 def parquet(table: pa.Table) -> bytes:
-    """A table as the content of a file."""
+    """A table as the content of a file: the same bytes whether its rows come from here, a worker, or another file.
+
+    Arrow calls the values of a list "item", Parquet "element", and pickling keeps either of some lists only.
+    """
+    lists = {
+        i: pa.list_(pa.field("element", field.type.value_type), getattr(field.type, "list_size", -1))
+        for i, field in enumerate(table.schema)
+        if hasattr(field.type, "value_field")
+    }
+    schema = pa.schema([field.with_type(lists.get(i, field.type)) for i, field in enumerate(table.schema)])
+    table = pa.Table.from_arrays(table.columns, schema=schema.with_metadata(table.schema.metadata))
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
     return sink.getvalue().to_pybytes()  # type: ignore[no-any-return]

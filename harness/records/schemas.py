@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from harness.families.protocol import Chosen, Column, Family, list_of
+from harness.families.protocol import Chosen, Column, Family
 from harness.loop.loop import Shard
 from harness.vocabulary import CRASH, OUTCOMES, FloatArray, Int8Array, IntArray, RecordArray
 
 _F8, _I1, _I2, _I8 = pa.float64(), pa.int8(), pa.int16(), pa.int64()
-_NAME, _MOTION = pa.dictionary(_I1, pa.string()), list_of(_F8)
+_NAME, _MOTION = pa.dictionary(_I1, pa.string()), pa.list_(_F8)
 
 
 def _field(name: str, kind: pa.DataType, unit: str, doc: str, *, nullable: bool = False) -> pa.Field:
@@ -34,7 +34,7 @@ def _facts(columns: Sequence[Column]) -> list[pa.Field]:
 
 def _per(n: int) -> pa.DataType:
     """List of one float64 per importance function or surrogate; Parquet has no fixed-size list of zero."""
-    return list_of(_F8, n or -1)
+    return pa.list_(_F8, n or -1)
 
 
 def episodes_schema(
@@ -193,7 +193,7 @@ def rows(values: np.ndarray) -> pa.Array:
     n, width = values.shape
     flat = pa.array(np.ascontiguousarray(values).ravel())
     if width:
-        return pa.FixedSizeListArray.from_arrays(flat, type=list_of(flat.type, width))
+        return pa.FixedSizeListArray.from_arrays(flat, type=pa.list_(flat.type, width))
     return pa.ListArray.from_arrays(pa.array(np.zeros(n + 1, np.int32)), flat)
 
 

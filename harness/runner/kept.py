@@ -310,8 +310,8 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         mend = "Continue it with --resume, or choose another folder with --out."
         raise refusal("this campaign, already begun", "a new or empty folder", mend)
     if manifest.get("controller_sha256") != resolved.controller_sha256:
-        found = "tests of this campaign whose controller's source file has been changed since"
-        mend = "Restore the file; or drive the vehicle as it is now, into a new folder."
+        found = "tests of this campaign; since then its controller, or a file that it is made of, has been changed"
+        mend = "Restore it; or drive the vehicle as it is now, into a new folder."
         raise refusal(found, "the same controller for all tests of a run", mend)
     return manifest
 

@@ -272,9 +272,9 @@ def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
     other = [f"{name} {there[name]} (here {here.get(name)})" for name in there if there[name] != here.get(name)]
     found = [f"The run was made with {', '.join(other)}; bits are promised for equal ones."] if other else []
     if manifest.get("controller_sha256") != require_controller(campaign.av):
-        found.append("The controller's source file has been changed since the run.")
+        found.append("The controller, or a file that it is made of, has been changed since the run.")
     elif campaign.av.model is None:
-        same = "Versions, CPU and the controller's source file are the run's. " if not other else ""
+        same = "Versions, CPU and the controller's files are the run's. " if not other else ""
         found.append(
             f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier tests, "
             "or a file that it reads. `harness av-check` looks for that."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import io
 import os
 import pickle
 import random
@@ -15,11 +16,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
-from harness.records.folder import write_json, write_part, write_together
+from harness.records.folder import parquet, write_json, write_part, write_together
 from harness.records.reader import read
 from harness.records.schemas import ShardTables
 from harness.report.summary import read_run_folder, summarise
@@ -52,6 +54,18 @@ def test_a_write_that_fails_leaves_nothing_but_the_old_file(tmp_path):
         assert files_below(tmp_path) == old
         write_atomically(path, lambda temporary: temporary.write_text("old"))
     assert path.read_text() == "old"
+
+
+def test_where_rows_come_from_changes_no_byte_of_a_file():
+    lists = {"fixed": pa.list_(pa.float64(), 2), "any": pa.list_(pa.int8())}
+    table = pa.table({name: pa.array([[1, 2], [3, 4]], kind) for name, kind in lists.items()})
+    written = parquet(table)
+    read_again = pq.read_table(io.BytesIO(written))
+    assert parquet(read_again) == parquet(pickle.loads(pickle.dumps(read_again))) == written
+    plain = io.BytesIO(), io.BytesIO()
+    for file, each in zip(plain, (table, read_again), strict=True):
+        pq.write_table(each, file)
+    assert plain[0].getvalue() != plain[1].getvalue()  # Arrow's own way
 
 
 @pytest.mark.parametrize(("umask", "mode"), [(0o077, 0o600), (0o027, 0o640), (0o002, 0o664)])

@@ -280,7 +280,7 @@ def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
     assert replay_episode(folder, 3).suspects is None
     campaign = load_campaign(folder / "campaign.yaml")
     assert "the vehicle does not do the same again" in suspects(manifest, campaign)
-    assert "source file has been changed" in suspects({**manifest, "controller_sha256": "0"}, campaign)
+    assert "made of, has been changed" in suspects({**manifest, "controller_sha256": "0"}, campaign)
     assert "CPU Z80 (here" in suspects({**manifest, "cpu": "Z80"}, campaign)
 
 

@@ -86,15 +86,23 @@ def test_two_processes_do_not_run_into_one_folder(stored, complaint_of, whole):
 
 def test_another_version_of_the_controller_is_refused(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
-    file, out = tmp_path / "versioned_controller.py", tmp_path / "run"
-    text = "from examples.idm import IDM\nclass Careful(IDM):\n    def step(self, seen): return -2.0"
-    settings = ("av={controller: 'versioned_controller:Careful'}", "world.engine=twin")
-    file.write_text(text)
+    file, beside, weights = (tmp_path / name for name in ("versioned_controller.py", "beside_it.py", "weights.txt"))
+    own = {
+        file: "import beside_it\nfrom examples.idm import IDM\nclass Careful(IDM):\n"
+        "    def __init__(self, weights): super().__init__()\n    def step(self, seen): return beside_it.ASKED",
+        beside: "ASKED = -2.0",
+        weights: "2.0",
+    }
+    for each, text in own.items():
+        each.write_text(text)
+    parameters, out = f"parameters: {{weights: {weights}}}", tmp_path / "run"
+    settings = (f"av={{controller: 'versioned_controller:Careful', {parameters}}}", "world.engine=twin")
     run_here(golden("forced-twin", *settings, "stop.episodes=20"), out)
-    file.write_text(text.replace("2.0", "3.0"))
-    with pytest.raises(RunFolderError, match="source file has been changed"):
-        run_here(golden("forced-twin", *settings, "stop.episodes=40"), out, resume=True)
-    file.write_text(text)
+    for each, text in own.items():
+        each.write_text(text.replace("2.0", "3.0") + "\n")
+        with pytest.raises(RunFolderError, match="made of, has been changed"):
+            run_here(golden("forced-twin", *settings, "stop.episodes=40"), out, resume=True)
+        each.write_text(text)
     assert run_here(golden("forced-twin", *settings, "stop.episodes=40"), out, resume=True).exit_code == 0
 
 

@@ -21,7 +21,7 @@ from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
 from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
-from harness.families.protocol import Chosen, Column, Exposure, Family, Paths, list_of
+from harness.families.protocol import Chosen, Column, Exposure, Family, Paths
 from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
 
 _STATE_DOCS = (
@@ -36,8 +36,8 @@ STATE_FACTS = tuple(
     for name, doc in zip(STATE_COLUMNS, _STATE_DOCS, strict=True)
 )
 MANEUVER_FACTS = (
-    Column("lv_maneuvers", list_of(pa.int8()), "1", "LV's draws, in order", "n_lv"),
-    Column("bv_maneuvers", list_of(pa.int8()), "1", "BV's draws, in order; 31 marks the cut-in", "n_bv"),
+    Column("lv_maneuvers", pa.list_(pa.int8()), "1", "LV's draws, in order", "n_lv"),
+    Column("bv_maneuvers", pa.list_(pa.int8()), "1", "BV's draws, in order; 31 marks the cut-in", "n_bv"),
 )
 
 

@@ -29,18 +29,7 @@ from harness.families.following.approach import (
 from harness.families.following.follow import STATE, drive_others, enumerate_events, move_others
 from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
 from harness.families.following.words import STAND_INS
-from harness.families.protocol import (
-    HOLDING,
-    Chosen,
-    Column,
-    Driven,
-    Events,
-    Exposure,
-    Family,
-    Paths,
-    Recorded,
-    list_of,
-)
+from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, Family, Paths, Recorded
 from harness.loop.cells import Script, natural_script
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vehicles.following import seen_after
@@ -50,7 +39,7 @@ from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray, Recor
 START_FACTS = (
     Column("start_speed_mps", pa.float64(), "m/s", "initial speed of all but a revealed vehicle"),
     Column("natural_headway_s", pa.float64(), "s", "headway that people keep on this path"),
-    Column("lead_accelerations", list_of(pa.int8()), "0.2 m/s²", "of the vehicle ahead, each second", "n_seconds"),
+    Column("lead_accelerations", pa.list_(pa.int8()), "0.2 m/s²", "of the vehicle ahead, each second", "n_seconds"),
     Column("event", pa.int64(), "1", "which of the family's grid, -1 for none"),
     Column("lead_speed_mps", pa.float64(), "m/s", "speed of the vehicle ahead at the onset"),
 )
