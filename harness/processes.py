@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from weakref import finalize
 
 from harness.cache import SAID, temporary_folder
+from harness.errors import HarnessError
 from harness.printed import Printed
 
 if TYPE_CHECKING:
@@ -197,6 +198,10 @@ def start_server() -> None:
 @contextmanager
 def _server() -> Iterator[None]:
     """The fork server as workers need it: nobody's main script runs again, neither there nor in them."""
+    try:
+        os.getcwd()  # noqa: PTH109 - one call
+    except FileNotFoundError:  # a vehicle has gone where there is no folder any more, and Python does not start there
+        os.chdir(os.sep)
     forkserver.set_forkserver_preload([_PRELOADED])
     short = _in_short(temporary_folder())
     main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
@@ -216,11 +221,15 @@ def _in_short(folder: str) -> str:
 def _started(work: tuple[Any, ...]) -> ForkServerProcess:
     for _ in range(_ATTEMPTS):
         process = ForkServerProcess(target=_begin, args=work)
-        with suppress(EOFError, OSError):  # the server was killed: the next attempt starts another
+        try:
             process.start()
+        except (EOFError, OSError) as error:  # the server was killed: the next attempt starts another
+            why = str(error)
+            time.sleep(_LOOK_S)  # until it is gone
+        else:
             return process
-        time.sleep(_LOOK_S)  # until it is gone
-    raise ChildProcessError("the process that starts workers ended again and again")
+    mend = "Raise the limits of open files, processes and memory (ulimit -n, -u, -v), then give the same command again."
+    raise HarnessError("workers", f"no process that can be started ({why})", "one for each of --workers", mend)
 
 
 def _begin(

@@ -80,14 +80,14 @@ def cause_of(error: BaseException) -> str:
     """
     try:
         text = f"{type(error).__name__}: {error}"
+        origin = error.name if isinstance(error, ImportError) else type(error).__module__
+        if str(origin).partition(".")[0] in ("traci", "libsumo"):  # not what stands for it here
+            text = f"{text.rstrip('.')}. Use the traci that is handed in (docs/controllers.md), not the module"
+        asked = type(error.obj) if isinstance(error, AttributeError) else object
+        if str(asked.__module__).startswith("harness."):
+            text += f". {did_you_mean(error.name, [name for name in dir(asked) if name[0] != '_'])}".rstrip(". ")
     except BaseException as again:  # noqa: BLE001 - whatever a user's code raises
         text = f"{type(error).__name__}, whose text raised {type(again).__name__}"
-    origin = error.name if isinstance(error, ImportError) else type(error).__module__
-    if (origin or "").partition(".")[0] in ("traci", "libsumo"):  # not what stands for it here
-        text = f"{text.rstrip('.')}. Use the traci that is handed in (docs/controllers.md), not the module"
-    asked = type(error.obj) if isinstance(error, AttributeError) else object
-    if isinstance(error, AttributeError) and asked.__module__.startswith("harness."):
-        text += f". {did_you_mean(error.name, [name for name in dir(asked) if name[0] != '_'])}".rstrip(". ")
     return text.encode("utf-8", "backslashreplace").decode().splitlines()[0][:500] + _place_of(error)
 
 
@@ -204,9 +204,10 @@ class Guard:
 
         An array of one element, as policies give it, is that.
         """
-        if not isinstance(answer, float) and hasattr(answer, "__array__") and (found := np.asarray(answer)).size == 1:
-            answer = found.item()
-        if not isinstance(answer, int | float | np.floating | np.integer) or isinstance(answer, bool):
+        if not isinstance(answer, float) and hasattr(answer, "__array__") and not np.ma.is_masked(answer):
+            found = np.asarray(answer)
+            answer = found.item() if found.size == 1 and found.dtype.kind in "iufO" else answer
+        if not isinstance(answer, int | float | np.floating) or isinstance(answer, bool):
             what = "None (is a return missing?)" if answer is None else type(answer).__name__
             return math.nan, f"returned {what}, expected an acceleration in m/s2 as a number"
         value = float(answer)
@@ -330,7 +331,7 @@ def _numbers(n: int, answer: Any) -> tuple[FloatArray | None, str | None]:
 
     That of a policy may be (n, 1).
     """
-    found = np.array(answer)
+    found = np.ma.array(answer, object).filled(None) if np.ma.is_masked(answer) else np.array(answer)
     if found.shape == (n, 1):
         found = found[:, 0]
     if found.shape != (n,):

@@ -63,9 +63,9 @@ NUMBERS = (
     *(Rule(name, np.isfinite, "no finite number", "a number in every row") for name in _NUMBERS),
     Rule("lane", lambda x: x % 1 == 0, "{:g}", "a whole number", "Number the lanes by whole numbers."),
 )
-SOME_LENGTH = Rule("length_m", lambda x: x > 0.0, "no length", "a length above 0 m", NO_LENGTH)
+SOME_LENGTH = Rule("length_m", lambda x: x >= 0.5, "length_m {:g}", "a length of 0.5 m or more", NO_LENGTH)
 NEAR_TIME = _near("time_s", 1e7)
-NEAR = _near("s_m", 1e5), _near("lane", 20), _near("length_m", 50.0)
+NEAR = _near("s_m", 1e5), _near("lane", 20), _near("length_m", 50.0), _near("speed_mps", 60.0)
 
 
 def require(rule: Rule, rows: pd.DataFrame, where: Callable[[int], str]) -> None:

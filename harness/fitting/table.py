@@ -184,7 +184,8 @@ class _Text(NamedTuple):
             raise TrajectoryError(str(path), kinds[0], "a CSV or Parquet file", mend)
         content = pa.input_stream(str(path))
         text = sample.decode("utf-8-sig", errors="replace")
-        head = text.lstrip("\r\n").partition("\n")[0].strip()
+        below = text.lstrip("\r\n")
+        head = below.partition("\n")[0].strip()
         if not head:
             raise TrajectoryError(str(path), "an empty file", "a header and rows", "Is it the right file?")
         if isinstance(content, pa.OSFile):  # of what is packed the end is known
@@ -205,7 +206,8 @@ class _Text(NamedTuple):
             mend = "Add a header; or list the names in a mapping (header: [vehicle_id, time_s, …])."
             raise TrajectoryError(str(path), found, "names of columns in the first row", mend)
         decimal_point = "," if delimiter != "," and marks[0] > marks[1] else "."
-        return cls(content, names if headed else mapping.header, delimiter, decimal_point, 1 + headed)
+        first = 1 + headed + text[: len(text) - len(below)].count("\n")
+        return cls(content, names if headed else mapping.header, delimiter, decimal_point, first)
 
 
 def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, str]:

@@ -95,7 +95,7 @@ def _each_elsewhere(source: Source, tests: list[Tests]) -> list[Bits | None]:
     """What each leaves; None of one that ends its process, or whose controller cannot be made once more."""
     try:
         return [*run_elsewhere(source, tests).bits]
-    except HarnessError:
+    except (HarnessError, OSError):
         half = len(tests) // 2
         return [None] if not half else _each_elsewhere(source, tests[:half]) + _each_elsewhere(source, tests[half:])
 

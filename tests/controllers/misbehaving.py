@@ -33,6 +33,10 @@ class UnprintableError(Exception):
         raise ValueError
 
 
+class LyingError(Exception):
+    __module__ = property(lambda _: 1)
+
+
 def raises(error):
     raise error
 
@@ -72,6 +76,9 @@ FAULTS = {
     "asks_another_traci": lambda: __import__("traci").vehicle.getSpeed("AV"),
     "none": lambda: None,
     "nan": lambda: math.nan,
+    "masked": lambda: np.ma.masked,
+    "time": lambda: np.timedelta64(1, "ns"),
+    "raises_what_lies": lambda: raises(LyingError("so")),
     "boolean": lambda: True,
     "impossible": lambda: -99.0,
     "lies": lambda: Lying(-1e6),

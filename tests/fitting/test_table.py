@@ -111,7 +111,7 @@ REFUSED = {
     "lateral feet": (changed(lateral_m=ROWS.lateral_m * FEET), r"lanes 11\.8 m apart.*units: \{lateral_m: ft\}"),
     "no lateral number": (changed(lateral_m=ROWS.lateral_m * 1e300), r"lanes 3\.6e\+300 m apart"),
     "lanes' middles": (changed(lateral_m=3.5 * ROWS.lane), "in a jump"),
-    "no length": (with_value(3, "length_m", 0.0), r"row 4 \(vehicle 0 of recording 0, t = 0\.3 s\): found no length"),
+    "no length": (with_value(3, "length_m", 0.0), r"row 4 \(vehicle 0 of recording 0, t = 0\.3 s\): found length_m 0;"),
     "NaN": (with_value(9, "speed_mps", np.nan), "row 10, speed_mps: found no finite number"),
     "a lone row each": (lambda: ROWS[ROWS.time_s == 0], "one row per vehicle"),
     "misspelt": (lambda: ROWS.rename(columns={"speed_mps": "sped_mps"}), "Did you mean 'sped_mps'"),
@@ -124,6 +124,10 @@ REFUSED = {
     "the end of time": (with_value(7, "time_s", 1e12), r"row 8 .*found time_s 1e\+12"),
     "lanes": (with_value(7, "lane", 1e12), r"row 8 .*found lane 1e\+12"),
     "long": (with_value(7, "length_m", 70.0), r"row 8 .*found length_m 70"),
+    "km/h of one vehicle": (
+        lambda: ROWS.assign(**{c: ROWS[c] * np.where(ROWS.vehicle_id == 2, 3.6, 1.0) for c in ("s_m", "speed_mps")}),
+        r"vehicle 2 of .*found speed_mps 1\d\d\.\d*; expected at most 60 from the median",
+    ),
     "one recording stands still": (
         changed(s_m=ROWS.s_m.where(ROWS.recording_id != 3, first("s_m"))),
         r"of recording 3, t = 0 s\): found s_m -40, and -40 in row 4981, where speeds say -36.* such pairs of rows",
@@ -221,7 +225,8 @@ def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):
     whole = judged(tmp_path / "all.parquet")
     text = (tmp_path / "all.csv").read_text()
     (tmp_path / "all.csv.gz").write_bytes(gzip.compress(text.encode()))
-    for name in ("all.csv", "all.csv.gz"):
+    (tmp_path / "below.csv").write_text(f"\n\r\n{text}")
+    for name in ("all.csv", "all.csv.gz", "below.csv"):
         assert judged(tmp_path / name) == whole
     assert judged(tmp_path / "german.csv", str(tmp_path / "own.yaml")) == whole
     parts = [tmp_path / "first.csv", tmp_path / "second.csv"]
