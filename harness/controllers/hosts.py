@@ -84,7 +84,7 @@ def cause_of(error: BaseException) -> str:
         if str(origin).partition(".")[0] in ("traci", "libsumo"):  # not what stands for it here
             text = f"{text.rstrip('.')}. Use the traci that is handed in (docs/controllers.md), not the module"
         asked = type(error.obj) if isinstance(error, AttributeError) else object
-        if str(asked.__module__).startswith("harness."):
+        if isinstance(error, AttributeError) and str(asked.__module__).startswith("harness."):
             text += f". {did_you_mean(error.name, [name for name in dir(asked) if name[0] != '_'])}".rstrip(". ")
     except BaseException as again:  # noqa: BLE001 - whatever a user's code raises
         text = f"{type(error).__name__}, whose text raised {type(again).__name__}"
