@@ -44,6 +44,7 @@ def ran(recipe, folder, *importable):
     return said
 
 
+@pytest.mark.slow
 def test_a_new_family_is_a_package_that_is_installed_beside(tmp_path):
     """Installed as pip does it: a module, its file, and a folder of metadata with the entry point."""
     recipe = laid_out("A new family", tmp_path)

@@ -84,10 +84,14 @@ def replay(done, row, hold):
 
 HOLDS = [
     *((method, 1.0) for method in METHODS),
-    *(("nde", 0.1), ("forced", 0.1), ("forced", 0.7), ("step_mixture", 0.5), ("episode_mixture", 0.5)),
-    *(pytest.param(method, 0.1, marks=pytest.mark.slow) for method in ("step_mixture", "episode_mixture")),
+    *(("nde", 0.1), ("forced", 0.1), ("forced", 0.7)),
+    *(
+        pytest.param(each, hold, marks=pytest.mark.slow)
+        for each in ("step_mixture", "episode_mixture")
+        for hold in (0.1, 0.5)
+    ),
 ]
-"""Tables for draws in every step take 12 s of a core, and as much for each surrogate."""
+"""Tables for draws in every step take 12 s of a core, for those in every fifth 8 s."""
 
 
 @pytest.mark.parametrize(("method", "hold_s"), HOLDS)

@@ -10,7 +10,7 @@ import pytest
 from harness.vocabulary import CUT_IN
 from tests.episode.twin_runs import Mean, run
 
-N = 30_000
+N = 12_000
 ALL = {"n": 4_000, "moments": "all"}
 
 

@@ -102,6 +102,7 @@ def test_one_that_does_not_is_not_told_of_them(tmp_path, capsys):
     assert json.loads((out / "estimates.json").read_text())["milder"]["n_crashes"] == 0
 
 
+@pytest.mark.slow
 def test_one_that_fails_is_told_and_the_run_goes_on(tmp_path):
     """A thirty-sixth is more than may fail of tests that count; here it speaks against the vehicle as a crash does."""
     (tmp_path / "my_av.py").write_text(AV)

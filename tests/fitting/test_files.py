@@ -138,6 +138,7 @@ def test_replicates_belong_to_one_environment(tmp_path):
             read()
 
 
+@pytest.mark.slow
 def test_a_mirror_is_given_and_taken_back(tmp_path, capsys):
     """highD's mapping has one."""
     overtaking(2.0).to_parquet(tmp_path / "rows.parquet", index=False)

@@ -84,7 +84,7 @@ def test_identities_anywhere(challenge, epsilon, situations):
     require_identities(after_cut_in(state, environment, importance, step), epsilon)
 
 
-@pytest.mark.parametrize("challenge", CHALLENGES)
+@pytest.mark.parametrize("challenge", [pytest.param("immediate", marks=pytest.mark.slow), "recursive"])
 def test_records_hold_what_was_drawn_from(challenge):
     """p, V_j and q_j of the maneuver taken, recomputed from the recorded state alone: equal in every bit."""
     done, state, before, after = recorded(challenge)

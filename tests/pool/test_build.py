@@ -56,6 +56,7 @@ def test_what_changes_a_pool_changes_its_key():
     assert len({campaign_pool_key(resolve(each)) for each in campaigns}) == len(changes)
 
 
+@pytest.mark.slow
 def test_a_pool_that_is_damaged_is_built_again(campaign, pool, tmp_path, monkeypatch):
     monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr("harness.pool.build.build_pool", lambda *_: pool)

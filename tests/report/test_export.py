@@ -114,7 +114,7 @@ def simulated(file: Path, tmp_path: Path) -> tuple[dict, list]:
 
 @pytest.mark.parametrize(
     ("name", "scenario"),
-    [("shells-twin", "cut_in"), ("", "cut_in"), ("", "lead_brakes"), ("", "cut_out")],
+    [("shells-twin", "cut_in"), ("shells-lateral-twin", "cut_in"), ("", "lead_brakes"), ("", "cut_out")],
     ids=["at once", "comes over", "lead brakes", "cut-out"],
 )
 def test_plain_sumo_repeats_the_motion_and_the_crash(name, scenario, crashing, stored_run, tmp_path, capsys):

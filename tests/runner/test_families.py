@@ -131,6 +131,7 @@ def test_a_folder_of_runs_that_is_not_whole_is_told(run, tmp_path, capsys):
     assert "no run folder" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_budget_that_leaves_a_scenario_without_tests_is_refused_and_may_be_raised(run, tmp_path):
     with pytest.raises(CampaignError, match=r"stop\.episodes: found 5, spent before a test of"):
         harness.run(campaign("stop.episodes=5"), tmp_path / "run", workers=1)

@@ -53,6 +53,7 @@ def test_the_rate_moves_with_the_share_that_does_not_look_and_the_ratio_does_not
     assert warning.startswith("only 5 replicates (a 90 % interval needs at least 20): the error of the fit ")
 
 
+@pytest.mark.slow
 def test_of_a_vehicle_whose_shares_may_change_there_is_an_upper_limit_alone(stored_run, tmp_path, monkeypatch):
     """All cut-ins of the shells that it crashes in may crash."""
     folder, mine = stored_run("shells-twin"), fitted(tmp_path, **{LOOK: [0.01, 0.02]})

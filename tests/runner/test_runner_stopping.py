@@ -107,6 +107,7 @@ def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, 
     assert n_outside == 0 or "library" not in changes[0]
 
 
+@pytest.mark.slow
 def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(campaign, run_here, tmp_path):
     """Where precision is out of reach; the same folder goes on when that is no longer asked."""
     asked = partial(campaign, *SHELLS, "world.engine=twin", "stop.rhw=0.01", "stop.episodes=2000")

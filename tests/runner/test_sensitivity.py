@@ -39,6 +39,7 @@ def test_the_rate_is_in_proportion_to_who_does_not_look_and_the_ratio_is_not(fol
     assert content["campaign_hash"] == manifest(folder)["campaign_hash"]
 
 
+@pytest.mark.slow
 def test_of_traffic_in_which_nobody_crashes_nothing_is_said(folder, capsys):
     """Tests too short for a crash: the reference driver's rate is 0, to which there is no ratio."""
     assert main(["sensitivity", str(folder), "--range", "scenario.duration_s=1:2", "--json"]) == 0
@@ -46,6 +47,7 @@ def test_of_traffic_in_which_nobody_crashes_nothing_is_said(folder, capsys):
     assert (bar["rate"], bar["ratio"], bar_note(bar)) == ([None, None], [None, None], "unlike what was tested")
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_tornado_of_these_tests_and_of_no_others(folder):
     assert main(["sensitivity", str(folder), "--range", "cut_in.ignore_share=0.005:0.02", "--json"]) == 0
     page = folder / "report.html"

@@ -36,6 +36,7 @@ def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
     assert re.search(r"; raise pool\.events_per_shell to \d,?\d+$", answer_in(result.folder)["scope"])
 
 
+@pytest.mark.slow
 def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
     """A vehicle that crashes often: after some thousand tests the pool's own error is most of the interval."""
     often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin")
