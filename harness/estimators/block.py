@@ -124,6 +124,11 @@ class Block:
         """Which episodes failed, shape (n,)."""
         return np.asarray(self.outcome == FAILED)
 
+    @property
+    def n_crashes_before_event(self) -> int:
+        """How many episodes ended in a crash before their event."""
+        return int(np.count_nonzero(self.crash & ~self.happened))
+
     def weights(self) -> FloatArray:
         """Likelihood ratios p/q_sampled, shape (n,); infinite where they overflow."""
         with np.errstate(over="ignore"):

@@ -59,6 +59,8 @@ class Diagnostics:
         counted = {"n_events": block.happened, "n_bv_lv_contacts": contact, "n_failed": block.failed}
         counted |= {f"n_{name}": block.columns[name] for name in BEFORE_OVERLAP if name in block.columns}
         self.counts.update({name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
+        if n_early := block.n_crashes_before_event:
+            self.counts["n_crashes_before_event"] += n_early
         self._weight += Moments.of(weights)
         self._event += Moments.of(weights[block.happened])
         self._contact += Moments.of(weights[contact])

@@ -10,7 +10,7 @@ from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
 from harness.report.rows import decided
-from harness.report.words import ENDED, GO_ON, milder_words, scope_words
+from harness.report.words import ENDED, GO_ON, early_words, milder_words, scope_words
 
 
 def called(family: str) -> str:
@@ -27,7 +27,7 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
     rows = [*verdict, *sum_rows(content), *(reading_rows(content) if readings else ())]
     ends = [] if report is None else [f"  report  {report}"]
     parts = columns([(row[1], f"{row[2]} of all", *row[3:]) for row in family_rows(content)])
-    under = wrapped([*milder(content), exposures(content), scope(content)])
+    under = wrapped([*warnings(content), exposures(content), scope(content)])
     return [" · ".join(head), *columns(rows), *parts, *under, *ends]
 
 
@@ -75,9 +75,11 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         yield name, called(name), part, rate, beside, hard
 
 
-def milder(content: Mapping[str, Any]) -> Iterator[str]:
-    """Warnings of crashes on events too mild to count."""
-    return (f"! {text}" for name, of in content["milder"].items() for text in milder_words(name, of))
+def warnings(content: Mapping[str, Any]) -> Iterator[str]:
+    """Warnings of crashes on events too mild to count, and of those that needed none."""
+    yield from (f"! {text}" for name, of in content["milder"].items() for text in milder_words(name, of))
+    early = content.get("before_event", {})
+    yield from (f"! {called(name)}: {text}" for name, n in early.items() for text in early_words(n))
 
 
 def exposures(content: Mapping[str, Any]) -> str:

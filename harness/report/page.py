@@ -16,7 +16,7 @@ from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.report.crashes import crash_gallery, shown_of
 from harness.report.drawing import Plot
-from harness.report.hour_words import called, exposures, family_rows, milder, reading_rows, scope, sum_rows
+from harness.report.hour_words import called, exposures, family_rows, reading_rows, scope, sum_rows, warnings
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.rows import decided
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
@@ -81,7 +81,7 @@ def write_hours(folder: Path, content: dict[str, Any]) -> Path:
         content=content, sums=[*sum_rows(content), *reading_rows(content)],
         verdict=None if decision is None else decided(decision).texts,
         rows=[(row, content["families"][row[0]]) for row in family_rows(content)],
-        warnings=list(milder(content)), exposures=exposures(content), scope=scope(content), called=called,
+        warnings=list(warnings(content)), exposures=exposures(content), scope=scope(content), called=called,
     )  # fmt: skip
 
 

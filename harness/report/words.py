@@ -23,6 +23,7 @@ from harness.numbers import WIDEST_RHW, count, leaves, number, plain, share, wor
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, rows_of
 from harness.report.traffic_words import too_few, with_traffic
+from harness.sampling.milder import n_left_out
 from harness.strata import ASSUMPTION_FREE
 
 CUT_OFF_SHARE = 0.2
@@ -124,10 +125,21 @@ def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[st
         )
 
 
+def early_words(n_early: int) -> Iterator[str]:
+    """That a vehicle crashes while it follows, before anything happens, if it does."""
+    if n_early:
+        yield (
+            f"{count(n_early)} tests crashed BEFORE the event, as it just followed: it does so in all driving, which "
+            "this rate leaves out (testing.method=nde counts it)"
+        )
+
+
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[str]:
     """What changes the meaning of the rows, a line each."""
     best, severity, assumed = told.best, told.severity, told.assumed
     yield from milder_words(campaign.scenario, told.milder)
+    n_early = told.diagnostics.get("n_crashes_before_event", 0)
+    yield from early_words(n_left_out(campaign, n_early))
     yield from map(note_words, best.cautions)
     repeated = manifest.get("repeated") or {}
     if n := len(repeated.get("differing", ())):

@@ -35,7 +35,7 @@ from harness.runner.kept import require_no_fewer, require_own_folder
 from harness.runner.run import ESTIMATES, EXIT_OF, RunResult, Underway, begun
 from harness.runner.stored import stored_blocks
 from harness.sampling.hours import HourRounds
-from harness.sampling.milder import beyond_scope
+from harness.sampling.milder import beyond_scope, n_left_out
 from harness.sampling.shells import Shells
 from harness.vocabulary import FAMILIES
 
@@ -85,7 +85,12 @@ def run_families(
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     milder = {name: of for name, each in results.items() if (of := each.estimates.get("milder"))}
-    beyond = sum(map(beyond_scope, milder.values()))
+    early = dict[str, int]()
+    for name, each in results.items():
+        n_early = each.estimates["diagnostics"].get("n_crashes_before_event", 0)
+        if n := n_left_out(ready[name].campaign, n_early):
+            early[name] = n
+    beyond = sum(map(beyond_scope, milder.values())) + sum(early.values())
     if (decision := rule.look.decision) is not None:
         decision = replace(decision, n_milder=beyond)
         code = EXIT_OF[decision.verdict]
@@ -96,7 +101,8 @@ def run_families(
         "format": 1, "name": campaign.name, "seed": campaign.seed, "engine": campaign.world.engine,
         "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
         "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
-        "milder": milder, "vehicle": vehicle_words(campaign.av)[0], "wall_time_s": round(time.monotonic() - began, 3),
+        "milder": milder, "before_event": early, "vehicle": vehicle_words(campaign.av)[0],
+        "wall_time_s": round(time.monotonic() - began, 3),
     }  # fmt: skip
     impacts = {name: _median_impact(each.estimates) for name, each in results.items()}
     content = finite_json({**asked, **_answer(hour, ready, impacts, campaign.stop.confidence)})

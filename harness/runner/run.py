@@ -39,7 +39,7 @@ from harness.runner.stored import even
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
 from harness.sampling.baseline import IN_WORDS, begin, requests_before, stored_baseline, stored_table
-from harness.sampling.milder import N_TESTS, beyond_scope, milder_of
+from harness.sampling.milder import N_TESTS, beyond_scope, milder_of, n_left_out
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import round_requests
 from harness.signals import uninterrupted
@@ -228,7 +228,8 @@ class Underway:
         missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
         if decision is not None:
-            decision = replace(decision, n_milder=beyond_scope(run.facts.get("milder")))
+            n_early = sum(each.n_crashes_before_event for each in run.blocks)
+            decision = replace(decision, n_milder=n_left_out(campaign, n_early) + beyond_scope(run.facts.get("milder")))
             code = EXIT_OF[decision.verdict]
             decided["decision"] = decision.to_json()
         decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None

@@ -12,6 +12,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from harness.campaign.campaign import Campaign
+from harness.families import family_named
 from harness.loop.loop import EpisodeLoop
 from harness.progress import Progress
 from harness.records.schemas import episodes_table
@@ -41,6 +43,16 @@ def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, Any]:
     exposure = family.exposure(family.milder(resolved.environment), resolved.parameters)
     counts = {"n_tests": len(table), "n_crashes": pc.sum(crashes).as_py()}
     return {**counts, "n_failed": len(table) - table.column("failure").null_count, "per_hour": exposure.per_hour}
+
+
+def n_left_out(campaign: Campaign, n_before_event: int) -> int:
+    """Crashes before the event, where a vehicle that follows is tested around events alone: it needs none to crash.
+
+    Where somebody changes lanes it is not known: a vehicle may see that before the event is done.
+    """
+    family = family_named(campaign.scenario)
+    at_once = family.follows and family.crosses < 0
+    return n_before_event if at_once and campaign.testing.method != "nde" else 0
 
 
 def beyond_scope(milder: Mapping[str, Any] | None) -> int:

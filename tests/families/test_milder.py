@@ -16,7 +16,7 @@ from harness.families.following.family import MILDEST_MPS2, N_SPEEDS
 from harness.families.protocol import Paths
 from harness.records.folder import read_manifest
 from harness.runner.stored import estimate_run
-from harness.sampling.milder import beyond_scope
+from harness.sampling.milder import beyond_scope, n_left_out
 from tests.families.roads import SETTINGS, traffic_of
 from tests.families.test_same_bits import SMALL
 from tests.in_process import controllers_here, one_process, run_here
@@ -41,6 +41,14 @@ class Fails(MyAV):
     def start(self, episode):
         if episode.episode == 3:
             raise RuntimeError("no")
+
+
+class Rams(MyAV):
+    def start(self, episode):
+        self.sleeps = episode.episode % 5 == 0
+
+    def step(self, seen):
+        return 3.0 if self.sleeps else max(super().step(seen), -8.0)
 """
 
 
@@ -68,11 +76,11 @@ def test_their_rate_is_a_sum_over_the_grid():
     assert lead.milder(lead.traffic(SETTINGS)) is None
 
 
-def gate(tmp_path, vehicle):
+def gate(tmp_path, vehicle, scenario="cut_out"):
     """Folder, JUnit file and exit code of a limit that is far above the rate of cut-outs in scope."""
     small = [f"--set={each}" for each in (*SMALL, "world.engine=twin", "stop.episodes=600")]
     out, junit = tmp_path / "run", tmp_path / "gate.xml"
-    asked = ["--scenario", "cut_out", "--accept", "0.9", "--out", str(out), "--junit", str(junit)]
+    asked = ["--scenario", scenario, "--accept", "0.9", "--out", str(out), "--junit", str(junit)]
     with one_process(), controllers_here():
         return out, junit, main(["run", vehicle, *asked, *small])
 
@@ -100,6 +108,24 @@ def test_one_that_does_not_is_not_told_of_them(tmp_path, capsys):
     assert code == 0
     assert "MILDER" not in capsys.readouterr().out
     assert json.loads((out / "estimates.json").read_text())["milder"]["n_crashes"] == 0
+
+
+def test_one_that_crashes_without_an_event_is_told_so_and_not_accepted(tmp_path, capsys):
+    """Every fifth test ends in the vehicle ahead before that brakes; the rate alone is far below the limit."""
+    (tmp_path / "my_av.py").write_text(AV)
+    out, _, code = gate(tmp_path, f"{tmp_path}/my_av.py:Rams", "lead_brakes")
+    estimates = json.loads((out / "estimates.json").read_text())
+    n = estimates["diagnostics"]["n_crashes_before_event"]
+    assert 0 < n == -(-estimates["n_episodes"] // 5)
+    assert f"{n} tests crashed BEFORE the event" in " ".join(capsys.readouterr().out.split())
+    assert (code, estimates["decision"]["verdict"]) == (4, "undecided")
+    assert estimates["decision"]["high"] < 0.9
+
+
+def test_where_somebody_changes_lanes_it_is_not_known_what_came_first():
+    """And plain simulation counts such crashes as they are."""
+    asked = [["scenario=lead_brakes"], ["scenario=lead_brakes", "testing.method=nde"], ["scenario=cut_out"], []]
+    assert [n_left_out(harness.load_campaign("idm", each), 3) for each in asked] == [3, 0, 0, 0]
 
 
 @pytest.mark.slow
