@@ -177,6 +177,7 @@ def test_an_interruption_as_tests_are_written_loses_none_of_them(campaign, run_h
         return run
 
     monkeypatch.setattr(Run, "with_shard", add_and_interrupt)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs are to ignore it
     with pytest.raises(KeyboardInterrupt):
         run_here(campaign("world.engine=twin", "stop.episodes=400", "run.shard_size=200"), out)
     assert (manifest(out)["status"], manifest(out)["n_episodes"]) == ("interrupted", 200)
