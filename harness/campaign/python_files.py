@@ -56,7 +56,7 @@ def files_imported(file: Path, root: Path) -> set[Path]:
         found.add(at := new.pop())
         for name in _imports(_parsed(str(at)) or ast.Module([], [])):
             path = name.lstrip(".")
-            below = [root, *at.parents][len(name) - len(path)].joinpath(*path.split("."))
+            below = [root, *at.parents][: len(name) - len(path) + 1][-1].joinpath(*path.split("."))
             for each in (below, *below.parents):
                 if not each.is_relative_to(root) or each in (root, root / "harness"):
                     break
