@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.following.approach import AV_START_M, LEAD, REVEALED, Following, Motion, happen, in_scope, walk
@@ -17,6 +18,14 @@ from harness.vocabulary import FloatArray, Int8Array, IntArray, Record, RecordAr
 NO_CRASH = -1
 STATE = 3
 """Of a driver at the onset: position (m), speed (m/s), acceleration (m/s²)."""
+
+
+class Tests(NamedTuple):
+    """Tests (n,): how they begin, what the vehicle ahead draws in each second (n, seconds), and what it then does."""
+
+    start: RecordArray
+    accelerations: Int8Array
+    event: RecordArray
 
 
 @compiled_inline
@@ -145,23 +154,16 @@ def enumerate_events(
 
 @compiled_threads
 def move_others(
-    start: RecordArray,
-    accelerations: Int8Array,
-    event: RecordArray,
-    traffic: Following,
-    motion: Motion,
-    x: FloatArray,
-    speed: FloatArray,
-    clear: IntArray,
+    tests: Tests, traffic: Following, motion: Motion, x: FloatArray, speed: FloatArray, clear: IntArray
 ) -> None:
     """The others' motion in tests (n,): first positions (n, O), speeds (n, steps, O), steps from which they are clear.
 
     ``x`` and ``speed`` have as many vehicles as the family; ``motion`` is room to work in.
     """
     most = traffic.numbers.max_steps
-    for i in range(start.size):
-        walk(start[i].speed_mps, accelerations[i], traffic.numbers, motion)
-        clear[i] = happen(event[i], most, traffic.numbers, motion)
+    for i in range(clear.size):
+        walk(tests.start[i].speed_mps, tests.accelerations[i], traffic.numbers, motion)
+        clear[i] = happen(tests.event[i], most, traffic.numbers, motion)
         for other in range(x.shape[1]):
             x[i, other] = motion.x[0, other]
             for step in range(most):
@@ -170,26 +172,20 @@ def move_others(
 
 @compiled_threads
 def drive_others(
-    start: RecordArray,
-    accelerations: Int8Array,
-    event: RecordArray,
-    traffic: Following,
-    drivers: RecordArray,
-    motion: Motion,
-    tracks: FloatArray,
-    end: IntArray,
+    tests: Tests, traffic: Following, drivers: RecordArray, motion: Motion, tracks: FloatArray, end: IntArray
 ) -> None:
     """Drive others in the AV's place in tests (n,); ``tracks`` (D, steps + 1, 2) holds the last of them afterwards.
 
     ``end`` (n, D) receives `NO_CRASH`, or the step after which each has crashed. ``motion`` is room to work in.
     """
     n = traffic.numbers
-    for i in range(start.size):
-        walk(start[i].speed_mps, accelerations[i], n, motion)
-        clear = happen(event[i], n.max_steps, n, motion)
+    for i in range(len(end)):
+        event, natural_s = tests.event[i], tests.start[i].natural_headway_s
+        walk(tests.start[i].speed_mps, tests.accelerations[i], n, motion)
+        clear = happen(event, n.max_steps, n, motion)
         for d in range(drivers.size):
-            track, natural_s = tracks[d], start[i].natural_headway_s
+            track = tracks[d]
             track[:] = 0.0
             end[i, d], a = approach(drivers[d], natural_s, n.onset, motion, track)
             if end[i, d] == NO_CRASH:
-                end[i, d] = meet(drivers[d], natural_s, event[i], clear, n, motion, a, track)
+                end[i, d] = meet(drivers[d], natural_s, event, clear, n, motion, a, track)
