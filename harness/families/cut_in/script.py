@@ -11,18 +11,7 @@ from harness.families.cut_in.path import place
 from harness.families.protocol import Chosen
 from harness.loop.cells import Script, natural_script
 from harness.vehicles.kinematics import next_speed
-from harness.vocabulary import (
-    BV,
-    LV,
-    STATE_COLUMNS,
-    STATE_DTYPE,
-    VEHICLES,
-    FloatArray,
-    Int8Array,
-    IntArray,
-    RecordArray,
-    states_from,
-)
+from harness.vocabulary import AV, BV, LV, STATE_COLUMNS, FloatArray, Int8Array, IntArray, RecordArray, states_from
 
 LEFT, RIGHT = 1, 0
 _LENGTHS = {"lv_maneuvers": "n_lv", "bv_maneuvers": "n_bv"}
@@ -33,7 +22,7 @@ def facts_of(state: RecordArray, maneuvers: Maneuvers) -> RecordArray:
     draws = maneuvers.lv.shape[1]
     lists = [(name, np.int8, (draws,)) for name in _LENGTHS]
     lengths = [(name, np.int64) for name in _LENGTHS.values()]
-    facts: RecordArray = np.zeros(len(state), np.dtype([*STATE_DTYPE.descr, *lists, *lengths]))
+    facts: RecordArray = np.zeros(len(state), np.dtype([*state.dtype.descr, *lists, *lengths]))
     for name in STATE_COLUMNS:
         facts[name] = state[name]
     facts["lv_maneuvers"], facts["bv_maneuvers"] = maneuvers.lv, maneuvers.bv
@@ -55,9 +44,9 @@ def maneuvers_of(chosen: Chosen) -> Maneuvers:
 def beginning(state: RecordArray) -> tuple[FloatArray, FloatArray, Int8Array]:
     """Positions (m), speeds (m/s) and lanes (n, 3) of LV, BV and AV in initial states (n,)."""
     n = len(state)
-    x, v = np.zeros((2, n, len(VEHICLES)))
+    x, v = np.zeros((2, n, AV + 1))
     _place(state, x, v)
-    lane = np.zeros((n, len(VEHICLES)), np.int8)
+    lane = np.zeros((n, AV + 1), np.int8)
     lane[:, [LV, BV]] = LEFT
     return x, v, lane
 
