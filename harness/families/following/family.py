@@ -173,7 +173,8 @@ class FollowingFamily(Family):
         n, steps, others = speed.shape
         x = np.column_stack((ahead, np.full(n, AV_START_M)))
         v = np.tile(facts["start_speed_mps"][:, None], (1, others + 1))
-        lane, lanes, visible = np.zeros((n, others + 1), np.int8), np.zeros(speed.shape, np.int8), np.zeros((n, others))
+        lane, lanes = np.zeros((n, others + 1), np.int8), np.zeros(speed.shape, np.int8)
+        visible = np.zeros((n, others), np.int64)
         lateral = events_of(traffic, facts["event"])["lateral_mps"]
         if others > 1:
             v[:, 1] = speed[:, 0, 1]
@@ -182,11 +183,13 @@ class FollowingFamily(Family):
                 onset + seen_after(float(traffic.numbers["visible_from_m"]), w, c - onset) if w > 0.0 else steps + 1
                 for w, c in zip(lateral.tolist(), clear.tolist(), strict=True)
             ]
-        return natural_script(
-            x, v, lane, speed, lanes, chosen.at, chosen.lead,
-            acts_from=0, visible_from=visible.astype(np.int64), headway_s=facts["natural_headway_s"],
-            sideways_mps=np.nan_to_num(lateral), set_speed_mps=float(traffic.numbers["approach__set_speed_mps"]),
-        )  # fmt: skip
+        return natural_script(x, v, lane, speed, lanes, chosen.at, chosen.lead)._replace(
+            acts_from=np.zeros(n, np.int64),
+            visible_from=visible,
+            headway_s=facts["natural_headway_s"].copy(),
+            sideways_mps=np.nan_to_num(lateral),
+            set_speed_mps=np.full(n, float(traffic.numbers["approach__set_speed_mps"])),
+        )
 
     def onset(self, traffic: Following, chosen: Chosen) -> IntArray:
         return np.where(chosen.at < 0, -1, int(traffic.numbers["onset"]))
