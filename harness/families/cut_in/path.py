@@ -76,12 +76,12 @@ def empty_trajectory(environment: Environment) -> Trajectory:
 
 @compiled_inline
 def place(state: State, x: FloatArray, v: FloatArray) -> None:
-    """Positions and speeds (3,) of LV, BV, AV in an initial state."""
+    """Positions and speeds (3,) of LV, BV, AV in an initial state; (3, n) in several."""
     x[AV] = AV_START_M
     x[BV] = AV_START_M + VEHICLE_LENGTH_M + state.r2_m
     x[LV] = x[BV] + VEHICLE_LENGTH_M + state.r1_m
     v[BV] = state.v_bv_mps
-    v[LV] = max(state.v_bv_mps + state.r1dot_mps, 0.0)
+    v[LV] = np.maximum(state.v_bv_mps + state.r1dot_mps, 0.0)
     v[AV] = state.v_bv_mps - state.r2dot_mps
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from harness.compiled import compiled_threads, unboxed
@@ -43,18 +45,12 @@ def maneuvers_of(chosen: Chosen) -> Maneuvers:
 
 def beginning(state: RecordArray) -> tuple[FloatArray, FloatArray, Int8Array]:
     """Positions (m), speeds (m/s) and lanes (n, 3) of LV, BV and AV in initial states (n,)."""
-    n = len(state)
-    x, v = np.zeros((2, n, AV + 1))
-    _place(state, x, v)
-    lane = np.zeros((n, AV + 1), np.int8)
+    columns: Any = state.view(np.recarray)
+    x, v = np.zeros((2, len(state), AV + 1))
+    place(columns, x.T, v.T)
+    lane = np.zeros(x.shape, np.int8)
     lane[:, [LV, BV]] = LEFT
     return x, v, lane
-
-
-@compiled_threads
-def _place(state: RecordArray, x: FloatArray, v: FloatArray) -> None:
-    for i in range(state.size):
-        place(state[i], x[i], v[i])
 
 
 def script_of(traffic: Environment, chosen: Chosen) -> Script:

@@ -166,18 +166,11 @@ _ROUNDING_MPS2 = 1e-9
 
 @compiled_inline
 def smallest_gaps(
-    speed: float,
-    r2: float,
-    r2dot: float,
-    maneuver: int,
-    hold: int,
-    steps_per_level: int,
-    driver: Record,
-    out: FloatArray,
+    speed: float, r2: float, r2dot: float, m: int, hold: int, steps_per_level: int, driver: Record, out: FloatArray
 ) -> None:
     """Smallest gap (m) within every remaining time: ``out`` (levels + 1,), level 0 being none.
 
-    BV takes a maneuver for one hold period and then keeps its speed.
+    BV takes the maneuver ``m`` for one hold period and then keeps its speed.
     """
     follower = speed - r2dot
     smallest = _NO_CONTACT_M
@@ -199,7 +192,7 @@ def smallest_gaps(
             a = driver_acceleration(driver, follower, speed, r2)
             if driver.kind == FVDM_KIND:
                 gap_of_shape, shape = r2, fvdm_shape(driver, max(r2, SMALLEST_GAP_M))
-        speed_after = next_speed(speed, acceleration(maneuver) if step < hold else 0.0)
+        speed_after = next_speed(speed, acceleration(m) if step < hold else 0.0)
         follower_after = next_speed(follower, a)
         r2 += 0.5 * (speed + speed_after - follower - follower_after) * STEP_S
         speed, follower = speed_after, follower_after
