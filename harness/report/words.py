@@ -145,8 +145,8 @@ def doubt_words(of: Mapping[str, Any], unit: str, but: str = "") -> Iterator[str
         again = count(repeated["n_episodes"])
         yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests that ran twice differed: see `harness av-check`"
     if n_failed := of["n_failed"]:
-        n, had = count(of["n_episodes"]), f"{number(of['if_failed_had_crashed'])}{unit}"
-        yield f"{count(n_failed)} of {n} tests FAILED; had they all crashed, the rate would be {had}"
+        tests, had = count(of["n_episodes"]), f"{number(of['if_failed_had_crashed'])}{unit}"
+        yield f"{count(n_failed)} of {tests} tests FAILED; had they all crashed, the rate would be {had}"
     worst = of["rate"] + of["cut_off"]
     if worst > max((1.0 + CUT_OFF_SHARE) * of["rate"], of["ci_high"]):
         yield f"some tests ended while the vehicle was still closing in; had all crashed: {number(worst)}{unit}{but}"
