@@ -46,6 +46,7 @@ _ATTEMPTS = 3
 _LOOK_S, _DYING_S = 0.5, 1.0
 """Time between two looks, and how long a process may take to end once its pipe has."""
 _PRELOADED = "harness.runner.preloaded"
+SAFE_PATH = "PYTHONSAFEPATH"
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -206,10 +207,14 @@ def _server() -> Iterator[None]:
     short = _in_short(temporary_folder())
     main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     before, tempfile.tempdir = tempfile.tempdir, short
+    safe_path = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"  # a json.py of the current folder is not what the server imports
     try:
         yield
     finally:
         sys.modules["__main__"], tempfile.tempdir = main, before
+        os.environ.pop(SAFE_PATH)
+        os.environ |= {} if safe_path is None else {SAFE_PATH: safe_path}
 
 
 @cache

@@ -302,8 +302,9 @@ class HourRule(Rule):
         level, n_crashes = Level.two_sided(self._confidence), hour.totals[1]
         limits = hour.limits(level)
         if self._accept is not None and self._accept.times_reference is not None:
-            beside = self._accept.times_reference
-            found = self._beside(hour, beside.at_most, beside.driver)
+            beside, found = self._accept.times_reference, self.look.decision
+            if found is None or found.verdict == "undecided":  # an answer stays while the folder holds further tests
+                found = self._beside(hour, beside.at_most, beside.driver)
             ended: Ended | None = None if found.verdict == "undecided" else "accept"
             asked = note("accept", asked="times_reference", limit=beside.at_most)
             self.look = Look(limits.rhw, ended, (asked,), decision=found)

@@ -10,7 +10,7 @@ from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
 from harness.report.rows import decided
-from harness.report.words import ENDED, GO_ON, early_words, milder_words, scope_words
+from harness.report.words import ENDED, GO_ON, doubt_words, early_words, milder_words, scope_words
 
 
 def called(family: str) -> str:
@@ -76,10 +76,11 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 
 
 def warnings(content: Mapping[str, Any]) -> Iterator[str]:
-    """Warnings of crashes on events too mild to count, and of those that needed none."""
-    yield from (f"! {text}" for name, of in content["milder"].items() for text in milder_words(name, of))
-    early = content.get("before_event", {})
-    yield from (f"! {called(name)}: {text}" for name, n in early.items() for text in early_words(n))
+    """What changes the meaning of the rows, a line each, by scenario."""
+    for name, of in content["families"].items():
+        yield from (f"! {text}" for text in milder_words(name, of["milder"]))
+        doubts = doubt_words({**of, "rate": of["rate_per_hour"]}, " per hour")
+        yield from (f"! {called(name)}: {text}" for text in (*early_words(of["n_crashes_before_event"]), *doubts))
 
 
 def exposures(content: Mapping[str, Any]) -> str:

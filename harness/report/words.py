@@ -133,21 +133,35 @@ def early_words(n_early: int) -> Iterator[str]:
         )
 
 
+def doubt_words(of: Mapping[str, Any], unit: str, but: str = "") -> Iterator[str]:
+    """What makes a rate doubtful, if anything does: ``of`` are rates in a ``unit``, and of how many tests.
+
+    ``but`` is added where tests ended too early to be told safe.
+    """
+    yield from map(note_words, of["cautions"])
+    repeated = of["repeated"] or {}
+    if n := len(repeated.get("differing", ())):
+        again = count(repeated["n_episodes"])
+        yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests that ran twice differed: see `harness av-check`"
+    if n_failed := of["n_failed"]:
+        tests, had = count(of["n_episodes"]), f"{number(of['if_failed_had_crashed'])}{unit}"
+        yield f"{count(n_failed)} of {tests} tests FAILED; had they all crashed, the rate would be {had}"
+    worst = of["rate"] + of["cut_off"]
+    if worst > max((1.0 + CUT_OFF_SHARE) * of["rate"], of["ci_high"]):
+        yield f"some tests ended while the vehicle was still closing in; had all crashed: {number(worst)}{unit}{but}"
+
+
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[str]:
     """What changes the meaning of the rows, a line each."""
     best, severity, assumed = told.best, told.severity, told.assumed
     yield from milder_words(campaign.scenario, told.milder)
     n_early = told.diagnostics.get("n_crashes_before_event", 0)
     yield from early_words(n_left_out(campaign, n_early))
-    yield from map(note_words, best.cautions)
-    repeated = manifest.get("repeated") or {}
-    if n := len(repeated.get("differing", ())):
-        of = count(repeated["n_episodes"])
-        yield f"NOT REPRODUCIBLE: {count(n)} of {of} tests that ran twice differed: see `harness av-check`"
-    if n_failed := best.details["n_failed"]:
-        had = number(best.details["crash_rate_if_failed_had_crashed"])
-        of = count(best.n_episodes)
-        yield f"{count(n_failed)} of {of} tests FAILED; had they all crashed, the rate would be {had}"
+    rates = {"rate": best.crash_rate, "ci_high": best.ci_high, "cut_off": told.cut_off}
+    rates["if_failed_had_crashed"] = best.details["crash_rate_if_failed_had_crashed"]
+    of_tests = {"n_failed": best.details["n_failed"], "n_episodes": best.n_episodes, "cautions": best.cautions}
+    but = "" if told.decision is None else ", as ACCEPTED would have to allow for"
+    yield from doubt_words({**rates, **of_tests, "repeated": manifest.get("repeated")}, " per test", but)
     if severity is not None and severity.share_below_1_mps > 0.5:
         left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
         part = share(severity.share_below_1_mps)
@@ -157,10 +171,6 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
     on_rate = told.decision is not None and not told.decision.get("driver")
     if on_rate and assumed is not None and assumed.no_lower_limit:
         yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; use --accept r157-cc"
-    worst = best.crash_rate + told.cut_off
-    if worst > max((1.0 + CUT_OFF_SHARE) * best.crash_rate, best.ci_high):
-        but = "" if told.decision is None else ", as ACCEPTED would have to allow for"
-        yield f"some tests ended while the vehicle was still closing in; had all crashed: {number(worst)} per test{but}"
     if (level := campaign.environment.lane_change_level) != 1.0:
         yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
 

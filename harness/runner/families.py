@@ -40,8 +40,9 @@ from harness.sampling.shells import Shells
 from harness.vocabulary import FAMILIES
 
 MEND = "Run the campaign again into the same folder with --resume."
-_SHOWN = ("families", "per_hour", "beside", "readings", "milder", "decision")
+_SHOWN = ("families", "per_hour", "beside", "readings", "decision")
 """Keys of ``families.json`` without which nothing can be shown."""
+EARLY = "n_crashes_before_event"
 
 
 @dataclass(frozen=True)
@@ -84,15 +85,11 @@ def run_families(
         hour, results = _run(campaign, begins, rule, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
-    milder = {name: of for name, each in results.items() if (of := each.estimates.get("milder"))}
-    early = dict[str, int]()
-    for name, each in results.items():
-        n_early = each.estimates["diagnostics"].get("n_crashes_before_event", 0)
-        if n := n_left_out(ready[name].campaign, n_early):
-            early[name] = n
-    beyond = sum(map(beyond_scope, milder.values())) + sum(early.values())
+    told = {name: (each.estimates, each.shown.manifest) for name, each in results.items()}
+    answer = _answer(hour, ready, told, campaign.stop.confidence)
     if (decision := rule.look.decision) is not None:
-        decision = replace(decision, n_milder=beyond)
+        of_each = answer["families"].values()
+        decision = replace(decision, n_milder=sum(beyond_scope(of["milder"]) + of[EARLY] for of in of_each))
         code = EXIT_OF[decision.verdict]
     from harness.report.page import write_hours  # noqa: PLC0415 - draws
     from harness.report.words import vehicle_words  # noqa: PLC0415
@@ -101,11 +98,9 @@ def run_families(
         "format": 1, "name": campaign.name, "seed": campaign.seed, "engine": campaign.world.engine,
         "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
         "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
-        "milder": milder, "before_event": early, "vehicle": vehicle_words(campaign.av)[0],
-        "wall_time_s": round(time.monotonic() - began, 3),
+        "vehicle": vehicle_words(campaign.av)[0], "wall_time_s": round(time.monotonic() - began, 3),
     }  # fmt: skip
-    impacts = {name: _median_impact(each.estimates) for name, each in results.items()}
-    content = finite_json({**asked, **_answer(hour, ready, impacts, campaign.stop.confidence)})
+    content = finite_json({**asked, **answer})
     write_sealed(out / FAMILIES, content)
     return Hours(out, content, write_hours(out, content), results, code)
 
@@ -164,22 +159,27 @@ def _no_test_yet(underway: Underway, exposures: Mapping[str, float]) -> OfFamily
 def _answer(
     hour: PerHour,
     ready: Mapping[str, Resolved],
-    impacts: Mapping[str, float | None],
+    told: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]],
     confidence: float,
     *,
     counts: bool = False,
 ) -> dict[str, Any]:
-    """The sum, with the mean speed by which hours are kilometres: of a vehicle that follows, where it does."""
+    """The sum, with what estimates and manifest of each have ``told``.
+
+    Hours are kilometres by the mean speed of a vehicle that follows, where it does.
+    """
     follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
     speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
     found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
-    for name, impact in impacts.items():
-        found["families"][name]["median_impact_mps"] = impact
+    for name, (estimates, manifest) in told.items():
+        of, best = found["families"][name], estimates["estimates"][estimates["headline"]]
+        per_test = of["exposure"]["per_hour"] / of["p_event"]
+        of["median_impact_mps"] = (estimates["severity"] or {}).get("median_mps")
+        of[EARLY] = n_left_out(ready[name].campaign, estimates["diagnostics"].get(EARLY, 0))
+        of["if_failed_had_crashed"] = per_test * best["details"]["crash_rate_if_failed_had_crashed"]
+        of["cut_off"] = per_test * estimates["cut_off"]
+        of |= {"milder": estimates["milder"], "cautions": best["cautions"], "repeated": manifest.get("repeated")}
     return found
-
-
-def _median_impact(estimates: Mapping[str, Any]) -> float | None:
-    return None if (severity := estimates.get("severity")) is None else severity["median_mps"]
 
 
 def read_families(folder: Path) -> dict[str, Any]:
@@ -218,7 +218,7 @@ def estimate_families(
     Raises `HarnessError`: a run is missing or damaged, or an exposure is of no scenario in it.
     """
     folder, exposures = Path(folder), exposures or {}
-    stored, families, ready, impacts = read_families(folder), [], {}, {}
+    stored, families, ready, told = read_families(folder), [], {}, {}
     names = list(stored["families"])
     if unknown := sorted(set(exposures) - set(names)):
         found = f"an exposure of {', '.join(unknown)}"
@@ -226,11 +226,11 @@ def estimate_families(
     given = {**stored["exposure"], **exposures}
     for name in names:
         of = folder / name
-        campaign, seen = read_campaign(of, read_manifest(of)), SeenShells.of_blocks(stored_blocks(of, moments=False))
-        resolved = ready[name] = resolve(campaign)
+        manifest, seen = read_manifest(of), SeenShells.of_blocks(stored_blocks(of, moments=False))
+        resolved = ready[name] = resolve(read_campaign(of, manifest))
         families.append(OfFamily(name, _exposure(resolved, given), seen))
-        impacts[name] = _median_impact(read_as(dict[str, Any], of / ESTIMATES, mend=MEND))
-    answer = _answer(PerHour(families), ready, impacts, confidence or stored["confidence"], counts=counts)
+        told[name] = read_as(dict[str, Any], of / ESTIMATES, mend=MEND), manifest
+    answer = _answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
     decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
     return finite_json({**stored, "exposure": given, "decision": decision, **answer})
 

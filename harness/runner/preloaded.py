@@ -5,6 +5,7 @@ import os
 from contextlib import suppress
 from importlib import import_module
 
+os.environ.pop("PYTHONSAFEPATH", None)  # of this process alone, not of what vehicles start (`harness.processes`)
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 for name in ("harness.runner.workers", "pandas", "libsumo"):  # pandas is loaded by pyarrow
     with suppress(Exception):  # who needs it will say so

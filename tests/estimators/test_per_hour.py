@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from harness.campaign.files import load_campaign
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.shells import SeenShells
+from harness.estimators.stopping import HourRule
 from harness.estimators.tally import Tally
 from harness.families.protocol import Exposure
 from harness.strata import Reference, ShellDesign
@@ -102,6 +104,19 @@ def test_ratio_to_the_competent_driver_and_what_assumed_exposures_do_to_it():
             ends.append(moved.rate / moved.reference_rate)
     assert hour.over_assumed() == pytest.approx((min(ends), max(ends)))
     assert math.isnan(PerHour([family("a", [1.0, 1.0], [9, 9], [1, 0], ASSUMED)]).ratio(LEVEL)[0])
+
+
+def test_a_verdict_stays_while_a_folder_holds_further_tests():
+    """Looked at without it, the same tests leave it open."""
+    accept = {"times_reference": {"driver": "r157-cc", "at_most": 1.0}}
+    rule, late = (HourRule(load_campaign("idm", [f"accept={accept}", "stop.rhw=null"])) for _ in range(2))
+    few = PerHour([family("cut_in", [1e-6, 4e-5], [9, 9], [1, 0], ASSUMED, CC)])
+    many = PerHour([family("cut_in", [1e-6, 4e-5], [9, 900], [5, 300], ASSUMED, CC)])
+    for hour in (many, few):
+        assert rule.observe(hour)
+        assert rule.look.decision.verdict == "rejected"
+    assert not late.observe(few)
+    assert late.look.decision.verdict == "undecided"
 
 
 @pytest.mark.slow

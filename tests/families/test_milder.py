@@ -14,6 +14,7 @@ from harness.families import family_named
 from harness.families.following.approach import starts_from
 from harness.families.following.family import MILDEST_MPS2, N_SPEEDS
 from harness.families.protocol import Paths
+from harness.numbers import number
 from harness.records.folder import read_manifest
 from harness.runner.stored import estimate_run
 from harness.sampling.milder import beyond_scope, n_left_out
@@ -24,6 +25,7 @@ from tests.in_process import controllers_here, one_process, run_here
 CUT_OUT = family_named("cut_out")
 AV = """
 import math
+import random
 
 
 class MyAV:
@@ -41,6 +43,16 @@ class Fails(MyAV):
     def start(self, episode):
         if episode.episode == 3:
             raise RuntimeError("no")
+
+
+class Moody(MyAV):
+    def start(self, episode):
+        self.dizzy, self.sleeps = episode.episode % 4 == 1, episode.episode % 4 == 2
+
+    def step(self, seen):
+        if self.dizzy and seen.gap_m < 30.0:
+            raise RuntimeError("no")
+        return 3.0 if self.sleeps else super().step(seen) - random.random()
 
 
 class Rams(MyAV):
@@ -126,6 +138,27 @@ def test_where_somebody_changes_lanes_it_is_not_known_what_came_first():
     """And plain simulation counts such crashes as they are."""
     asked = [["scenario=lead_brakes"], ["scenario=lead_brakes", "testing.method=nde"], ["scenario=cut_out"], []]
     assert [n_left_out(harness.load_campaign("idm", each), 3) for each in asked] == [3, 0, 0, 0]
+
+
+def test_the_sum_warns_of_what_a_scenario_alone_would(tmp_path):
+    """Tests that failed, that differed when run twice, that crashed before the event: each says of which scenario."""
+    (tmp_path / "my_av.py").write_text(AV)
+    quick = (*SMALL, "world.engine=twin", "stop.rhw=null", "stop.below_reference=null", "stop.episodes=400")
+    both = ("scenarios=[cut_in, lead_brakes]", "run.max_failed_share=0.5")
+    run = run_here(harness.load_campaign(f"{tmp_path}/my_av.py:Moody", [*quick, *both]), tmp_path / "run")
+    told = " ".join(repr(run).split())
+    for name, words in (("cut_in", "cut-in"), ("lead_brakes", "lead brakes")):
+        of, alone = run.content["families"][name], run.runs[name].estimates
+        best, scale = alone["estimates"]["shells"], of["exposure"]["per_hour"] / of["p_event"]
+        assert of["n_failed"] == best["details"]["n_failed"] > 0
+        worst = scale * best["details"]["crash_rate_if_failed_had_crashed"]
+        assert of["if_failed_had_crashed"] == pytest.approx(worst, rel=1e-12)
+        failed = f"{of['n_failed']} of {of['n_episodes']} tests FAILED; had they all crashed, the rate would be"
+        assert f"! {words}: {failed} {number(worst)} per hour" in told
+        assert f"! {words}: NOT REPRODUCIBLE: " in told
+    assert "! lead brakes: " in told.partition("tests crashed BEFORE the event")[0]
+    again = harness.estimate_families(run.folder)
+    assert {**again, "crc32": 0} == {**run.content, "crc32": 0}
 
 
 @pytest.mark.slow

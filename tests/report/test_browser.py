@@ -182,13 +182,15 @@ def hours_page(place: Path) -> Path:
     part = {
         "rate_per_hour": 1.26e-3, "ci_low": 1.19e-3, "ci_high": 1.89e-3, "upper_bound": None, "share": 0.5,
         "ratio": 34.0, "n_episodes": 100, "n_crashes": 10, "median_impact_mps": 7.0, "exposure": exposure,
+        "n_failed": 1, "if_failed_had_crashed": 1.3e-3, "cut_off": 0.0, "cautions": [], "repeated": None,
+        "milder": None, "n_crashes_before_event": 0,
     }  # fmt: skip
     beside = {"ratio": 15.0, "ratio_low": 14.0, "ratio_high": 22.0, "over_assumed": [4.4, 27.0], "reference": "r157-cc"}
     content = {
         "vehicle": "idm", "name": "r157", "n_episodes": 300, "n_crashes": 30, "seed": 1, "confidence": 0.9,
         "per_hour": {"rate": 1.27e-3, "ci_low": 1.2e-3, "ci_high": 1.9e-3, "upper_bound": None, "rhw": 0.3},
         "per_1e6_km": 11.3, "beside": beside, "decision": None, "stopped_by": "rhw", "asked_rhw": 0.3,
-        "counts_in_interval": False, "readings": [beside], "milder": {},
+        "counts_in_interval": False, "readings": [beside],
         "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
     }  # fmt: skip
     return write_hours(place, content)

@@ -31,6 +31,7 @@ def answering(connection) -> None:
 
 def abandoned(connection, note) -> None:
     """Starts a program, another in a session of its own, and writes down who they are; then it is busy."""
+    assert "PYTHONSAFEPATH" not in os.environ  # which was the server's alone
     helpers = [subprocess.Popen(["/bin/sleep", "600"], start_new_session=apart).pid for apart in (False, True)]
     Path(note).write_text(" ".join(map(str, (os.getpid(), *helpers))), encoding="utf-8")
     Path(note).rename(note + ".done")

@@ -198,9 +198,12 @@ os.kill(os.getpid(), signal.SIGKILL)
 def test_a_busy_worker_does_not_outlive_a_killed_parent_nor_does_what_it_has_started(tmp_path):
     script, note = tmp_path / "parent.py", tmp_path / "pids"
     script.write_text(ABANDONED, encoding="utf-8")
+    here = tmp_path / "here"
+    here.mkdir()
+    (here / "random.py").write_text("raise ImportError('not the library’s')", encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(script), str(note)]
-    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, cwd=here)
     assert finished(process) == (-signal.SIGKILL, "")
     for pid in map(int, (tmp_path / "pids.done").read_text().split()):
         wait_until_gone(Path(f"/proc/{pid}/stat"))
