@@ -177,9 +177,8 @@ class ParameterFile(Section):
         for section, of in self:
             for name, entry in of if isinstance(of, Section) else ():
                 found[f"{section}__{name}"] = entry
-                found |= {
-                    f"{section}__{name}__{i}": each for i, each in enumerate(entry if isinstance(entry, list) else ())
-                }
+                listed = enumerate(entry if isinstance(entry, list) else ())
+                found |= {f"{section}__{name}__{i}": each for i, each in listed}
         return {name: entry for name, entry in found.items() if isinstance(entry, Number)}
 
     def values(self) -> dict[str, float]:

@@ -41,14 +41,11 @@ DISTANCE_SEED = DISTANCE_PATHS = 20_000
 """Paths over which the mean distance of a test is taken; its standard error is below 0.5 %. Tests with a cut-in are too
 few (some 3e-5 at level 1) to matter."""
 
-EXPOSURE = Exposure(
-    0.048,
-    0.013,
-    0.123,
-    (3, 63.0),
+_COUNTED = (
     "cut-ins that begin at more than 5 m/s of closing speed and 22.2 m/s or more, in the trajectories of de Gelder et "
-    "al. (2021), doi:10.1109/ACCESS.2021.3136585",
+    "al. (2021), doi:10.1109/ACCESS.2021.3136585"
 )
+EXPOSURE = Exposure(0.048, 0.013, 0.123, (3, 63.0), _COUNTED)
 
 
 class CutIn(Family):

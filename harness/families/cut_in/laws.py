@@ -90,11 +90,8 @@ class AccelerationLaw(NamedTuple):
 
 def build_environment(numbers: Record, lateral: LateralMotion, wish: Wish, accepted: FloatArray) -> Environment:
     """Tables of an environment from its parameter record."""
-    braking = np.where(
-        numbers["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2,
-        np.exp(numbers["free_driving__brake_slope_s2pm"] * ACCELERATIONS_MPS2),
-        0.0,
-    )
+    powers = np.exp(numbers["free_driving__brake_slope_s2pm"] * ACCELERATIONS_MPS2)
+    braking = np.where(numbers["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2, powers, 0.0)
     cumulative = np.cumsum(braking) / braking.sum()
     cumulative[-1] = 1.0
     noise_t = np.stack([t_table(float(numbers[name])) for name in ("free_driving__df", "car_following__df")])

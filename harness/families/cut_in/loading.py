@@ -82,49 +82,33 @@ def require_sound_laws(environment: Environment, file: str) -> None:
         _require(inside, where, "noise of scale {:.3g} m/s²" + _IN_STATE, (scale[law], *states.T), limits)
         whole = (pmf[law] >= 0.0).all(axis=1) & (np.abs(total - 1.0) < 1e-9)
         _require(whole, where, "probabilities that sum to {:.12g}" + _IN_STATE, (total, *states.T), "a sum of 1")
-    _require(
-        (accepted > 0.0) & (accepted <= 1.0),
-        f"cut_in.accept_scale_s and cut_in.ignore_share ({file})",
-        "a share of {:.3g} accepted at R2 = {:g} m, R2dot = {:g} m/s",
-        (accepted, *approaches.T),
-        "a share above 0 and at most 1",
-    )
+    is_share, where = (accepted > 0.0) & (accepted <= 1.0), f"cut_in.accept_scale_s and cut_in.ignore_share ({file})"
+    found = "a share of {:.3g} accepted at R2 = {:g} m, R2dot = {:g} m/s"
+    _require(is_share, where, found, (accepted, *approaches.T), "a share above 0 and at most 1")
     possible = np.isfinite(chance) & (chance * accepted.min() > SMALLEST_CHANCE)
     wish = "a wish to change lanes of {:.3g}" + _IN_STATE
     _require(possible, f"cut_in ({file})", wish, (chance, *states.T), "a finite number above 0")
 
 
 def _require_initial_states(environment: Environment, speeds: FloatArray, file: str) -> None:
-    n = environment.numbers
-    initial = InitialStates(n)
-    _require(
-        np.diff(initial.speed_cdf) >= -1e-9,  # rounding shows where next to nothing of the distribution is left
-        f"initial_state.v_location_mps, v_scale_mps and v_shape ({file})",
-        "no speed within the fit range",
-        (),
-        "a distribution of v_BV that reaches into it",
-    )
+    n, initial = environment.numbers, InitialStates(environment.numbers)
+    reaches = np.diff(initial.speed_cdf) >= -1e-9  # rounding shows where next to nothing of the distribution is left
+    where = f"initial_state.v_location_mps, v_scale_mps and v_shape ({file})"
+    _require(reaches, where, "no speed within the fit range", (), "a distribution of v_BV that reaches into it")
+    least, most = n["fit_range__r1_min_m"], n["fit_range__r1_max_m"]
     for speed in speeds:
         states = initial.given_speed(speed, *(u.ravel() for u in np.meshgrid(PROBABILITIES, PROBABILITIES)))
         r1 = states["r1_m"][: PROBABILITIES.size]
         rate = states["r1dot_mps"].reshape(PROBABILITIES.size, -1)
-        inside = (r1 >= n["fit_range__r1_min_m"] - 1e-6) & (r1 <= n["fit_range__r1_max_m"] + 1e-6)
+        inside = (r1 >= least - 1e-6) & (r1 <= most + 1e-6)
         rises = np.append(r1[2:] > r1[:-2], [True, True])  # pairs, because the outermost two may agree
-        _require(
-            inside & rises,
-            f"initial_state.r1_* ({file})",
-            f"R1 = {{:.3g}} m in the {{:.6g}} quantile at v = {speed:g} m/s",
-            (r1, PROBABILITIES),
-            f"gaps spread within the fit range, {n['fit_range__r1_min_m']:g} to {n['fit_range__r1_max_m']:g} m",
-        )
+        found = f"R1 = {{:.3g}} m in the {{:.6g}} quantile at v = {speed:g} m/s"
+        expected = f"gaps spread within the fit range, {least:g} to {most:g} m"
+        _require(inside & rises, f"initial_state.r1_* ({file})", found, (r1, PROBABILITIES), expected)
         fast = np.where(np.isfinite(rate).all(axis=0), speed + rate[RARE], np.inf)
-        _require(
-            fast <= FASTEST_LV_MPS,
-            f"initial_state.r1dot_* ({file})",
-            f"LV at {{:.3g}} m/s in one of a million tests, at v = {speed:g} m/s, R1 = {{:.3g}} m",
-            (fast, r1),
-            f"rates that are finite, and an LV of at most {FASTEST_LV_MPS:g} m/s in all but one of a million",
-        )
+        found = f"LV at {{:.3g}} m/s in one of a million tests, at v = {speed:g} m/s, R1 = {{:.3g}} m"
+        expected = f"rates that are finite, and an LV of at most {FASTEST_LV_MPS:g} m/s in all but one of a million"
+        _require(fast <= FASTEST_LV_MPS, f"initial_state.r1dot_* ({file})", found, (fast, r1), expected)
 
 
 def _require(sound: BoolArray, where: str, found: str, values: tuple[FloatArray, ...], expected: str) -> None:

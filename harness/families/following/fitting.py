@@ -125,7 +125,5 @@ class FollowingFitter:
             return counted, f"{told}, {number(n / hours)} per hour ({limits})"
         needed = f", some {number(hours * FEWEST_COUNTED / n, 2)} h" if n else ""
         excluded = "" if low <= kept.value <= high else ", which these data exclude"
-        told += (
-            f" ({limits} per hour); at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)} per hour"
-        )
-        return {}, f"{told} [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
+        told += f" ({limits} per hour); at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)}"
+        return {}, f"{told} per hour [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"

@@ -87,16 +87,13 @@ def _told(fit: Fit, tally: Tally, n_replicates: int) -> tuple[str, ...]:
 
 def _facts(fit: Fit, tally: Tally) -> dict[str, object]:
     steps, traffic = fit.acceptance, fit.traffic
+    counted = {"events": steps.events.tolist(), "exposure": steps.exposure.tolist()}
     return {
         "recordings": traffic.n_recordings,
         "vehicles": tally.vehicles,
         "hours": tally.driven_s / 3600.0,
         "lane_changes": tally.used,
         "resampled": "recordings" if traffic.by_recording else "vehicles",
-        "acceptance": {
-            "events": steps.events.tolist(),
-            "exposure": steps.exposure.tolist(),
-            "share": steps.shares.tolist(),
-        },
+        "acceptance": counted | {"share": steps.shares.tolist()},
         "kept": fit.kept,
     }

@@ -129,9 +129,8 @@ class Acceptance:
         wished = hazard.rate(rows) * rows["duration_s"]
         near = at < n - 1
         exposure = np.bincount(at, wished, minlength=n).astype(np.float64)
-        return cls(
-            events, exposure, _design(hazard.knots, rows[near]), at[near].astype(np.int64), rows["duration_s"][near]
-        )
+        design = _design(hazard.knots, rows[near])
+        return cls(events, exposure, design, at[near].astype(np.int64), rows["duration_s"][near])
 
     def exposures(self, theta: FloatArray) -> FloatArray:
         """Expected lane changes (b, 5) in all bins but the last, by coefficients (b, p) of the hazard."""
