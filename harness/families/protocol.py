@@ -18,6 +18,7 @@ import pyarrow as pa
 
 from harness.campaign.drivers import Surrogate
 from harness.campaign.sections import EnvironmentSettings
+from harness.errors import CampaignError
 from harness.families.numbers import ParameterFile
 from harness.families.words import Shown, Words
 from harness.loop.cells import Script
@@ -188,6 +189,10 @@ class Family(Protocol):
         self, settings: EnvironmentSettings, parameters: Any, values: Mapping[str, float]
     ) -> Environment | None:
         """The same with other numbers; None where they give no laws."""
+        try:
+            return self.traffic(settings, parameters.with_values(values))
+        except (CampaignError, ValueError):
+            return None
 
     def digest(self, traffic: Environment) -> str:
         """Hash of all numbers of it."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,7 +16,6 @@ import pyarrow as pa
 from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
-from harness.errors import CampaignError
 from harness.families.following.approach import (
     AV_START_M,
     START_DTYPE,
@@ -72,14 +70,6 @@ class FollowingFamily(Family):
         dtype = [*((name, "f8") for name in known), *((name, "i8") for name in steps)]
         numbers = np.array([(*known.values(), *steps.values())], dtype)[0]
         return Following(numbers, *given.grid())
-
-    def traffic_with(
-        self, settings: EnvironmentSettings, parameters: FollowingParameters, values: Mapping[str, float]
-    ) -> Following | None:
-        try:
-            return self.traffic(settings, parameters.with_values(values))
-        except (CampaignError, ValueError):
-            return None
 
     def digest(self, traffic: Following) -> str:
         numbers = {name: traffic.numbers[name].item() for name in traffic.numbers.dtype.names or ()}
