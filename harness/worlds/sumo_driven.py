@@ -11,7 +11,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -137,16 +136,7 @@ class SumoAvWorld(SumoWorld):
 
     drives_av = True
 
-    def __init__(
-        self,
-        n_cells: int,
-        av: Mapping[str, str | float],
-        vehicles: Sequence[str] = VEHICLES,
-        *,
-        acts_before_event: bool = False,
-        **options: Any,
-    ) -> None:
-        self.acts_before_event = acts_before_event
+    def __init__(self, n_cells: int, av: Mapping[str, str | float], vehicles: Sequence[str] = VEHICLES) -> None:
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._wanted: FloatArray = np.zeros((n_cells, len(vehicles)))
         attributes = av_type(av)
@@ -155,7 +145,7 @@ class SumoAvWorld(SumoWorld):
         self._type_file, stderr = SharedFile(xml.encode()), SharedFile()
         try:
             with _stderr_to(stderr.path):
-                super().__init__(n_cells, vehicles, **options)
+                super().__init__(n_cells, vehicles)
         except Exception as error:
             lines = stderr.path.read_text(encoding="utf-8").splitlines()
             messages = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
@@ -210,10 +200,10 @@ class FreshWorld(SumoAvWorld):
     """
 
     def __init__(
-        self, av: Mapping[str, str | float], seed: int, vehicles: Sequence[str] = VEHICLES, **options: Any
+        self, av: Mapping[str, str | float], seed: int, vehicles: Sequence[str] = VEHICLES, *, acts_before_event: bool
     ) -> None:
-        self._seed, self._sumo_seed = seed, 0
-        super().__init__(1, av, vehicles, **options)
+        self.acts_before_event, self._seed, self._sumo_seed = acts_before_event, seed, 0
+        super().__init__(1, av, vehicles)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:  # noqa: ARG002 - there is one cell
         """Load a new simulation for the coming episode."""
