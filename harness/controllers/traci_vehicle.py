@@ -240,11 +240,8 @@ class VehicleDomain(Domain):
         """Values of what has been subscribed to around a vehicle, by its and their names; none without."""
         dist, variables = self._around.get(objectID, (-1.0, ()))
         here = self.getPosition(objectID)
-        return {
-            name: self._values(name, variables)
-            for name in self._seen
-            if math.dist(here, self.getPosition(name)) <= dist
-        }
+        near = [name for name in self._seen if math.dist(here, self.getPosition(name)) <= dist]
+        return {name: self._values(name, variables) for name in near}
 
     def getLeader(self, vehID: str, dist: float = 100.0) -> tuple[str, float] | None:  # noqa: ARG002 - TraCI's signature
         """Vehicle ahead on the lane and the gap to it (m, less the minGap of zero), however far away.

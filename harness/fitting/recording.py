@@ -114,10 +114,8 @@ class Recording:
 
     def where(self, i: int | np.intp) -> str:
         """Place in the file of the i-th row."""
-        vehicle = self.vehicles[self.vehicle[i]]
-        return (
-            f"{self.file}, row {self.row[i]} (vehicle {vehicle} of recording {self.name}, t = {self.time_s[i]:.10g} s)"
-        )
+        who = f"vehicle {self.vehicles[self.vehicle[i]]} of recording {self.name}"
+        return f"{self.file}, row {self.row[i]} ({who}, t = {self.time_s[i]:.10g} s)"
 
     @cached_property
     def piece(self) -> IntArray:

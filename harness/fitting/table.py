@@ -152,14 +152,10 @@ def _read(path: Path, mapping: Mapping) -> pd.DataFrame:
             text = _Text.of(path, mapping)
             columns = _columns(path, text.names, mapping)
             types = {name: pa.string() if column in NAMES else pa.float64() for column, name in columns.items()}
-            table = pa.csv.read_csv(
-                text.content,
-                pa.csv.ReadOptions(column_names=text.names, skip_rows=text.row - 1, block_size=1 << 22),
-                pa.csv.ParseOptions(delimiter=text.delimiter),
-                pa.csv.ConvertOptions(
-                    column_types=types, include_columns=list(types), decimal_point=text.decimal_point
-                ),
-            )
+            read = pa.csv.ReadOptions(column_names=text.names, skip_rows=text.row - 1, block_size=1 << 22)
+            wanted = {"column_types": types, "include_columns": list(types), "decimal_point": text.decimal_point}
+            parse, convert = pa.csv.ParseOptions(delimiter=text.delimiter), pa.csv.ConvertOptions(**wanted)
+            table = pa.csv.read_csv(text.content, read, parse, convert)
         if not len(table):
             raise TrajectoryError(str(path), "no rows", "one row per vehicle and time", "Is it the right file?")
         return _renamed(table, columns, path, mapping, text.row if text else 1)

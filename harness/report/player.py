@@ -75,9 +75,8 @@ class Scenes:
             row = np.searchsorted(floats(rows.column("episode")), episode)
             begins = step == self._family.onset(environment, chosen)[row] + 1
             start[row[begins]] = np.stack((x, v), axis=1)[begins]
-        drivers = library_records(
-            [driver for _, driver in self._family.stand_ins.values()], self._family.shows(environment)
-        )
+        others = [driver for _, driver in self._family.stand_ins.values()]
+        drivers = library_records(others, self._family.shows(environment))
         driven = self._family.drive(environment, chosen, start, drivers, last=last)
         if self._acts:
             driven.end[np.isnan(start[:, 0])] = UNKNOWN
@@ -249,9 +248,8 @@ def _facts(scene: Scene, bv: Scene, av: Scene, family: Family, event: str) -> li
         " ".join(words.shows): shows if onset != cut else ", ".join(filter(None, (event, where))),
         "AV brakes": f"at up to {hardest} m/s²",
     }
-    facts = [
-        (name, f"{_when(step, cut, words.since)}: {told[name]}") for step, name in scene["moments"] if name in told
-    ]
+    moments = [(step, name) for step, name in scene["moments"] if name in told]
+    facts = [(name, f"{_when(step, cut, words.since)}: {told[name]}") for step, name in moments]
     facts += [("AV brakes", "never")] if av["brakes"] is None else []
     facts.append(("AV", _ending(av, bv, scene, family)))
     for each in scene["ghosts"]:

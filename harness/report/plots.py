@@ -122,14 +122,10 @@ def shells_plot(found: ShownShells) -> Plot:
     tested = [shell for shell in shells if shell.n_episodes] or list(shells)
     limit = 1.12 * max(shell.high for shell in tested)
     widest = 1.3 * max(*(shell.half_width for shell in tested), pool)
-    rows, y = np.arange(len(names)), Axis("", len(names) - 0.4, -0.6, names=names)
-    left, right = (
-        Panel(title, Axis(f"{label}, per test", 0.0, end), y, height=62.0 + 26.0 * len(names))
-        for title, label, end in (
-            ("Where the rate comes from", "contribution to the crash rate", limit),
-            ("Where the uncertainty lies", "half-width", widest),
-        )
-    )
+    rows, y, height = np.arange(len(names)), Axis("", len(names) - 0.4, -0.6, names=names), 62.0 + 26.0 * len(names)
+    adds = Axis("contribution to the crash rate, per test", 0.0, limit)
+    left = Panel("Where the rate comes from", adds, y, height=height)
+    right = Panel("Where the uncertainty lies", Axis("half-width, per test", 0.0, widest), y, height=height)
     at, inside = rows[:-1], np.array([shell.inside for shell in shells])
     low, rate, high = np.array([(shell.low, shell.contribution, shell.high) for shell in shells]).T
     for kind, colour in ((inside, "blue"), (~inside, "vermillion")):

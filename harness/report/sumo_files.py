@@ -43,11 +43,9 @@ def write_floating_car_data(trace: pa.Table, file: Path) -> None:
                 f'<vehicle id={quoteattr(name)} x="{at!r}" y="{left!r}" angle="90.00" type={quoteattr(name)} '
                 f'speed="{speed!r}" pos="{at!r}" lane="cell0_{on}" slope="0.00"/>'
             )
-    lines = [
-        line
-        for step, vehicles in sorted(frames.items())
-        for line in (f'<timestep time="{step * STEP_S:.1f}">', *vehicles, "</timestep>")
-    ]
+    lines: list[str] = []
+    for step, vehicles in sorted(frames.items()):
+        lines += [f'<timestep time="{step * STEP_S:.1f}">', *vehicles, "</timestep>"]
     _write(file, "fcd-export", lines)
 
 

@@ -27,9 +27,8 @@ def sentence(text: str) -> str:
 def templates(package: str = "harness.report") -> Environment:
     """Templates of a package, which may include those of this one."""
     place = Path(__file__).parent
-    css, more_css, script = (
-        (place / name).read_text(encoding="utf-8") for name in ("report.css", "player.css", "player.js")
-    )
+    files = (place / name for name in ("report.css", "player.css", "player.js"))
+    css, more_css, script = (file.read_text(encoding="utf-8") for file in files)
     loader = ChoiceLoader([PackageLoader(each, ".") for each in (package, "harness.report")])
     found = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
