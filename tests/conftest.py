@@ -76,7 +76,7 @@ def open_world() -> Iterator[Callable]:
     from harness.worlds.sumo import SumoWorld
 
     with ExitStack() as worlds:
-        yield lambda *arguments, **options: worlds.enter_context(closing(SumoWorld(*arguments, **options)))
+        yield lambda *arguments, of=SumoWorld, **options: worlds.enter_context(closing(of(*arguments, **options)))
 
 
 @pytest.fixture(scope="session")

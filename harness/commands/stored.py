@@ -161,7 +161,7 @@ def _compared_elsewhere(folder: Path, environment: str, confidence: float | None
         from pydantic import TypeAdapter
 
         from harness.estimators.traffic import TrafficError
-        from harness.report.traffic_words import traffic_rows
+        from harness.report.rows import traffic_rows
 
         traffic = content["traffic"]
         rows = traffic_rows(TypeAdapter(TrafficError).validate_python(traffic))
@@ -215,7 +215,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
 
 
 def _bar(bar: dict[str, Any]) -> dict[str, str]:
-    from harness.report.traffic_words import bar_note
+    from harness.report.rows import bar_note
 
     def ends(of: list[float | None]) -> str:
         return "× " + " … ".join(number(end, 3) for end in of)

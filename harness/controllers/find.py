@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import os
 import sys
 from collections.abc import Callable
 from copy import deepcopy
@@ -111,7 +112,7 @@ def build_host(
         return VehicleHost(*told, fmu_maker(av.fmu), n_cells, names=names)
     try:
         make = _script(av, guard) or _maker(av)
-        guard.restore_modes()
+        guard.modes.restored()  # imported libraries that were compiled for speed change how this thread computes
         first = _made(make, str(av.controller), guard)
         is_batch = _is_batch(first)
     except HarnessError:
@@ -289,12 +290,6 @@ def _sources_of_made(av: AutomatedVehicle) -> str | None:
     files = {str(real_path(file)), *(value for value in given if isinstance(value, str))}
     if is_users(root := str(real_path(file).parents[above])):
         files |= {str(each) for each in files_imported(real_path(file), Path(root))}
-    contents = sorted(hashlib.sha256(Path(each).read_bytes()).hexdigest() for each in files if _is_file(each))
+    known = filter(os.path.isfile, files)  # a parameter may be no path: too long, or with a zero in it
+    contents = sorted(hashlib.sha256(Path(each).read_bytes()).hexdigest() for each in known)
     return hashlib.sha256("".join(contents).encode()).hexdigest() if contents else None
-
-
-def _is_file(name: str) -> bool:
-    try:
-        return Path(name).is_file()
-    except (OSError, ValueError):  # a parameter that is no path: too long, or with a zero in it
-        return False

@@ -67,12 +67,6 @@ def death_cause(exit_code: int | None, limits: Limits) -> str:
     return f"the controller ended the worker process (exit code {exit_code})"
 
 
-def require_fault(error: BaseException) -> None:
-    """Let Ctrl-C pass. Workers and other children ignore it: there even KeyboardInterrupt is the controller's own."""
-    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        raise error
-
-
 def cause_of(error: BaseException) -> str:
     """One line for the record, which is UTF-8: the text is the user's, and so is the code that makes it.
 
@@ -126,7 +120,7 @@ class Guard:
         self._makes = False
         """Of the call under way."""
         self._pid = os.getpid()
-        self._modes, self._others = FloatingPointModes(), OtherModules()
+        self.modes, self._others = FloatingPointModes(), OtherModules()
         self.construction_s: list[float] = []
         """Time that each constructor took."""
         self._since: float | None = None
@@ -160,12 +154,14 @@ class Guard:
         signal.setitimer(signal.ITIMER_REAL, self._limits[makes][0])
         try:
             answer = function(*arguments)
-            if self._modes.restored():
+            if self.modes.restored():
                 return answer, CHANGED_MODES
             return check(answer) if check else (answer, None)
-        except BaseException as error:  # noqa: BLE001 - whatever a user's code raises is its episode's end
-            require_fault(error)
-            self._modes.restored()
+        except BaseException as error:
+            # Ctrl-C passes. Workers and other children ignore it: there even KeyboardInterrupt is the controller's own.
+            if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+                raise
+            self.modes.restored()
             return None, cause_of(error)
         finally:
             self._since = None  # the timer itself is set again by the next call
@@ -173,10 +169,6 @@ class Guard:
                 self.construction_s.append(monotonic() - since)
             if os.getpid() != self._pid:  # a copy that the controller has made of the process
                 os._exit(0)
-
-    def restore_modes(self) -> None:
-        """After a module has been imported: libraries that were compiled for speed change how this thread computes."""
-        self._modes.restored()
 
     def require_untouched(self) -> None:
         """Refuse a vehicle that has replaced what the harness itself calls; a `CampaignError` names it."""

@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
-from typing import Any
 
 import numpy as np
 import sumo_data
@@ -38,9 +37,7 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         found, place = f"{name}, which is no Python", f"{error.msg} in line {error.lineno}"
         raise CampaignError("av.controller", found, "a TraCI script", f"Fix it: {place}.") from error
     os.environ.setdefault("SUMO_HOME", sumo_data.__path__[0])  # as libsumo does: scripts look for it
-    ego = style.ego
-    late: Any = None
-    if ego is None:
+    if (ego := style.ego) is None:
         with guard:
             answer, late = guard.call(_found, script, makes=True)
         ego, wrong = answer or (None, f"{FAILS}: {late}")
@@ -130,12 +127,8 @@ def _found(script: Script) -> tuple[str | None, str]:
 def _commanded(script: Script, ego: str) -> tuple[list[str], str]:
     """Names of the vehicles that a script commands when a car cuts in before it; and what it raises."""
     tried = _Tried(ego)
-
-    def made(*_: Any) -> _Tried:
-        return tried
-
     try:
-        with closing(ScriptController(script, made)) as controller:
+        with closing(ScriptController(script, lambda *_: tried)) as controller:
             _drive(controller)
     except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a user's code raises
         return list(tried.commanded), cause_of(error)

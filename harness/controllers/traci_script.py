@@ -16,7 +16,7 @@ from functools import partial
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Any, NoReturn
+from typing import Any
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
@@ -157,7 +157,10 @@ class ScriptTraci(Traci):
     def simulationStep(self, step: float = 0.0) -> list[Any]:
         """Hand over for a step, or until a time (s)."""
         if self.simulation.over:
-            self._has_ended()
+            self._n_after += 1
+            while self._n_after > _PATIENCE:
+                _hand_over()
+            raise FatalTraCIError("Connection closed by SUMO.")
         if not step:
             self._advance()
         while step - self.simulation.time_s > _ROUNDING and not self.simulation.over:
@@ -179,12 +182,6 @@ class ScriptTraci(Traci):
             _hand_over()
         simulation.n_steps += 1
         simulation.time_s = round(STEP_S * simulation.n_steps, 6)
-
-    def _has_ended(self) -> NoReturn:
-        self._n_after += 1
-        while self._n_after > _PATIENCE:
-            _hand_over()
-        raise FatalTraCIError("Connection closed by SUMO.")
 
     def addStepListener(self, listener: Any) -> int:
         self._n_listeners += 1

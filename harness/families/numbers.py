@@ -159,7 +159,7 @@ class ParameterFile(Section):
         """Numbers with which there are half as many events of each kind that the data have not."""
         return {}
 
-    def unseen_in(self, kinds: Collection[int]) -> str:  # noqa: ARG002 - there is none
+    def unseen_in(self, kinds: Collection[int]) -> str:
         """Where some of these kinds are."""
         return ""
 

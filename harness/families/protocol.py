@@ -198,18 +198,18 @@ class Family(Protocol):
     def sideways_m(self, traffic: Environment) -> float:
         """Way (m) from a first lateral motion to overlap."""
 
-    def shows(self, traffic: Environment) -> bool:  # noqa: ARG002 - where nothing else is said
+    def shows(self, traffic: Environment) -> bool:
         """Whether events can be seen before they happen."""
         return False
 
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:
         """How often there are events, as `Events.probability` counts them."""
 
-    def milder(self, traffic: Environment) -> Environment | None:  # noqa: ARG002
+    def milder(self, traffic: Environment) -> Environment | None:
         """The same with events that are too mild to count, of which some are driven all the same; None without any."""
         return None
 
-    def mean_distance_m(self, traffic: Environment) -> float | None:  # noqa: ARG002
+    def mean_distance_m(self, traffic: Environment) -> float | None:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens.
 
         None where a test is an event that happens for certain: between two of them lies no distance that tests know.
@@ -247,7 +247,7 @@ class Family(Protocol):
     def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:
         """Steps (m,) at whose end chosen events begin; what happens in them may be later."""
 
-    def told(self, facts: Mapping[str, Any]) -> str:  # noqa: ARG002
+    def told(self, facts: Mapping[str, Any]) -> str:
         """What an event is like, by the columns of its test, as a phrase behind that of its onset; may be empty."""
         return ""
 

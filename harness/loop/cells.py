@@ -91,40 +91,27 @@ class Script(NamedTuple):
 
 
 def natural_script(
-    x: FloatArray,
-    v: FloatArray,
-    lane: Int8Array,
-    speed: FloatArray,
-    lanes: Int8Array,
-    at: IntArray,
-    lead: IntArray,
-    *,
-    n_steps: int | IntArray | None = None,
-    acts_from: int | IntArray | None = None,
-    visible_from: IntArray | None = None,
-    headway_s: float | FloatArray = math.nan,
-    sideways_mps: float | FloatArray = 0.0,
-    set_speed_mps: float | FloatArray = math.nan,
+    x: FloatArray, v: FloatArray, lane: Int8Array, speed: FloatArray, lanes: Int8Array, at: IntArray, lead: IntArray
 ) -> Script:
     """A script whose tests weigh 1; see `Script`.
 
-    Where nothing else is said a test may be as long as its motion, and the AV sees all, and acts from the step after
-    the onset on.
+    A test may be as long as its motion, and the AV sees all, and acts from the step after the onset on: a family with
+    other tests replaces what is otherwise (`_replace`).
     """
-    n, most = len(x), speed.shape[1] if n_steps is None else n_steps
-    if acts_from is None:
-        acts_from = np.where(at < 0, NEVER, np.maximum(at - lead, 0) + 1)
-    if visible_from is None:
-        visible_from = np.zeros((n, x.shape[1] - 1), np.int64)
-    most, acts_from = (np.array(np.broadcast_to(each, n), np.int64) for each in (most, acts_from))
-    headway, sideways, cruise = (
-        np.array(np.broadcast_to(each, n), np.float64) for each in (headway_s, sideways_mps, set_speed_mps)
-    )
-    stratum, weighs, unknown = np.full(n, -1), np.zeros(n), np.full(n, math.nan)
-    index, motion = np.full(n, -1), np.zeros(n, np.uint64)
-    moves = x, v, lane, speed, lanes, at, lead
+    n = len(x)
     return Script(
-        *moves, most, acts_from, visible_from, headway, sideways, cruise, stratum, weighs, unknown, index, motion
+        *(x, v, lane, speed, lanes, at, lead),
+        n_steps=np.full(n, speed.shape[1]),
+        acts_from=np.where(at < 0, NEVER, np.maximum(at - lead, 0) + 1),
+        visible_from=np.zeros((n, x.shape[1] - 1), np.int64),
+        headway_s=np.full(n, math.nan),
+        sideways_mps=np.zeros(n),
+        set_speed_mps=np.full(n, math.nan),
+        stratum=np.full(n, -1),
+        log_weight=np.zeros(n),
+        log_p_event=np.full(n, math.nan),
+        announced_index=np.full(n, -1),
+        motion_hash=np.zeros(n, np.uint64),
     )
 
 

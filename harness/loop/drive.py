@@ -14,7 +14,7 @@ from harness.vehicles.following import Ahead, braking_seen_after, follow_on, hea
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
 from harness.vehicles.references import Memory, react, reaction_steps, still_cruises
 from harness.vehicles.sideways import lateral_position, perceived_in
-from harness.vocabulary import FloatArray, IntArray, read_only
+from harness.vocabulary import FloatArray, Int8Array, IntArray, read_only
 
 
 @compiled
@@ -39,7 +39,7 @@ def drive(kernel: KernelState) -> None:
 @compiled_inline
 def follow(k: int, kernel: KernelState) -> None:
     """Acceleration of a built-in AV that follows from the start; see `harness.vehicles.following`."""
-    cells, driver, script = kernel.cells, kernel.driver[0], kernel.script
+    cells, driver, script, lane = kernel.cells, kernel.driver[0], kernel.script, kernel.cells.lane_before
     cell, speed = cells.cell[k], kernel.v[k, kernel.x.shape[1] - 1]
     late, perceived, reacts = reaction_steps(driver, kernel.seed, cell.episode), 0, NEVER
     lead = revealed = Ahead(speed, math.inf, 0.0)
@@ -52,7 +52,7 @@ def follow(k: int, kernel: KernelState) -> None:
         reacts = perceived + late
     for other in range(kernel.x.shape[1] - 1):
         hidden = script.visible_from[cell.row, other] > 0
-        if not is_ahead_of(k, other, kernel) or (hidden and (cell.onset_step < 0 or cell.step < perceived)):
+        if not is_ahead_of(k, other, lane, kernel) or (hidden and (cell.onset_step < 0 or cell.step < perceived)):
             continue
         seen = ahead_of(k, other, kernel)
         if hidden and seen.gap < revealed.gap:
@@ -110,7 +110,7 @@ def observe(kernel: KernelState) -> int:
         cell = cells.cell[k]
         if cell.row < 0 or cell.step < cell.acts_from:
             continue
-        leader, comes = leader_of(k, kernel), 0 <= cell.onset_step < cell.step
+        leader, comes = leader_of(k, cells.lane_before, False, kernel), 0 <= cell.onset_step < cell.step
         on_lane = cells.lane_before[k, bv] == cells.lane_before[k, av] and is_visible(k, bv, kernel)
         out.cell[n], out.episode[n], out.time_s[n] = k, cell.announced_index, cell.step * STEP_S
         out.position_m[n], out.speed_mps[n] = x[k, av], v[k, av]
@@ -142,18 +142,18 @@ def is_visible(k: int, other: int, kernel: KernelState) -> bool:
 
 
 @compiled_inline
-def is_ahead_of(k: int, other: int, kernel: KernelState) -> bool:
-    """Whether another vehicle is on the AV's lane, ahead of it."""
-    x, lane, av = kernel.x, kernel.cells.lane_before, kernel.x.shape[1] - 1
+def is_ahead_of(k: int, other: int, lane: Int8Array, kernel: KernelState) -> bool:
+    """Whether another vehicle is ahead of the AV and on its ``lane`` (K, V)."""
+    x, av = kernel.x, kernel.x.shape[1] - 1
     return bool(lane[k, other] == lane[k, av] and x[k, other] > x[k, av])
 
 
 @compiled_inline
-def leader_of(k: int, kernel: KernelState) -> int:
-    """The nearest vehicle ahead on the AV's lane that it sees; -1 for none."""
+def leader_of(k: int, lane: Int8Array, sees_all: bool, kernel: KernelState) -> int:
+    """The nearest vehicle ahead on the AV's ``lane`` (K, V), of all or of those that it sees; -1 for none."""
     x, leader = kernel.x, -1
     for other in range(x.shape[1] - 1):
-        ahead = is_ahead_of(k, other, kernel) and is_visible(k, other, kernel)
+        ahead = is_ahead_of(k, other, lane, kernel) and (sees_all or is_visible(k, other, kernel))
         if ahead and (leader < 0 or x[k, other] < x[k, leader]):
             leader = other
     return leader

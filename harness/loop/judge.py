@@ -8,6 +8,7 @@ import numpy as np
 
 from harness.compiled import compiled, compiled_inline
 from harness.loop.cells import KernelState
+from harness.loop.drive import leader_of
 from harness.loop.repeat import gap_and_rate
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, overlaps
 from harness.vocabulary import (
@@ -104,19 +105,8 @@ def both_stand(k: int, kernel: KernelState) -> bool:
     v, onset = kernel.v, kernel.cells.cell[k].onset_step
     if v[k, v.shape[1] - 1] != 0.0 or not 0 <= onset < kernel.cells.cell[k].step:
         return False
-    leader = leader_now(k, kernel)
+    leader = leader_of(k, kernel.cells.lane, True, kernel)
     return leader >= 0 and v[k, leader] == 0.0
-
-
-@compiled_inline
-def leader_now(k: int, kernel: KernelState) -> int:
-    """The nearest vehicle ahead on the AV's lane; -1 for none."""
-    x, lane, av, leader = kernel.x, kernel.cells.lane, kernel.x.shape[1] - 1, -1
-    for other in range(av):
-        ahead = lane[k, other] == lane[k, av] and x[k, other] > x[k, av]
-        if ahead and (leader < 0 or x[k, other] < x[k, leader]):
-            leader = other
-    return leader
 
 
 @compiled_inline
@@ -125,7 +115,7 @@ def time_to_collision(k: int, kernel: KernelState) -> float:
 
     Of d = w t + a t²/2 it is the smaller root, d being the gap, w the closing speed and a the AV's acceleration.
     """
-    v, leader, av = kernel.v, leader_now(k, kernel), kernel.x.shape[1] - 1
+    v, leader, av = kernel.v, leader_of(k, kernel.cells.lane, True, kernel), kernel.x.shape[1] - 1
     if leader < 0 or v[k, av] <= v[k, leader]:
         return math.inf
     closing, left = v[k, av] - v[k, leader], gap(kernel.x[k, leader], kernel.x[k, av])

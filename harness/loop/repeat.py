@@ -103,20 +103,12 @@ def repeat(kernel: KernelState) -> None:
         for vehicle in range(script.speed.shape[2]):
             cells.speed[k, vehicle] = script.speed[cell.row, cell.step, vehicle]
             cells.lane[k, vehicle] = script.lanes[cell.row, cell.step, vehicle]
-        note_onset(k, kernel)
+        test = kernel.episode[cell.row]
+        if cell.step == cell.onset_step:
+            test.onset_gap_m, test.onset_rate_mps = gap_and_rate(k, kernel)
         if cell.step == script.at[cell.row]:
             note_event(k, kernel)
-            test = kernel.episode[cell.row]
             test.n_control_steps += test.component >= 0 or test.log_weight != 0.0  # drawn otherwise than traffic would
-
-
-@compiled_inline
-def note_onset(k: int, kernel: KernelState) -> None:
-    """Keep where the principal vehicle is when its event begins to show itself."""
-    cell = kernel.cells.cell[k]
-    if cell.step == cell.onset_step:
-        test = kernel.episode[cell.row]
-        test.onset_gap_m, test.onset_rate_mps = gap_and_rate(k, kernel)
 
 
 @compiled_inline

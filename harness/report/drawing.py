@@ -56,17 +56,13 @@ class Axis(NamedTuple):
             few = math.log10(self.high / self.low) < FEW_DECADES
             step = 1 if few else math.ceil(len(decades) / MOST_TICKS)
             steps = [m * 10.0**k for k in decades[::step] for m in ((1, 2, 5) if few else (1,))]
-            return [
-                (value, tick_label(value))
-                for value in steps
-                if 0.999 <= value / self.low <= 1.001 * self.high / self.low
-            ]
+            within = (value for value in steps if 0.999 <= value / self.low <= 1.001 * self.high / self.low)
+            return [(value, tick_label(value)) for value in within]
         rough = (self.high - self.low) / MOST_TICKS
         unit = 10.0 ** math.floor(math.log10(rough))
         step_size = next(m * unit for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * unit >= rough)
-        values = step_size * np.arange(
-            math.ceil(self.low / step_size - 1e-9), math.floor(self.high / step_size + 1e-9) + 1
-        )
+        first, last = math.ceil(self.low / step_size - 1e-9), math.floor(self.high / step_size + 1e-9)
+        values = step_size * np.arange(first, last + 1)
         scale = 10.0 ** exponent_of(self.high)
         return [(float(value), plain(float(f"{value / scale:.6g}"))) for value in values]
 
@@ -202,10 +198,8 @@ def _drawn(mark: Mark, panel: Panel, width: float, height: float) -> str:
     x, y = [width * panel.x.place(each) for each in xs], [height * (1.0 - panel.y.place(each)) for each in ys]
     if mark.kind == "text":
         anchor, dx = ("end", -4.0) if x[0][0] > 0.9 * width else ("start", 5.0)
-        style, place = (
-            f"text-anchor:{anchor};fill:var(--{mark.colour})",
-            f'x="{x[0][0] + dx:.1f}" y="{y[0][0] + 4.0:.1f}"',
-        )
+        style = f"text-anchor:{anchor};fill:var(--{mark.colour})"
+        place = f'x="{x[0][0] + dx:.1f}" y="{y[0][0] + 4.0:.1f}"'
         return f'<text {place} class="on" style="{style}">{escape(mark.label)}</text>'
     if mark.kind == "dots":
         discs = zip(x[0], y[0], np.broadcast_to(rest[1], x[0].shape), strict=True)

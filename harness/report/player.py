@@ -98,16 +98,14 @@ class Scenes:
         first, onset, ghosts, seen = 0, None, list[Scene](), list[tuple[int, str]]()
         if cut is not None and cut < last:
             chosen = chosen_from(row, self._family)
-            known = self._environment is not None
-            onset = int(
-                (self._family.onset(self._environment, chosen) if known else onset_steps(chosen.at, chosen.lead))[0]
-            )
-            first = max(min(onset - BEFORE, last - FEWEST), 0)
+            onset = int(onset_steps(chosen.at, chosen.lead)[0])
             if self._environment is not None:
+                onset = int(self._family.onset(self._environment, chosen)[0])
                 ghosts = self._ghosts(self._environment, row, trace, onset, bv, av)
                 from_step = self._family.script(self._environment, chosen).visible_from[0].tolist()
                 hidden = zip(from_step, self._family.vehicles, strict=False)
                 seen = [(step, f"{name} becomes visible") for step, name in hidden if 0 < step <= last]
+            first = max(min(onset - BEFORE, last - FEWEST), 0)
         for each in (*tracks, *ghosts):
             each |= {key: each[key][first:] for key in "xv"}
             each["brakes"] = _brakes(each["v"], first)

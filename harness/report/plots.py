@@ -215,15 +215,14 @@ def where_plot(summary: RunSummary, family: Family, environment: Environment | N
     met = np.isfinite(rows["event_gap_m"]) & np.isfinite(rows["event_rate_mps"]) & (rows["outcome"] != FAILED)
     if not met.any():
         return None
-    weight, crash = rows["weight"][met], rows["outcome"][met] == CRASH
-    panels = [_map(axes, rows, met, weight, crash, words.events) for axes in family.maps]
-    fast = panels[0].y.high
-    lines = {} if environment is None else limits_of_others(family, environment, summary, fast)
+    panels = [_map(axes, rows, met, words.events) for axes in family.maps]
+    lines = {} if environment is None else limits_of_others(family, environment, summary, panels[0].y.high)
     for (name, (speeds, gaps)), colour, dash in zip(lines.items(), ("ink", "blue"), ("", DASHED), strict=False):
         panels[0].add("line", colour, gaps, speeds, dash=dash, label=f"{name}’s limit")
     x, y = (_bare(each.words) for each in family.maps[0])
+    n_crashes = count(int(np.count_nonzero(rows["outcome"][met] == CRASH)))
     text = (
-        f"Each of {count(met.sum())} {words.events} by its {x} and {y}; {count(crash.sum())} of them crashed. "
+        f"Each of {count(met.sum())} {words.events} by its {x} and {y}; {n_crashes} of them crashed. "
         "Where no cell is drawn, nothing was tested."
     )
     return Plot("where", panels, text + words.limits * bool(lines), text + words.limits * bool(lines))
@@ -234,15 +233,9 @@ def _bare(words: str) -> str:
     return words.partition(" at ")[0].partition(" of ")[0].partition(" when ")[0]
 
 
-def _map(
-    axes: tuple[Shown, Shown],
-    rows: Mapping[str, FloatArray],
-    met: BoolArray,
-    weight: FloatArray,
-    crash: BoolArray,
-    events: str,
-) -> Panel:
-    """Share of events that crash in cells; ``weight`` and ``crash`` are those of the rows that ``met`` one."""
+def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArray, events: str) -> Panel:
+    """Share of events that crash in cells, of the rows that ``met`` one."""
+    weight, crash = rows["weight"][met], rows["outcome"][met] == CRASH
     of, n = crash if crash.any() else np.ones_like(crash), crash.size
     cells = int(np.clip(0.7 * math.sqrt(n), 12, 40))  # with few events each in one of its own
     values, edges = list[FloatArray](), list[FloatArray]()

@@ -21,8 +21,7 @@ from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.numbers import WIDEST_RHW, count, leaves, number, plain, share, words
 from harness.report.notes import note_words
-from harness.report.rows import Row, end, rows_of
-from harness.report.traffic_words import too_few, with_traffic
+from harness.report.rows import Row, end, rows_of, too_few, with_traffic
 from harness.sampling.milder import n_left_out
 from harness.strata import ASSUMPTION_FREE
 

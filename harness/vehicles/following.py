@@ -78,22 +78,15 @@ def behind(driver: Record, headway_s: float, speed: float, lead: Ahead) -> float
 
 @compiled_inline
 def follow_on(
-    driver: Record,
-    headway_s: float,
-    memory: Memory,
-    since: int,
-    waits: bool,
-    speed: float,
-    lead: Ahead,
-    revealed: Ahead,
+    driver: Record, headway_s: float, memory: Memory, since: int, late: bool, speed: float, lead: Ahead, revealed: Ahead
 ) -> Memory:
     """What a driver does in a step, as what it will remember of it.
 
-    ``since`` counts steps from the first in which it reacts to the event, and is negative before; it ``waits`` between
-    the onset and that.
+    ``since`` counts steps from the first in which it reacts to the event, and is negative before; it is ``late``
+    between the onset and that.
     """
     before, danger = memory.acceleration, memory.danger
-    if waits or (driver.kind == CONSTANT_KIND and since < 0):
+    if late or (driver.kind == CONSTANT_KIND and since < 0):
         return memory
     if driver.kind == CAREFUL_COMPETENT_KIND and since >= 0:
         wanted, danger = careful_competent(driver, headway_s, memory, since, speed, lead, revealed)

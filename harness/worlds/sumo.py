@@ -175,21 +175,17 @@ SPEED_CHECK_STEPS = 10
 class SumoWorld(SumoCells):
     """World in SUMO, one in a process: libsumo holds no more; see `harness.worlds.World`.
 
-    ``vanilla`` lets SUMO plan in every step (action step 0.1 s), as a reference for tests; ``shim`` uses the compiled
-    shim where it is installed, with the same bits.
+    ``shim`` uses the compiled shim where it is installed, with the same bits.
     """
 
     _open: ClassVar[bool] = False
     _shim: Shim | None = None
 
-    def __init__(
-        self, n_cells: int, vehicles: Sequence[str] = VEHICLES, *, vanilla: bool = False, shim: bool = True
-    ) -> None:
+    def __init__(self, n_cells: int, vehicles: Sequence[str] = VEHICLES, *, shim: bool = True) -> None:
         if SumoWorld._open:
             mend = "Close the other world first, or use another process."
             raise CampaignError("libsumo", "a simulation that already runs in this process", "one at a time", mend)
         super().__init__(n_cells, vehicles)
-        self._vanilla = vanilla
         self._told: FloatArray = np.zeros_like(self.x)
         self._n_steps = 0
         self._running = False
@@ -203,9 +199,6 @@ class SumoWorld(SumoCells):
         self._set_speed, self._simulation_step = inner.vehicle_setSpeed, inner.simulation_step
         self._get_collisions = inner.simulation_getCollisions
         self._shim = open_shim(self._flat, self._told, self.x, self.v) if shim else None
-
-    def _type_of(self, vehicle: int) -> str:
-        return "vanilla" if self._vanilla else super()._type_of(vehicle)
 
     def load_again(self) -> None:
         """Begin a new simulation, all vehicles parked."""
@@ -257,10 +250,6 @@ class SumoWorld(SumoCells):
         names = compress(self._flat, changed.tobytes())
         deque(map(self._set_speed, names, speed[changed].tolist()), maxlen=0)
         self._told[:] = speed
-
-    def _plan_every(self, to: Any, seconds: float, name: str) -> None:
-        if not self._vanilla:
-            super()._plan_every(to, seconds, name)
 
     def _require_equal(
         self, unit: str, getter: Callable[[str], float], expected: FloatArray, names: Sequence[str] | None = None

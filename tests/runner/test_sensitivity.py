@@ -13,7 +13,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
-from harness.report.traffic_words import bar_note
+from harness.report.rows import bar_note
 from harness.runner.sensitivity import Move, bar_of, moves, sensitivity
 from harness.runner.stored_shells import Nearby
 from tests.stored_runs import copy_of, edit, manifest

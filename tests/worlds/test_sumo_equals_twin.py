@@ -55,6 +55,18 @@ class Motion(NamedTuple):
     contact: np.ndarray
 
 
+def planning(world: type) -> type:
+    """A kind of world whose vehicles SUMO lets plan in every step (action step 0.1 s): a reference."""
+
+    class Vanilla(world):
+        def _type_of(self, _vehicle):
+            return "vanilla"
+
+        def _plan_every(self, *_): ...
+
+    return Vanilla
+
+
 def record(job: Job) -> tuple[list[Motion], np.ndarray]:
     """Episodes in index order, with their outcomes (n,).
 
@@ -89,7 +101,8 @@ def record(job: Job) -> tuple[list[Motion], np.ndarray]:
             read(np.zeros(job.n_cells, bool))
             return contact
 
-    with closing(RecordedWorld(job.n_cells, vanilla=job.vanilla, shim=job.shim)) as world:
+    of = planning(RecordedWorld) if job.vanilla else RecordedWorld
+    with closing(of(job.n_cells, shim=job.shim)) as world:
         shard = run_episodes(job, world)
     quantities, placed = [np.stack(values) for values in zip(*seen, strict=True)], np.stack(filled)
     steps = np.flatnonzero(~placed.any(axis=1))
@@ -284,8 +297,10 @@ SPEEDS = {
 @pytest.mark.parametrize("vanilla", [False, True])
 @pytest.mark.parametrize("speeds", SPEEDS)
 def test_a_step_of_sumo_is_the_formula_in_every_bit(speeds, vanilla, open_world):
+    from harness.worlds.sumo import SumoWorld
+
     random = np.random.default_rng(SEED)
-    world = open_world(CELLS, vanilla=vanilla)
+    world = open_world(CELLS, of=planning(SumoWorld) if vanilla else SumoWorld)
     everywhere, lanes = np.arange(CELLS), np.tile(np.array([1, 1, 0], np.int8), (CELLS, 1))
     for _ in range(ROUNDS):
         x, (before, after) = random_positions(random), SPEEDS[speeds](random)

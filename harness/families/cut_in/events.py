@@ -22,7 +22,7 @@ from harness.families.protocol import HOLDING, Events, Paths, Recorded
 from harness.random_stream import LV_DRAWS, uniform
 from harness.vehicles.drivers import Followers
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
-from harness.vocabulary import AV, CUT_IN, LV, Int8Array, IntArray, RecordArray
+from harness.vocabulary import AV, CUT_IN, LV, Int8Array, IntArray
 
 FREE_DRAWS_PER_CUT_IN = 256
 """Stride of the uniforms for BV's free driving: each cut-in time of a path of a pool has draws of its own."""
@@ -57,15 +57,14 @@ def enumerate_cut_ins(
     first = np.zeros(n, np.int64) if offset is None else offset
     scratch = empty_trajectory(traffic)
     known = unboxed(traffic), unboxed(drivers), unboxed(recorded)
-    _enumerate(seed, paths.number, paths.start, stride, first, *known, unboxed(scratch), unboxed(found))
+    _enumerate(seed, unboxed(paths), stride, first, *known, unboxed(scratch), unboxed(found))
     return found
 
 
 @compiled_threads
 def _enumerate(
     seed: int,
-    index: IntArray,
-    state: RecordArray,
+    paths: Paths,
     stride: int,
     offset: IntArray,
     environment: Environment,
@@ -75,11 +74,10 @@ def _enumerate(
     found: Events,
 ) -> None:
     max_steps = environment.numbers.max_steps
-    for i in range(index.size):
-        if recorded.n_steps.size == 0:
-            steps = reach = walk(state[i], seed, index[i], 0, max_steps, True, environment, path)
-        else:
-            reach = walk(state[i], seed, index[i], 0, max_steps, False, environment, path)
+    for i in range(offset.size):
+        number, keeps_speed = paths.number[i], recorded.n_steps.size == 0
+        steps = reach = walk(paths.start[i], seed, number, 0, max_steps, keeps_speed, environment, path)
+        if not keeps_speed:
             steps = min(recorded.n_steps[i], reach)
             for step in range(steps + 1):
                 path.x[step, AV], path.v[step, AV] = recorded.x_m[i, step], recorded.v_mps[i, step]
@@ -89,9 +87,9 @@ def _enumerate(
             if path.hazard[cut] > 0.0 and cut % stride == offset[i]:
                 found.probability[i, cut] = stride * (math.exp(-hazard) * -math.expm1(-path.hazard[cut]))
                 if followers.drivers.size > 0:
-                    leave(cut, max_steps, seed, index[i], cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
+                    leave(cut, max_steps, seed, number, cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
                     if gap(path.x[cut + 1, LV], path.x_after[cut + 1]) >= CONTACT_M:  # else it ends as bv_lv_contact
-                        lead = draw_lead(cut, seed, index[i], environment.lateral)
+                        lead = draw_lead(cut, seed, number, environment.lateral)
                         found.crashes[i, cut] = who_crashes(followers, cut, lead, environment, path)
             hazard += path.hazard[cut]
         found.log_any[i] = math.log(-math.expm1(-hazard))
@@ -115,25 +113,18 @@ def write_maneuvers(
     n_lv, n_bv, lead = np.zeros((3, n), np.int64)
     found = Maneuvers(lv, bv, n_lv, n_bv, lead)
     known = unboxed(environment), unboxed(scratch), unboxed(found)
-    _write(seed, paths.number, cut, paths.start, draws_per_cut_in, *known)
+    _write(seed, unboxed(paths), cut, draws_per_cut_in, *known)
     return found
 
 
 @compiled_threads
 def _write(
-    seed: int,
-    index: IntArray,
-    cut: IntArray,
-    state: RecordArray,
-    draws_per_cut_in: int,
-    environment: Environment,
-    path: Trajectory,
-    found: Maneuvers,
+    seed: int, paths: Paths, cut: IntArray, stride: int, environment: Environment, path: Trajectory, found: Maneuvers
 ) -> None:
     n, lv, bv = environment.numbers, found.lv, found.bv
-    for i in range(index.size):
-        until = cut[i] + 1 if cut[i] >= 0 else n.max_steps
-        steps = walk(state[i], seed, index[i], 0, until, False, environment, path)
+    for i in range(cut.size):
+        number, until = paths.number[i], cut[i] + 1 if cut[i] >= 0 else n.max_steps
+        steps = walk(paths.start[i], seed, number, 0, until, False, environment, path)
         before = (steps - 1) // n.hold_steps + 1
         for m in range(before):
             lv[i, m], bv[i, m] = path.lv[m], path.bv[m]
@@ -141,16 +132,16 @@ def _write(
         if cut[i] < 0:
             continue
         bv[i, before] = CUT_IN
-        drawn = leave(cut[i], n.max_steps, seed, index[i], cut[i] * draws_per_cut_in, 0, environment, path)
+        drawn = leave(cut[i], n.max_steps, seed, number, cut[i] * stride, 0, environment, path)
         for m in range(drawn):
             bv[i, before + 1 + m] = path.free[m]
         found.n_bv[i] += 1 + drawn
-        found.lead[i] = draw_lead(cut[i], seed, index[i], environment.lateral)
+        found.lead[i] = draw_lead(cut[i], seed, number, environment.lateral)
         found.n_lv[i] = (n.max_steps - 1) // n.hold_steps + 1
         v = path.v[0, LV]
         for step in range(n.max_steps):
             m = step // n.hold_steps
             if step % n.hold_steps == 0 and m >= before:
-                u = uniform(seed, index[i], LV_DRAWS, m)
+                u = uniform(seed, number, LV_DRAWS, m)
                 lv[i, m] = laws.drive_freely(u, v, environment)
             v = next_speed(v, laws.acceleration(lv[i, m]))

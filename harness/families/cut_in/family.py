@@ -24,16 +24,12 @@ from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
 from harness.families.protocol import Chosen, Column, Exposure, Family, Paths
 from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
 
-_STATE_DOCS = (
-    "speed of BV",
-    "gap LV-BV, bumper to bumper",
-    "rate of R1: v_LV - v_BV",
-    "gap BV-AV, bumper to bumper",
-    "rate of R2: v_BV - v_AV",
-)
-STATE_FACTS = tuple(
-    Column(name, pa.float64(), "m/s" if name.endswith("_mps") else "m", doc)
-    for name, doc in zip(STATE_COLUMNS, _STATE_DOCS, strict=True)
+STATE_FACTS = (
+    Column("v_bv_mps", pa.float64(), "m/s", "speed of BV"),
+    Column("r1_m", pa.float64(), "m", "gap LV-BV, bumper to bumper"),
+    Column("r1dot_mps", pa.float64(), "m/s", "rate of R1: v_LV - v_BV"),
+    Column("r2_m", pa.float64(), "m", "gap BV-AV, bumper to bumper"),
+    Column("r2dot_mps", pa.float64(), "m/s", "rate of R2: v_BV - v_AV"),
 )
 MANEUVER_FACTS = (
     Column("lv_maneuvers", pa.list_(pa.int8()), "1", "LV's draws, in order", "n_lv"),
@@ -114,7 +110,7 @@ class CutIn(Family):
         states = InitialStates(traffic.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
         return float((states["v_bv_mps"] - states["r2dot_mps"]).mean())
 
-    def exposure(self, traffic: Environment, parameters: Any) -> Exposure:  # noqa: ARG002 - counted, whatever the laws
+    def exposure(self, traffic: Environment, parameters: Any) -> Exposure:  # counted, whatever the laws
         return EXPOSURE
 
     def sources(self) -> Mapping[Method, type[Any]]:
@@ -129,7 +125,7 @@ class CutIn(Family):
         maneuvers = write_maneuvers(seed, paths, event, traffic, FREE_DRAWS_PER_CUT_IN if of_pool else 0)
         return Chosen(facts_of(paths.start, maneuvers), event, maneuvers.lead)
 
-    def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:  # noqa: ARG002 - records have its lead
+    def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:  # records have its lead
         return np.asarray(np.maximum(chosen.at - chosen.lead, 0))
 
     def avoidable(

@@ -30,16 +30,7 @@ from harness.compiled import compiled_inline
 from harness.families.cut_in.lateral import LateralMotion
 from harness.families.flow import Flow
 from harness.random_stream import INITIAL, uniforms
-from harness.vocabulary import (
-    ACCELERATIONS_MPS2,
-    N_ACCELERATIONS,
-    STATE_COLUMNS,
-    FloatArray,
-    Record,
-    RecordArray,
-    State,
-    states_from,
-)
+from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, Record, RecordArray, State, states_from
 
 FREE_DRIVING, CAR_FOLLOWING = 0, 1
 """Which table of noise a law has."""
@@ -321,7 +312,7 @@ class InitialStates(Flow):
 
     def draw(self, seed: int, first_episode: int, n_episodes: int) -> RecordArray:
         """States of consecutive episodes, shape (n_episodes,)."""
-        return self.from_uniforms(uniforms(seed, first_episode, n_episodes, INITIAL, len(STATE_COLUMNS)))
+        return self.from_uniforms(uniforms(seed, first_episode, n_episodes, INITIAL, len(State._fields)))
 
     def from_uniforms(self, u: FloatArray) -> RecordArray:
         """States (n,) from uniforms (n, 5), one for each of their numbers."""

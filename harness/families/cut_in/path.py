@@ -76,12 +76,12 @@ def empty_trajectory(environment: Environment) -> Trajectory:
 
 @compiled_inline
 def place(state: State, x: FloatArray, v: FloatArray) -> None:
-    """Positions and speeds (3,) of LV, BV, AV in an initial state."""
+    """Positions and speeds (3,) of LV, BV, AV in an initial state; (3, n) in several."""
     x[AV] = AV_START_M
     x[BV] = AV_START_M + VEHICLE_LENGTH_M + state.r2_m
     x[LV] = x[BV] + VEHICLE_LENGTH_M + state.r1_m
     v[BV] = state.v_bv_mps
-    v[LV] = max(state.v_bv_mps + state.r1dot_mps, 0.0)
+    v[LV] = np.maximum(state.v_bv_mps + state.r1dot_mps, 0.0)
     v[AV] = state.v_bv_mps - state.r2dot_mps
 
 
@@ -150,18 +150,11 @@ def weigh_cut_ins(steps: int, environment: Environment, path: Trajectory) -> flo
 
 @compiled_inline
 def leave(
-    cut: int,
-    until: int,
-    seed: int,
-    episode: int,
-    first_draw: int,
-    known: int,
-    environment: Environment,
-    path: Trajectory,
+    cut: int, until: int, seed: int, episode: int, first: int, known: int, environment: Environment, path: Trajectory
 ) -> int:
     """BV's motion from its cut-in in step ``cut`` to a step; returns how many maneuvers that takes.
 
-    The first ``known`` of them stand in ``path``; the others are drawn, ``first_draw`` being the index of the first.
+    The first ``known`` of them stand in ``path``; the others are drawn, ``first`` being the index of the first.
     """
     hold_steps = environment.numbers.hold_steps
     x, v = path.x[cut, BV], path.v[cut, BV]
@@ -170,7 +163,7 @@ def leave(
     for step in range(cut, until):
         if step > cut and (step - cut - 1) % hold_steps == 0:
             if draws >= known:
-                u = uniform(seed, episode, BV_FREE_DRAWS, first_draw + draws)
+                u = uniform(seed, episode, BV_FREE_DRAWS, first + draws)
                 path.free[draws] = laws.drive_freely(u, v, environment)
             a = acceleration(path.free[draws])
             draws += 1

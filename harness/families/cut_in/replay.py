@@ -66,27 +66,21 @@ def leave_stored(i: int, until: int, stored: StoredPaths, environment: Environme
 
 @compiled_threads
 def drive_others(
-    stored: StoredPaths,
-    start: FloatArray,
-    environment: Environment,
-    drivers: RecordArray,
-    path: Trajectory,
-    end: IntArray,
-    motion: FloatArray,
+    tests: StoredPaths, start: FloatArray, environment: Environment, drivers: RecordArray, path: Trajectory, out: Driven
 ) -> None:
     """Drive others in the AV's place along stored episodes with a cut-in, from the end of the step of its onset.
 
-    ``start`` (n, 2) is the AV's position (m) and speed (m/s) then, NaN where it has kept its speed until there. ``end``
-    (n, D) receives the step after which each of ``drivers`` (D,) has run into BV, `NO_CRASH` or `WAS_AHEAD`, and
-    ``motion`` (D, steps + 1, 2) its position (m) and speed (m/s) in the last of the episodes; (0, 0, 0) is not filled.
-    ``path`` is room to work in, and holds BV's motion of the last episode, as if nobody had hit it.
+    ``start`` (n, 2) is the AV's position (m) and speed (m/s) then, NaN where it has kept its speed until there.
+    ``out.end`` receives the step after which each of ``drivers`` (D,) has run into BV, `NO_CRASH` or `WAS_AHEAD`, and
+    ``out.motion`` its motion in the last of the episodes, unless that is of shape (0, 0, 0). ``path`` is room to work
+    in, and holds BV's motion of the last episode, as if nobody had hit it.
     """
-    most = environment.numbers.max_steps
-    for i in range(stored.cut_step.size):
-        cut, lead = stored.cut_step[i], stored.script.lead[i]
-        known, after = recall(i, stored, path), onset_of(cut, lead) + 1
-        walk(stored.state[i], stored.seed, stored.episode[i], known, cut + 1, False, environment, path)
-        leave_stored(i, most, stored, environment, path)
+    most, motion = environment.numbers.max_steps, out.motion
+    for i in range(tests.cut_step.size):
+        cut, lead = tests.cut_step[i], tests.script.lead[i]
+        known, after = recall(i, tests, path), onset_of(cut, lead) + 1
+        walk(tests.state[i], tests.seed, tests.episode[i], known, cut + 1, False, environment, path)
+        leave_stored(i, most, tests, environment, path)
         if not math.isnan(start[i, 0]):
             path.x[after, AV], path.v[after, AV] = start[i]
         if motion.size > 0:
@@ -98,8 +92,8 @@ def drive_others(
                 follow(1, drivers, cut, lead, until, path)
                 if motion.size > 0:
                     motion[d, until, 0], motion[d, until, 1] = path.follower[0].x, path.follower[0].v
-                end[i, d] = path.follower[0].end
-                if end[i, d] != NO_CRASH:
+                out.end[i, d] = path.follower[0].end
+                if out.end[i, d] != NO_CRASH:
                     break
 
 
@@ -110,10 +104,10 @@ def drive_along(
     n, steps = len(chosen.facts), int(traffic.numbers["max_steps"])
     known = maneuvers_of(chosen)
     stored = StoredPaths(0, np.zeros(n, np.int64), states_of(chosen.facts), np.full(n, steps), chosen.at, known)
-    end, path = np.zeros((n, len(drivers)), np.int64), empty_trajectory(traffic)
-    motion = np.zeros((len(drivers), steps + 1, 2) if last else (0, 0, 0))
-    drive_others(unboxed(stored), start, unboxed(traffic), drivers, unboxed(path), end, motion)
-    return Driven(end, motion, np.stack((path.x_after, path.v_after), axis=1))
+    motion, path = np.zeros((len(drivers), steps + 1, 2) if last else (0, 0, 0)), empty_trajectory(traffic)
+    driven = Driven(np.zeros((n, len(drivers)), np.int64), motion, np.zeros((0, 0)))
+    drive_others(unboxed(stored), start, unboxed(traffic), drivers, unboxed(path), unboxed(driven))
+    return driven._replace(ahead=np.stack((path.x_after, path.v_after), axis=1))
 
 
 def avoids(

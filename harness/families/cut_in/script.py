@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from harness.compiled import compiled_threads, unboxed
@@ -11,18 +13,7 @@ from harness.families.cut_in.path import place
 from harness.families.protocol import Chosen
 from harness.loop.cells import Script, natural_script
 from harness.vehicles.kinematics import next_speed
-from harness.vocabulary import (
-    BV,
-    LV,
-    STATE_COLUMNS,
-    STATE_DTYPE,
-    VEHICLES,
-    FloatArray,
-    Int8Array,
-    IntArray,
-    RecordArray,
-    states_from,
-)
+from harness.vocabulary import AV, BV, LV, STATE_COLUMNS, FloatArray, Int8Array, IntArray, RecordArray, states_from
 
 LEFT, RIGHT = 1, 0
 _LENGTHS = {"lv_maneuvers": "n_lv", "bv_maneuvers": "n_bv"}
@@ -33,7 +24,7 @@ def facts_of(state: RecordArray, maneuvers: Maneuvers) -> RecordArray:
     draws = maneuvers.lv.shape[1]
     lists = [(name, np.int8, (draws,)) for name in _LENGTHS]
     lengths = [(name, np.int64) for name in _LENGTHS.values()]
-    facts: RecordArray = np.zeros(len(state), np.dtype([*STATE_DTYPE.descr, *lists, *lengths]))
+    facts: RecordArray = np.zeros(len(state), np.dtype([*state.dtype.descr, *lists, *lengths]))
     for name in STATE_COLUMNS:
         facts[name] = state[name]
     facts["lv_maneuvers"], facts["bv_maneuvers"] = maneuvers.lv, maneuvers.bv
@@ -54,18 +45,12 @@ def maneuvers_of(chosen: Chosen) -> Maneuvers:
 
 def beginning(state: RecordArray) -> tuple[FloatArray, FloatArray, Int8Array]:
     """Positions (m), speeds (m/s) and lanes (n, 3) of LV, BV and AV in initial states (n,)."""
-    n = len(state)
-    x, v = np.zeros((2, n, len(VEHICLES)))
-    _place(state, x, v)
-    lane = np.zeros((n, len(VEHICLES)), np.int8)
+    columns: Any = state.view(np.recarray)
+    x, v = np.zeros((2, len(state), AV + 1))
+    place(columns, x.T, v.T)
+    lane = np.zeros(x.shape, np.int8)
     lane[:, [LV, BV]] = LEFT
     return x, v, lane
-
-
-@compiled_threads
-def _place(state: RecordArray, x: FloatArray, v: FloatArray) -> None:
-    for i in range(state.size):
-        place(state[i], x[i], v[i])
 
 
 def script_of(traffic: Environment, chosen: Chosen) -> Script:

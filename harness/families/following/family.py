@@ -26,7 +26,7 @@ from harness.families.following.approach import (
     empty_motion,
     starts_from,
 )
-from harness.families.following.follow import STATE, drive_others, enumerate_events, move_others
+from harness.families.following.follow import STATE, Tests, drive_others, enumerate_events, move_others
 from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
 from harness.families.following.words import STAND_INS
 from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, Family, Paths, Recorded
@@ -34,7 +34,7 @@ from harness.loop.cells import Script, natural_script
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray, RecordArray
+from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 START_FACTS = (
     Column("start_speed_mps", pa.float64(), "m/s", "initial speed of all but a revealed vehicle"),
@@ -125,7 +125,7 @@ class FollowingFamily(Family):
         seed: int,
         paths: Paths,
         drivers: Followers,
-        recorded: Recorded = HOLDING,  # noqa: ARG002 - what the AV does moves no probability
+        recorded: Recorded = HOLDING,  # what the AV does moves no probability
         stride: int = 1,
         offset: IntArray | None = None,
     ) -> Events:
@@ -139,15 +139,7 @@ class FollowingFamily(Family):
         enumerate_events(paths.start, accelerations, stride, first, *known, track, at_onset, unboxed(found))
         return found
 
-    def choose(
-        self,
-        traffic: Following,
-        seed: int,
-        paths: Paths,
-        event: IntArray,
-        *,
-        of_pool: bool = True,  # noqa: ARG002
-    ) -> Chosen:
+    def choose(self, traffic: Following, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
         n, seconds = event.size, -(-int(traffic.numbers["onset"]) // 10)
         lists = [("lead_accelerations", np.int8, (seconds,)), ("n_seconds", np.int64)]
         real = [(each.name, np.float64) for each in self.columns if each.kind == pa.float64()]
@@ -164,7 +156,7 @@ class FollowingFamily(Family):
         lead = np.where(clear - onset < traffic.numbers["max_steps"], clear - onset - 1, 0)
         return Chosen(facts, np.where(event < 0, -1, onset + lead), np.where(event < 0, 0, lead))
 
-    def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:  # noqa: ARG002
+    def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
         """Facts of the family's own, of events (n,) with a vehicle ahead at a speed: here those of its grid."""
         return {each.name: events[each.name] for each in self.columns if each.name in (EVENT_DTYPE.names or ())}
 
@@ -172,8 +164,7 @@ class FollowingFamily(Family):
         n, others = len(facts), len(self.vehicles) - 1
         x, speed = np.zeros((n, others)), np.zeros((n, self.max_steps(traffic), others))
         clear = np.zeros(n, np.int64)
-        known = unboxed(traffic), unboxed(empty_motion(traffic))
-        move_others(*beginning(facts), events_of(traffic, facts["event"]), *known, x, speed, clear)
+        move_others(_tests(traffic, facts), unboxed(traffic), unboxed(empty_motion(traffic)), x, speed, clear)
         return x, speed, clear
 
     def script(self, traffic: Following, chosen: Chosen) -> Script:
@@ -182,7 +173,8 @@ class FollowingFamily(Family):
         n, steps, others = speed.shape
         x = np.column_stack((ahead, np.full(n, AV_START_M)))
         v = np.tile(facts["start_speed_mps"][:, None], (1, others + 1))
-        lane, lanes, visible = np.zeros((n, others + 1), np.int8), np.zeros(speed.shape, np.int8), np.zeros((n, others))
+        lane, lanes = np.zeros((n, others + 1), np.int8), np.zeros(speed.shape, np.int8)
+        visible = np.zeros((n, others), np.int64)
         lateral = events_of(traffic, facts["event"])["lateral_mps"]
         if others > 1:
             v[:, 1] = speed[:, 0, 1]
@@ -191,30 +183,24 @@ class FollowingFamily(Family):
                 onset + seen_after(float(traffic.numbers["visible_from_m"]), w, c - onset) if w > 0.0 else steps + 1
                 for w, c in zip(lateral.tolist(), clear.tolist(), strict=True)
             ]
-        return natural_script(
-            x, v, lane, speed, lanes, chosen.at, chosen.lead,
-            acts_from=0, visible_from=visible.astype(np.int64), headway_s=facts["natural_headway_s"],
-            sideways_mps=np.nan_to_num(lateral), set_speed_mps=float(traffic.numbers["approach__set_speed_mps"]),
-        )  # fmt: skip
+        return natural_script(x, v, lane, speed, lanes, chosen.at, chosen.lead)._replace(
+            acts_from=np.zeros(n, np.int64),
+            visible_from=visible,
+            headway_s=facts["natural_headway_s"].copy(),
+            sideways_mps=np.nan_to_num(lateral),
+            set_speed_mps=np.full(n, float(traffic.numbers["approach__set_speed_mps"])),
+        )
 
     def onset(self, traffic: Following, chosen: Chosen) -> IntArray:
         return np.where(chosen.at < 0, -1, int(traffic.numbers["onset"]))
 
     def drive(
-        self,
-        traffic: Following,
-        chosen: Chosen,
-        start: FloatArray,  # noqa: ARG002 - whoever follows has followed from the start
-        drivers: RecordArray,
-        *,
-        last: bool = False,
+        self, traffic: Following, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
     ) -> Driven:
-        steps, facts = self.max_steps(traffic), chosen.facts
+        steps, facts = self.max_steps(traffic), chosen.facts  # whoever follows has done so from the start
         end, tracks = np.zeros((len(facts), len(drivers)), np.int64), np.zeros((len(drivers), steps + 1, 2))
         room = empty_motion(traffic)
-        drive_others(
-            *beginning(facts), events_of(traffic, facts["event"]), unboxed(traffic), drivers, unboxed(room), tracks, end
-        )
+        drive_others(_tests(traffic, facts), unboxed(traffic), drivers, unboxed(room), tracks, end)
         ahead = np.stack((room.x[:, self.principal], room.v[:, self.principal]), axis=1)
         return Driven(end, tracks if last else np.zeros((0, 0, 0)), ahead if last else np.zeros((0, 0)))
 
@@ -222,11 +208,12 @@ class FollowingFamily(Family):
         return None
 
 
-def beginning(facts: RecordArray) -> tuple[RecordArray, Int8Array]:
-    """How paths of tests (n,) begin, and what the vehicle ahead draws."""
+def _tests(traffic: Following, facts: RecordArray) -> Tests:
+    """Tests (n,) by their facts, for kernels."""
     start: RecordArray = np.zeros(len(facts), START_DTYPE)
     start["speed_mps"], start["natural_headway_s"] = facts["start_speed_mps"], facts["natural_headway_s"]
-    return start, np.ascontiguousarray(facts["lead_accelerations"])
+    drawn = np.ascontiguousarray(facts["lead_accelerations"])
+    return unboxed(Tests(start, drawn, events_of(traffic, facts["event"])))
 
 
 def events_of(traffic: Following, number: IntArray) -> RecordArray:

@@ -92,7 +92,7 @@ class FollowingFitter:
     def observe(self, recording: Recording) -> None:
         self._seen.append(self.seen(recording))
 
-    def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:  # noqa: ARG002 - it has no page
+    def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:
         base = self.family.default_parameters
         hours = math.fsum(each.hours for each in self._seen)
         events = np.concatenate([each.events for each in self._seen])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.following.approach import AV_START_M, LEAD, REVEALED, Following, Motion, happen, in_scope, walk
@@ -19,6 +20,14 @@ STATE = 3
 """Of a driver at the onset: position (m), speed (m/s), acceleration (m/s²)."""
 
 
+class Tests(NamedTuple):
+    """Tests (n,): how they begin, what the vehicle ahead draws in each second (n, seconds), and what it then does."""
+
+    start: RecordArray
+    accelerations: Int8Array
+    event: RecordArray
+
+
 @compiled_inline
 def behind(motion: Motion, vehicle: int, step: int, x: float) -> Ahead:
     """A vehicle ahead of a driver at a position (m)."""
@@ -28,38 +37,22 @@ def behind(motion: Motion, vehicle: int, step: int, x: float) -> Ahead:
 
 
 @compiled_inline
-def approach(driver: Record, natural_s: float, until: int, motion: Motion, track: FloatArray) -> tuple[int, float]:
-    """Drive up to a step; returns `NO_CRASH` or the step after which it has crashed, and its acceleration (m/s²).
-
-    ``track`` (steps + 1, 2) receives positions (m) and speeds (m/s).
-    """
-    headway_s, memory = headway_of(driver, natural_s, motion.v[0, LEAD]), Memory(0.0, math.inf, 0.0)
-    track[0, 0], track[0, 1] = AV_START_M, motion.v[0, LEAD]
-    for step in range(until):
-        x, v = track[step, 0], track[step, 1]
-        lead = behind(motion, LEAD, step, x)
-        memory = follow_on(driver, headway_s, memory, -1, False, v, lead, Ahead(v, math.inf, 0.0))
-        v_after = next_speed(v, memory.acceleration)
-        track[step + 1, 0], track[step + 1, 1] = next_position(x, v, v_after), v_after
-        if gap(motion.x[step + 1, LEAD], track[step + 1, 0]) < CONTACT_M:
-            return step + 1, memory.acceleration
-    return NO_CRASH, memory.acceleration
-
-
-@compiled_inline
-def meet(
+def drive_on(
     driver: Record,
     natural_s: float,
     event: Record,
     clear: int,
+    first: int,
+    until: int,
+    acceleration: float,
     numbers: Record,
     motion: Motion,
-    acceleration: float,
     track: FloatArray,
-) -> int:
-    """Drive on from the onset; returns `NO_CRASH`, or the step after which the driver has run into a vehicle ahead.
+) -> tuple[int, float]:
+    """Drive from a step to another; ``track`` (steps + 1, 2) receives positions (m) and speeds (m/s).
 
-    That is also the case where both stand; then the test is over.
+    Returns `NO_CRASH`, or the step after which the driver has run into a vehicle ahead, and its acceleration (m/s²). It
+    is also `NO_CRASH` where both stand after the onset; then the test is over.
     """
     headway_s, memory = headway_of(driver, natural_s, motion.v[0, LEAD]), Memory(acceleration, math.inf, 0.0)
     onset, reveals = numbers.onset, clear < NEVER
@@ -68,7 +61,7 @@ def meet(
         least_m = max(driver.perceives_lateral_m, numbers.visible_from_m)
         perceived = onset + seen_after(least_m, event.lateral_mps, clear - onset)
     reacts = perceived + int(driver.delay_steps)
-    for step in range(onset, numbers.max_steps):
+    for step in range(first, until):
         x, v = track[step, 0], track[step, 1]
         nobody = Ahead(v, math.inf, 0.0)
         lead = behind(motion, LEAD, step, x) if step < clear else nobody
@@ -78,12 +71,13 @@ def meet(
         x_after = next_position(x, v, v_after)
         track[step + 1, 0], track[step + 1, 1] = x_after, v_after
         if step < clear and gap(motion.x[step + 1, LEAD], x_after) < CONTACT_M:
-            return step + 1
-        if reveals and gap(motion.x[step + 1, REVEALED], x_after) < CONTACT_M:
-            return step + 1
-        if v_after == 0.0 and motion.v[step + 1, LEAD if step + 1 < clear else REVEALED] == 0.0:
-            return NO_CRASH
-    return NO_CRASH
+            return step + 1, memory.acceleration
+        if reveals and step >= onset and gap(motion.x[step + 1, REVEALED], x_after) < CONTACT_M:
+            return step + 1, memory.acceleration
+        ahead = LEAD if step + 1 < clear else REVEALED
+        if step >= onset and v_after == 0.0 and motion.v[step + 1, ahead] == 0.0:
+            return NO_CRASH, memory.acceleration
+    return NO_CRASH, memory.acceleration
 
 
 @compiled_inline
@@ -112,10 +106,11 @@ def enumerate_events(
     """
     n, drivers, above = traffic.numbers, followers.drivers, followers.counts_above_mps
     for i in range(start.size):
-        early = 0
+        early, natural_s, nothing = 0, start[i].natural_headway_s, traffic.grid[0]
         walk(start[i].speed_mps, accelerations[i], n, motion)
+        track[0, 0], track[0, 1] = AV_START_M, start[i].speed_mps
         for d in range(drivers.size):
-            end, a = approach(drivers[d], start[i].natural_headway_s, n.onset, motion, track)
+            end, a = drive_on(drivers[d], natural_s, nothing, NEVER, 0, n.onset, 0.0, n, motion, track)
             at_onset[d, 0], at_onset[d, 1], at_onset[d, 2] = track[n.onset, 0], track[n.onset, 1], a
             if end != NO_CRASH and hits_hard_enough(end, NEVER, above, motion, track):
                 early |= 1 << d
@@ -136,8 +131,8 @@ def enumerate_events(
                 if early >> d & 1:
                     continue
                 track[n.onset, 0], track[n.onset, 1] = at_onset[d, 0], at_onset[d, 1]
-                natural_s, a = start[i].natural_headway_s, at_onset[d, 2]
-                end = meet(drivers[d], natural_s, event, clear, n, motion, a, track)
+                a, most = at_onset[d, 2], n.max_steps
+                end, a = drive_on(drivers[d], natural_s, event, clear, n.onset, most, a, n, motion, track)
                 if end != NO_CRASH and hits_hard_enough(end, clear, above, motion, track):
                     found.crashes[i, e] |= 1 << d
         found.log_any[i] = math.log(min(total, 1.0)) if total > 0.0 else -math.inf
@@ -145,23 +140,16 @@ def enumerate_events(
 
 @compiled_threads
 def move_others(
-    start: RecordArray,
-    accelerations: Int8Array,
-    event: RecordArray,
-    traffic: Following,
-    motion: Motion,
-    x: FloatArray,
-    speed: FloatArray,
-    clear: IntArray,
+    tests: Tests, traffic: Following, motion: Motion, x: FloatArray, speed: FloatArray, clear: IntArray
 ) -> None:
     """The others' motion in tests (n,): first positions (n, O), speeds (n, steps, O), steps from which they are clear.
 
     ``x`` and ``speed`` have as many vehicles as the family; ``motion`` is room to work in.
     """
     most = traffic.numbers.max_steps
-    for i in range(start.size):
-        walk(start[i].speed_mps, accelerations[i], traffic.numbers, motion)
-        clear[i] = happen(event[i], most, traffic.numbers, motion)
+    for i in range(clear.size):
+        walk(tests.start[i].speed_mps, tests.accelerations[i], traffic.numbers, motion)
+        clear[i] = happen(tests.event[i], most, traffic.numbers, motion)
         for other in range(x.shape[1]):
             x[i, other] = motion.x[0, other]
             for step in range(most):
@@ -170,26 +158,18 @@ def move_others(
 
 @compiled_threads
 def drive_others(
-    start: RecordArray,
-    accelerations: Int8Array,
-    event: RecordArray,
-    traffic: Following,
-    drivers: RecordArray,
-    motion: Motion,
-    tracks: FloatArray,
-    end: IntArray,
+    tests: Tests, traffic: Following, drivers: RecordArray, motion: Motion, tracks: FloatArray, end: IntArray
 ) -> None:
     """Drive others in the AV's place in tests (n,); ``tracks`` (D, steps + 1, 2) holds the last of them afterwards.
 
     ``end`` (n, D) receives `NO_CRASH`, or the step after which each has crashed. ``motion`` is room to work in.
     """
     n = traffic.numbers
-    for i in range(start.size):
-        walk(start[i].speed_mps, accelerations[i], n, motion)
-        clear = happen(event[i], n.max_steps, n, motion)
+    for i in range(len(end)):
+        event, natural_s = tests.event[i], tests.start[i].natural_headway_s
+        walk(tests.start[i].speed_mps, tests.accelerations[i], n, motion)
+        clear = happen(event, n.max_steps, n, motion)
         for d in range(drivers.size):
-            track, natural_s = tracks[d], start[i].natural_headway_s
-            track[:] = 0.0
-            end[i, d], a = approach(drivers[d], natural_s, n.onset, motion, track)
-            if end[i, d] == NO_CRASH:
-                end[i, d] = meet(drivers[d], natural_s, event[i], clear, n, motion, a, track)
+            tracks[d] = 0.0
+            tracks[d, 0, 0], tracks[d, 0, 1] = AV_START_M, tests.start[i].speed_mps
+            end[i, d], _ = drive_on(drivers[d], natural_s, event, clear, 0, n.max_steps, 0.0, n, motion, tracks[d])

@@ -17,6 +17,7 @@ import numpy as np
 from harness.campaign.files import Places, validated
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
+from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.fitting.hazard import FREE_TTC_S, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
 from harness.families.cut_in.fitting.laws import LAWS, FittedLaw, Traffic, fit_rate
 from harness.families.cut_in.loading import load_environment, require_sound_laws
@@ -137,10 +138,7 @@ def replicates(fit: Fit, n: int, seed: int, progress: Progress) -> dict[str, Flo
     for _ in range(MOST_DRAWS):
         drawn = _draw(fit, n, random)
         for row in zip(*drawn.values(), strict=True):
-            try:
-                moved = fit.environment.with_values(dict(zip(drawn, row, strict=True)))
-                require_sound_laws(load_environment(settings, moved), "replicate")
-            except (CampaignError, ValueError):
+            if CUT_IN.traffic_with(settings, fit.environment, dict(zip(drawn, row, strict=True))) is None:
                 continue
             good.append(row)
             progress.advance(1)

@@ -21,7 +21,7 @@ from harness.fitting.protocol import Asked, Fitted
 from harness.fitting.recording import Recording
 from harness.fitting.table import places
 from harness.records.folder import parquet
-from harness.report.traffic_words import too_few
+from harness.report.rows import too_few
 
 OF_PAGE = b"Traffic fitted to trajectories"
 BASE = "ndd-overtaking-2"
@@ -54,7 +54,7 @@ class CutInFitter:
         tied = {"replicates": {"file": beside.name, "sha256": content_hash(drawn)}}
         text = f"{_text(fit, tally, asked)}\n{yaml_text(tied)}"
         told = [line for each in others.values() for line in each.told]
-        shows = page(fit, tally, noise_mps2, rows, out.name, asked.files, told)
+        shows = page(fit, tally, noise_mps2, asked, told)
         files = {out: text.encode(), shown: shows.encode(), beside: drawn}
         return Fitted(files, _told(fit, tally, asked.n_replicates), _facts(fit, tally))
 

@@ -287,18 +287,12 @@ def fit_free_driving(traffic: Traffic, base: Base) -> FittedLaw | None:
     u, k = _scaled(base, kinds // N_ACCELERATIONS / 4.0), kinds % N_ACCELERATIONS
     brakes = base["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2
 
-    def log_likelihood(
-        rows: RecordArray,
-        mean: FloatArray,
-        log_scale: FloatArray,
-        eta: FloatArray,
-        logit: FloatArray,
-        slope: FloatArray,
-    ) -> FloatArray:
+    def log_likelihood(rows: RecordArray, *predictors: FloatArray) -> FloatArray:
+        *student, logit, slope = predictors
         share = special.expit(logit)
         powers = np.exp(slope[:, None] * ACCELERATIONS_MPS2[brakes])
         braking = np.where(brakes[rows["bin"]], np.exp(slope * ACCELERATIONS_MPS2[rows["bin"]]), 0.0)
-        return _log((1.0 - share) * _in_bin(rows, mean, log_scale, eta) + share * braking / powers.sum(axis=1))
+        return _log((1.0 - share) * _in_bin(rows, *student) + share * braking / powers.sum(axis=1))
 
     designs = [_columns(k.size, *each) for each in ((1.0,), (1.0, u, u * u), (1.0,), (1.0, u), (1.0,))]
     counted = _binned(k, N_ACCELERATIONS - 1), cell
@@ -340,8 +334,8 @@ def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
     scale = _columns(rows.size, 1.0, np.minimum(np.abs(r1dot), n["rate_cap_mps"]))
     binned = _binned(bins(rows["acceleration_mps2"]), guard_caps(r1, r1dot, base))
 
-    def log_likelihood(rows: RecordArray, mean: FloatArray, log_scale: FloatArray, eta: FloatArray) -> FloatArray:
-        return _log(_in_bin(rows, mean, log_scale, eta))
+    def log_likelihood(rows: RecordArray, *predictors: FloatArray) -> FloatArray:
+        return _log(_in_bin(rows, *predictors))
 
     def values(theta: FloatArray) -> FloatArray:
         rate, gain, b0, b1, b2, closing, log_scale, log_scale_rate, eta = np.moveaxis(theta, -1, 0)

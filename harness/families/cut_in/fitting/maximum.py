@@ -123,35 +123,33 @@ def maximise(
     return None
 
 
+@dataclass(eq=False)
 class _Sum:
-    def __init__(
-        self,
-        log_likelihood: LogLikelihood,
-        rows: RecordArray,
-        designs: Sequence[FloatArray],
-        members: sparse.csr_array,
-        prior: Prior,
-    ) -> None:
-        self._row, self._rows, self._designs, self._members = log_likelihood, rows, designs, members
-        self.prior = prior
-        self._counts = np.asarray(members.sum(axis=0)).ravel()
-        self._ends = np.cumsum([design.shape[1] for design in designs])
+    log_likelihood: LogLikelihood
+    rows: RecordArray
+    designs: Sequence[FloatArray]
+    members: sparse.csr_array
+    prior: Prior
+
+    def __post_init__(self) -> None:
+        self._counts = np.asarray(self.members.sum(axis=0)).ravel()
+        self._ends = np.cumsum([design.shape[1] for design in self.designs])
 
     def thinned(self) -> _Sum:
         """The sum over a part of the rows, weighted to stand for all."""
-        n = self._rows.size
+        n = self.rows.size
         few = np.arange(0, n, n // _ROWS_AT_FIRST)
-        designs = [design[few] for design in self._designs]
-        return _Sum(self._row, self._rows[few], designs, self._members[:, few] * (n / few.size), self.prior)
+        designs = [design[few] for design in self.designs]
+        return replace(self, rows=self.rows[few], designs=designs, members=self.members[:, few] * (n / few.size))
 
     def _predictors(self, theta: FloatArray) -> list[FloatArray]:
         parts = np.split(theta, self._ends[:-1])
-        return [design @ part for design, part in zip(self._designs, parts, strict=True)]
+        return [design @ part for design, part in zip(self.designs, parts, strict=True)]
 
     def value(self, theta: FloatArray) -> float:
         """Penalised log-likelihood; -inf where it is not defined."""
         with np.errstate(all="ignore"):
-            value = self._counts @ self._row(self._rows, *self._predictors(theta))
+            value = self._counts @ self.log_likelihood(self.rows, *self._predictors(theta))
             off = self.prior.weights @ (theta - self.prior.centre)
             value -= 0.5 * float(off @ off)
         return float(value) if np.isfinite(value) else -np.inf
@@ -165,7 +163,7 @@ class _Sum:
             shifted = list(eta)
             for each in moved:  # ±(predictor + 1)
                 shifted[abs(each) - 1] = shifted[abs(each) - 1] + np.sign(each) * _STEP
-            return self._row(self._rows, *shifted)
+            return self.log_likelihood(self.rows, *shifted)
 
         with np.errstate(all="ignore"):
             middle, up, down = at(), [at(j + 1) for j in range(k)], [at(-j - 1) for j in range(k)]
@@ -176,9 +174,9 @@ class _Sum:
                 for j in range(i):
                     both = at(i + 1, j + 1) + at(-i - 1, -j - 1) + 2.0 * middle
                     second[i][j] = second[j][i] = (both - up[i] - up[j] - down[i] - down[j]) / (2.0 * _STEP**2)
-        scores = np.hstack([self._members @ (self._designs[j] * first[j][:, None]) for j in range(k)])
+        scores = np.hstack([self.members @ (self.designs[j] * first[j][:, None]) for j in range(k)])
         blocks = [
-            [-self._designs[i].T @ (self._designs[j] * (self._counts * second[i][j])[:, None]) for j in range(k)]
+            [-self.designs[i].T @ (self.designs[j] * (self._counts * second[i][j])[:, None]) for j in range(k)]
             for i in range(k)
         ]
         return scores, np.block(blocks) + self.prior.precision

@@ -226,7 +226,9 @@ def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int]:
         if near.size < window or reach.size < 2 * window:
             continue
         before_s = (reach - row - 0.5) / track.rate_hz
-        speed = _slope(near / track.rate_hz, track.lateral[near])
+        at_s = near / track.rate_hz
+        at_s -= at_s.mean()
+        speed = at_s @ track.lateral[near] / (at_s @ at_s)
         jumps = np.abs(np.diff(track.lateral[near])).max() > JUMP_M
         odd += int(jumps or abs(speed) < STRAIGHT_MPS)
         if before_s[0] <= -SEEN_BEFORE_S:
@@ -242,11 +244,6 @@ def _onset(time_s: FloatArray, lateral: FloatArray) -> float:
     rises -= rises.mean(axis=1, keepdims=True)
     explained = (rises @ lateral) ** 2 / (rises * rises).sum(axis=1)
     return float(time_s[np.argmax(explained)])
-
-
-def _slope(x: FloatArray, y: FloatArray) -> float:
-    x = x - x.mean()
-    return float(x @ y / (x @ x))
 
 
 # -- is it enough? --

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy import special, stats
@@ -22,6 +21,7 @@ from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environmen
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.sections import HAZARD_OF
+from harness.fitting.protocol import Asked
 from harness.numbers import number
 from harness.report.drawing import Axis, Panel, Plot
 from harness.report.templates import templates
@@ -35,35 +35,22 @@ MOST_ROWS = 20_000
 _SEED = 1
 
 
-def page(
-    fit: Fit,
-    tally: Tally,
-    noise_mps2: float,
-    rows: Mapping[str, FloatArray],
-    name: str,
-    files: Sequence[Path],
-    others: Sequence[str],
-) -> str:
-    """The page, self-contained; ``rows`` are the replicates, ``name`` is that of the environment's file.
+def page(fit: Fit, tally: Tally, noise_mps2: float, asked: Asked, others: Sequence[str]) -> str:
+    """The page, self-contained.
 
     ``noise_mps2`` is the standard deviation of accelerations by measurement noise; ``others`` say what was found for
     other families.
     """
-    shown = (
-        templates(__package__)
-        .get_template("fit.html.j2")
-        .render(
-            fit=fit,
-            tally=tally,
-            name=name,
-            files=[file.name for file in files],
-            n_replicates=len(next(iter(rows.values()))),
-            plots=list(_plots(fit)),
-            bins=list(_bins(fit)),
-            numbers=list(_numbers(fit)),
-            noise_mps2=noise_mps2,
-            others=others,
-        )
+    template = templates(__package__).get_template("fit.html.j2")
+    shown = template.render(
+        fit=fit,
+        tally=tally,
+        asked=asked,
+        plots=list(_plots(fit)),
+        bins=list(_bins(fit)),
+        numbers=list(_numbers(fit)),
+        noise_mps2=noise_mps2,
+        others=others,
     )
     return printable(shown)
 

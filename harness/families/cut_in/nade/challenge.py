@@ -39,16 +39,7 @@ from harness.compiled import compiled_inline, compiled_threads, unboxed
 from harness.families.cut_in import laws
 from harness.families.cut_in.laws import Environment, InitialStates, acceleration
 from harness.families.cut_in.loading import evaluate_laws
-from harness.families.cut_in.nade.grid import (
-    AFTER,
-    BEFORE,
-    GridPoints,
-    interpolate,
-    locate,
-    points_of,
-    shape_of,
-    state_at,
-)
+from harness.families.cut_in.nade.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, state_at
 from harness.processes import usable_cpus
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
@@ -144,7 +135,7 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
 
     U by remaining time (LEVELS + 1, v, R2, R2dot), level 0 being none; C(s, a) with the longest (v, R2, R2dot, 31).
     """
-    points, shape = points_of(AFTER), shape_of(AFTER)
+    points, shape = points_of(AFTER), AFTER.shape
     hold = int(environment.numbers["hold_steps"])
     lagging = lags(driver.view(np.recarray)[0])
     at_speeds = np.pad(points.speed[:, None], ((0, 0), (0, 2)))  # R1 and R1dot do not matter
@@ -175,18 +166,11 @@ _ROUNDING_MPS2 = 1e-9
 
 @compiled_inline
 def smallest_gaps(
-    speed: float,
-    r2: float,
-    r2dot: float,
-    maneuver: int,
-    hold: int,
-    steps_per_level: int,
-    driver: Record,
-    out: FloatArray,
+    speed: float, r2: float, r2dot: float, m: int, hold: int, steps_per_level: int, driver: Record, out: FloatArray
 ) -> None:
     """Smallest gap (m) within every remaining time: ``out`` (levels + 1,), level 0 being none.
 
-    BV takes a maneuver for one hold period and then keeps its speed.
+    BV takes the maneuver ``m`` for one hold period and then keeps its speed.
     """
     follower = speed - r2dot
     smallest = _NO_CONTACT_M
@@ -208,7 +192,7 @@ def smallest_gaps(
             a = driver_acceleration(driver, follower, speed, r2)
             if driver.kind == FVDM_KIND:
                 gap_of_shape, shape = r2, fvdm_shape(driver, max(r2, SMALLEST_GAP_M))
-        speed_after = next_speed(speed, acceleration(maneuver) if step < hold else 0.0)
+        speed_after = next_speed(speed, acceleration(m) if step < hold else 0.0)
         follower_after = next_speed(follower, a)
         r2 += 0.5 * (speed + speed_after - follower - follower_after) * STEP_S
         speed, follower = speed_after, follower_after
@@ -245,7 +229,7 @@ def roll_out(
 
 def build_immediate(environment: Environment, driver: RecordArray) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Tables of one surrogate, in metres: value, maneuvers (see `build_after_cut_in`), and least, shaped as value."""
-    points, shape = points_of(AFTER), shape_of(AFTER)
+    points, shape = points_of(AFTER), AFTER.shape
     hold = int(environment.numbers["hold_steps"])
     value, least = np.empty((2, LEVELS + 1, *shape), np.float32)
     maneuvers = np.empty((*shape, N_ACCELERATIONS), np.float32)
@@ -350,7 +334,7 @@ def build_before_cut_in(environment: Environment, value: Float32Array) -> Float3
     hold, steps = int(environment.numbers["hold_steps"]), int(environment.numbers["max_steps"])
     periods = -(-steps // hold)
     law = unboxed(environment)
-    table = np.zeros((periods + 1, *shape_of(BEFORE)), np.float32)
+    table = np.zeros((periods + 1, *BEFORE.shape), np.float32)
     for period in range(periods - 1, -1, -1):
         later, out = table[period + 1], table[period]
         backward_period(period * hold, level_steps(hold), law, value, pmf, points, later, out)

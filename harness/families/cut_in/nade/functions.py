@@ -61,7 +61,9 @@ def build_importance(campaign: Campaign, tables: Tables | None) -> Importance:
     """Importance functions of a campaign; ``nde`` and ``forced`` need no challenge tables."""
     testing, sampling = campaign.testing, campaign.sampling
     recursive = testing.challenge != "immediate"  # one of the user's own is a probability, too
-    none = _none(5), _none(5), _none(5), np.zeros((0, 1, 1, 1, 1), np.bool_)
+    # Read-only like tables that are mapped, for kernels to be compiled once.
+    no_table = read_only(np.zeros((0, 1, 1, 1, 1), np.float32))
+    none = no_table, no_table, no_table, no_table.astype(np.bool_)
     return Importance(
         int(recursive),
         int(sampling.mixes_episodes),
@@ -87,11 +89,6 @@ def harmless_cells(tables: Tables, *, recursive: bool) -> BoolArray:
         n = cells.shape[axis]
         cells = cells.take(range(n - 1), axis) & cells.take(range(1, n), axis)
     return cells
-
-
-def _none(dimensions: int) -> Float32Array:
-    """No table; read-only like those that are mapped, for kernels to be compiled once."""
-    return read_only(np.zeros((0,) + (1,) * (dimensions - 1), np.float32))
 
 
 @compiled_inline
@@ -209,10 +206,9 @@ def propose_acceleration(
                 q[j, m] = p[m]
             continue
         interpolate_maneuvers(importance.maneuvers[j], where, q[j])
-        for m in range(N_ACCELERATIONS):
-            q[j, m] = p[m] * as_challenge(q[j, m], importance.recursive)
         total = 0.0
         for m in range(N_ACCELERATIONS):
+            q[j, m] = p[m] * as_challenge(q[j, m], importance.recursive)
             total += q[j, m]
         v[j] = total
         critical = critical or total > importance.threshold

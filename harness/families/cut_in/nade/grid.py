@@ -30,6 +30,11 @@ class Grid(NamedTuple):
     r2: Axis
     r2dot: Axis
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of a table."""
+        return self.speed.size, self.r2.size, self.r2dot.size
+
 
 class GridPoints(NamedTuple):
     """Where a table has entries, by axis: v_BV (m/s), R2 (m), R2dot (m/s)."""
@@ -42,11 +47,6 @@ class GridPoints(NamedTuple):
 AFTER = Grid(Axis(5.0, 5.0, 9), Axis(0.0, 90.0 / 149.0**2, 150), Axis(-24.0, 0.25, 121))
 BEFORE = Grid(Axis(20.0, 5.0, 5), Axis(0.0, 110.0 / 99.0**2, 100), Axis(-18.0, 1.0, 21))
 """After the cut-in, and before it."""
-
-
-def shape_of(grid: Grid) -> tuple[int, int, int]:
-    """Shape of a table."""
-    return grid.speed.size, grid.r2.size, grid.r2dot.size
 
 
 def points_of(grid: Grid) -> GridPoints:

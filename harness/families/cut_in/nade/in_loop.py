@@ -38,7 +38,8 @@ class DrawnInLoop(Traffic):
         n, nowhere = len(states), np.full(len(states), -1)
         nothing = np.zeros((n, 0, BV + 1)), np.zeros((n, 0, BV + 1), np.int8)
         start, steps = beginning(states), int(environment.numbers["max_steps"])
-        super().__init__(natural_script(*start, *nothing, nowhere, np.zeros(n, np.int64), n_steps=steps), states)
+        script = natural_script(*start, *nothing, nowhere, np.zeros(n, np.int64))
+        super().__init__(script._replace(n_steps=np.full(n, steps)), states)
         self._given = states, environment, importance, moment_limit
 
     def rows(self, rows: slice) -> DrawnInLoop:

@@ -19,7 +19,7 @@ from harness.controllers.hosts import cause_of
 from harness.errors import CampaignError
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.nade.challenge import LEVELS, build_before_cut_in, level_steps
-from harness.families.cut_in.nade.grid import AFTER, points_of, shape_of
+from harness.families.cut_in.nade.grid import AFTER, points_of
 from harness.families.cut_in.nade.tables import Tables
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, RecordArray
@@ -35,7 +35,7 @@ def own_challenge(name: str) -> Callable[[Environment, RecordArray, str], Tables
 
     def build(environment: Environment, driver: RecordArray, _: str) -> Tables:
         function = own_code(name, WHERE, "a function of a driver and a state (docs/method.md)")
-        numbers, shape, none = driver.view(np.recarray)[0], shape_of(AFTER), np.zeros((0, 2, 2, 2), np.float32)
+        numbers, shape, none = driver.view(np.recarray)[0], AFTER.shape, np.zeros((0, 2, 2, 2), np.float32)
         per_level_s = STEP_S * level_steps(int(environment.numbers["hold_steps"]))
         value, maneuvers = np.zeros((LEVELS + 1, *shape), np.float32), np.zeros((*shape, N_ACCELERATIONS), np.float32)
         for i, speed in enumerate(points_of(AFTER).speed):
