@@ -285,6 +285,7 @@ def _sources_of_made(av: AutomatedVehicle) -> str | None:
     else:
         name = getattr(own_code(av.controller), "__module__", "")
         file, above = getattr(sys.modules.get(name), "__file__", None) or "", name.count(".")
+        above += file.endswith("__init__.py")  # which stands within the package that it is
     given = av.parameters.values() if isinstance(av.parameters, dict) else ()
     files = {str(real_path(file)), *(value for value in given if isinstance(value, str))}
     if is_users(root := str(real_path(file).parents[above])):

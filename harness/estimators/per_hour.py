@@ -22,6 +22,9 @@ from harness.estimators.tally import FEWEST_PATHS, RateLimits, Tally, paths_that
 from harness.families.protocol import Exposure
 from harness.vocabulary import FloatArray
 
+_GRID = 13
+"""Places of each counted exposure at which the search for the outermost limit looks first; the middle is as counted."""
+
 
 class OfFamily(NamedTuple):
     """Tests of one family, how often its events are met, and by which ``reading`` the competent driver acts.
@@ -135,7 +138,8 @@ class PerHour:
 
         Of k events an exposure x times the counted one costs k (x - 1 - ln x) of the threshold, the Poisson law's
         likelihood ratio: a limit is the outermost over x of that with what is left of it. The threshold is that of few
-        events, however many crashes there are.
+        events, however many crashes there are. There is an outermost one of each family that may crash where no test
+        has, so that the search begins at the best of a grid.
         """
         from scipy.optimize import minimize  # noqa: PLC0415 - slow to import, and seldom asked for
 
@@ -157,9 +161,16 @@ class PerHour:
 
         if not free.size:
             return self.limits(level)[1:3]
-        ends = (minimize(limit, np.zeros(free.size), (side,), method="Nelder-Mead").fun for side in (-1, 1))
-        low, high = (float(end) for end in ends)
-        return low, -high
+        scale = level.threshold / np.array(counted)[free]
+        farthest = np.sqrt(2.0 * scale) + scale  # beyond, x alone costs more than the threshold
+        grid = [farthest * at for at in product(np.linspace(-1.0, 1.0, _GRID), repeat=free.size)]
+
+        def outermost(side: int) -> float:
+            best = min(grid, key=lambda log_x: limit(log_x, side))
+            simplex = best + np.vstack([np.zeros(free.size), np.diag(farthest / _GRID)])
+            return float(minimize(limit, best, (side,), "Nelder-Mead", options={"initial_simplex": simplex}).fun)
+
+        return outermost(-1), -outermost(1)
 
     def ratio(self, level: Level) -> tuple[float, float, float]:
         """Rate over that of the competent driver, with limits; NaN and any where that never crashes."""
@@ -223,7 +234,8 @@ class PerHour:
         limits = self.limits(level)
         if counts:
             limits = limits._replace(**dict(zip(("low", "high"), self.limits_with_counts(level), strict=True)))
-        bound = self.limits(Level.of_bound(confidence, n)).high
+        of_bound = Level.of_bound(confidence, n)
+        bound = self.limits_with_counts(of_bound)[1] if counts else self.limits(of_bound).high
         per_km = 1e6 / (3.6 * speed_mps)  # of a million km, per hour
         names = dict.fromkeys(name for of in self.families for name in of.readings) or [""]
         beside, *readings = (

@@ -113,5 +113,5 @@ def scope(content: Mapping[str, Any]) -> str:
         ended += f"{'' if rhw is None else f', at ± {share(rhw)}'} (asked: ± {share(target)})"
     elif content["stopped_by"] == "episodes" and content["decision"] is not None:
         ended += GO_ON
-    counted = ", and that of counted events," if content["counts_in_interval"] else ""
+    counted = ", that of the sum also of counted events," if content["counts_in_interval"] else ""
     return scope_words(content["confidence"], ended, counted)

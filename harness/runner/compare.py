@@ -37,7 +37,7 @@ from harness.resolved import Resolved, require_ready
 from harness.runner.kept import Earlier, require_own_folder
 from harness.runner.run import begun
 from harness.sampling.protocol import ShardRequest
-from harness.sampling.shells import PairRounds, Shells
+from harness.sampling.shells import PairRounds
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import COMPARISON
 
@@ -178,10 +178,9 @@ def _compared(
         earlier = [require_own_folder(*each, resume=True) for each in both]  # both, before either is touched
         begins = [begun(*each, found, workers, progress, 2) for each, found in zip(both, earlier, strict=True)]
         runs = [working.enter_context(each) for each in begins]
-        source = runs[0].run.source  # the other's is the same: one environment and one library make one pool
-        assert isinstance(source, Shells)
-        design, available = source.prescribed.design, source.prescribed.available
-        rounds, pairs = PairRounds(campaign, design, available, rule), PairedShells(design)
+        prescribed = runs[0].prescribed  # as the other's: one environment and one library make one pool
+        rounds = PairRounds(campaign, prescribed.design, prescribed.available, rule)
+        pairs = PairedShells(prescribed.design)
         progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
         for side, each in enumerate(runs):
             for shard in each.drive(stored_requests(each.run.earlier), rule):

@@ -25,7 +25,6 @@ from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import HourRule
 from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
-from harness.pool.shells import PrescribedEpisodes
 from harness.printed import PRINTED
 from harness.progress import Progress
 from harness.records.folder import read_as, read_manifest, sole_use, write_sealed
@@ -36,7 +35,6 @@ from harness.runner.run import ESTIMATES, EXIT_OF, RunResult, Underway, begun
 from harness.runner.stored import stored_blocks
 from harness.sampling.hours import HourRounds
 from harness.sampling.milder import beyond_scope, n_left_out
-from harness.sampling.shells import Shells
 from harness.vocabulary import FAMILIES
 
 MEND = "Run the campaign again into the same folder with --resume."
@@ -65,11 +63,9 @@ class Hours:
         return "\n".join(hour_lines(self.content, self.report))
 
 
-def run_families(
-    campaign: Campaign, out: Path, *, workers: int | None = None, resume: bool = False, progress: Progress | None = None
-) -> Hours:
+def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: bool, progress: Progress) -> Hours:
     """Run the scenarios of a campaign until their sum is known; see `harness.run`."""
-    names, progress, began = campaign.scenarios or [], progress or Progress(), time.monotonic()
+    names, began = campaign.scenarios or [], time.monotonic()
     ready = {name: require_ready(campaign.of_family(name)) for name in names}
     require_same_driver(campaign, ready)
     rule = HourRule(campaign)
@@ -116,42 +112,31 @@ def _run(
             runs[name].drive_before_tests()
         progress.remark = ""
         hour = PerHour([_no_test_yet(underway, campaign.exposure) for underway in runs.values()])
-        rounds = HourRounds(campaign, hour, [_drawn(underway).available for underway in runs.values()], rule)
-        n_held = {name: underway.run.earlier.n_episodes for name, underway in runs.items()}
-        progress.stage("tests of all scenarios", None, done=sum(n_held.values()))
+        rounds = HourRounds(campaign, hour, [underway.prescribed.available for underway in runs.values()], rule)
+        n_held = sum(underway.run.earlier.n_episodes for underway in runs.values())
+        progress.stage("tests of all scenarios", None, done=n_held)
         while np.concatenate(added_to := rounds.next_round(hour)).any():
             for of, added in zip(hour.families, added_to, strict=True):
                 for shard in runs[of.family].drive_added(of.tally.tests, added, rule):
                     of.seen.add(shard.block if campaign.accept is None else shard.block.cut_off_as_failed())
-            if rule.observe(hour) and all(runs[name].run.n_episodes >= n for name, n in n_held.items()):
+            if rule.observe(hour) and not any(underway.run.is_behind for underway in runs.values()):
                 break
         for name, underway in runs.items():
             if not underway.run.n_episodes:
-                found, expected = (
-                    f"{campaign.stop.episodes}, spent before a test of {name}",
-                    "some tests of each scenario",
-                )
+                found = f"{campaign.stop.episodes}, spent before a test of {name}"
                 mend = "Raise it and go on with --resume, or lower testing.shells.first_tests."
-                raise CampaignError("stop.episodes", found, expected, mend)
+                raise CampaignError("stop.episodes", found, "some tests of each scenario", mend)
             underway.run.require_few_failed()
             require_no_fewer(underway.run.folder, underway.run.earlier.n_episodes, underway.run.n_episodes)
-    of_all, rule.look = rule.look, replace(rule.look, decision=None)  # which is about the sum
     results = {name: underway.finish(rule, of_sum=True) for name, underway in runs.items()}
-    rule.look = of_all
     if campaign.accept is not None:  # tests that were cut off count as crashes in its decision alone
         seen = {name: SeenShells.of_blocks(underway.run.blocks) for name, underway in runs.items()}
         hour = PerHour([of._replace(seen=seen[of.family]) for of in hour.families])
     return hour, results
 
 
-def _drawn(underway: Underway) -> PrescribedEpisodes:
-    """The tests of one of several scenarios, which are of shells (`REFUSED`)."""
-    assert isinstance(underway.run.source, Shells)
-    return underway.run.source.prescribed
-
-
 def _no_test_yet(underway: Underway, exposures: Mapping[str, float]) -> OfFamily:
-    resolved, design, seen = underway.run.resolved, _drawn(underway).design, SeenShells()
+    resolved, design, seen = underway.run.resolved, underway.prescribed.design, SeenShells()
     seen.count(design, empty_tally(design.cell_p.size))
     return OfFamily(resolved.campaign.scenario, _exposure(resolved, exposures), seen)
 

@@ -218,13 +218,8 @@ class FirstAnswers:
 
 @contextmanager
 def _opened(source: Source, n_cells: int | None = None) -> Iterator[EpisodeLoop]:
-    world = build_world(source.campaign, n_cells)
-    loop = source.loop(world)
-    try:
+    with closing(build_world(source.campaign, n_cells)) as world, closing(source.loop(world)) as loop:
         yield loop
-    finally:
-        loop.close()
-        world.close()
 
 
 def _timed_run(source: Source, n_episodes: int) -> tuple[Shard, Speed]:
@@ -275,9 +270,8 @@ def _first_answers(source: Source, av: AutomatedVehicle, n: int) -> dict[int, fl
     """Of tests that did not fail."""
     host = build_host(av, n_cells=1, seed=source.campaign.seed, names=source.scenario.shown)
     answers: Any = FirstAnswers(host) if host is not None else None
-    with closing(
-        EpisodeLoop(TwinWorld(1, source.scenario.vehicles), source.scenario, source.records(), answers)
-    ) as loop:
+    world = TwinWorld(1, source.scenario.vehicles)
+    with closing(EpisodeLoop(world, source.scenario, source.records(), answers)) as loop:
         failed = loop.run(0, source.tests(0, n)).failures
     return {i: answer for i, answer in answers.noted.items() if i not in failed}
 
@@ -318,9 +312,8 @@ def _follows(shard: Shard) -> Follows:
         if trace[until, -1, 1] > 0.0:
             headways.append(float(gap[-1] / trace[until, -1, 1]))
         faster.append(float(trace[until, -1, 1] - trace[until, 0, 1]))
-    empty = math.nan
-    median = float(np.median(headways)) if headways else empty
-    return Follows(median, min(gaps, default=empty), float(np.median(faster)) if faster else empty, n_hit)
+    headway, speed = (float(np.median(each or [math.nan])) for each in (headways, faster))
+    return Follows(headway, min(gaps, default=math.nan), speed, n_hit)
 
 
 def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
@@ -336,18 +329,14 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         if cut >= 0:
             braking = np.flatnonzero(commanded[onset + 1 :] < BRAKING_MPS2)
             reactions.append(float(braking[0]) * STEP_S if braking.size else np.inf)
-    a = np.concatenate([*acted, np.empty(0)])
-    a = a if a.size else np.array([np.nan])
+    a = np.concatenate(acted) if any(each.size for each in acted) else np.array([np.nan])
     reaction = np.array(reactions)
     braked = np.isfinite(reaction)
     return Behaviour(
-        mean_acceleration_mps2=float(a.mean()),
-        min_acceleration_mps2=float(a.min()),
-        max_acceleration_mps2=float(a.max()),
-        share_at_min=float(np.mean(a <= limits[0] + AT_LIMIT_MPS2)),
+        mean_acceleration_mps2=float(a.mean()), min_acceleration_mps2=float(a.min()),
+        max_acceleration_mps2=float(a.max()), share_at_min=float(np.mean(a <= limits[0] + AT_LIMIT_MPS2)),
         share_at_max=float(np.mean(a >= limits[1] - AT_LIMIT_MPS2)),
         reaction_s=float(np.median(reaction[braked])) if braked.any() else np.nan,
         braking_share=float(braked.mean()) if reaction.size else np.nan,
-        n_events=len(reactions),
-        n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
-    )
+        n_events=len(reactions), n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
+    )  # fmt: skip

@@ -22,6 +22,7 @@ from harness.estimators.answer import ended_by, estimate_blocks, expected_for, p
 from harness.estimators.stopping import Rule, Verdict
 from harness.files import remove_unfinished
 from harness.pool.moved import assumed
+from harness.pool.shells import PrescribedEpisodes
 from harness.progress import Progress
 from harness.records.folder import MILDER, SHELLS, StoppedBy, parquet, sole_use, write_sealed
 from harness.records.shown import ShownTests
@@ -41,7 +42,7 @@ from harness.sampling import prepare
 from harness.sampling.baseline import IN_WORDS, begin, requests_before, stored_baseline, stored_table
 from harness.sampling.milder import N_TESTS, beyond_scope, milder_of, n_left_out
 from harness.sampling.protocol import ShardRequest
-from harness.sampling.shells import round_requests
+from harness.sampling.shells import Shells, round_requests
 from harness.signals import uninterrupted
 from harness.strata import STORED_DESIGN
 from harness.vocabulary import IntArray
@@ -126,18 +127,19 @@ def run_campaign(
     >>> result.stopped_by, result.exit_code
     ('episodes', 0)
     """
+    out, progress = Path(out), progress or Progress()
     if not isinstance(campaign, Resolved):
         campaign = campaign_of(campaign)
         if campaign.scenarios is not None:
             from harness.runner.families import run_families  # noqa: PLC0415 - runs of this file, for several
 
-            return run_families(campaign, Path(out), workers=workers, resume=resume, progress=progress)
-    resolved = campaign if isinstance(campaign, Resolved) else require_ready(campaign)
-    out = Path(out)
+            return run_families(campaign, out, workers=workers, resume=resume, progress=progress)
+        campaign = require_ready(campaign)
+    resolved = campaign
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)
         require_no_fewer(out, earlier["n_episodes"], resolved.campaign.stop.episodes)
-        with begun(out, resolved, earlier, workers, progress or Progress()) as underway:
+        with begun(out, resolved, earlier, workers, progress) as underway:
             underway.drive_before_tests()
             rule = underway.drive_tests()
         require_no_fewer(out, earlier["n_episodes"], underway.run.n_episodes)
@@ -151,6 +153,12 @@ class Underway:
     run: Run
     crew: Workers
     progress: Progress
+
+    @property
+    def prescribed(self) -> PrescribedEpisodes:
+        """The tests of a run of shells."""
+        assert isinstance(self.run.source, Shells)
+        return self.run.source.prescribed
 
     def keep_design(self) -> None:
         """Write the strata, without which nothing can be estimated, where the folder has no others."""
@@ -221,13 +229,13 @@ class Underway:
     def finish(self, rule: Rule, *, of_sum: bool = False) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left.
 
-        Of one of several scenarios the rule is about their sum.
+        Of one of several scenarios the rule, and so its decision, is about their sum.
         """
-        run, campaign, decision, decided = self.run, self.run.resolved.campaign, rule.look.decision, dict[str, Any]()
+        run, campaign, decided = self.run, self.run.resolved.campaign, dict[str, Any]()
         stopped_by: StoppedBy = "sum" if of_sum else ended_by(campaign, rule, run.n_episodes)
         missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
-        if decision is not None:
+        if (decision := rule.look.decision) is not None and not of_sum:
             n_early = sum(each.n_crashes_before_event for each in run.blocks)
             decision = replace(decision, n_milder=n_left_out(campaign, n_early) + beyond_scope(run.facts.get("milder")))
             code = EXIT_OF[decision.verdict]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -105,7 +106,6 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     design, needed = source.stored_design(folder), list(source.columns)
     needed += BASELINE_COLUMNS if design is not None and design.candidates else ()
     ratios = list(MOMENT_COLUMNS) if moments and campaign.sampling.mixes_steps else []
-
     keeps = ratios and campaign.records.moments != "none"
     none = moments_schema((), len(campaign.surrogates)).empty_table().select(ratios) if keeps else None
 
@@ -116,14 +116,14 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     n = 0
     for block in made_ahead(read, manifest["parts"], N_READERS):
         if block.first_episode != n:
-            raise _incomplete(folder, f"a part that begins at test {block.first_episode}", f"test {n}")
+            raise RunFolderError(str(folder), f"a part that begins at test {block.first_episode}", f"test {n}", _FINISH)
         counted = block.take(slice(0, n_counted - n))
         n += len(counted)
         if len(counted):
             yield counted
         if n == n_counted:
             return
-    raise _incomplete(folder, f"{n} tests on record", f"{n_counted} (manifest.json)")
+    raise RunFolderError(str(folder), f"{n} tests on record", f"{n_counted} (manifest.json)", _FINISH)
 
 
 def even(blocks: Iterable[Block]) -> Iterator[Block]:
@@ -140,10 +140,6 @@ def even(blocks: Iterable[Block]) -> Iterator[Block]:
             size = min(max(FEWEST_TOGETHER, round(n * (SPACING - 1.0))), MOST_TOGETHER)
     if waiting:
         yield joined(waiting)
-
-
-def _incomplete(folder: Path, found: str, expected: str) -> RunFolderError:
-    return RunFolderError(str(folder), found, expected, _FINISH)
 
 
 _TRUST = "Look at stored motion alone (--stored), which runs no code; or read that code, and then add --trust."
@@ -256,11 +252,8 @@ def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) ->
     if source.baseline_paths is not None:
         begin(source, partial(read_stored, folder, source.baseline_paths, read_manifest(folder)["before"]))
     require_same_pool(folder, source)
-    world = build_world(resolved.campaign, 1)
-    try:
+    with closing(build_world(resolved.campaign, 1)) as world:
         shard = source.run_again(source.loop(world, traces="all"), episode, stored)
-    finally:
-        world.close()
     tables = shard_tables(shard, resolved.campaign.seed, keep_traces=True)
     return {"episodes": tables.episodes, "traces": tables.traces}
 

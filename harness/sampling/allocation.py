@@ -22,7 +22,7 @@ INNER_RHW = 0.3
 """Relative half-width inside the boundary at which testing turns to what lies outside."""
 CONFIDENCE = 0.9
 """Level at which widths are compared, whatever the campaign reports."""
-_TAIL, _LEVEL = (1.0 - CONFIDENCE) / 2.0, Level.two_sided(CONFIDENCE)
+LEVEL = Level.two_sided(CONFIDENCE)
 FIRST_TESTS = 36
 """First tests of all strata within the boundary together, each its share of the probability there."""
 LEAST_FIRST_TESTS, MOST_FIRST_TESTS = 3, 12
@@ -102,7 +102,7 @@ class Allocation:
             return np.zeros_like(tests)
 
         def of_crashes(n: int) -> float:
-            return combined(self.p[:n], tally.part(slice(0, n)), self.n_paths, _LEVEL).rhw
+            return combined(self.p[:n], tally.part(slice(0, n)), self.n_paths, LEVEL).rhw
 
         begun = np.arange(tests.size) < self._n_begun(tests, inner_rhw or of_crashes)
         active = begun & (tests < self.available)
@@ -121,7 +121,8 @@ class Allocation:
 
     def _used_up(self, tally: Tally) -> bool:
         """Whether nearly all that is left to know lies in strata without further events."""
-        tests, (low, high) = tally.tests, clopper_pearson(tally.crashes, tally.tests, _TAIL, tally.failed)
+        tests, tail = tally.tests, (1.0 - CONFIDENCE) / 2.0
+        low, high = clopper_pearson(tally.crashes, tests, tail, tally.failed)
         relevant = np.arange(tests.size) < self.n_asked
         squares = np.where(relevant, (self.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
@@ -129,17 +130,10 @@ class Allocation:
     def _n_begun(self, tests: IntArray, inner_rhw: Callable[[int], float]) -> int:
         """Of how many strata it is time: of those inside the boundary while they leave much open."""
         n = min(self.n_inside, self.n_asked)
-        return self.n_asked if n == self.n_asked or self._enough_inside(n, tests, inner_rhw) else n
-
-    def _enough_inside(self, n: int, tests: IntArray, inner_rhw: Callable[[int], float]) -> bool:
-        """Whether it is time to test more than the first ``n`` strata."""
-        s = slice(0, n)
-        if np.any(tests[n:] > 0) or np.all(tests[s] >= self.available[s]):
-            return True
+        enough = n == self.n_asked or np.any(tests[n:] > 0) or np.all(tests[:n] >= self.available[:n])
         # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
-        if tests[s].sum() >= MOST_INNER_TESTS * self.first_tests[s].sum():
-            return True
-        return inner_rhw(n) <= INNER_RHW
+        enough = enough or tests[:n].sum() >= MOST_INNER_TESTS * self.first_tests[:n].sum()
+        return self.n_asked if enough or inner_rhw(n) <= INNER_RHW else n
 
     def _spread(self, tally: Tally, size: int, most: IntArray) -> IntArray:
         weights, room = np.column_stack([self.p, np.zeros_like(self.p)]), ADDED * (tally.tests > 0)
@@ -147,4 +141,4 @@ class Allocation:
             np.column_stack([crashes + room, tally.tests - crashes + room])
             for crashes in (tally.crashes, tally.crashes + tally.failed)
         )
-        return spread(weights, lower, upper, _LEVEL, size, most)
+        return spread(weights, lower, upper, LEVEL, size, most)

@@ -11,14 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.estimators.likelihood import Level
 from harness.estimators.per_hour import PerHour
 from harness.estimators.stopping import HourRule
 from harness.estimators.tally import Tally
-from harness.sampling.allocation import CONFIDENCE, Allocation
+from harness.sampling.allocation import LEVEL, Allocation
 from harness.vocabulary import IntArray
-
-_LEVEL = Level.two_sided(CONFIDENCE)
 
 
 class HourRounds:
@@ -44,17 +41,14 @@ class HourRounds:
         tallies = [of.tally for of in hour.families]
         left = self._budget - hour.totals[0]
         if self._each and all(tally.tests.any() for tally in tallies):
-            worst = int(np.argmax([of.limits(_LEVEL).rhw for of in hour.families]))
+            worst = int(np.argmax([of.limits(LEVEL).rhw for of in hour.families]))
             of_each = [np.zeros_like(tally.tests) for tally in tallies]
             of_each[worst] = self._own[worst].next_round(tallies[worst], left)
             return of_each
-        joined = _side_by_side(tallies, self._order)
-        found = self._all.next_round(joined, left, inner_rhw=lambda _: hour.limits(_LEVEL, inside=True).rhw)
+        columns = [np.concatenate(column)[self._order] for column in zip(*(each[:3] for each in tallies), strict=True)]
+        joined = Tally.counted(*columns)
+        found = self._all.next_round(joined, left, inner_rhw=lambda _: hour.limits(LEVEL, inside=True).rhw)
         self.rule.of_first_tests = self._all.is_first(joined.tests, found)
         added = np.zeros_like(found)
         added[self._order] = found
         return np.split(added, self._ends)
-
-
-def _side_by_side(tallies: Sequence[Tally], order: IntArray) -> Tally:
-    return Tally.counted(*(np.concatenate(column)[order] for column in list(zip(*tallies, strict=True))[:3]))

@@ -18,7 +18,6 @@ import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
-from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairCounts
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
@@ -33,7 +32,7 @@ from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_pat
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
-from harness.sampling.allocation import CONFIDENCE, Allocation
+from harness.sampling.allocation import LEVEL, Allocation
 from harness.sampling.protocol import Rounds, ShardRequest, Source
 from harness.strata import ShellDesign, StoredDesign
 from harness.vocabulary import IntArray
@@ -155,15 +154,14 @@ class PairRounds:
     def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, rule: PairRule) -> None:
         self.rule, self._budget = rule, campaign.stop.episodes
         self._allocation = Allocation.of(campaign.testing.shells, design, available)
-        self._level = Level.two_sided(CONFIDENCE)
 
     def next_round(self, pairs: PairCounts) -> IntArray:
         """Pairs to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
         added = self._allocation.next_round(
             _differing(pairs),
             self._budget - int(pairs.tests.sum()),
-            inner_rhw=lambda n: pairs.inside(n).rhw(self._level),
-            given_by=partial(pairs.spread, self._level),
+            inner_rhw=lambda n: pairs.inside(n).rhw(LEVEL),
+            given_by=partial(pairs.spread, LEVEL),
         )
         self.rule.of_first_tests = self._allocation.is_first(pairs.tests, added)
         return added

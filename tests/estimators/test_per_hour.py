@@ -157,6 +157,22 @@ def test_few_counted_events_are_in_the_interval_on_request():
     assert assumed.limits_with_counts(LEVEL) == assumed.limits(LEVEL)[1:3]
 
 
+def test_counted_exposures_move_the_limit_where_another_family_bounds_it_at_their_counts():
+    """At the counted exposure lead braking bounds the rate from above, beyond it the cut-in, and by more."""
+    cut_in = family("cut_in", [1e-9, 4e-5], [20, 240], [12, 0], COUNTED, CC, p_event=5e-5)
+    lead = family("lead_brakes", [1e-4, 9e-1], [12, 460], [6, 0], ASSUMED, CC)
+    hour, ends = PerHour([cut_in, lead]), []
+    for x in np.geomspace(0.15, 3.0, 1501):
+        if (lost := 3.0 * (x - 1.0 - math.log(x))) < LEVEL.threshold:
+            left = Level(LEVEL.threshold - lost, LEVEL.z * math.sqrt(1.0 - lost / LEVEL.threshold))
+            ends.append(hour.with_exposures({"cut_in": 0.048 * x}).limits(left)[1:3])
+    low, high = np.array(ends).T
+    assert high.max() > 1.05 * hour.limits(LEVEL).high
+    assert hour.limits_with_counts(LEVEL) == pytest.approx((low.min(), high.max()), rel=1e-3)
+    told = hour.to_json(0.9, 32.0, counts=True)["per_hour"]
+    assert told["upper_bound"] == told["ci_high"] == pytest.approx(high.max(), rel=1e-3)
+
+
 @pytest.mark.slow
 def test_intervals_with_counted_exposures_cover():
     """800 draws of counts and crashes at 90 %: one that covers .90 falls below .867 in one of a thousand.

@@ -84,11 +84,20 @@ def test_two_processes_do_not_run_into_one_folder(stored, complaint_of, whole):
     assert unlike_columns(whole, stored) == []
 
 
-def test_another_version_of_the_controller_is_refused(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("module", "named", "imports"),
+    [
+        ("versioned_controller", "{}.py", "import beside_it"),
+        ("versioned_package", "{}/__init__.py", "from versioned_package import beside_it"),
+    ],
+)
+def test_another_version_of_the_controller_is_refused(module, named, imports, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
-    file, beside, weights = (tmp_path / name for name in ("versioned_controller.py", "beside_it.py", "weights.txt"))
+    file = tmp_path / named.format(module)
+    file.parent.mkdir(exist_ok=True)
+    beside, weights = file.parent / "beside_it.py", tmp_path / "weights.txt"
     own = {
-        file: "import beside_it\nfrom examples.idm import IDM\nclass Careful(IDM):\n"
+        file: f"{imports}\nfrom examples.idm import IDM\nclass Careful(IDM):\n"
         "    def __init__(self, weights): super().__init__()\n    def step(self, seen): return beside_it.ASKED",
         beside: "ASKED = -2.0",
         weights: "2.0",
@@ -96,7 +105,7 @@ def test_another_version_of_the_controller_is_refused(tmp_path, monkeypatch):
     for each, text in own.items():
         each.write_text(text)
     parameters, out = f"parameters: {{weights: {weights}}}", tmp_path / "run"
-    settings = (f"av={{controller: 'versioned_controller:Careful', {parameters}}}", "world.engine=twin")
+    settings = (f"av={{controller: '{module}:Careful', {parameters}}}", "world.engine=twin")
     run_here(golden("forced-twin", *settings, "stop.episodes=20"), out)
     for each, text in own.items():
         each.write_text(text.replace("2.0", "3.0") + "\n")
