@@ -11,6 +11,7 @@ import pytest
 from benchmarks.kills import orphans
 from harness.cli import main
 from harness.controllers.find import build_host
+from harness.controllers.hosts import _numbers
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.printed import PRINTED
 from harness.runner.workers import LocalWorkers
@@ -221,6 +222,25 @@ def test_what_is_loaded_is_loaded_once_a_process_and_shared_and_nothing_else_is(
     assert av.parameters["braking"] == [1.0]
     assert (len(host.construction_s), len(Learned.made)) == (3, 3)  # the first of all is that of a cell
     host.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "numbers", "wrong"),
+    [
+        (np.array([1.0, np.float32(2.0)], object), [1.0, 2.0], None),
+        ([[1], [2]], [1.0, 2.0], None),
+        (np.ma.array([1.0, 2.0], mask=[False, True]), [1.0, np.nan], None),
+        (np.array([1.0, None], object), [1.0, np.nan], None),
+        (np.array(["1", 2.0], object), None, "an array of object, expected accelerations"),
+        (np.array([np.timedelta64(1, "s"), 2.0], object), None, "an array of object, expected accelerations"),
+        (["1", "2"], None, "an array of <U1, expected accelerations"),
+        ([1.0], None, "an array of shape (1,), expected (2,)"),
+    ],
+)
+def test_what_a_batch_controller_may_answer(answer, numbers, wrong):
+    found, why = _numbers(2, answer)
+    assert (None if found is None else found.tolist()) == pytest.approx(numbers, nan_ok=True)
+    assert (wrong or "None") in str(why)
 
 
 @pytest.mark.parametrize(
