@@ -1,7 +1,8 @@
 """How often the interval of crashes per hour over three scenarios holds, pools and tests drawn anew each time.
 
 ``python -m studies.replication.hours --replications 40`` runs built-in vehicles in the twin until the half-width is
-0.3 of the rate. The truth is what the enumeration of independent paths says of the same driver.
+0.3 of the rate. The truth is what the enumeration of independent paths says of the same driver; of one that fails at
+random, of both that it is, each by its probability.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import harness
-from harness.campaign.drivers import IDMParameters, Reflexes
+from harness.campaign.drivers import IDMParameters, Reaction
 from harness.campaign.sections import EnvironmentSettings
 from harness.families import family_named
 from harness.families.protocol import Paths
@@ -24,11 +25,17 @@ from harness.vehicles.drivers import Followers, driver_records
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
 VEHICLES = {
-    "idm": (IDMParameters(), Reflexes()),
-    "late 1 s": (IDMParameters(), Reflexes(delay_s=1.0)),
-    "brakes 6 m/s²": (IDMParameters(min_acceleration_mps2=-6.0), Reflexes()),
-    "0.5 s behind, late 1 s": (IDMParameters(time_headway_s=0.5), Reflexes(delay_s=1.0)),
-}
+    "idm": (IDMParameters(), Reaction()),
+    "late 1 s": (IDMParameters(), Reaction(delay_s=1.0)),
+    "brakes 6 m/s²": (IDMParameters(min_acceleration_mps2=-6.0), Reaction()),
+    "0.5 s behind, late 1 s": (IDMParameters(time_headway_s=0.5), Reaction(delay_s=1.0)),
+} | {
+    f"late 2.5 s in {p:.0%} of tests": (
+        IDMParameters(), Reaction(inattention_probability=p, inattention_delay_s=2.5),
+    )
+    for p in (0.01, 0.1, 0.3)
+}  # fmt: skip
+"""The first are alike in all tests, so that most strata's shares are 0 or 1; the last fail at random in each."""
 TRUTH_SEED, BLOCK = 77_000_001, 1024
 POOL_ERROR = 0.03
 """Of the pools that are drawn anew: coarser than by default, so that their error is part of what is judged."""
@@ -37,11 +44,16 @@ POOL_ERROR = 0.03
 def truths(paths: int) -> dict[str, tuple[float, float]]:
     """Crashes per hour of each vehicle, with standard errors, from so many paths of each scenario."""
     drivers, reactions = zip(*VEHICLES.values(), strict=True)
+    late = [{"delay_s": each.delay_s + each.inattention_delay_s, "inattention_probability": 0.0} for each in reactions]
+    attentive = [each.model_copy(update={"inattention_probability": 0.0}) for each in reactions]
+    inattentive = [each.model_copy(update=given) for each, given in zip(reactions, late, strict=True)]
+    part = np.array([each.inattention_probability for each in reactions])
     total, variance = np.zeros((2, len(VEHICLES)))
     for name in NAMES:
         family, settings = family_named(name), EnvironmentSettings()
         traffic = family.traffic(settings)
-        followers = Followers(driver_records(drivers, reactions, see_onset=family.shows(traffic)))
+        both = driver_records(drivers * 2, attentive + inattentive, see_onset=family.shows(traffic))
+        followers = Followers(both)
         n = paths if family.follows else 16 * paths
         rates = np.zeros((n, len(VEHICLES) + 1))
         for first in range(0, n, BLOCK):
@@ -49,9 +61,10 @@ def truths(paths: int) -> dict[str, tuple[float, float]]:
             given = Paths(first + np.arange(BLOCK), family.start(traffic, u))
             offset = np.random.default_rng(first).integers(0, family.stride, BLOCK)
             found = family.events(traffic, TRUTH_SEED, given, followers, stride=family.stride, offset=offset)
-            for d in range(len(VEHICLES)):
-                rates[first : first + BLOCK, d] = np.where(found.crashes >> d & 1, found.probability, 0.0).sum(1)
-            rates[first : first + BLOCK, -1] = found.probability.sum(1)
+            rows = slice(first, first + BLOCK)
+            for d, p in enumerate(np.concatenate([1.0 - part, part])):
+                rates[rows, d % part.size] += p * np.where(found.crashes >> d & 1, found.probability, 0.0).sum(1)
+            rates[rows, -1] = found.probability.sum(1)
         per_hour = family.exposure(traffic, family.parameters(settings)).per_hour / rates[:, -1].mean()
         total += per_hour * rates[:, :-1].mean(0)
         variance += per_hour**2 * rates[:, :-1].var(0) / n
