@@ -57,8 +57,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     A full disk or a killed process leaves no half-written file under the final name. The temporary file of a killed
     process goes when the next one writes into this folder.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
         remove_unfinished(path.parent.glob(_UNFINISHED.format("*")))
         temporary = path.with_name(_UNFINISHED.format(uuid.uuid4().hex))
         try:

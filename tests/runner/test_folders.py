@@ -141,6 +141,7 @@ def pipe(file: str):
         *((written("campaign.yaml", text), READERS[:1], "campaign.yaml") for text in (None, "{}")),
         *((pipe(file), READERS[:1], file) for file in ("manifest.json", "campaign.yaml", f"episodes/{SECOND}")),
         (pipe("estimates.json"), READERS[1:2], "estimates.json"),  # nobody would ever write into it
+        (written("plots", ""), READERS[1:2], "plots found: a file expected: a folder"),
     ],
 )
 def test_what_is_not_as_it_was_left(damage, commands, said, stored, complaint_of):
