@@ -20,11 +20,13 @@ from pydantic_core import ErrorDetails
 
 from harness.campaign.problems import KINDS, describe_found, did_you_mean
 from harness.errors import HarnessError
+from harness.vocabulary import MOST_ASKED
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-AtLeastOne = Annotated[int, Field(ge=1)]
+AtLeastOne = Annotated[int, Field(ge=1, le=MOST_ASKED)]
+AtLeastTwo = Annotated[int, Field(ge=2, le=MOST_ASKED)]
 Episode = Annotated[int, Field(ge=0)]
 
 _PLAIN = (int, float, bool, str, NoneType)

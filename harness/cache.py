@@ -19,7 +19,7 @@ from pathlib import Path
 import platformdirs
 
 from harness.errors import OF_THE_DISK, HarnessError
-from harness.files import checksum, write_atomically
+from harness.files import checksum, read_bytes, write_atomically
 
 FOLDER = "HARNESS_CACHE_DIR"
 """Environment variable that names the cache; the default is the user's own, if there is a home to have it in."""
@@ -90,7 +90,7 @@ def read(name: str) -> bytes | None:
     """What is kept under a name; None if nothing is, or it is damaged."""
     for path in places(name):
         with suppress(OSError):
-            content = path.read_bytes()
+            content = read_bytes(path)
             if zlib.crc32(content, zlib.crc32(name.encode())) == _SEALED:
                 return content[:-_SEAL_BYTES]
     return None

@@ -98,6 +98,8 @@ SAMPLING: dict[Method, Sampling] = {
     "shells": Sampling(("shells",), baseline_runs=True, strata=True),
 }
 
+MOST_ASKED = 100_000
+"""Of workers, of tests of a check, of replicates: more is a slip of the hand that no memory holds."""
 COMPARISON, FAMILIES = "compare.json", "families.json"
 """By these files a folder is that of a comparison, or of several scenarios, and not of a run."""
 

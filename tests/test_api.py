@@ -103,6 +103,9 @@ RUN = "shells-twin"
         ),
         (lambda _: harness.compare("idm", "fvdm", "out", labels="ab"), "harness.compare(labels=", "a tuple"),
         (lambda _: harness.av_check("idm", 1), "harness.av_check(n_episodes=", "found 1"),
+        (lambda _: harness.run("idm", "out", workers=10**20), "harness.run(workers=", "found 10000"),
+        (lambda _: harness.av_check("idm", 10**9), "harness.av_check(n_episodes=", "found 1000000000"),
+        (lambda _: harness.fit(["no.csv"], "a.yaml", n_replicates=0), "harness.fit(n_replicates=", "found 0"),
     ],
 )
 def test_arguments_that_are_wrong_are_named(call, where, said, stored_run, tmp_path, monkeypatch):

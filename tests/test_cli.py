@@ -83,6 +83,9 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
         ["check", SMOKE, "--nothing"],
         ["estimate", ".", "--confidence", "1"],
         ["estimate", ".", "--confidence", "1e-16"],
+        ["run", SMOKE, "--junit", ""],
+        ["run", SMOKE, "--workers", "9" * 20],
+        ["av-check", SMOKE, "--tests", "9" * 20],
         [],
     ],
 )

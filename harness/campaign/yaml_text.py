@@ -21,6 +21,7 @@ from yaml.reader import ReaderError
 
 from harness.campaign.problems import did_you_mean
 from harness.errors import CampaignError
+from harness.files import opened
 
 YamlPath = Sequence[str | int]
 Lines = dict[tuple[str | int, ...], int]
@@ -73,7 +74,7 @@ def parse_value(text: str, where: str) -> Any:
 def read_text(path: Path) -> str:
     """Text of a UTF-8 file of no more than `LARGEST_FILE` bytes; else a `CampaignError`."""
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             content = file.read(LARGEST_FILE + 1)  # not all of what may be a device without an end
         if len(content) <= LARGEST_FILE:
             return content.decode("utf-8-sig")

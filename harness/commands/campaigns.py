@@ -16,6 +16,7 @@ from harness.commands.options import CAMPAIGN, FOLDER, examples, progress_bar
 from harness.commands.printing import print_either, print_json, print_table, prints_kept_in, say
 from harness.numbers import leaves, words
 from harness.processes import start_server
+from harness.vocabulary import MOST_ASKED
 
 
 @click.command(
@@ -167,7 +168,9 @@ def named_if_written(folder: Path, *, chosen: bool) -> Iterator[None]:
     epilog=examples("harness av-check my_av.py:MyClass", "harness av-check my.yaml --set av.parameters.hardest_mps2=8"),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
-@click.option("--tests", "episodes", type=click.IntRange(min=2), default=48, show_default=True, help="Tests to run.")
+@click.option(
+    "--tests", "episodes", type=click.IntRange(2, MOST_ASKED), default=48, show_default=True, help="Tests to run."
+)
 @options.scenario_option
 @options.av_option
 @options.set_option

@@ -11,6 +11,7 @@ import click
 import harness
 from harness.commands.options import FILE, examples, json_option, progress_bar, written_file
 from harness.commands.printing import print_json, say
+from harness.vocabulary import MOST_ASKED
 
 
 @click.command(
@@ -30,7 +31,9 @@ from harness.commands.printing import print_json, say
     "--mirror/--no-mirror", default=None, help="Fit lane changes to the left: vehicles close in there, or not."
 )
 @click.option("--leave-out", multiple=True, metavar="NAME", help="A recording that is not fitted; also several times.")
-@click.option("--replicates", type=click.IntRange(min=2), default=200, show_default=True, help="Environments to draw.")
+@click.option(
+    "--replicates", type=click.IntRange(2, MOST_ASKED), default=200, show_default=True, help="Environments to draw."
+)
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the replicates.")
 @click.option("--force", is_flag=True, help="Write over files that no fit has written.")
 @json_option

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from harness.errors import HarnessError
+from harness.vocabulary import MOST_ASKED
 
 if TYPE_CHECKING:
     from harness.progress import Progress
@@ -31,7 +32,7 @@ def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
             return None
         if value.suffix not in suffixes:
             option, found = parameter.opts[0], f"a name that ends in '{value.suffix}'"
-            mend = f"Write {option} {value.with_suffix(suffixes[0])}."
+            mend = f"Write {option} {value.parent / (value.stem or 'mine')}{suffixes[0]}."
             raise HarnessError(f"{option} {value}", found, f"a name that ends in {' or '.join(suffixes)}", mend)
         from harness.records.folder import require_place
 
@@ -50,7 +51,7 @@ av_option = click.option(
     "--av", "av", metavar="VEHICLE", help="Test this vehicle instead of the campaign's; named as for `harness run`."
 )
 workers_option = click.option(
-    "--workers", type=click.IntRange(min=1),
+    "--workers", type=click.IntRange(1, MOST_ASKED),
     help="Processes that simulate. Default: one per CPU that this process may use; with Ray, as many as the cluster "
     "has room for.",
 )  # fmt: skip

@@ -288,7 +288,7 @@ class VehicleDomain(Domain):
     def setAcceleration(self, vehID: str, acceleration: float, duration: float) -> None:
         """Accelerate (m/s²) for a duration (s)."""
         self._require_own(vehID, "setAcceleration")
-        if duration < 0.0:
+        if not duration >= 0.0:  # nan is not, either
             raise TraCIException("Duration must not be negative.")
         self._begin(partial(self._accelerate, _finite(acceleration), duration), duration)
 
@@ -297,7 +297,7 @@ class VehicleDomain(Domain):
         self._require_own(vehID, "slowDown")
         if not speed >= 0.0:
             raise TraCIException("Speed must not be negative.")
-        if duration < 0.0:
+        if not duration >= 0.0:  # nan is not, either
             raise TraCIException("Invalid time interval.")
         self._begin(partial(self._approach, _finite(speed), duration), duration)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from harness.arguments import checked
+from harness.arguments import AtLeastTwo, checked
 from harness.errors import HarnessError, printable
 from harness.families import families
 from harness.fitting.protocol import Asked, Fitted, Fitter
@@ -58,7 +58,7 @@ def fit_files(
     mapping: str | None = None,
     mirror: bool | None = None,
     leave_out: Sequence[str] = (),
-    n_replicates: int = REPLICATES,
+    n_replicates: AtLeastTwo = REPLICATES,
     seed: int = SEED,
     force: bool = False,
     progress: Progress | None = None,

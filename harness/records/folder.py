@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened
-from harness.files import write_atomically
+from harness.files import read_bytes, write_atomically
 from harness.vocabulary import FAMILIES
 
 T = TypeVar("T")
@@ -174,7 +174,7 @@ def read_table(
     once: what is decoded is what the checksum is of.
     """
     try:
-        content = path.read_bytes()
+        content = read_bytes(path)
         require_sum(path, crc32, content, mend)
         # Faster than read_table by a millisecond.
         with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=crc32 is None) as file:
@@ -301,7 +301,7 @@ def read_as(kind: type[T], path: Path, *, mend: str) -> T:
     """Read a JSON file of a run as a type; one that no run has written is refused by the first value that is wrong."""
     expected = "a JSON file of a run"
     try:
-        content = path.read_bytes()
+        content = read_bytes(path)
         value = TypeAdapter(kind).validate_json(content, strict=True)
         values = json.loads(content)
     except (OSError, UnicodeDecodeError) as error:

@@ -19,6 +19,7 @@ import platformdirs
 
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import RunFolderError
+from harness.files import read_bytes
 from harness.records.folder import CAMPAIGN
 
 
@@ -35,7 +36,7 @@ def code_of(av: AutomatedVehicle) -> str | None:
 
 def require_trust(folder: Path, manifest: Mapping[str, Any], code: str | None, mend: str) -> None:
     """Refuse (`RunFolderError`) to run ``code`` that a folder names which this user has not made on this machine."""
-    signed = signature((folder / CAMPAIGN).read_bytes())
+    signed = signature(read_bytes(folder / CAMPAIGN))
     if code is not None and (signed is None or not hmac.compare_digest(signed, str(manifest.get("signature")))):
         found = f"a run that was not made on this machine by this user; it names {code}, which would be run"
         raise RunFolderError(str(folder), found, "a run of your own, or your word for that code", mend)

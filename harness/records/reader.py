@@ -21,6 +21,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.errors import CampaignError, RunFolderError
 from harness.families.protocol import Environment
+from harness.files import read_bytes
 from harness.processes import made_ahead
 from harness.records.folder import (
     CAMPAIGN,
@@ -65,7 +66,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
         expected = "a campaign with all its sections, as the run has written it"
         raise RunFolderError(str(path), found, expected, mend) from error
     crc32 = manifest.get("campaign_crc32")
-    require_sum(path, crc32, path.read_bytes(), mend)
+    require_sum(path, crc32, read_bytes(path), mend)
     if crc32 is None:  # its run was killed as it began
         with suppress(CampaignError):  # its environment file is gone: nobody can tell
             require_campaign(path, resolve(campaign).content_hash, manifest)

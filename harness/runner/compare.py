@@ -28,10 +28,11 @@ from harness.estimators.answer import ended_by
 from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
+from harness.files import read_bytes
 from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import Draw, acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import CAMPAIGN, read_manifest, sole_use, write_sealed
+from harness.records.folder import CAMPAIGN, read_manifest, sole_use, write_bytes, write_sealed
 from harness.records.origin import code_of, require_trust
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import Earlier, require_own_folder
@@ -248,7 +249,9 @@ def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
     with sole_use(unfinished):  # in which a call that was killed may have left a part
         try:
             shutil.rmtree(unfinished / "a", ignore_errors=True)
-            copy = shutil.copytree(stored, unfinished / "a")
+            copy = unfinished / "a"
+            for file in filter(Path.is_file, stored.rglob("*")):
+                write_bytes(copy / file.relative_to(stored), read_bytes(file))
             if folder.exists():
                 folder.rmdir()
             copy.replace(folder)

@@ -9,12 +9,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
 
-from harness.arguments import checked
+from harness.arguments import AtLeastTwo, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.campaign.vehicle import AutomatedVehicle
@@ -142,7 +141,7 @@ class AvCheck:
 
 
 @checked("harness.av_check")
-def check_av(campaign: Campaign | str | Path, n_episodes: Annotated[int, Field(ge=2)] = EPISODES) -> AvCheck:
+def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES) -> AvCheck:
     """Run a few dozen episodes with a campaign's AV, twice, and say what is to be seen.
 
     The second run has other cells, begins in the middle, and follows episodes of its own: a controller that remembers

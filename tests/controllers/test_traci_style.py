@@ -120,7 +120,10 @@ def test_a_command_that_the_av_does_not_follow_waits_until_it_does(traci, comman
 NAN, RATIOS, UNKNOWN = float("nan"), "the crash rate would be wrong", "'AV7' is not known"
 COMMANDS = {"setSpeed": (3.0,), "setAcceleration": (1.0, 1.0), "slowDown": (1.0, 1.0), "setDecel": (1.0,)}
 MOVES = ("moveTo", "changeLane", "remove", "setRoute")
-IMPOSSIBLE = {"slowDown": [(-1.0, 1.0), (1.0, -1.0)], "setAcceleration": [(1.0, -1.0), (NAN, 1.0)]}
+IMPOSSIBLE = {
+    "slowDown": [(-1.0, 1.0), (1.0, -1.0), (1.0, NAN)],
+    "setAcceleration": [(1.0, -1.0), (NAN, 1.0), (1.0, NAN)],
+}
 REFUSED = [
     *(
         (f"{name}.*{of}.*{RATIOS}", f"vehicle.{name}", of, *rest)

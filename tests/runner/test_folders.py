@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from harness.cli import main
@@ -125,6 +127,10 @@ def written(file: str, text: str | None):
     return lambda run: (run / file).unlink() if text is None else (run / file).write_text(text)
 
 
+def pipe(file: str):
+    return lambda run: ((run / file).unlink(), os.mkfifo(run / file))
+
+
 @pytest.mark.parametrize(
     ("damage", "commands", "said"),
     [
@@ -142,6 +148,9 @@ def written(file: str, text: str | None):
         (lambda run: truncate(run / "manifest.json"), READERS[:1], "manifest.json"),
         *((written("manifest.json", text), READERS[:1], "manifest.json") for text in (None, '{"parts": 5}')),
         *((written("campaign.yaml", text), READERS[:1], "campaign.yaml") for text in (None, "{}")),
+        *((pipe(file), READERS[:1], file) for file in ("manifest.json", "campaign.yaml", f"episodes/{SECOND}")),
+        (pipe("estimates.json"), READERS[1:2], "estimates.json"),  # nobody would ever write into it
+        (written("plots", ""), READERS[1:2], "plots found: a file expected: a folder"),
     ],
 )
 def test_what_is_not_as_it_was_left(damage, commands, said, stored, complaint_of):
