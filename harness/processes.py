@@ -121,7 +121,7 @@ class Child:
         """Whether there is an `answer` now; receives one word, which may not be it."""
         try:
             word = self.connection.recv() if self.connection.poll() else WorkerDeath(self._died(), self._episode)
-        except (EOFError, OSError):
+        except (EOFError, OSError, pickle.UnpicklingError):  # a vehicle may have spoilt what its process sends
             word = WorkerDeath(self._died(), self._episode)
         self._answer, self._episode = (self._answer, word.episode) if isinstance(word, Began) else (word, None)
         return not isinstance(word, Began)

@@ -29,6 +29,12 @@ def answering(connection) -> None:
     connection.send(os.getpid())
 
 
+def garbled(connection) -> None:
+    """Sends what nobody can read, and lives on."""
+    connection.send_bytes(b"no pickle")
+    time.sleep(600)
+
+
 def abandoned(connection, note) -> None:
     """Starts a program, another in a session of its own, and writes down who they are; then it is busy."""
     assert "PYTHONSAFEPATH" not in os.environ  # which was the server's alone

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.processes import Child, first_to_answer, start_server
+from harness.processes import CLOSED_PIPE_EXIT_CODE, Child, first_to_answer, start_server
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner import workers
@@ -218,6 +218,12 @@ def test_workers_begin_where_the_process_was_killed_that_they_are_copies_of():
         child = Child(bad_workers.answering)
         assert first_to_answer([child]).answer() == child._process.pid
         child.kill()
+
+
+def test_a_worker_that_sends_what_nobody_can_read_has_died():
+    child = Child(bad_workers.garbled)
+    assert first_to_answer([child]).answer().exit_code == CLOSED_PIPE_EXIT_CODE
+    assert not child._process.is_alive()
 
 
 def wait_until_gone(state: Path) -> None:
