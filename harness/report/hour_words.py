@@ -27,7 +27,7 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
     rows = [*verdict, *sum_rows(content), *(reading_rows(content) if readings else ())]
     ends = [] if report is None else [f"  report  {report}"]
     parts = columns([(row[1], f"{row[2]} of all", *row[3:]) for row in family_rows(content)])
-    under = wrapped([*warnings(content), exposures(content), scope(content)])
+    under = wrapped([*(f"! {text}" for text in warnings(content)), exposures(content), scope(content)])
     return [" · ".join(head), *columns(rows), *parts, *under, *ends]
 
 
@@ -78,9 +78,9 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 def warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
     for name, of in content["families"].items():
-        yield from (f"! {text}" for text in milder_words(name, of["milder"]))
+        yield from milder_words(name, of["milder"])
         doubts = doubt_words({**of, "rate": of["rate_per_hour"]}, " per hour")
-        yield from (f"! {called(name)}: {text}" for text in (*early_words(of["n_crashes_before_event"]), *doubts))
+        yield from (f"{called(name)}: {text}" for text in (*early_words(of["n_crashes_before_event"]), *doubts))
 
 
 def exposures(content: Mapping[str, Any]) -> str:
