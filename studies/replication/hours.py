@@ -94,9 +94,10 @@ def main() -> None:
     options.add_argument("--replications", type=int, default=40)
     options.add_argument("--paths", type=int, default=32 * BLOCK, help="of the truth, a multiple of 1,024")
     options.add_argument("--first-seed", type=int, default=1000)
+    options.add_argument("--only", default="", help="vehicles whose name this is a part of")
     asked = options.parse_args()
     truth = truths(asked.paths)
-    seen: dict[str, list[tuple[float, float, float, int]]] = {name: [] for name in VEHICLES}
+    seen: dict[str, list[tuple[float, float, float, int]]] = {name: [] for name in VEHICLES if asked.only in name}
     for seed in range(asked.first_seed, asked.first_seed + asked.replications):
         for name, rows in seen.items():
             with tempfile.TemporaryDirectory() as folder:
