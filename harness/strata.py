@@ -108,6 +108,11 @@ class ShellDesign:
         """Probability per test that an event of each stratum happens, shape (S,)."""
         return np.asarray(np.bincount(self.cell_stratum, self.cell_p, minlength=len(self.strata)), np.float64)
 
+    @property
+    def p_event_error(self) -> float:
+        """Relative standard error of ``p_event``."""
+        return self.p_event_se / self.p_event
+
     def n_within(self, statement: str) -> int:
         """Strata that are asked about: those inside the boundary, or all."""
         return self.n_inside if statement == LIBRARY_STATEMENT else len(self.strata)

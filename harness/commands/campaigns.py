@@ -257,8 +257,11 @@ def compare(
     the half-width of the difference is 0.1 of the larger rate, or both are below stop.below_reference; or until
     --margin is decided; or, with --set stop.rhw=R, until that half-width is R.
 
+    With --scenario all the difference is in crashes per hour, summed over three scenarios.
+
     A may be a run folder: its tests are copied, not run again. So are finished tests of an earlier call with the same
-    --out. The folder receives the run folders a and b, compare.json and report.html.
+    --out. The folder receives the run folders a and b, compare.json and report.html; of several scenarios, each in a
+    folder of its own.
 
     Exit code 5: B is worse than A by more than --margin; 4: tests or pool were used up before that was known.
     """
@@ -266,7 +269,7 @@ def compare(
         raise click.UsageError("Name a second campaign, or say with --against or --against-av how B differs.")
     stored = source_a if source_a.is_dir() else None
     file_a = source_a if stored is None else stored / "campaign.yaml"
-    overrides = [*options.of_scenario(scenario, "compare"), *overrides]
+    overrides = [*options.of_scenario(scenario), *overrides]
     a = harness.load_campaign(file_a, overrides, av=av)
     b = harness.load_campaign(file_b or file_a, [*overrides, *against], av=against_av or av)
     if stored is not None:  # how far it was run before says nothing about now

@@ -9,9 +9,11 @@ round, whichever takes it farther.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cache
-from typing import Any, Literal, NamedTuple
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -68,42 +70,50 @@ class Interval(NamedTuple):
         return (self.ci_high - self.ci_low) / 2.0
 
 
-@dataclass(frozen=True, eq=False)
-class PairCounts:
-    """Pairs of tests of some strata, which are the first of the design's.
+class Pairs(ABC):
+    """Pairs of tests of some strata, of one scenario or of several side by side, and limits of what they say.
 
     ``ends`` (S, 3, 3) is how often A ended in one way (second axis) and B in another (third): no crash, crash, failed.
-    ``mass`` (S, 3, 3, S) is, over the same pairs, the sum of their paths' probability of an event of every stratum.
     Where something is asked with A, or B, the ``worse`` (1, or -1; 0 for neither), its failed tests count as crashes.
     """
 
-    design: ShellDesign
     ends: Counts
-    mass: FloatArray
 
     @property
+    @abstractmethod
     def p(self) -> FloatArray:
-        """Probabilities of the strata, shape (S,)."""
-        return self.design.p[: len(self.ends)]
+        """What the strata stand for, shape (S,): their probabilities per test; of several scenarios events per hour."""
+
+    @property
+    @abstractmethod
+    def designs(self) -> Sequence[ShellDesign]:
+        """Whose strata they are, of each scenario."""
+
+    @abstractmethod
+    def within(self, statement: str | None = None) -> Self:
+        """Those of the strata that a statement is about, by default those within the boundary."""
+
+    @abstractmethod
+    def times(self, factor: float) -> Self:
+        """So many times as many pairs of each stratum, ending as often."""
+
+    @abstractmethod
+    def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
+        """Variance of a weighted sum that comes from the pools' finite number of paths."""
+
+    @property
+    @abstractmethod
+    def reference(self) -> tuple[float, float] | None:
+        """Crash rate of the reference driver, and its standard error; None where none crashes."""
 
     @property
     def tests(self) -> IntArray:
         """Pairs of each stratum, shape (S,)."""
         return np.asarray(self.ends.sum((1, 2)))
 
-    def inside(self, n: int | None = None) -> PairCounts:
-        """Only the first ``n`` strata, by default those within the boundary."""
-        within = slice(0, self.design.n_inside if n is None else n)
-        return PairCounts(self.design, self.ends[within], self.mass[within, :, :, within])
-
     def outcomes(self, worse: float = 0.0) -> Counts:
         """How often both crash, only A, only B, neither, shape (S, 4)."""
         return np.tensordot(self.ends, _kinds(worse))
-
-    def tally(self, side: int) -> Tally:
-        """Tests of A (0) or B (1) by themselves."""
-        ends, mass = self.ends.sum(2 - side), self.mass.sum(2 - side)
-        return Tally(self.tests, ends[:, CRASH], ends[:, FAILED], mass[:, CRASH], mass[:, FAILED])
 
     @property
     def n_alone(self) -> tuple[int, int]:
@@ -128,24 +138,6 @@ class PairCounts:
         """Crashes that these tests of one vehicle would have brought at a rate, spread evenly over the strata."""
         return rate * int(self.tests.sum()) / float(self.p.sum())
 
-    def times(self, factor: float) -> PairCounts:
-        """So many times as many pairs of each stratum, ending as often."""
-        return PairCounts(self.design, np.asarray(self.ends * factor, np.float64), self.mass * factor)
-
-    def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
-        """Variance of a weighted sum that comes from the pool's finite number of paths.
-
-        The mean square of a path's part in it is at most that of its outcomes of positive weight and that of those of
-        negative weight together, as the product of the two only lowers it.
-        """
-        scale, square, rate, kinds = weight_of_a_test(self.p, self.tests), 0.0, 0.0, _kinds(worse)
-        for sign in (1.0, -1.0):
-            part = np.maximum(sign * weights, 0.0)
-            mass = np.tensordot(self.mass, kinds @ part, ((1, 2), (0, 1)))
-            square += float(part.max()) * mean_square(scale, mass)
-            rate += sign * float(scale @ (self.outcomes(worse) @ part))
-        return max(square - rate**2, 0.0) / self.design.n_paths
-
     def limit(self, weights: FloatArray, level: Level, side: float) -> float:
         """One limit of a weighted sum that does not fall where A crashes more often or B less."""
         variance = self.pool_variance(weights, side)
@@ -160,7 +152,7 @@ class PairCounts:
         """Rate of events on which A (0), or B (1), crashes and the other one does not."""
         sign, weights = ((1.0, ONLY_A), (-1.0, ONLY_B))[side]  # `limit` is of what does not fall where A crashes more
         low, high = sorted(sign * self.limit(sign * weights, level, end) for end in (-1.0, 1.0))
-        return Interval(self.rate(weights), max(low, 0.0) + 0.0, min(high, 1.0))
+        return Interval(self.rate(weights), max(low, 0.0) + 0.0, min(high, max(float(self.p.sum()), 1.0)))
 
     def highest_rate(self, level: Level) -> float:
         """Upper limit of the crash rate of A or B, whichever is higher."""
@@ -196,6 +188,116 @@ class PairCounts:
         if self.limit(excess, level, -1.0) > 0.0:
             return "proven"
         return "refuted" if self.limit(excess, level, 1.0) < 0.0 else "open"
+
+
+@dataclass(frozen=True, eq=False)
+class PairCounts(Pairs):
+    """Pairs of one scenario, of strata that are the first of the design's; ``ends`` see `Pairs`.
+
+    ``mass`` (S, 3, 3, S) is, over the same pairs, the sum of their paths' probability of an event of every stratum.
+    """
+
+    design: ShellDesign
+    ends: Counts
+    mass: FloatArray
+
+    @property
+    def p(self) -> FloatArray:
+        """See `Pairs`."""
+        return self.design.p[: len(self.ends)]
+
+    @property
+    def designs(self) -> Sequence[ShellDesign]:
+        """See `Pairs`."""
+        return (self.design,)
+
+    def within(self, statement: str | None = None) -> PairCounts:
+        """See `Pairs`."""
+        n = self.design.n_inside if statement is None else self.design.n_within(statement)
+        return PairCounts(self.design, self.ends[:n], self.mass[:n, :, :, :n])
+
+    def times(self, factor: float) -> PairCounts:
+        """See `Pairs`."""
+        return PairCounts(self.design, np.asarray(self.ends * factor, np.float64), self.mass * factor)
+
+    def tally(self, side: int) -> Tally:
+        """Tests of A (0) or B (1) by themselves."""
+        ends, mass = self.ends.sum(2 - side), self.mass.sum(2 - side)
+        return Tally(self.tests, ends[:, CRASH], ends[:, FAILED], mass[:, CRASH], mass[:, FAILED])
+
+    def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
+        """See `Pairs`.
+
+        The mean square of a path's part in it is at most that of its outcomes of positive weight and that of those of
+        negative weight together, as the product of the two only lowers it.
+        """
+        scale, square, rate, kinds = weight_of_a_test(self.p, self.tests), 0.0, 0.0, _kinds(worse)
+        for sign in (1.0, -1.0):
+            part = np.maximum(sign * weights, 0.0)
+            mass = np.tensordot(self.mass, kinds @ part, ((1, 2), (0, 1)))
+            square += float(part.max()) * mean_square(scale, mass)
+            rate += sign * float(scale @ (self.outcomes(worse) @ part))
+        return max(square - rate**2, 0.0) / self.design.n_paths
+
+    @property
+    def reference(self) -> tuple[float, float] | None:
+        """See `Pairs`: the first of the library that crashes at all."""
+        crash = np.flatnonzero(self.design.reference_rate)
+        return self.of_reference(int(crash[0])) if crash.size else None
+
+    def of_reference(self, r: int) -> tuple[float, float]:
+        """Crash rate of a reference driver by its place in the library, and its standard error."""
+        rate, square = float(self.design.reference_rate[r]), float(self.design.reference_square[r])
+        return rate, math.sqrt(max(square - rate * rate, 0.0) / self.design.n_independent)
+
+
+@dataclass(frozen=True, eq=False)
+class PairsPerHour(Pairs):
+    """Pairs of several scenarios: of each, its own, and how many ``tests_per_hour`` an hour of driving stands for."""
+
+    each: tuple[PairCounts, ...]
+    tests_per_hour: tuple[float, ...]
+
+    @property
+    def p(self) -> FloatArray:
+        """See `Pairs`."""
+        return np.concatenate([times * of.p for times, of in zip(self.tests_per_hour, self.each, strict=True)])
+
+    @cached_property
+    def ends(self) -> Counts:  # type: ignore[override] # nobody writes to it
+        """See `Pairs`."""
+        return np.concatenate([of.ends for of in self.each])
+
+    @property
+    def designs(self) -> Sequence[ShellDesign]:
+        """See `Pairs`."""
+        return [of.design for of in self.each]
+
+    def within(self, statement: str | None = None) -> PairsPerHour:
+        """See `Pairs`."""
+        return replace(self, each=tuple(of.within(statement) for of in self.each))
+
+    def times(self, factor: float) -> PairsPerHour:
+        """See `Pairs`."""
+        return replace(self, each=tuple(of.times(factor) for of in self.each))
+
+    def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
+        """See `Pairs`: pools are independent, and none knows exactly how often a test has an event."""
+        return math.fsum(
+            times**2 * (of.pool_variance(weights, worse) + (of.design.p_event_error * of.rate(weights)) ** 2)
+            for times, of in zip(self.tests_per_hour, self.each, strict=True)
+        )
+
+    @property
+    def reference(self) -> tuple[float, float] | None:
+        """See `Pairs`: the first of each library, whether it crashes there or not."""
+        total, errors = 0.0, list[float]()
+        for times, of in zip(self.tests_per_hour, self.each, strict=True):
+            if of.design.references:
+                rate, error = of.of_reference(0)
+                total += times * rate
+                errors.append(times * math.hypot(error, of.design.p_event_error * rate))
+        return (total, math.hypot(*errors)) if total else None
 
 
 class PairedShells:
@@ -236,8 +338,8 @@ def no_pairs(design: ShellDesign) -> PairCounts:
     return PairCounts(design, np.zeros((n, N_ENDS, N_ENDS), np.int64), np.zeros((n, N_ENDS, N_ENDS, n)))
 
 
-def contrast(pairs: PairCounts, level: Level) -> dict[str, Any]:
-    """What lies between A and B in some strata, difference A - B and ratio A/B; rates are crashes per test.
+def contrast(pairs: Pairs, level: Level) -> dict[str, Any]:
+    """What lies between A and B in some strata, difference A - B and ratio A/B; rates are per test, or per hour.
 
     ``rhw`` is the half-width of the difference over the larger of the two rates, ``rhw_from_pool`` what the pool's own
     error alone would leave of it; ``only_a`` and ``only_b`` are rates of events on which only one of the two crashes.
@@ -259,7 +361,7 @@ def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
 
     ``conditional`` is what lies between if neither crashes beyond the boundary, ``refuted`` once one has.
     """
-    level, design, inside = Level.two_sided(confidence), pairs.design, pairs.inside()
+    level, design, inside = Level.two_sided(confidence), pairs.design, pairs.within()
     each, tallies = [_own(pairs, side, confidence) for side in (0, 1)], [pairs.tally(side) for side in (0, 1)]
     counts = "n_both", "n_only_a", "n_only_b", "n_neither"
     shells = [

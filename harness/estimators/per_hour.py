@@ -43,11 +43,6 @@ class OfFamily(NamedTuple):
         return self.exposure.per_hour / self.seen.design.p_event
 
     @property
-    def relative_error(self) -> float:
-        """Relative standard error of that."""
-        return self.seen.design.p_event_se / self.seen.design.p_event
-
-    @property
     def p(self) -> FloatArray:
         """Events of each stratum per hour, (S,)."""
         return self.per_hour * self.seen.design.p
@@ -123,7 +118,7 @@ class PerHour:
             variance = 0.0
             for (of, strata), tally in zip(parts, each, strict=True):  # masses are per test, as a design's p is
                 own = pool_variance(of.seen.design.p[strata], tally, of.seen.design.n_independent)
-                variance += of.per_hour**2 * own + (of.relative_error * of.rate) ** 2
+                variance += of.per_hour**2 * own + (of.seen.design.p_event_error * of.rate) ** 2
             crashes, tests = (
                 np.concatenate(column) for column in zip(*((t.crashes, t.tests) for t in each), strict=True)
             )
@@ -197,7 +192,7 @@ class PerHour:
                 found = pool_variance(design.p, own, design.n_independent), 0.0, 0.0
             mine, theirs = of.rate, of.reference_rate
             errors += of.per_hour**2 * np.array(found)
-            errors += of.relative_error**2 * np.array((mine * mine, mine * theirs, theirs * theirs))
+            errors += of.seen.design.p_event_error**2 * np.array((mine * mine, mine * theirs, theirs * theirs))
         of_paths, covariance, of_reference = errors.tolist()
 
         def variance(x: float) -> float:

@@ -27,7 +27,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept, Stop
 from harness.estimators.estimate import Estimate, Note, note
 from harness.estimators.likelihood import Level
-from harness.estimators.pairs import PairCounts, PairDecision, PairVerdict
+from harness.estimators.pairs import PairDecision, Pairs, PairVerdict
 from harness.estimators.per_hour import PerHour
 from harness.estimators.shells import SeenShells
 from harness.strata import ASSUMPTION_FREE
@@ -348,9 +348,9 @@ class PairRule(Rule):
         self.conditional = self._statement != ASSUMPTION_FREE
         self.decision = PairDecision(margin or 0.0, "open", (1.0 + stop.confidence) / 2.0, self.conditional)
 
-    def observe(self, pairs: PairCounts) -> bool:
+    def observe(self, pairs: Pairs) -> bool:
         """Whether to stop at the end of a round."""
-        watched, level = pairs.inside(pairs.design.n_within(self._statement)), Level.two_sided(self._confidence)
+        watched, level = pairs.within(self._statement), Level.two_sided(self._confidence)
         self.decision = replace(self.decision, verdict=self._verdict(watched))
         pool = watched.rhw_from_pool(level)
         found, of = (watched.rhw(level), pairs.n_crashes), "rhw_of_difference"
@@ -365,28 +365,26 @@ class PairRule(Rule):
             self.look = replace(self.look, ended=ended, unmet=unmet)
         return self.look.stopped or given_up
 
-    def more_pairs(self, pairs: PairCounts) -> float:
+    def more_pairs(self, pairs: Pairs) -> float:
         """How many times as many pairs would decide, if they end as often; infinite where nobody can tell."""
-        watched, times = pairs.inside(pairs.design.n_within(self._statement)), 1.0
+        watched, times = pairs.within(self._statement), 1.0
         while times < MOST_TIMES:
             times *= LOOK_RATIO
             if self._verdict(watched.times(times)) != "open":
                 return times
         return math.inf
 
-    def _verdict(self, watched: PairCounts) -> PairVerdict:
+    def _verdict(self, watched: Pairs) -> PairVerdict:
         level = Level.two_sided(self._confidence)
         if watched.n_crashes and not self.ends_at_rhw:
             level = self.level_at(watched.expected(watched.larger_rate), self._confidence)
         return watched.verdict(self.decision.margin, level)
 
-    def _both_below(self, watched: PairCounts) -> bool:
+    def _both_below(self, watched: Pairs) -> bool:
         """Whether both are known to crash less than so many times as often as the reference driver does at least."""
-        design, limit = watched.design, self._below_reference
-        if limit is None or design.first_reference is None:
+        limit, reference = self._below_reference, watched.reference
+        if limit is None or reference is None:
             return False
-        r = [each.name for each in design.references].index(design.first_reference[0])
-        rate, square = float(design.reference_rate[r]), float(design.reference_square[r])
+        rate, error = reference
         level = self.level_at(watched.expected(limit * rate), self._confidence)
-        error = math.sqrt(max(square - rate * rate, 0.0) / design.n_independent)
         return watched.highest_rate(level) < limit * (rate - level.z * error)

@@ -17,7 +17,8 @@ from harness.numbers import count, tenths
 from harness.records.folder import read_as
 from harness.report.crashes import rows_of
 from harness.report.drawing import Plot
-from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
+from harness.report.hour_words import beside_row, called
+from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words, ratio_words
 from harness.report.player import Scene, Scenes, beside_other
 from harness.report.plots import WHO, pairs_plot
 from harness.report.summary import RunFolder, read_run_folder, summarise
@@ -40,6 +41,10 @@ def write_comparison(folder: str | Path) -> Path:
     """
     folder = Path(folder)
     stored = read_as(dict[str, Any], folder / COMPARISON, mend=MEND)
+    if "families" in stored:
+        for name in stored["families"]:
+            write_comparison(folder / name)
+        return write_sum(folder, stored)
     runs = [read_run_folder(folder / side) for side in ("a", "b")]
     for run, of in zip(runs, stored["campaigns"].values(), strict=True):
         if (found := run.manifest["campaign_hash"]) != of["campaign_hash"]:
@@ -54,14 +59,33 @@ def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder
     family = family_named(runs[0].campaign.scenario)
     return write_page(
         folder / "report.html", "compare.html.j2",
-        compared=stored, asked=asked, given=asked is not stored,
-        verdict=pair_words(stored["decision"]), warnings=list(pair_warnings(stored)),
+        **_told(stored), asked=asked, given=asked is not stored,
         answers=[short_answer(run.campaign, run.manifest, run.estimates) for run in runs],
-        to_decide=deciding_words(stored), above=runs[0].campaign.crash.counts_above_mps,
+        above=runs[0].campaign.crash.counts_above_mps,
         sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
         family=family, words=family.words, plot=pairs.plot(family),
         scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
     )  # fmt: skip
+
+
+def write_sum(folder: Path, stored: dict[str, Any]) -> Path:
+    """Write the page of a comparison in several scenarios: the sum, and the way to each one's own page."""
+    sides = list(zip("AB", (stored["a"], stored["b"]), stored["campaigns"].values(), strict=True))
+    rows = [
+        (called(name), name, of, {"ratio": ratio_words(of), "verdict": pair_words(of["decision"])})
+        for name, of in stored["families"].items()
+    ]
+    beside = [beside_row("", side["beside"], seen=side["n_crashes"] > 0) for _, side, _ in sides]
+    told = {**_told(stored), "ratio": ratio_words(stored), "beside": beside}
+    return write_page(folder / "report.html", "compare_sum.html.j2", **told, sides=sides, rows=rows)
+
+
+def _told(stored: dict[str, Any]) -> dict[str, Any]:
+    """What both kinds of pages tell."""
+    return {
+        "compared": stored, "verdict": pair_words(stored["decision"]), "to_decide": deciding_words(stored),
+        "warnings": list(pair_warnings(stored)),
+    }  # fmt: skip
 
 
 class Pairs(NamedTuple):

@@ -7,11 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.campaign.campaign import Campaign
-from harness.families import family_named
-from harness.numbers import count, duration, interval, number, plain, ratio, share
-from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words
-from harness.report.words import ENDED, ShortAnswer, scope_words
+from harness.numbers import count, duration, interval, share
+from harness.report.words import ShortAnswer
 
 WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
@@ -65,37 +62,3 @@ def wrapped(texts: Iterable[str]) -> Iterator[str]:
     for text in texts:
         whole = text.replace(" %", "\u00a0%").replace("± ", "±\u00a0")  # a number and its sign stay together
         yield from (line.replace("\u00a0", " ") for line in fill.wrap(whole))
-
-
-def pair_lines(
-    content: Mapping[str, Any], campaign: Campaign, report: Path, s_per_pair: float | None = None
-) -> list[str]:
-    """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is what a pair takes.
-
-    Of the ``campaign`` it says which scenario was driven, and which crashes count.
-    """
-    asked = pair_asked(content)
-    rows = []
-    for name in "AB":
-        of, label = content[name.lower()], content["campaigns"][name.lower()]["label"]
-        rate, ends = number(of["crash_rate"]), interval(of["ci_low"], of["ci_high"])
-        if not of["n_crashes"]:
-            rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
-        label = label if len(label) <= LABEL else f"{label[: LABEL - 2]} …"
-        rows.append((f"{name} {label}", rate, ends, f"{count(of['n_crashes'])} crashes"))
-    if asked["ratio"] is not None:
-        most = "no limit" if asked["ratio_high"] is None else ratio(asked["ratio_high"])
-        rows.append(("A / B", ratio(asked["ratio"]), f"{ratio(asked['ratio_low'])} to {most}", ""))
-    alone = f"crashes of A alone {count(asked['n_only_a'])}, B {count(asked['n_only_b'])}"
-    rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), alone))
-    remarks = [f"! {text}" for text in pair_warnings(content)]
-    if asked is not content:
-        given = f"A / B and A − B assume that both crash only where {asked['boundary']} of the library does"
-        remarks.insert(0, given)
-    scope = scope_words(content["confidence"], ENDED.get(content.get("ended", ""), "interrupted"))
-    above = campaign.crash.counts_above_mps
-    counted = f" above {plain(above)} m/s" if above else ""
-    pairs = f"{count(content['n_pairs'])} pairs of tests, {family_named(campaign.scenario).words.called}"
-    head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per test"
-    last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
-    return [head, *columns(rows), *wrapped([*remarks[: 3 - len(last)], *last]), f"  report  {report}"]

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
-from harness.numbers import count, duration, share, two_digits_up
+from harness.campaign.campaign import Campaign
+from harness.numbers import count, duration, interval, number, plain, ratio, share, two_digits_up
+from harness.report.hour_words import called
+from harness.report.hour_words import warnings as hour_warnings
+from harness.report.lines import LABEL, columns, wrapped
 from harness.report.notes import note_words
-from harness.report.words import unseen_words
+from harness.report.words import ENDED, milder_words, scope_words, unseen_words
 from harness.strata import LIBRARY_STATEMENT
 
 
@@ -25,18 +30,23 @@ def pair_words(decision: Mapping[str, Any]) -> str:
 def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of a comparison (``compare.json``)."""
     sides = {name: content[name.lower()] for name in "AB"}
+    if "families" in content:
+        for name, of in sides.items():
+            yield from (f"{name}, {text}" for text in hour_warnings(of))
+        return
     for name, of in sides.items():
         if n := of["details"]["n_failed"]:
             yield f"{count(n)} tests of {name} FAILED"
     for name, of in sides.items():
         yield from (f"{name}: {note_words(each)}" for each in of["warnings"])
+        yield from (f"{name}: {text}" for text in milder_words(content["scenario"], content["milder"][name.lower()]))
     if where := content.get("unseen"):
         yield unseen_words(where)
 
 
 def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) -> str | None:
     """What would decide a comparison (``compare.json``) that was left open, and its cost; None of a decided one."""
-    if content["decision"]["verdict"] != "open":
+    if content["decision"]["verdict"] != "open" or content.get("ended") == "sum":
         return None
     if (needed := content["to_decide"]) is None:
         return "how many pairs would decide is not known: so far the two are too alike"
@@ -50,6 +60,60 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
     """What lies between A and B under the statement that the comparison (``compare.json``) was asked for."""
-    given = content.get("asked") == LIBRARY_STATEMENT and not content["conditional"].get("refuted")
+    given = content.get("asked") == LIBRARY_STATEMENT and not content["conditional"].get("refuted")  # of one scenario
     asked: Mapping[str, Any] = content["conditional"] if given else content
     return asked
+
+
+def rates_of(side: Mapping[str, Any]) -> dict[str, Any]:
+    """Rate with limits, and counts, of A or B in ``compare.json``: per test, or per hour of several scenarios."""
+    found = side.get("per_hour") or {**side, "rate": side["crash_rate"]}
+    return {**found, "n_crashes": side["n_crashes"], "n_episodes": side["n_episodes"]}
+
+
+def ratio_words(of: Mapping[str, Any]) -> tuple[str, str]:
+    """A over B, and its interval."""
+    most = "no limit" if of["ratio_high"] is None else ratio(of["ratio_high"])
+    return ("–", "") if of["ratio"] is None else (ratio(of["ratio"]), f"{ratio(of['ratio_low'])} to {most}")
+
+
+def alone_words(of: Mapping[str, Any]) -> str:
+    """Pairs of which one crashes and the other does not."""
+    return f"crashes of A alone {count(of['n_only_a'])}, B {count(of['n_only_b'])}"
+
+
+def pair_lines(
+    content: Mapping[str, Any], campaign: Campaign, report: Path, s_per_pair: float | None = None
+) -> list[str]:
+    """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is what a pair takes.
+
+    Of the ``campaign`` it says which scenario was driven, and which crashes count.
+    """
+    asked, rows = pair_asked(content), []
+    for name in "AB":
+        of, label = rates_of(content[name.lower()]), content["campaigns"][name.lower()]["label"]
+        rate, ends = number(of["rate"]), interval(of["ci_low"], of["ci_high"])
+        if not of["n_crashes"]:
+            rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
+        label = label if len(label) <= LABEL else f"{label[: LABEL - 2]} …"
+        rows.append((f"{name} {label}", rate, ends, f"{count(of['n_crashes'])} crashes"))
+    if asked["ratio"] is not None:
+        rows.append(("A / B", *ratio_words(asked), ""))
+    rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), alone_words(asked)))
+    families = content.get("families", {})
+    parts = columns(
+        [(called(name), f"A / B {' '.join(ratio_words(of))}", alone_words(of)) for name, of in families.items()]
+    )
+    remarks = [f"! {text}" for text in pair_warnings(content)]
+    if asked is not content:
+        given = f"A / B and A − B assume that both crash only where {asked['boundary']} of the library does"
+        remarks.insert(0, given)
+    scope = scope_words(content["confidence"], ENDED.get(content.get("ended", ""), "interrupted"))
+    above = campaign.crash.counts_above_mps
+    counted = f" above {plain(above)} m/s" if above else ""
+    scenarios, unit = (f"{len(families)} scenarios", "hour") if families else (called(campaign.scenario), "test")
+    pairs = f"{count(content['n_pairs'])} pairs of tests, {scenarios}"
+    head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per {unit}"
+    last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
+    under = wrapped([*(remarks if families else remarks[: 3 - len(last)]), *last])
+    return [head, *columns(rows), *parts, *under, f"  report  {report}"]

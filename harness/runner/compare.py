@@ -1,21 +1,17 @@
 """Compare two AVs on the same events drawn from shells: both are driven round by round, to where they differ.
 
-The i-th event of a stratum is the same for both, as it follows from the campaign's seed and the pool. What either
-folder holds already, from an earlier call or because it is the copy of a stored run, is not driven again.
+Of one scenario the folder holds run folders ``a`` and ``b``, ``compare.json`` and the page. Of several it holds such a
+folder of each, and the sum: crashes per hour of driving.
 """
 
 from __future__ import annotations
 
 import math
-import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from pydantic import Field
 
 from harness.arguments import AtLeastOne, checked
@@ -23,21 +19,23 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.campaign.sections import MOST_EVENTS
 from harness.campaign.vehicle import Limits
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, RunFolderError
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import ended_by
-from harness.estimators.pairs import PairCounts, PairedShells, PairVerdict, paired_estimate
+from harness.estimators.estimate import finite_json
+from harness.estimators.likelihood import Level
+from harness.estimators.pairs import Pairs, PairsPerHour, PairVerdict, contrast, paired_estimate
+from harness.estimators.per_hour import OfFamily, PerHour
+from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
-from harness.files import read_bytes
 from harness.numbers import leaves, two_digits_up
-from harness.pool.shells import Draw, acceleration_limit
+from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import CAMPAIGN, read_manifest, sole_use, write_bytes, write_sealed
+from harness.records.folder import CAMPAIGN, read_manifest, write_sealed
 from harness.records.origin import code_of, require_trust
-from harness.resolved import Resolved, require_ready
-from harness.runner.kept import Earlier, require_own_folder
-from harness.runner.run import begun
-from harness.sampling.protocol import ShardRequest
+from harness.resolved import require_ready
+from harness.runner.families import exposure_of, hour_answer
+from harness.runner.paired import SIDES, Both, Scenario, copy_stored, drive_pairs, together
 from harness.sampling.shells import PairRounds
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import COMPARISON
@@ -45,11 +43,8 @@ from harness.vocabulary import COMPARISON
 if TYPE_CHECKING:
     from harness.report.summary import RunFolder
 
-SIDES = ("a", "b")
 MAY_DIFFER = frozenset({"av", "name", "description"})
 EXIT_OF: Mapping[PairVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
-
-Both = tuple[Resolved, Resolved]
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,7 +63,7 @@ class Comparison:
     """What the page is made of, of A and of B."""
 
     def __repr__(self) -> str:
-        from harness.report.lines import pair_lines  # noqa: PLC0415 - draws
+        from harness.report.pair_words import pair_lines  # noqa: PLC0415 - draws
 
         last = self.shown[1]
         s_per_pair = last.manifest["wall_time_s"] / self.content["n_pairs"]
@@ -79,6 +74,8 @@ class Comparison:
         from harness.report.compare_page import crashing_pairs  # noqa: PLC0415 - draws
         from harness.report.page import shown_with  # noqa: PLC0415
 
+        if "shells" not in self.content:  # of several scenarios, each of which has its own map
+            return shown_with(repr(self), None)
         plot = crashing_pairs(self.shown, self.content["shells"]).plot(family_named(self.shown[0].campaign.scenario))
         return shown_with(repr(self), plot)
 
@@ -102,9 +99,9 @@ def compare_campaigns(
     ----------
     a, b : Campaign, str or Path
         Campaigns, or the paths or vehicles' names that stand for them, equal but for av, name and description; their
-        own ``stop.rhw`` is about one vehicle, and not asked.
+        own ``stop.rhw`` is about one vehicle, and not asked. Of several scenarios the sum is compared, per hour.
     out : str or Path
-        Folder of the run folders ``a`` and ``b``; what an earlier call has finished there is used again.
+        Folder of the run folders ``a`` and ``b``, or of such a folder of each scenario; what an earlier call has finished there is used again.
     workers, progress
         As in `harness.run`.
     labels : tuple of two str, optional
@@ -133,77 +130,110 @@ def compare_campaigns(
       90 % intervals cover sampling error in this simulated traffic only; stopped: verdict reached
       report  runs/late/report.html
     """
-    a, b = campaign_of(a), campaign_of(b)
+    a, b, out = campaign_of(a), campaign_of(b), Path(out)
+    folders = {name: name for name in a.scenarios} if a.scenarios else {a.scenario: ""}
     if stored is not None:
-        mend = f"Read that code; then name {Path(stored) / CAMPAIGN} for A, which drives it anew."
-        require_trust(Path(stored), read_manifest(Path(stored)), code_of(a.av), mend)
+        stored = Path(stored)
+        for folder in folders.values():
+            mend = f"Read that code; then name {stored / CAMPAIGN} for A, which drives it anew."
+            require_trust(stored / folder, read_manifest(stored / folder), code_of(a.av), mend)
     if margin is not None and rhw is not None:
         expected = "one end of the comparison"
         raise CampaignError("--margin", f"stop.rhw={rhw:g} beside it", expected, "Leave out --margin or stop.rhw.")
-    sides = require_ready(a, "compare"), require_ready(b, "compare")
-    require_comparable(*(side.campaign for side in sides))
-    require_same_shells(sides, stored)
-    out = Path(out)
-    folders = out / "a", out / "b"
+    if a.scenarios or b.scenarios:
+        require_comparable(a, b)
+    if a.stop.each_family:
+        expected = "false: a comparison ends by the sum of its scenarios"
+        raise CampaignError("stop.each_family", "true", expected, "Write --set stop.each_family=false.")
+    ready: dict[Path, Both] = {}
+    for name, folder in folders.items():
+        of_a, of_b = (require_ready(of.of_family(name) if of.scenarios else of, "compare") for of in (a, b))
+        require_comparable(of_a.campaign, of_b.campaign)
+        require_same_shells((of_a, of_b), stored)
+        ready[out / folder] = of_a, of_b
     if stored is not None:
-        _take_over(Path(stored), folders[0], sides[0])
-    rule = PairRule(sides[0].campaign, margin, rhw)
-    rounds, pairs, shown = _compared(sides, folders, rule, workers, progress or Progress())
-    found = paired_estimate(pairs, a.stop.confidence)
-    told = zip(SIDES, labels or (a.name, b.name), sides, strict=True)
-    campaigns = {name: {"label": label, "campaign_hash": side.content_hash} for name, label, side in told}
-    content = {
-        "format": 1, "method": a.testing.method, "seed": a.seed, "campaigns": campaigns, **found,
-        "decision": asdict(rule.decision), "to_decide": _to_decide(sides[0].campaign, rounds, pairs),
-        "asked": LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE,
-        "ended": ended_by(a, rule, found["n_pairs"]), "unseen": sides[0].parameters.unseen,
-    }  # fmt: skip
+        for folder in folders.values():
+            copy_stored(stored / folder, out / folder / "a", ready[out / folder][0])
+    rule = PairRule(a, margin, rhw)
+    rounds, scenarios = drive_pairs(a, ready, rule, workers, progress or Progress())
+    pairs = together(scenarios, a)
     code = EXIT_DONE if rule.look.stopped else EXIT_BUDGET_SPENT
     if margin is not None:
         code = EXIT_OF[rule.decision.verdict]
-    write_sealed(out / COMPARISON, content)
+    ended = {
+        "decision": asdict(rule.decision), "to_decide": _to_decide(a, rounds, pairs),
+        "ended": ended_by(a, rule, int(pairs.tests.sum())),
+    }  # fmt: skip
+    told = labels or (a.name, b.name), LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE
+    if not isinstance(pairs, PairsPerHour):
+        return _written(scenarios[0], ended, *told, code)
+    each = {}
+    for of in scenarios:
+        own = PairRule(a, margin, rhw)
+        own.observe(of.pairs)
+        each[of.name] = asdict(own.decision)
+        _written(of, {"decision": each[of.name], "to_decide": None, "ended": "sum"}, *told, code)
+    return _sum_written(out, a, pairs, scenarios, ended, each, told[0], code)
+
+
+def _written(of: Scenario, ended: Mapping[str, Any], labels: tuple[str, str], asked: str, code: int) -> Comparison:
+    """Write what is known of one scenario, and its page."""
+    resolved = [each.run.resolved for each in of.runs]
+    campaign, told = resolved[0].campaign, zip(SIDES, labels, resolved, strict=True)
+    content = {
+        "format": 1, "method": campaign.testing.method, "seed": campaign.seed, "scenario": campaign.scenario,
+        "campaigns": {side: {"label": label, "campaign_hash": own.content_hash} for side, label, own in told},
+        **paired_estimate(of.pairs, campaign.stop.confidence), **ended, "asked": asked,
+        "unseen": resolved[0].parameters.unseen,
+        "milder": {side: each.estimates["milder"] for side, each in zip(SIDES, of.results, strict=True)},
+    }  # fmt: skip
+    write_sealed(of.folder / COMPARISON, content)
     from harness.report.compare_page import write_page_of  # noqa: PLC0415 - draws
 
-    return Comparison(out, content, code, write_page_of(out, content, shown), shown)
+    shown = [each.shown for each in of.results]
+    return Comparison(of.folder, content, code, write_page_of(of.folder, content, shown), shown)
 
 
-def _compared(
-    sides: Both, folders: tuple[Path, Path], rule: PairRule, workers: int | None, progress: Progress
-) -> tuple[PairRounds, PairCounts, list[RunFolder]]:
-    """Rounds of pairs until the rule is content: what those say that it has seen, and what pages show of both runs."""
-    campaign = sides[0].campaign
-    with ExitStack() as held, ExitStack() as working:
-        for folder in folders:
-            held.enter_context(sole_use(folder))
-        both = list(zip(folders, sides, strict=True))
-        earlier = [require_own_folder(*each, resume=True) for each in both]  # both, before either is touched
-        begins = [begun(*each, found, workers, progress, 2) for each, found in zip(both, earlier, strict=True)]
-        runs = [working.enter_context(each) for each in begins]
-        prescribed = runs[0].prescribed  # as the other's: one environment and one library make one pool
-        rounds = PairRounds(campaign, prescribed.design, prescribed.available, rule)
-        pairs = PairedShells(prescribed.design)
-        progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
-        for side, each in enumerate(runs):
-            for shard in each.drive(stored_requests(each.run.earlier), rule):
-                pairs.add(side, shard.block)
-        n_pairs = np.zeros_like(pairs.tests(0))
-        counts = pairs.first(n_pairs)
-        while (added := rounds.next_round(counts)).any():
-            n_pairs = n_pairs + added
-            for side, each in enumerate(runs):  # what is missing of the first events of each stratum
-                tested = pairs.tests(side)
-                for shard in each.drive_added(tested, np.maximum(n_pairs - tested, 0), rule):
-                    pairs.add(side, shard.block)
-            counts = pairs.first(n_pairs)
-            if rule.observe(counts):
-                break
-        for each in runs:
-            each.run.require_few_failed()
-        working.close()
-        return rounds, counts, [each.finish(rule).shown for each in runs]
+def _sum_written(
+    out: Path,
+    campaign: Campaign,
+    pairs: PairsPerHour,
+    scenarios: Sequence[Scenario],
+    ended: Mapping[str, Any],
+    decisions: Mapping[str, Any],
+    labels: tuple[str, str],
+    code: int,
+) -> Comparison:
+    """Write what is known of the sum of several scenarios, and its page; each one's own has been written."""
+    confidence = campaign.stop.confidence
+    level, sides = Level.two_sided(confidence), {}
+    for i, side in enumerate(SIDES):
+        runs = {of.name: (of.runs[i].run, of.results[i]) for of in scenarios}
+        families = [
+            OfFamily(name, exposure_of(run.resolved, campaign.exposure), SeenShells.of_blocks(run.blocks))
+            for name, (run, _) in runs.items()
+        ]
+        ready = {name: run.resolved for name, (run, _) in runs.items()}
+        told = {name: (result.estimates, result.shown.manifest) for name, (_, result) in runs.items()}
+        sides[side] = hour_answer(PerHour(families), ready, told, confidence)
+    of_each = zip(scenarios, pairs.each, pairs.tests_per_hour, strict=True)
+    content = finite_json({
+        "format": 1, "method": campaign.testing.method, "seed": campaign.seed, "exposure": campaign.exposure,
+        "campaigns": {side: {"label": label} for side, label in zip(SIDES, labels, strict=True)},
+        **sides, **contrast(pairs, level), **ended, "confidence": confidence,
+        "families": {
+            of.name: {**contrast(PairsPerHour((own,), (times,)), level), "decision": decisions[of.name]}
+            for of, own, times in of_each
+        },
+    })  # fmt: skip
+    write_sealed(out / COMPARISON, content)
+    from harness.report.compare_page import write_sum  # noqa: PLC0415 - draws
+
+    shown = [each.shown for of in scenarios for each in of.results]
+    return Comparison(out, content, code, write_sum(out, content), shown)
 
 
-def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: PairCounts) -> dict[str, Any] | None:
+def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: Pairs) -> dict[str, Any] | None:
     """How many pairs would decide what was left open, and what to set; None where nobody can tell."""
     rule = rounds.rule
     if rule.decision.verdict != "open" or math.isinf(times := rule.more_pairs(pairs)):
@@ -216,47 +246,6 @@ def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: PairCounts) -> dic
             return None
         settings["pool.events_per_shell"] = kept
     return {"pairs": needed, "settings": settings, "new_folder": new_folder}
-
-
-def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:
-    """Tests that a folder holds, as they were asked for."""
-    taken: dict[int, int] = {}
-    for index, part in enumerate(earlier.parts):
-        tables = earlier.tables(part.first_episode, part.n_episodes)
-        if tables is None:  # what is gone is driven anew, and so is all that follows
-            return
-        stratum = tables.episodes.column("component").to_numpy()
-        edges = [0, *(np.flatnonzero(np.diff(stratum)) + 1).tolist(), stratum.size]
-        draws = []
-        for first, end in pairwise(edges):
-            s, n = int(stratum[first]), end - first
-            draws.append(Draw(s, taken.get(s, 0), n))
-            taken[s] = taken.get(s, 0) + n
-        yield ShardRequest(index, part.first_episode, part.n_episodes, tuple(draws))
-
-
-def _take_over(stored: Path, folder: Path, resolved: Resolved) -> None:
-    """Copy a stored run of A, and no other (`RunFolderError`), to where A is to be run, unless it is there already."""
-    if folder.exists() and any(folder.iterdir()):
-        return
-    manifest = read_manifest(stored)
-    if manifest["campaign_hash"] != resolved.content_hash:
-        expected = f"one of A as it is to be compared ({resolved.content_hash})"
-        mend = "Leave out --set and --av where they change more than the stop rule, or name A's campaign file."
-        raise RunFolderError(str(stored), f"a run of campaign {manifest['campaign_hash']}", expected, mend)
-    require_own_folder(stored, resolved, resume=True)
-    unfinished = folder.with_name(f".{folder.name}.part")
-    with sole_use(unfinished):  # in which a call that was killed may have left a part
-        try:
-            shutil.rmtree(unfinished / "a", ignore_errors=True)
-            copy = unfinished / "a"
-            for file in filter(Path.is_file, stored.rglob("*")):
-                write_bytes(copy / file.relative_to(stored), read_bytes(file))
-            if folder.exists():
-                folder.rmdir()
-            copy.replace(folder)
-        finally:
-            shutil.rmtree(unfinished)
 
 
 def require_comparable(a: Campaign, b: Campaign) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from harness.arguments import checked
 from harness.campaign.campaign import Campaign
+from harness.campaign.files import dump_campaign
 from harness.campaign.sections import Confidence, EventsPerHour
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import ended_by
@@ -27,7 +28,7 @@ from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
 from harness.printed import PRINTED
 from harness.progress import Progress
-from harness.records.folder import read_as, read_manifest, sole_use, write_sealed
+from harness.records.folder import CAMPAIGN, read_as, read_manifest, sole_use, write_bytes, write_sealed
 from harness.records.reader import read_campaign
 from harness.resolved import Resolved, require_ready, resolve
 from harness.runner.kept import require_no_fewer, require_own_folder
@@ -78,11 +79,12 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
         begins = {
             name: begun(out / name, each, earlier[name], workers, progress, len(names)) for name, each in ready.items()
         }
+        write_bytes(out / CAMPAIGN, dump_campaign(campaign).encode())
         hour, results = _run(campaign, begins, rule, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     told = {name: (each.estimates, each.shown.manifest) for name, each in results.items()}
-    answer = _answer(hour, ready, told, campaign.stop.confidence)
+    answer = hour_answer(hour, ready, told, campaign.stop.confidence)
     if (decision := rule.look.decision) is not None:
         of_each = answer["families"].values()
         decision = replace(decision, n_milder=sum(beyond_scope(of["milder"]) + of[EARLY] for of in of_each))
@@ -121,12 +123,8 @@ def _run(
                     of.seen.add(shard.block if campaign.accept is None else shard.block.cut_off_as_failed())
             if rule.observe(hour) and not any(underway.run.is_behind for underway in runs.values()):
                 break
-        for name, underway in runs.items():
-            if not underway.run.n_episodes:
-                found = f"{campaign.stop.episodes}, spent before a test of {name}"
-                mend = "Raise it and go on with --resume, or lower testing.shells.first_tests."
-                raise CampaignError("stop.episodes", found, "some tests of each scenario", mend)
-            underway.run.require_few_failed()
+        for underway in runs.values():
+            underway.require_tests()
             require_no_fewer(underway.run.folder, underway.run.earlier.n_episodes, underway.run.n_episodes)
     results = {name: underway.finish(rule, of_sum=True) for name, underway in runs.items()}
     if campaign.accept is not None:  # tests that were cut off count as crashes in its decision alone
@@ -138,10 +136,10 @@ def _run(
 def _no_test_yet(underway: Underway, exposures: Mapping[str, float]) -> OfFamily:
     resolved, design, seen = underway.run.resolved, underway.prescribed.design, SeenShells()
     seen.count(design, empty_tally(design.cell_p.size))
-    return OfFamily(resolved.campaign.scenario, _exposure(resolved, exposures), seen)
+    return OfFamily(resolved.campaign.scenario, exposure_of(resolved, exposures), seen)
 
 
-def _answer(
+def hour_answer(
     hour: PerHour,
     ready: Mapping[str, Resolved],
     told: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]],
@@ -213,14 +211,15 @@ def estimate_families(
         of = folder / name
         manifest, seen = read_manifest(of), SeenShells.of_blocks(stored_blocks(of, moments=False))
         resolved = ready[name] = resolve(read_campaign(of, manifest))
-        families.append(OfFamily(name, _exposure(resolved, given), seen))
+        families.append(OfFamily(name, exposure_of(resolved, given), seen))
         told[name] = read_as(dict[str, Any], of / ESTIMATES, mend=MEND), manifest
-    answer = _answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
+    answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
     decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
     return finite_json({**stored, "exposure": given, "decision": decision, **answer})
 
 
-def _exposure(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
+def exposure_of(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
+    """How often events of a scenario are met: the shipped number, or the one that is given for it."""
     shipped = resolved.family.exposure(resolved.environment, resolved.parameters)
     return own_exposure(shipped, given.get(resolved.campaign.scenario))
 
@@ -239,7 +238,7 @@ def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> No
 
 def require_no_other(out: Path, names: Sequence[str]) -> None:
     """Refuse (`RunFolderError`) a folder that holds something else than runs of these scenarios."""
-    known = {*names, FAMILIES, PRINTED, "report.html"}
+    known = {*names, FAMILIES, CAMPAIGN, PRINTED, "report.html"}
     if other := sorted(each.name for each in out.iterdir() if each.name[0] != "." and each.name not in known):
         expected = "a new or empty folder, or one of the same scenarios"
         raise RunFolderError(str(out), f"a folder with {other[0]}", expected, "Choose another folder with --out.")

@@ -226,6 +226,15 @@ class Underway:
         places = len(run.blocks), run.n_episodes, run.resolved.campaign.run.smallest_shard
         return self.drive(round_requests(tested, added, *places) if added.any() else (), rule)
 
+    def require_tests(self) -> None:
+        """Refuse a run of few tests that did not fail, or without any (`HarnessError`)."""
+        if not self.run.n_episodes:
+            campaign = self.run.resolved.campaign
+            found = f"{campaign.stop.episodes}, spent before a test of {campaign.scenario}"
+            mend = "Raise it and go on with --resume, or lower testing.shells.first_tests."
+            raise CampaignError("stop.episodes", found, "some tests of each scenario", mend)
+        self.run.require_few_failed()
+
     def finish(self, rule: Rule, *, of_sum: bool = False) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left.
 

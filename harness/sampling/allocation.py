@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -142,3 +142,35 @@ class Allocation:
             for crashes in (tally.crashes, tally.crashes + tally.failed)
         )
         return spread(weights, lower, upper, LEVEL, size, most)
+
+
+class Joined:
+    """The same for pools side by side, of which the strata stand for ``p`` (S,): those inside a boundary come first.
+
+    ``available`` are the most tests of each pool's strata.
+    """
+
+    def __init__(
+        self, shells: ShellSettings, designs: Sequence[ShellDesign], p: FloatArray, available: Sequence[IntArray]
+    ) -> None:
+        inside = np.concatenate([np.arange(design.p.size) < design.n_inside for design in designs])
+        self._order = np.argsort(~inside, kind="stable")
+        self._place = np.argsort(self._order)
+        self._ends = np.cumsum([design.p.size for design in designs])[:-1]
+        first = np.concatenate([first_tests(design, shells.first_tests) for design in designs])
+        most, n = np.concatenate(available), int(inside.sum())
+        asked = shells.statement, shells.smallest_round
+        self.all = Allocation(p[self._order], n, first[self._order], most[self._order], *asked)
+
+    def next_round(
+        self,
+        counts: Sequence[IntArray],
+        budget: int,
+        inner_rhw: Callable[[], float],
+        given_by: Callable[[int, IntArray], IntArray] | None = None,
+    ) -> tuple[list[IntArray], bool]:
+        """Tests to add per stratum of each pool, and whether they are first ones; ``counts`` see `Tally.counted`."""
+        tally = Tally.counted(*(column[self._order] for column in counts))
+        given = None if given_by is None else (lambda n, room: given_by(n, room[self._place])[self._order])
+        added = self.all.next_round(tally, budget, inner_rhw=lambda _: inner_rhw(), given_by=given)
+        return np.split(added[self._place], self._ends), self.all.is_first(tally.tests, added)

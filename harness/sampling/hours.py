@@ -13,8 +13,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.estimators.per_hour import PerHour
 from harness.estimators.stopping import HourRule
-from harness.estimators.tally import Tally
-from harness.sampling.allocation import LEVEL, Allocation
+from harness.sampling.allocation import LEVEL, Allocation, Joined
 from harness.vocabulary import IntArray
 
 
@@ -28,13 +27,7 @@ class HourRounds:
         self.rule, self._budget, self._each = rule, campaign.stop.episodes, campaign.stop.each_family
         shells, designs = campaign.testing.shells, [of.seen.design for of in hour.families]
         self._own = [Allocation.of(shells, *each) for each in zip(designs, available, strict=True)]
-        inside = np.concatenate([np.arange(design.p.size) < design.n_inside for design in designs])
-        self._order = np.argsort(~inside, kind="stable")  # those inside a boundary come first
-        self._ends = np.cumsum([design.p.size for design in designs])[:-1]
-        first = np.concatenate([each.first_tests for each in self._own])[self._order]
-        most = np.concatenate(available)[self._order]
-        p = np.concatenate([of.p for of in hour.families])[self._order]
-        self._all = Allocation(p, int(inside.sum()), first, most, shells.statement, shells.smallest_round)
+        self._all = Joined(shells, designs, np.concatenate([of.p for of in hour.families]), available)
 
     def next_round(self, hour: PerHour) -> list[IntArray]:
         """Tests to add per stratum of each family; all 0 when no stratum or no budget is left."""
@@ -45,10 +38,7 @@ class HourRounds:
             of_each = [np.zeros_like(tally.tests) for tally in tallies]
             of_each[worst] = self._own[worst].next_round(tallies[worst], left)
             return of_each
-        columns = [np.concatenate(column)[self._order] for column in zip(*(each[:3] for each in tallies), strict=True)]
-        joined = Tally.counted(*columns)
-        found = self._all.next_round(joined, left, inner_rhw=lambda _: hour.limits(LEVEL, inside=True).rhw)
-        self.rule.of_first_tests = self._all.is_first(joined.tests, found)
-        added = np.zeros_like(found)
-        added[self._order] = found
-        return np.split(added, self._ends)
+        columns = [np.concatenate(column) for column in zip(*(each[:3] for each in tallies), strict=True)]
+        added, first = self._all.next_round(columns, left, lambda: hour.limits(LEVEL, inside=True).rhw)
+        self.rule.of_first_tests = first
+        return added

@@ -8,7 +8,7 @@ boundary are tested until their rate is roughly known; then all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
-from harness.estimators.pairs import PairCounts
+from harness.estimators.pairs import FAILED, Pairs
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
@@ -32,7 +32,7 @@ from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_pat
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
-from harness.sampling.allocation import LEVEL, Allocation
+from harness.sampling.allocation import LEVEL, Allocation, Joined
 from harness.sampling.protocol import Rounds, ShardRequest, Source
 from harness.strata import ShellDesign, StoredDesign
 from harness.vocabulary import IntArray
@@ -148,34 +148,28 @@ class PairRounds:
 
     Rounds are those of one vehicle, with pairs in place of tests; within a round pairs go to where the likelihood ratio
     says that one more narrows the interval of the difference most. The campaigns are equal but for the vehicle;
-    ``available``, shape (S,), are the most pairs of each stratum; ``rule`` looks at each round.
+    ``none`` are no pairs, ``available`` the most of each stratum, (S,) of each pool; ``rule`` looks at each round.
     """
 
-    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, rule: PairRule) -> None:
-        self.rule, self._budget = rule, campaign.stop.episodes
-        self._allocation = Allocation.of(campaign.testing.shells, design, available)
+    def __init__(self, campaign: Campaign, none: Pairs, available: Sequence[IntArray], rule: PairRule) -> None:
+        self.rule, self._budget, self._available = rule, campaign.stop.episodes, np.concatenate(available)
+        self._joined = Joined(campaign.testing.shells, none.designs, none.p, available)
 
-    def next_round(self, pairs: PairCounts) -> IntArray:
-        """Pairs to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
-        added = self._allocation.next_round(
-            _differing(pairs),
-            self._budget - int(pairs.tests.sum()),
-            inner_rhw=lambda n: pairs.inside(n).rhw(LEVEL),
-            given_by=partial(pairs.spread, LEVEL),
+    def next_round(self, pairs: Pairs) -> list[IntArray]:
+        """Pairs to add per stratum of each pool; all 0 when no stratum or no budget is left."""
+        tests, differing = pairs.tests, pairs.outcomes()[:, 1:3].sum(1)  # those stand in the crashes' place
+        may_differ = np.maximum(pairs.ends[:, FAILED].sum(1), pairs.ends[:, :, FAILED].sum(1))
+        added, self.rule.of_first_tests = self._joined.next_round(
+            (tests, differing, np.minimum(may_differ, tests - differing)),
+            self._budget - int(tests.sum()),
+            lambda: pairs.within().rhw(LEVEL),
+            partial(pairs.spread, LEVEL),
         )
-        self.rule.of_first_tests = self._allocation.is_first(pairs.tests, added)
         return added
 
-    def used_of_pool(self, pairs: PairCounts) -> float:
-        """Largest share of the pool's events of a stratum that these pairs have used."""
-        return float(np.max(pairs.tests / np.maximum(self._allocation.available, 1)))
-
-
-def _differing(pairs: PairCounts) -> Tally:
-    """Pairs of which one vehicle has crashed and the other has not, in the crashes' place."""
-    differing = pairs.outcomes()[:, 1:3].sum(1)
-    may_differ = np.maximum(pairs.tally(0).failed, pairs.tally(1).failed)
-    return Tally.counted(pairs.tests, differing, np.minimum(may_differ, pairs.tests - differing))
+    def used_of_pool(self, pairs: Pairs) -> float:
+        """Largest share of a pool's events of a stratum that these pairs have used."""
+        return float(np.max(pairs.tests / np.maximum(self._available, 1)))
 
 
 def round_requests(

@@ -352,16 +352,16 @@ class PairedCampaign(_Drawn):
             PairRule(each, rhw=each.stop.rhw)
             for each in (self.campaign, self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT))
         )
-        planner = PairRounds(self.campaign, drawn[0].design, drawn[0].available(self.campaign), rule)
         pairs, early, enough = no_pairs(drawn[0].design), None, False
-        while not enough and (added := planner.next_round(pairs)).any():
+        planner = PairRounds(self.campaign, pairs, [drawn[0].available(self.campaign)], rule)
+        while not enough and (added := planner.next_round(pairs)[0]).any():
             pairs = _with_round(pairs, drawn, added, rng)
             enough = planner.rule.observe(pairs)
             if early is None:
                 given.observe(pairs)
-                early = pairs.inside() if given.look.stopped else None
+                early = pairs.within() if given.look.stopped else None
         yield self._row(DIFFERENCE, replication, pairs, reached=planner.rule.look.stopped)
-        yield self._row(CONDITIONAL_DIFFERENCE, replication, early or pairs.inside(), reached=early is not None)
+        yield self._row(CONDITIONAL_DIFFERENCE, replication, early or pairs.within(), reached=early is not None)
 
     def _row(self, result: str, replication: int, pairs: PairCounts, *, reached: bool) -> Row:
         level = Level.two_sided(self.campaign.stop.confidence)

@@ -69,7 +69,10 @@ def test_failed_tests_widen_both_ways():
     assert ratio.ci_high == pytest.approx(worst_a.ratio(LEVEL).ci_high)
     assert ratio.ci_low == pytest.approx(worst_b.ratio(LEVEL).ci_low)
     estimate = paired_estimate(failed, 0.9)
-    assert list(pair_warnings(estimate))[:2] == ["3 tests of A FAILED", "2 tests of B FAILED"]
+    assert list(pair_warnings({**estimate, "scenario": "cut_in", "milder": dict.fromkeys("ab")}))[:2] == [
+        "3 tests of A FAILED",
+        "2 tests of B FAILED",
+    ]
     assert estimate["shells"][0]["n_failed_tests"] == 5
 
 
@@ -92,7 +95,7 @@ def test_a_margin_is_where_the_ratio_ends():
         assert PAIRS.verdict(factor / low - 1.0, LEVEL) == verdict
     assert PAIRS.verdict(1.001 / high - 1.0, LEVEL) == "open"
     swapped = PairCounts(DESIGN, PAIRS.ends.transpose(0, 2, 1), PAIRS.mass.transpose(0, 2, 1, 3))
-    assert swapped.inside().verdict(0.1, LEVEL) == "refuted"
+    assert swapped.within().verdict(0.1, LEVEL) == "refuted"
 
 
 def test_equal_vehicles_are_not_told_apart_and_json_has_no_infinity():

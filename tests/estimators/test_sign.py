@@ -13,7 +13,7 @@ from scipy.stats import binomtest
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.likelihood import Level
-from harness.estimators.pairs import CRASH, NO_CRASH, no_pairs
+from harness.estimators.pairs import CRASH, NO_CRASH, PairsPerHour, no_pairs
 from harness.estimators.stopping import PairRule
 from harness.sampling.shells import PairRounds
 from harness.strata import Reference, ShellDesign
@@ -38,26 +38,38 @@ def population(both, only_a, only_b):
 
 
 _EACH = {"a": 0.5, "b": 0.3, "c": 0.3, "d": 0.2, "e": 0.2}
+_HALF = {"b": 0.2, "o": 5e-4}
 EQUAL = {
     "both alone outside": ("assumption_free", population({"a": 1.0}, {"o": 1e-3}, {"o": 1e-3})),
     "all shares uncertain": ("assumption_free", population({}, *[{**_EACH, "f": 0.1, "o": 1e-3}] * 2)),
     "B by a rare hole": ("assumption_free", population({"a": 1.0}, {"b": 0.4}, {"o": 0.4 * P[1] / P[6]})),
     "within the library": ("library", population({}, _EACH, _EACH)),
+    "A in one scenario, B in another": (
+        "assumption_free",
+        [population({"a": 1.0}, {"b": 0.4, "o": 1e-3}, {}), population({}, {}, _HALF)],
+    ),
     "within it, two shells": ("library", population({"a": 1.0}, {"b": 0.04}, {"e": 0.04 * P[1] / P[4]})),
 }
 """Vehicles of equal rates: what is tested, and how their pairs end."""
 QUICK = "both alone outside", "within the library"
+PER_HOUR = (1.0, 2.0)
+"""Tests per hour of two scenarios of these strata."""
 
 
 def rounds_of(statement, shares, seed, *args, **stop):
-    """Rule and pairs after each round of a comparison, until there is enough."""
+    """Rule and pairs after each round of a comparison, until there is enough; ``shares`` are those of each scenario."""
     settings = {"testing": {"shells": {"statement": statement}}, "stop": {"episodes": 100_000, **stop}}
     campaign, rng = Campaign.model_validate({"name": "x", **settings}), np.random.default_rng(seed)
-    rule, pairs = PairRule(campaign, *args), no_pairs(DESIGN)
-    rounds = PairRounds(campaign, DESIGN, KEPT, rule)
-    while (added := rounds.next_round(pairs)).any():
-        for end, n in zip(ENDS, rng.multinomial(added, shares).T, strict=True):
-            pairs.ends[:, *end] += n
+    several = isinstance(shares, list)
+    shares = shares if several else [shares]
+    rule, each = PairRule(campaign, *args), [no_pairs(DESIGN) for _ in shares]
+    pairs = PairsPerHour(tuple(each), PER_HOUR) if several else each[0]
+    rounds = PairRounds(campaign, pairs, [KEPT for _ in shares], rule)
+    while np.concatenate(added := rounds.next_round(pairs)).any():
+        for of, ends, more in zip(each, shares, added, strict=True):
+            for end, n in zip(ENDS, rng.multinomial(more, ends).T, strict=True):
+                of.ends[:, *end] += n
+        pairs = PairsPerHour(tuple(each), PER_HOUR) if several else each[0]
         enough = rule.observe(pairs)
         yield rule, pairs
         if enough:
@@ -70,7 +82,7 @@ def signs(name, seed):
     for rule, pairs in rounds_of(*EQUAL[name], seed, 0.0):
         allowed = rule.decision.verdict
         if first == "open":
-            watched = pairs.inside() if rule.conditional else pairs
+            watched = pairs.within() if rule.conditional else pairs
             first = watched.verdict(0.0, Level.two_sided(0.9))
     return allowed, first
 
@@ -109,7 +121,7 @@ def test_what_ends_a_comparison(statement, shares, args, stop, ended, verdict):
     """The sign, half-width 0.1, or both far below the reference; what is asked by hand ends at that alone."""
     *_, (rule, pairs) = rounds_of(statement, shares, 3, *args, **stop)
     assert (rule.look.ended, rule.decision.verdict) == (ended, verdict)
-    watched = pairs.inside() if rule.conditional else pairs
+    watched = pairs.within() if rule.conditional else pairs
     level = Level.two_sided(0.9)
     if ended == "rhw":
         assert watched.rhw(level) <= (0.05 if len(args) == 2 else 0.1)

@@ -1,0 +1,159 @@
+"""Drive two vehicles on the same events, round by round, in one scenario or in several side by side.
+
+The i-th event of a stratum is the same for both, as it follows from the campaign's seed and the pool. What either
+folder holds already, from an earlier call or because it is the copy of a stored run, is not driven again.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from harness.campaign.campaign import Campaign
+from harness.errors import RunFolderError
+from harness.estimators.pairs import PairCounts, PairedShells, Pairs, PairsPerHour
+from harness.estimators.stopping import PairRule
+from harness.files import read_bytes
+from harness.pool.shells import Draw
+from harness.progress import Progress
+from harness.records.folder import read_manifest, sole_use, write_bytes
+from harness.resolved import Resolved
+from harness.runner.families import exposure_of
+from harness.runner.kept import Earlier, require_own_folder
+from harness.runner.run import RunResult, Underway, begun
+from harness.sampling.protocol import ShardRequest
+from harness.sampling.shells import PairRounds
+from harness.vocabulary import IntArray
+
+SIDES = ("a", "b")
+
+Both = tuple[Resolved, Resolved]
+
+
+class Scenario:
+    """Both vehicles in one scenario: ``folder``, runs of A and B, what these have left, and pairs so far."""
+
+    results: tuple[RunResult, RunResult]  # once all is driven
+
+    def __init__(self, folder: Path, a: Underway, b: Underway) -> None:
+        self.folder, self.runs = folder, (a, b)
+        self._tests = PairedShells(a.prescribed.design)  # as B's: one environment and one library make one pool
+        self._n = np.zeros_like(self._tests.tests(0))
+        self.pairs: PairCounts = self._tests.first(self._n)
+
+    @property
+    def name(self) -> str:
+        """That of the scenario."""
+        return self.runs[0].run.resolved.campaign.scenario
+
+    def tests_per_hour(self, campaign: Campaign) -> float:
+        """Tests that an hour of driving stands for."""
+        return exposure_of(self.runs[0].run.resolved, campaign.exposure).per_hour / self.pairs.design.p_event
+
+    def take_over(self, rule: PairRule) -> None:
+        """Take what the folders hold."""
+        for side, each in enumerate(self.runs):
+            for shard in each.drive(stored_requests(each.run.earlier), rule):
+                self._tests.add(side, shard.block)
+
+    def drive(self, added: IntArray, rule: PairRule) -> None:
+        """Drive so many more pairs per stratum, (S,), but for tests that are there."""
+        self._n = self._n + added
+        for side, each in enumerate(self.runs):
+            tested = self._tests.tests(side)
+            for shard in each.drive_added(tested, np.maximum(self._n - tested, 0), rule):
+                self._tests.add(side, shard.block)
+        self.pairs = self._tests.first(self._n)
+
+
+def drive_pairs(
+    campaign: Campaign, ready: Mapping[Path, Both], rule: PairRule, workers: int | None, progress: Progress
+) -> tuple[PairRounds, list[Scenario]]:
+    """Rounds of pairs until the rule is content; returns them, and what there is of each scenario.
+
+    ``ready`` are A and B, ready to be run in ``a`` and ``b`` of the folder of each.
+    """
+    places = [(folder / side, own) for folder, both in ready.items() for side, own in zip(SIDES, both, strict=True)]
+    with ExitStack() as held, ExitStack() as working:
+        for folder, _ in places:
+            held.enter_context(sole_use(folder))
+        earlier = [require_own_folder(*each, resume=True) for each in places]  # all, before one is touched
+        runs: list[Underway] = []
+        for each, found in zip(places, earlier, strict=True):
+            if campaign.scenarios is not None:
+                progress.remark = f" ({each[1].campaign.scenario.replace('_', ' ')})"
+            runs.append(working.enter_context(begun(*each, found, workers, progress, len(places))))
+            runs[-1].drive_before_tests()
+        progress.remark = ""
+        scenarios = [Scenario(*each) for each in zip(ready, runs[::2], runs[1::2], strict=True)]
+        available = [of.runs[0].prescribed.available for of in scenarios]
+        rounds = PairRounds(campaign, together(scenarios, campaign), available, rule)
+        progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
+        for of in scenarios:
+            of.take_over(rule)
+        while np.concatenate(added := rounds.next_round(together(scenarios, campaign))).any():
+            for of, more in zip(scenarios, added, strict=True):
+                of.drive(more, rule)
+            if rule.observe(together(scenarios, campaign)):
+                break
+        for underway in runs:
+            underway.require_tests()
+        working.close()
+        several = campaign.scenarios is not None
+        for of in scenarios:
+            a, b = (each.finish(rule, of_sum=several) for each in of.runs)
+            of.results = a, b
+        return rounds, scenarios
+
+
+def together(scenarios: list[Scenario], campaign: Campaign) -> Pairs:
+    """The pairs of one scenario, per test; of several, those of all, per hour."""
+    if campaign.scenarios is None:
+        return scenarios[0].pairs
+    return PairsPerHour(tuple(of.pairs for of in scenarios), tuple(of.tests_per_hour(campaign) for of in scenarios))
+
+
+def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:
+    """Tests that a folder holds, as they were asked for."""
+    taken: dict[int, int] = {}
+    for index, part in enumerate(earlier.parts):
+        tables = earlier.tables(part.first_episode, part.n_episodes)
+        if tables is None:  # what is gone is driven anew, and so is all that follows
+            return
+        stratum = tables.episodes.column("component").to_numpy()
+        edges = [0, *(np.flatnonzero(np.diff(stratum)) + 1).tolist(), stratum.size]
+        draws = []
+        for first, end in pairwise(edges):
+            s, n = int(stratum[first]), end - first
+            draws.append(Draw(s, taken.get(s, 0), n))
+            taken[s] = taken.get(s, 0) + n
+        yield ShardRequest(index, part.first_episode, part.n_episodes, tuple(draws))
+
+
+def copy_stored(stored: Path, folder: Path, resolved: Resolved) -> None:
+    """Copy a stored run of A, and no other (`RunFolderError`), to where A is to be run, unless it is there already."""
+    if folder.exists() and any(folder.iterdir()):
+        return
+    manifest = read_manifest(stored)
+    if manifest["campaign_hash"] != resolved.content_hash:
+        expected = f"one of A as it is to be compared ({resolved.content_hash})"
+        mend = "Leave out --set and --av where they change more than the stop rule, or name A's campaign file."
+        raise RunFolderError(str(stored), f"a run of campaign {manifest['campaign_hash']}", expected, mend)
+    require_own_folder(stored, resolved, resume=True)
+    unfinished = folder.with_name(f".{folder.name}.part")
+    with sole_use(unfinished):  # in which a call that was killed may have left a part
+        try:
+            shutil.rmtree(unfinished / "a", ignore_errors=True)
+            copy = unfinished / "a"
+            for file in filter(Path.is_file, stored.rglob("*")):
+                write_bytes(copy / file.relative_to(stored), read_bytes(file))
+            if folder.exists():
+                folder.rmdir()
+            copy.replace(folder)
+        finally:
+            shutil.rmtree(unfinished)
