@@ -101,7 +101,8 @@ def compare_campaigns(
         Campaigns, or the paths or vehicles' names that stand for them, equal but for av, name and description; their
         own ``stop.rhw`` is about one vehicle, and not asked. Of several scenarios the sum is compared, per hour.
     out : str or Path
-        Folder of the run folders ``a`` and ``b``, or of such a folder of each scenario; what an earlier call has finished there is used again.
+        Folder of the run folders ``a`` and ``b``, or of such a folder of each scenario; what an earlier call has
+        finished there is used again.
     workers, progress
         As in `harness.run`.
     labels : tuple of two str, optional
