@@ -257,6 +257,8 @@ def compare(
     the half-width of the difference is 0.1 of the larger rate, or both are below stop.below_reference; or until
     --margin is decided; or, with --set stop.rhw=R, until that half-width is R.
 
+    B is a vehicle, which is driven as A's campaign says, or a campaign that is equal but for the vehicle.
+
     With --scenario all the difference is in crashes per hour, summed over three scenarios.
 
     A may be a run folder: its tests are copied, not run again. So are finished tests of an earlier call with the same
@@ -267,15 +269,20 @@ def compare(
     """
     if file_b is None and not against and against_av is None:
         raise click.UsageError("Name a second campaign, or say with --against or --against-av how B differs.")
+    from harness.campaign.files import names_a_campaign, parse_override
+
     stored = source_a if source_a.is_dir() else None
     file_a = source_a if stored is None else stored / "campaign.yaml"
     overrides = [*options.of_scenario(scenario), *overrides]
     a = harness.load_campaign(file_a, overrides, av=av)
-    b = harness.load_campaign(file_b or file_a, [*overrides, *against], av=against_av or av)
+    of_b = file_b or file_a
+    if names_a_campaign(file_a) and not names_a_campaign(of_b):  # a vehicle, driven as A's campaign says
+        b = harness.load_campaign(file_a, [*overrides, *against], av=against_av or av or str(of_b))
+        b = b.model_copy(update={"name": harness.load_campaign(of_b).name})
+    else:
+        b = harness.load_campaign(of_b, [*overrides, *against], av=against_av or av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
-    from harness.campaign.files import parse_override
-
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     labels = (a.name, label_b) if a.name != label_b else (str(source_a), str(file_b))
     if chosen := folder is None:

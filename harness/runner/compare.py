@@ -25,7 +25,6 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import Pairs, PairsPerHour, PairVerdict, contrast, paired_estimate
 from harness.estimators.per_hour import OfFamily, PerHour
-from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
 from harness.numbers import leaves, two_digits_up
@@ -209,13 +208,11 @@ def _sum_written(
     confidence = campaign.stop.confidence
     level, sides = Level.two_sided(confidence), {}
     for i, side in enumerate(SIDES):
-        runs = {of.name: (of.runs[i].run, of.results[i]) for of in scenarios}
+        ready = {of.name: of.runs[i].run.resolved for of in scenarios}
+        told = {of.name: (of.results[i].estimates, of.results[i].shown.manifest) for of in scenarios}
         families = [
-            OfFamily(name, exposure_of(run.resolved, campaign.exposure), SeenShells.of_blocks(run.blocks))
-            for name, (run, _) in runs.items()
+            OfFamily(of.name, exposure_of(ready[of.name], campaign.exposure), of.tests_of_pairs(i)) for of in scenarios
         ]
-        ready = {name: run.resolved for name, (run, _) in runs.items()}
-        told = {name: (result.estimates, result.shown.manifest) for name, (_, result) in runs.items()}
         sides[side] = hour_answer(PerHour(families), ready, told, confidence)
     of_each = zip(scenarios, pairs.each, pairs.tests_per_hour, strict=True)
     content = finite_json({

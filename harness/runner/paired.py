@@ -16,7 +16,9 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
+from harness.estimators.block import joined
 from harness.estimators.pairs import PairCounts, PairedShells, Pairs, PairsPerHour
+from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule
 from harness.files import read_bytes
 from harness.pool.shells import Draw
@@ -69,6 +71,12 @@ class Scenario:
             for shard in each.drive_added(tested, np.maximum(self._n - tested, 0), rule):
                 self._tests.add(side, shard.block)
         self.pairs = self._tests.first(self._n)
+
+    def tests_of_pairs(self, side: int) -> SeenShells:
+        """Tests of A (0) or B (1) that belong to pairs: a folder may hold more."""
+        block = joined(self.runs[side].run.blocks)
+        rows = [np.flatnonzero(block.stratum == s)[:n] for s, n in enumerate(self._n.tolist())]
+        return SeenShells.of_blocks([block.chosen(np.concatenate(rows))])
 
 
 def drive_pairs(

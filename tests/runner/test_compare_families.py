@@ -72,14 +72,17 @@ def test_pages_are_written_anew(done):
 def test_what_is_there_is_not_driven_again(done, tmp_path, monkeypatch, capsys):
     """Neither an earlier call's tests nor those of a stored run of A in the same scenarios."""
     run = harness.run(campaign(), tmp_path / "stored", workers=1)
-    call = ["compare", str(run.folder), "--against", HARDER, "--out", str(tmp_path / "out"), "--workers", "1", "--json"]
+    call = ["compare", str(run.folder), "late-600ms", "--out", str(tmp_path / "out"), "--workers", "1", "--json"]
     assert main(call) == 0
     found = json.loads(capsys.readouterr().out)
     for name in NAMES:
         held, n_pairs = read_manifest(run.folder / name)["n_episodes"], found["families"][name]["n_pairs"]
         n = read_manifest(tmp_path / "out" / name / "a")["n_episodes"]
         assert max(held, n_pairs) <= n < held + n_pairs  # those held are of strata that pairs need, or not
-    assert found["decision"]["verdict"] == done.content["decision"]["verdict"]
+    assert [of["label"] for of in found["campaigns"].values()] == ["idm", "late-600ms"]  # as A's campaign says
+    a, b = (found[side] for side in "ab")
+    assert a["per_hour"]["rate"] - b["per_hour"]["rate"] == pytest.approx(found["difference"])
+    assert a["n_episodes"] == b["n_episodes"] == found["n_pairs"]  # further tests that are held do not count
     monkeypatch.setattr("harness.runner.workers.ShardRunner.run", None)
     again = compare_campaigns(campaign(), campaign(HARDER), done.folder, workers=1)
     assert again.content == done.content
