@@ -16,12 +16,13 @@ the place of strata. Tests that failed count as whatever makes an interval wider
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from harness.estimators.estimate import Number
-from harness.estimators.likelihood import CRASH, Level, ratio_limits
+from harness.estimators.likelihood import CRASH, Counts, Level, ratio_limits
 from harness.estimators.tally import Tally, crash_square, pool_variance
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vocabulary import BoolArray, FloatArray
@@ -103,15 +104,22 @@ def rate_ratio_limits(
     Of that ``moments`` has the rate and the mean square of a path's probability of a crash; ``with_reference`` (S,) is,
     over the crashed tests of each stratum, the sum of their paths' probability that the reference crashes.
     """
-    rate, _ = moments
-    of_paths, covariance, of_reference = path_errors(p, tally, with_reference, moments, n_paths)
+    errors = path_errors(p, tally, with_reference, moments, n_paths)
+    return limits_over(moments[0], p, tally.outcomes, errors, level)
+
+
+def limits_over(
+    rate: float, p: FloatArray, outcomes: Counts, errors: Sequence[float], level: Level
+) -> tuple[float, float]:
+    """Limits of Σ p_s θ_s over a reference's ``rate``; ``errors`` see `path_errors`."""
+    of_paths, covariance, of_reference = errors
 
     def variance(x: float) -> float:
         return max(of_paths - 2.0 * x * covariance + x * x * of_reference, 0.0)
 
     # A constant as a sum over strata: the same for either outcome.
     below = np.full((p.size, 2), rate / p.size)
-    return ratio_limits(np.outer(p, CRASH), below, tally.outcomes, level, variance)
+    return ratio_limits(np.outer(p, CRASH), below, outcomes, level, variance)
 
 
 def path_errors(

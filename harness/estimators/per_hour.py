@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness.estimators.beside import path_errors
-from harness.estimators.likelihood import CRASH, Counts, Level, likelihood_limit, ratio_limits
+from harness.estimators.beside import limits_over, path_errors
+from harness.estimators.likelihood import Counts, Level, likelihood_limit
 from harness.estimators.shells import SeenShells
 from harness.estimators.tally import FEWEST_PATHS, RateLimits, Tally, paths_that_count, pool_variance
 from harness.families.protocol import Exposure
@@ -193,14 +193,8 @@ class PerHour:
             mine, theirs = of.rate, of.reference_rate
             errors += of.per_hour**2 * np.array(found)
             errors += of.seen.design.p_event_error**2 * np.array((mine * mine, mine * theirs, theirs * theirs))
-        of_paths, covariance, of_reference = errors.tolist()
-
-        def variance(x: float) -> float:
-            return max(of_paths - 2.0 * x * covariance + x * x * of_reference, 0.0)
-
-        p = np.concatenate([of.p for of in self.families])
-        below = np.full((p.size, 2), self.reference_rate / p.size)
-        return ratio_limits(np.outer(p, CRASH), below, np.concatenate(outcomes).astype(np.float64), level, variance)
+        p, counts = np.concatenate([of.p for of in self.families]), np.concatenate(outcomes)
+        return limits_over(self.reference_rate, p, counts.astype(np.float64), errors.tolist(), level)
 
     def over_assumed(self) -> tuple[float, float] | None:
         """The least and the largest ratio over all ends of the assumed exposures; None where it has none."""
