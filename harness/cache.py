@@ -25,6 +25,8 @@ FOLDER = "HARNESS_CACHE_DIR"
 """Environment variable that names the cache; the default is the user's own, if there is a home to have it in."""
 SAID = "HARNESS_CACHE_SAID"
 """Environment variable that keeps a process from saying what another of the same command has said, or will say."""
+MOST_BYTES = 4 << 30
+"""That files of one kind may take up [assumed]: tables of a challenge are 110 MB for each traffic."""
 _SEAL_BYTES, _SEALED = 4, 0x2144DF1C
 """The CRC-32 of whatever ends with its own is always this."""
 
@@ -82,6 +84,7 @@ def find(name: str) -> Path | None:
     for path in places(name):
         with suppress(OSError):
             if checksum(path, zlib.crc32(name.encode())) == _SEALED:
+                _used(path)
                 return path
     return None
 
@@ -92,6 +95,7 @@ def read(name: str) -> bytes | None:
         with suppress(OSError):
             content = read_bytes(path)
             if zlib.crc32(content, zlib.crc32(name.encode())) == _SEALED:
+                _used(path)
                 return content[:-_SEAL_BYTES]
     return None
 
@@ -104,7 +108,28 @@ def keep(name: str, content: bytes | memoryview) -> Path:
             file.write(content)
             file.write(zlib.crc32(content, zlib.crc32(name.encode())).to_bytes(_SEAL_BYTES, "little"))
 
-    return put(name, lambda path: write_atomically(path, write))
+    kept = put(name, lambda path: write_atomically(path, write))
+    _make_room(kept)
+    return kept
+
+
+def _used(path: Path) -> None:
+    with suppress(OSError):  # a cache that may only be read
+        os.utime(path)
+
+
+def _make_room(kept: Path) -> None:
+    """Remove what has not been used for longest of what lies beside a file, where all is more than `MOST_BYTES`."""
+    beside = []
+    for path in kept.parent.glob("[!.]*"):  # not what others are just writing
+        with suppress(OSError):  # another process has removed it
+            beside.append((path.stat(), path))
+    left = sum(of.st_size for of, _ in beside) - MOST_BYTES
+    for of, path in sorted(beside, key=lambda each: each[0].st_mtime):
+        if left > 0 and path != kept:
+            with suppress(OSError):
+                path.unlink()
+                left -= of.st_size
 
 
 def put(name: str, write: Callable[[Path], object]) -> Path:

@@ -146,3 +146,17 @@ def test_a_run_without_a_place_for_temporary_files_is_refused(tmp_path, monkeypa
     assert main(["run", "idm", "--out", str(tmp_path / "run")]) == 2
     assert "error: TMPDIR" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_what_has_not_been_used_for_longest_makes_room(folder, monkeypatch):
+    names = [f"tables/{i}" for i in range(4)]
+    for i, name in enumerate(names[:3]):
+        cache.keep(name, CONTENT)
+        os.utime(folder / name, (i, i))
+    monkeypatch.setattr(cache, "MOST_BYTES", 3 * 260)
+    assert cache.read(names[0]) == CONTENT
+    cache.keep(names[3], CONTENT)
+    assert [cache.has(name) for name in names] == [True, False, True, True]
+    monkeypatch.setattr(cache, "MOST_BYTES", 0)  # a file is not its own room
+    cache.keep(names[1], CONTENT)
+    assert [cache.has(name) for name in names] == [False, True, False, False]
