@@ -33,7 +33,7 @@ from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, write_sealed
 from harness.records.origin import code_of, require_trust
 from harness.resolved import require_ready
-from harness.runner.families import exposure_of, hour_answer
+from harness.runner.families import exposure_of, hour_answer, require_no_other
 from harness.runner.paired import SIDES, Both, Scenario, copy_stored, drive_pairs, together
 from harness.sampling.shells import PairRounds
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
@@ -145,6 +145,8 @@ def compare_campaigns(
     if a.stop.each_family:
         expected = "false: a comparison ends by the sum of its scenarios"
         raise CampaignError("stop.each_family", "true", expected, "Write --set stop.each_family=false.")
+    if out.is_dir():
+        require_no_other(out, [*(a.scenarios or SIDES), COMPARISON])
     ready: dict[Path, Both] = {}
     for name, folder in folders.items():
         of_a, of_b = (require_ready(of.of_family(name) if of.scenarios else of, "compare") for of in (a, b))

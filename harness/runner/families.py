@@ -72,7 +72,7 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     rule = HourRule(campaign)
     with ExitStack() as held:
         held.enter_context(sole_use(out))
-        require_no_other(out, names)
+        require_no_other(out, [*names, FAMILIES, CAMPAIGN])
         for name in names:
             held.enter_context(sole_use(out / name))
         earlier = {name: require_own_folder(out / name, ready[name], resume=resume) for name in names}
@@ -237,8 +237,8 @@ def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> No
 
 
 def require_no_other(out: Path, names: Sequence[str]) -> None:
-    """Refuse (`RunFolderError`) a folder that holds something else than runs of these scenarios."""
-    known = {*names, FAMILIES, CAMPAIGN, PRINTED, "report.html"}
+    """Refuse (`RunFolderError`) a folder that holds something else than what is so called, or written beside it."""
+    known = {*names, PRINTED, "report.html"}
     if other := sorted(each.name for each in out.iterdir() if each.name[0] != "." and each.name not in known):
         expected = "a new or empty folder, or one of the same scenarios"
         raise RunFolderError(str(out), f"a folder with {other[0]}", expected, "Choose another folder with --out.")

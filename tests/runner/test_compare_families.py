@@ -99,5 +99,12 @@ def test_what_cannot_be_compared_is_refused(done, tmp_path):
         with pytest.raises(CampaignError, match=said):
             compare_campaigns(campaign(*of_a), campaign(*of_b), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    with pytest.raises(RunFolderError):
+    with pytest.raises(RunFolderError, match="another campaign"):
         compare_campaigns(campaign("seed=2"), campaign("seed=2", HARDER), done.folder)
+    alone = campaign("scenarios=null"), campaign("scenarios=null", HARDER)
+    with pytest.raises(RunFolderError, match="a folder with cut_in"):
+        compare_campaigns(*alone, done.folder)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "families.json").touch()
+    with pytest.raises(RunFolderError, match=r"a folder with families\.json"):
+        compare_campaigns(campaign(), campaign(HARDER), tmp_path / "run")
