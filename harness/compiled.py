@@ -8,8 +8,8 @@ yesterday's callee; it runs what it finds, damaged or not; and where it cannot w
 lies there, or refuses the function. A function is known by its module, so that the same sources are compiled once,
 wherever they are installed.
 
-All that is used of numba is documented, but for what `_KernelCache` needs: a kernel's ``_cache``, ``NullCache``,
-``_reduce`` and ``_rebuild`` of a ``CompileResult``, and ``serialize.dumps`` (tried with numba 0.62.0, 0.65.1, 0.68.1).
+Our own hangs on what numba does not document: a kernel's ``_cache`` and what passes through it, a ``CompileResult``
+that is taken apart and put together, ``serialize.dumps``. It was tried with numba 0.62.0, 0.65.1 and 0.68.1.
 """
 
 from __future__ import annotations
