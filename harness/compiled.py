@@ -2,10 +2,14 @@
 
 Bit-exactness rests on three choices made here. No fast-math and no fused operations, so that SUMO's C++ arithmetic can
 be matched. No short-vector math library, whose `exp` and `log` differ from the scalar ones depending on how a loop was
-vectorised. And a cache of our own under a hash of *all* sources of compiled code: numba's own looks only at the file
-that a function stands in, and would keep a caller compiled with yesterday's callee; it unpickles what it finds, damaged
-or not; and where it cannot write it takes another place, whatever lies there. A function is known by its module, so
-that the same sources are compiled once, wherever they are installed.
+vectorised. And a cache of our own under a hash of *all* sources of compiled code: numba's own, also where
+``NUMBA_CACHE_DIR`` says, looks only at the file that a function stands in, and would keep a caller compiled with
+yesterday's callee; it runs what it finds, damaged or not; and where it cannot write it takes another place, whatever
+lies there, or refuses the function. A function is known by its module, so that the same sources are compiled once,
+wherever they are installed.
+
+Our own hangs on what numba does not document: a kernel's ``_cache`` and what passes through it, a ``CompileResult``
+that is taken apart and put together, ``serialize.dumps``. It was tried with numba 0.62.0, 0.65.1 and 0.68.1.
 """
 
 from __future__ import annotations
@@ -66,7 +70,6 @@ import numpy as np  # noqa: E402
 from llvmlite import ir  # noqa: E402
 from numba import extending, types  # noqa: E402
 from numba.core import caching, compiler, serialize  # noqa: E402
-from numba.core.typing.templates import AttributeTemplate  # noqa: E402
 
 _settings: Any = numba.config
 if _settings.USING_SVML:
@@ -206,12 +209,19 @@ def _n_words(kind: Any) -> int:
     return 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
 
 
-class _UnboxedType(types.Type):
-    """Numba's type of an `_Unboxed` whose bundle is of type ``content``."""
+class _UnboxedType(types.BaseNamedTuple):
+    """Numba's type of an `_Unboxed` whose bundle is of type ``content``: a named tuple, read by `_read_field`."""
 
     def __init__(self, content: Any) -> None:
-        self.content = content
+        self.content, self.fields = content, content.fields
         super().__init__(f"unboxed {content.instance_class.__name__}")
+
+    def __getitem__(self, place: int) -> Any:  # type: ignore[override]
+        field = self.content.types[place]
+        return _UnboxedType(field) if isinstance(field, types.BaseTuple) else field
+
+    def __len__(self) -> int:
+        return len(self.fields)
 
     @property
     def key(self) -> Any:
@@ -226,22 +236,11 @@ def _unbox(_kind: _UnboxedType, obj: Any, c: Any) -> Any:
     return _extending.NativeValue(pointer, is_error=c.pyapi.c_api_error())
 
 
-class _Fields(AttributeTemplate):
-    key = _UnboxedType
-
-    def generic_resolve(self, kind: _UnboxedType, name: str) -> Any:  # type: ignore[override]
-        content = kind.content
-        if name not in content.fields:
-            return None
-        field = content.types[content.fields.index(name)]
-        return _UnboxedType(field) if isinstance(field, types.BaseTuple) else field
-
-
 def _read_field(context: Any, builder: Any, kind: _UnboxedType, value: Any, name: str) -> Any:
-    place = kind.content.fields.index(name)
-    *before, field = kind.content.types[: place + 1]
-    pointer = builder.gep(value, [ir.IntType(64)(8 * sum(_n_words(each) for each in before))], inbounds=True)
-    if isinstance(field, types.BaseTuple):
+    place = kind.fields.index(name)
+    field, before = kind[place], sum(_n_words(each) for each in kind.content.types[:place])
+    pointer = builder.gep(value, [ir.IntType(64)(8 * before)], inbounds=True)
+    if isinstance(field, _UnboxedType):
         return pointer
     return _load(builder, pointer, context.get_value_type(field), owned=isinstance(field, types.Array))
 
@@ -264,5 +263,4 @@ def _load(builder: Any, pointer: Any, what: Any, *, owned: bool = False) -> Any:
 
 _extending.register_model(_UnboxedType)(_extending.models.OpaqueModel)
 _extending.unbox(_UnboxedType)(_unbox)
-_extending.infer_getattr(_Fields)
 _extending.lower_getattr_generic(_UnboxedType)(_read_field)
