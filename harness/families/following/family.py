@@ -24,7 +24,7 @@ from harness.families.following.approach import (
     empty_motion,
     starts_from,
 )
-from harness.families.following.follow import STATE, Tests, drive_others, enumerate_events, move_others
+from harness.families.following.follow import DRIVING_DTYPE, STATE, Tests, drive_others, enumerate_events, move_others
 from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
 from harness.families.following.words import STAND_INS
 from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, Family, Paths, Recorded
@@ -124,9 +124,9 @@ class FollowingFamily(Family):
         first = np.zeros(n, np.int64) if offset is None else offset
         accelerations = drawn_accelerations(traffic.numbers, seed, paths.number, paths.start["speed_mps"])
         room = empty_motion(traffic)
-        track, at_onset = np.zeros_like(room.x), np.zeros((drivers.drivers.size, STATE))
+        at, at_onset = np.zeros(drivers.drivers.size, DRIVING_DTYPE), np.zeros((drivers.drivers.size, STATE))
         known = unboxed(traffic), unboxed(drivers), unboxed(room)
-        enumerate_events(paths.start, accelerations, stride, first, *known, track, at_onset, unboxed(found))
+        enumerate_events(paths.start, accelerations, stride, first, *known, at, at_onset, unboxed(found))
         return found
 
     def choose(self, traffic: Following, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
@@ -190,7 +190,8 @@ class FollowingFamily(Family):
         steps, facts = self.max_steps(traffic), chosen.facts  # whoever follows has done so from the start
         end, tracks = np.zeros((len(facts), len(drivers)), np.int64), np.zeros((len(drivers), steps + 1, 2))
         room = empty_motion(traffic)
-        drive_others(_tests(traffic, facts), unboxed(traffic), drivers, unboxed(room), tracks, end)
+        at = np.zeros(len(drivers), DRIVING_DTYPE)
+        drive_others(_tests(traffic, facts), unboxed(traffic), drivers, unboxed(room), at, tracks, end)
         ahead = np.stack((room.x[:, self.principal], room.v[:, self.principal]), axis=1)
         return Driven(end, tracks if last else np.zeros((0, 0, 0)), ahead if last else np.zeros((0, 0)))
 

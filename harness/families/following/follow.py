@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.following.approach import AV_START_M, LEAD, REVEALED, Following, Motion, happen, in_scope, walk
 from harness.families.protocol import Events
@@ -15,7 +17,16 @@ from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, next_position, n
 from harness.vehicles.references import Memory
 from harness.vocabulary import FloatArray, Int8Array, IntArray, Record, RecordArray
 
-NO_CRASH = -1
+GOES_ON, NO_CRASH = -2, -1
+"""Of a driver: on its way; or at the end of a test without a crash."""
+DRIVING_DTYPE = np.dtype(
+    [
+        *((name, np.float64) for name in ("x_m", "speed_mps", "acceleration_mps2", "danger", "headway_s")),
+        *((name, np.int64) for name in ("perceived", "reacts", "end")),
+    ]
+)
+"""A driver in a test: where and how fast, what it remembers, from which steps on it sees and reacts; and ``end``, the
+step after which it has run into a vehicle ahead, `NO_CRASH` or `GOES_ON`."""
 STATE = 3
 """Of a driver at the onset: position (m), speed (m/s), acceleration (m/s²)."""
 
@@ -37,54 +48,73 @@ def behind(motion: Motion, vehicle: int, step: int, x: float) -> Ahead:
 
 
 @compiled_inline
-def drive_on(
+def set_out(
     driver: Record,
     natural_s: float,
     event: Record,
     clear: int,
-    first: int,
-    until: int,
-    acceleration: float,
-    numbers: Record,
+    x: float,
+    v: float,
+    a: float,
+    traffic: Following,
     motion: Motion,
-    track: FloatArray,
-) -> tuple[int, float]:
-    """Drive from a step to another; ``track`` (steps + 1, 2) receives positions (m) and speeds (m/s).
-
-    Returns `NO_CRASH`, or the step after which the driver has run into a vehicle ahead, and its acceleration (m/s²). It
-    is also `NO_CRASH` where both stand after the onset; then the test is over.
-    """
-    headway_s, memory = headway_of(driver, natural_s, motion.v[0, LEAD]), Memory(acceleration, math.inf, 0.0)
-    onset, reveals = numbers.onset, clear < NEVER
-    perceived = onset + braking_seen_after(driver)
-    if reveals:  # nobody sees through the one that leaves
-        least_m = max(driver.perceives_lateral_m, numbers.visible_from_m)
-        perceived = onset + seen_after(least_m, event.lateral_mps, clear - onset)
-    reacts = perceived + int(driver.delay_steps)
-    for step in range(first, until):
-        x, v = track[step, 0], track[step, 1]
-        nobody = Ahead(v, math.inf, 0.0)
-        lead = behind(motion, LEAD, step, x) if step < clear else nobody
-        slow = behind(motion, REVEALED, step, x) if reveals and step >= perceived else nobody
-        memory = follow_on(driver, headway_s, memory, step - reacts, onset < step < reacts, v, lead, slow)
-        v_after = next_speed(v, memory.acceleration)
-        x_after = next_position(x, v, v_after)
-        track[step + 1, 0], track[step + 1, 1] = x_after, v_after
-        if step < clear and gap(motion.x[step + 1, LEAD], x_after) < CONTACT_M:
-            return step + 1, memory.acceleration
-        if reveals and step >= onset and gap(motion.x[step + 1, REVEALED], x_after) < CONTACT_M:
-            return step + 1, memory.acceleration
-        ahead = LEAD if step + 1 < clear else REVEALED
-        if step >= onset and v_after == 0.0 and motion.v[step + 1, ahead] == 0.0:
-            return NO_CRASH, memory.acceleration
-    return NO_CRASH, memory.acceleration
+    at: Record,
+) -> None:
+    """A driver at a position (m), speed (m/s) and acceleration (m/s²), who is to meet an event."""
+    n = traffic.numbers
+    at.x_m, at.speed_mps, at.acceleration_mps2, at.danger, at.end = x, v, a, math.inf, GOES_ON
+    at.headway_s = headway_of(driver, natural_s, motion.v[0, LEAD])
+    at.perceived = n.onset + braking_seen_after(driver)
+    if clear < NEVER:  # nobody sees through the one that leaves
+        least_m = max(driver.perceives_lateral_m, n.visible_from_m)
+        at.perceived = n.onset + seen_after(least_m, event.lateral_mps, clear - n.onset)
+    at.reacts = at.perceived + int(driver.delay_steps)
 
 
 @compiled_inline
-def hits_hard_enough(end: int, clear: int, above_mps: float, motion: Motion, track: FloatArray) -> bool:
-    """Whether a driver that has crashed after a step did so with an impact (m/s) that counts."""
-    ahead = LEAD if end - 1 < clear and gap(motion.x[end, LEAD], track[end, 0]) < CONTACT_M else REVEALED
-    return bool(above_mps == 0.0 or track[end, 1] - motion.v[end, ahead] > above_mps)
+def drive_step(driver: Record, step: int, clear: int, onset: int, motion: Motion, at: Record) -> None:
+    """Drive on by a step. Where both stand after the onset the test is over."""
+    reveals, x, v = clear < NEVER, at.x_m, at.speed_mps
+    nobody = Ahead(v, math.inf, 0.0)
+    lead = behind(motion, LEAD, step, x) if step < clear else nobody
+    slow = behind(motion, REVEALED, step, x) if reveals and step >= at.perceived else nobody
+    memory, late = Memory(at.acceleration_mps2, at.danger, 0.0), onset < step < at.reacts
+    memory = follow_on(driver, at.headway_s, memory, step - at.reacts, late, v, lead, slow)
+    v_after = next_speed(v, memory.acceleration)
+    x_after = next_position(x, v, v_after)
+    at.x_m, at.speed_mps, at.acceleration_mps2, at.danger = x_after, v_after, memory.acceleration, memory.danger
+    ahead = LEAD if step + 1 < clear else REVEALED
+    if (step < clear and gap(motion.x[step + 1, LEAD], x_after) < CONTACT_M) or (
+        reveals and step >= onset and gap(motion.x[step + 1, REVEALED], x_after) < CONTACT_M
+    ):
+        at.end = step + 1
+    elif step >= onset and v_after == 0.0 and motion.v[step + 1, ahead] == 0.0:
+        at.end = NO_CRASH
+
+
+@compiled_inline
+def drive_on(
+    drivers: RecordArray, first: int, until: int, clear: int, onset: int, motion: Motion, at: RecordArray
+) -> None:
+    """Drive those who go on from a step to another, side by side: none waits for the arithmetic of another."""
+    for step in range(first, until):
+        on = 0
+        for d in range(drivers.size):
+            if at[d].end == GOES_ON:
+                drive_step(drivers[d], step, clear, onset, motion, at[d])
+                on += 1
+        if on == 0:
+            return
+
+
+@compiled_inline
+def hits_hard_enough(at: Record, clear: int, above_mps: float, motion: Motion) -> bool:
+    """Whether a driver has crashed, with an impact (m/s) that counts."""
+    end = at.end
+    if end < 0:
+        return False
+    ahead = LEAD if end - 1 < clear and gap(motion.x[end, LEAD], at.x_m) < CONTACT_M else REVEALED
+    return bool(above_mps == 0.0 or at.speed_mps - motion.v[end, ahead] > above_mps)
 
 
 @compiled_threads
@@ -96,23 +126,24 @@ def enumerate_events(
     traffic: Following,
     followers: Followers,
     motion: Motion,
-    track: FloatArray,
+    at: RecordArray,
     at_onset: FloatArray,
     found: Events,
 ) -> None:
     """Every ``stride``-th event of paths (n,), and who crashes; see `harness.families.protocol.Family.events`.
 
-    ``motion``, ``track`` (steps + 1, 2) and ``at_onset`` (D, 3) are room to work in.
+    ``motion``, ``at`` (D,), `DRIVING_DTYPE`, and ``at_onset`` (D, 3) are room to work in.
     """
     n, drivers, above = traffic.numbers, followers.drivers, followers.counts_above_mps
     for i in range(start.size):
-        early, natural_s, nothing = 0, start[i].natural_headway_s, traffic.grid[0]
-        walk(start[i].speed_mps, accelerations[i], n, motion)
-        track[0, 0], track[0, 1] = AV_START_M, start[i].speed_mps
+        early, natural_s, nothing, v = 0, start[i].natural_headway_s, traffic.grid[0], start[i].speed_mps
+        walk(v, accelerations[i], n, motion)
         for d in range(drivers.size):
-            end, a = drive_on(drivers[d], natural_s, nothing, NEVER, 0, n.onset, 0.0, n, motion, track)
-            at_onset[d, 0], at_onset[d, 1], at_onset[d, 2] = track[n.onset, 0], track[n.onset, 1], a
-            if end != NO_CRASH and hits_hard_enough(end, NEVER, above, motion, track):
+            set_out(drivers[d], natural_s, nothing, NEVER, AV_START_M, v, 0.0, traffic, motion, at[d])
+        drive_on(drivers, 0, n.onset, NEVER, n.onset, motion, at)
+        for d in range(drivers.size):
+            at_onset[d, 0], at_onset[d, 1], at_onset[d, 2] = at[d].x_m, at[d].speed_mps, at[d].acceleration_mps2
+            if hits_hard_enough(at[d], NEVER, above, motion):
                 early |= 1 << d
         total = 0.0
         for e in range(traffic.grid.size):
@@ -128,12 +159,13 @@ def enumerate_events(
             found.crashes[i, e] = early
             clear = happen(event, n.max_steps, n, motion)
             for d in range(drivers.size):
+                x, v, a = at_onset[d, 0], at_onset[d, 1], at_onset[d, 2]
+                set_out(drivers[d], natural_s, event, clear, x, v, a, traffic, motion, at[d])
                 if early >> d & 1:
-                    continue
-                track[n.onset, 0], track[n.onset, 1] = at_onset[d, 0], at_onset[d, 1]
-                a, most = at_onset[d, 2], n.max_steps
-                end, a = drive_on(drivers[d], natural_s, event, clear, n.onset, most, a, n, motion, track)
-                if end != NO_CRASH and hits_hard_enough(end, clear, above, motion, track):
+                    at[d].end = NO_CRASH
+            drive_on(drivers, n.onset, n.max_steps, clear, n.onset, motion, at)
+            for d in range(drivers.size):
+                if hits_hard_enough(at[d], clear, above, motion):
                     found.crashes[i, e] |= 1 << d
         found.log_any[i] = math.log(min(total, 1.0)) if total > 0.0 else -math.inf
 
@@ -158,18 +190,30 @@ def move_others(
 
 @compiled_threads
 def drive_others(
-    tests: Tests, traffic: Following, drivers: RecordArray, motion: Motion, tracks: FloatArray, end: IntArray
+    tests: Tests,
+    traffic: Following,
+    drivers: RecordArray,
+    motion: Motion,
+    at: RecordArray,
+    tracks: FloatArray,
+    end: IntArray,
 ) -> None:
     """Drive others in the AV's place in tests (n,); ``tracks`` (D, steps + 1, 2) holds the last of them afterwards.
 
-    ``end`` (n, D) receives `NO_CRASH`, or the step after which each has crashed. ``motion`` is room to work in.
+    ``end`` (n, D) receives `NO_CRASH`, or the step after which each has crashed. ``motion`` and ``at`` (D,) are room to
+    work in.
     """
     n = traffic.numbers
     for i in range(len(end)):
-        event, natural_s = tests.event[i], tests.start[i].natural_headway_s
-        walk(tests.start[i].speed_mps, tests.accelerations[i], n, motion)
+        event, natural_s, v = tests.event[i], tests.start[i].natural_headway_s, tests.start[i].speed_mps
+        walk(v, tests.accelerations[i], n, motion)
         clear = happen(event, n.max_steps, n, motion)
         for d in range(drivers.size):
             tracks[d] = 0.0
-            tracks[d, 0, 0], tracks[d, 0, 1] = AV_START_M, tests.start[i].speed_mps
-            end[i, d], _ = drive_on(drivers[d], natural_s, event, clear, 0, n.max_steps, 0.0, n, motion, tracks[d])
+            tracks[d, 0, 0], tracks[d, 0, 1] = AV_START_M, v
+            set_out(drivers[d], natural_s, event, clear, AV_START_M, v, 0.0, traffic, motion, at[d])
+            for step in range(n.max_steps):
+                if at[d].end == GOES_ON:
+                    drive_step(drivers[d], step, clear, n.onset, motion, at[d])
+                    tracks[d, step + 1, 0], tracks[d, step + 1, 1] = at[d].x_m, at[d].speed_mps
+            end[i, d] = max(at[d].end, NO_CRASH)
