@@ -24,6 +24,7 @@ from harness.campaign.sections import DEFAULT, Section
 from harness.campaign.vehicle import AV_SOURCES, Panel, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml, yaml_text
 from harness.errors import CampaignError
+from harness.families import DEFAULT_FAMILY
 from harness.files import real_path
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -96,7 +97,8 @@ def _with_real_paths(campaign: Campaign, place: Places, folder: Path, *, check_f
         if not Path(file).exists() and place(where).startswith("--set"):
             file = _absolute(name, Path.cwd())
         if check_files and not Path(file).is_file():
-            mend = file_meant(Path(file)) or "Correct the path; it is relative to the folder of the campaign file."
+            here = "the current folder" if folder == Path.cwd() else "that of the campaign file"
+            mend = file_meant(Path(file)) or f"Correct the path, which is relative to {here}."
             raise CampaignError(place(where), f"no file {file}", expected, mend)
         campaign = campaign.replaced(where, f"{file}:{end}" if end else file)
     return campaign
@@ -375,6 +377,8 @@ def written_out(campaign: Campaign) -> dict[str, Any]:
     """Plain data of a campaign with every default, but of the sources of an AV only the one that drives it."""
     data = campaign.model_dump()
     data["av"] = {key: value for key, value in data["av"].items() if key not in AV_SOURCES or value is not None}
+    if campaign.scenarios is not None and campaign.scenario == DEFAULT_FAMILY:  # which is not asked then
+        del data["scenario"]
     return data
 
 

@@ -57,8 +57,8 @@ workers_option = click.option(
 )  # fmt: skip
 scenario_option = click.option(
     "--scenario", metavar="NAME",
-    help="What happens in the tests: cut_in (default), lead_brakes or cut_out. `harness run` also takes several, with "
-    "commas, or 'all': their answer is crashes per hour of driving.",
+    help="What happens in the tests: cut_in (default), lead_brakes or cut_out. `harness run` and `harness compare` "
+    "also take several, with commas, or 'all': their answer is crashes per hour of driving.",
 )  # fmt: skip
 executor_option = click.option(
     "--executor", type=click.Choice(["local", "ray"]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from harness.report.words import late_words
 from harness.runner.look import SLOW_S, AvCheck, Cause
 
 MOVES_MPS2 = 0.5
@@ -62,6 +63,8 @@ def verdict(found: AvCheck) -> str:
             f" Its constructor takes {speed.construction_s:.1f} s, and each worker of a run calls it "
             f"{speed.constructions} times: what all may share, load once (`load`, see docs/controllers.md)."
         )
+    if found.shows and found.source == "controller" and not seen.n_took_over_early:
+        advice += f" But {late_words(found.controller)}."
     return (
         f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
         f"{found.events}, {seen.reaction_s:.1f} s after they began (median; some leave time to wait); "

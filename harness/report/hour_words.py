@@ -22,7 +22,8 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
     """The answer for a terminal, at most ten lines of 100 columns; with ``readings`` two more."""
     n, engine = count(content["n_episodes"]), "SUMO" if content["engine"] == "sumo" else "SUMO’s twin"
     scenarios = f"{len(content['families'])} scenarios"
-    head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", duration(content["wall_time_s"])]
+    took = [] if readings else [duration(content["wall_time_s"])]  # of the run, not of an answer given anew
+    head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", *took]
     verdict = [] if content["decision"] is None else [decided(content["decision"]).texts]
     rows = [*verdict, *sum_rows(content), *(reading_rows(content) if readings else ())]
     ends = [] if report is None else [f"  report  {report}"]

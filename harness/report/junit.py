@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
 from harness.records.folder import write_bytes
-from harness.report.rows import within
-from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
+from harness.report.rows import limit_words, within
+from harness.strata import LIBRARY_STATEMENT
 
 Outcome = Literal["passed", "failure", "error"]
 
@@ -47,7 +47,9 @@ def statement_case(content: dict[str, Any], message: str, asked: str, exit_code:
     asks = found is not None and asked == LIBRARY_STATEMENT
     besides = () if found is None or asks else (" ".join(filter(None, within(found).texts)),)
     outcome = "failure" if asks and found["refuted"] else outcome_of(exit_code)
-    return Case(asked if asks else ASSUMPTION_FREE, message, outcome, besides)
+    decision = content.get("decision")
+    name = "crash rate" if decision is None else f"crash rate below {limit_words(decision)}"
+    return Case(f"{name}, given the {LIBRARY_STATEMENT}" if asks else name, message, outcome, besides)
 
 
 def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path]) -> None:
@@ -59,7 +61,9 @@ def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path])
     attached = [f"[[ATTACHMENT|{each.resolve()}]]" for each in attachments]
     told = [case.message, *case.besides]
     if case.outcome != "passed":
-        ET.SubElement(element, case.outcome, message=told.pop(0))
+        answer = told.pop(0)
+        verdict = answer.splitlines()[:2] or [""]  # below what was tested
+        ET.SubElement(element, case.outcome, message=verdict[-1].strip()).text = answer
     ET.SubElement(element, "system-out").text = "\n".join([*told, *attached, ""])
     ET.indent(root)
     text = printable(ET.tostring(root, encoding="unicode", xml_declaration=True))

@@ -115,17 +115,25 @@ def _share_within(value: float, limits: tuple[float, float] | None, of: str) -> 
     return "" if high - low > ANY_SHARE else f"{share(value)} ({100.0 * low:.0f}–{100.0 * high:.0f} %){of}"
 
 
+def limit_words(decision: Mapping[str, Any]) -> str:
+    """What a verdict is about."""
+    driver = decision.get("driver")
+    return f"{plain(decision['limit'])} × {driver}" if driver else f"{plain(decision['limit'])} per test"
+
+
 def decided(decision: Mapping[str, Any]) -> Row:
     """The verdict on a limit, of one scenario or of several."""
     driver, verdict = decision.get("driver"), decision["verdict"]
-    limit = f"{plain(decision['limit'])} × {driver}" if driver else f"{plain(decision['limit'])} per test"
+    limit = limit_words(decision)
     low, high = (ratio(decision[end]) if driver else number(decision[end]) for end in ("low", "high"))
     value, ends = {
         "accepted": (f"rate below {limit}", f"at most {high}"),
         "rejected": (f"rate above {limit}", f"at least {low}"),
     }.get(verdict, (f"limit {limit}", f"it may be {low} to {high}"))
     given = "" if decision["statement"] == ASSUMPTION_FREE else f", given {decision['statement']}"
-    return Row("verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])}{given}", ends)
+    return Row(
+        "verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])} over all looks{given}", ends
+    )
 
 
 def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: bool) -> Row:

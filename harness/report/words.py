@@ -175,6 +175,12 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
         yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
 
 
+def late_words(controller: str | None) -> str:
+    """That a vehicle does nothing before BV is in its lane, and what would show it."""
+    what = "getLateralLanePosition" if controller is not None and is_script(controller) else "bv_lateral_m"
+    return f"it reacted only once the other car (BV) was in its lane; {what} shows it some 2 s earlier"
+
+
 def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> Iterator[str]:
     """What the vehicle did while BV came over, a line each."""
     if not manifest.get("events_show") or campaign.av.acts_before_event:
@@ -182,7 +188,7 @@ def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Map
     if campaign.av.source in ("sumo", "traci"):
         yield "SUMO changes lanes in one step: this vehicle cannot see the other car (BV) coming over, as drivers can"
     elif counts.get("n_events") and not counts.get("n_took_over_early"):
-        yield "it reacted only once the other car (BV) was in its lane; bv_lateral_m shows it some 2 s earlier"
+        yield late_words(campaign.av.controller)
     if (n := counts.get("n_asked_to_speed_up")) and campaign.av.model is None:  # of our own it is known
         yield f"in {count(n)} tests it asked to speed up before BV was in its lane; its speed was held (av.takes_over)"
 

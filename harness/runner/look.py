@@ -54,7 +54,8 @@ class Behaviour:
     """What the AV did in all steps in which it acted, and after the cut-ins.
 
     ``reaction_s`` is the median time from the onset of the cut-in to the first braking beyond 0.1 m/s², over the
-    episodes that braked at all; their share is ``braking_share``.
+    episodes that braked at all; their share is ``braking_share``. ``n_took_over_early`` did something before the
+    overlap.
     """
 
     mean_acceleration_mps2: float
@@ -66,6 +67,7 @@ class Behaviour:
     braking_share: float
     n_events: int
     n_crashes: int
+    n_took_over_early: int
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,7 @@ class AvCheck:
     events: str = "cut-ins"
     follows: Follows | None = None
     idm_follows: Follows | None = None
+    controller: str | None = None
 
     @property
     def exit_code(self) -> int:
@@ -180,7 +183,7 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
         behaviour=_behaviour(first, limits, early=early), idm_behaviour=_behaviour(of_idm, limits, early=early),
         speed=own_speed, idm_speed=idm_speed, events=family.words.events,
         follows=_follows(first) if family.follows else None,
-        idm_follows=_follows(of_idm) if family.follows else None,
+        idm_follows=_follows(of_idm) if family.follows else None, controller=tested.av.controller,
     )  # fmt: skip
 
 
@@ -316,7 +319,7 @@ def _follows(shard: Shard) -> Follows:
 
 
 def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
-    episode = shard.episode
+    episode, took_over = shard.episode, shard.episode["took_over_step"]
     acted, reactions = [], []
     for row, trace in sorted(shard.traces.items()):
         cut, onset = int(episode["event_step"][row]), int(episode["onset_step"][row])
@@ -338,4 +341,5 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         reaction_s=float(np.median(reaction[braked])) if braked.any() else np.nan,
         braking_share=float(braked.mean()) if reaction.size else np.nan,
         n_events=len(reactions), n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
+        n_took_over_early=int(np.count_nonzero((took_over >= 0) & (took_over <= episode["event_step"]))),
     )  # fmt: skip

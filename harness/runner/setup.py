@@ -31,7 +31,10 @@ def compile_kernels(progress: Progress | None = None) -> bool:
     with TemporaryDirectory() as folder:
         controller = Path(folder) / "holds.py"
         controller.write_text(_CONTROLLER)
-        for number, vehicle in enumerate(("idm", f"{controller}:Holds")):
-            run_campaign(load_campaign(vehicle, _SMALL), Path(folder) / str(number), workers=1, progress=progress)
+        vehicles, progress = ("idm", f"{controller}:Holds"), progress or Progress()
+        progress.stage("compiling", len(vehicles))
+        for number, vehicle in enumerate(vehicles):
+            run_campaign(load_campaign(vehicle, _SMALL), Path(folder) / str(number), workers=1)
+            progress.advance(1)
     cache.keep(done, b"")
     return True
