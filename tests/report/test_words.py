@@ -22,7 +22,12 @@ SAID = {
     "step-immediate-twin": ["the true rate may lie far above this interval: a crash may weigh 1.00 × 10²⁰⁰, and all"],
     "forced-failing-twin": [" of 240 tests FAILED; had they all crashed, the rate would be "],
     "shells-twin": ["crash rate  ", "× competent driver  ", "r157-cc, UN R157’s driver", "even by braking at 8 m/s²"],
-    "shells-accepted": ["ACCEPTED ", "rate below 4 × 10⁻⁷ per test", "confidence 0.95 over all looks", "stopped: verdict reached"],
+    "shells-accepted": [
+        "ACCEPTED ",
+        "rate below 4 × 10⁻⁷ per test",
+        "confidence 0.95 over all looks",
+        "stopped: verdict reached",
+    ],
     "shells-refuted": ["138 (crashes more)", "stopped: all tests done"],
     "shells-inside": ["given the library ", "no tests outside it", "crash rate so far", "unavoidable so far"],
     "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc, from the same state"],
