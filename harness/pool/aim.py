@@ -106,8 +106,11 @@ class EnumeratedPaths:
 
     def rates(self, n_surrogates: int) -> FloatArray:
         """Per path: its weighted probability that each surrogate crashes, and of an event; shape (n, D + 1)."""
-        columns = [np.where(self.crashes & (1 << d), self.mass, 0.0).sum(1) for d in range(n_surrogates)]
-        return np.column_stack([*columns, self.mass.sum(1)])
+
+        def of(d: int) -> FloatArray:
+            return np.asarray(np.where(self.crashes & (1 << d), self.mass, 0.0).sum(1))
+
+        return np.column_stack([*made_ahead(of, range(n_surrogates)), self.mass.sum(1)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -136,11 +136,13 @@ class FollowingFamily(Family):
         facts: RecordArray = np.zeros(n, np.dtype([*real, ("event", np.int64), *lists]))
         facts["start_speed_mps"] = paths.start["speed_mps"]
         facts["natural_headway_s"] = paths.start["natural_headway_s"]
-        drawn = drawn_accelerations(traffic.numbers, seed, paths.number, paths.start["speed_mps"])
-        facts["lead_accelerations"], facts["n_seconds"], facts["event"] = drawn, seconds, event
+        _, one, path = np.unique(paths.number, return_index=True, return_inverse=True)  # a pool has many events of each
+        drawn = drawn_accelerations(traffic.numbers, seed, paths.number[one], paths.start["speed_mps"][one])
+        facts["lead_accelerations"], facts["n_seconds"], facts["event"] = drawn[path], seconds, event
         onset, events = int(traffic.numbers["onset"]), events_of(traffic, event)
-        script_v, clear = self._moved(traffic, facts)[1:]
-        facts["lead_speed_mps"] = script_v[:, onset - 1, 0]
+        facts["lead_speed_mps"] = self._moved(traffic, facts[one])[1][path, onset - 1, 0]
+        _, one, kind = np.unique(event, return_index=True, return_inverse=True)
+        clear = self._moved(traffic, facts[one])[2][kind]
         for name, values in self.facts_of(traffic, events, facts["lead_speed_mps"]).items():
             facts[name] = np.where(event < 0, np.nan, values)
         lead = np.where(clear - onset < traffic.numbers["max_steps"], clear - onset - 1, 0)
