@@ -7,13 +7,14 @@ that a folder that may only be read is a cache, too, and a user without a home h
 
 from __future__ import annotations
 
+import fcntl
 import os
 import stat
 import sys
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import platformdirs
@@ -130,6 +131,23 @@ def _make_room(kept: Path) -> None:
             with suppress(OSError):
                 path.unlink()
                 left -= of.st_size
+
+
+@contextmanager
+def made_once(name: str, waits: Callable[[], object]) -> Iterator[None]:
+    """Keep other processes from making the same meanwhile; ``waits`` is called where one of them is at it already."""
+    with ExitStack() as held:
+        with suppress(OSError):  # a cache that may only be read, or a file system without locks
+            path = next(places(name)).with_suffix(".lock")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = held.enter_context(path.open("wb"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                waits()
+                fcntl.flock(file, fcntl.LOCK_EX)
+            held.callback(path.unlink, missing_ok=True)
+        yield
 
 
 def put(name: str, write: Callable[[Path], object]) -> Path:

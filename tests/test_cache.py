@@ -4,6 +4,8 @@ import os
 import pwd
 import shutil
 import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -160,3 +162,28 @@ def test_what_has_not_been_used_for_longest_makes_room(folder, monkeypatch):
     monkeypatch.setattr(cache, "MOST_BYTES", 0)  # a file is not its own room
     cache.keep(names[1], CONTENT)
     assert [cache.has(name) for name in names] == [False, True, False, False]
+
+
+def test_what_another_makes_is_waited_for(folder):
+    waited, made = [], []
+
+    def make(i):
+        with cache.made_once(NAME, lambda: waited.append(i)):
+            if cache.read(NAME) is None:
+                time.sleep(0.2)
+                made.append(i)
+                cache.keep(NAME, CONTENT)
+
+    with ThreadPoolExecutor(3) as threads:
+        list(threads.map(make, range(3)))
+    assert (len(made), len(waited)) == (1, 2)
+    assert [path.name for path in (folder / "pools").iterdir()] == ["one"]
+    with cache.made_once(OTHER, lambda: waited.append(-1)):
+        pass
+    assert len(waited) == 2
+
+
+def test_where_no_lock_can_be_had_nobody_waits(folder):
+    folder.write_text("no folder")
+    with cache.made_once(NAME, lambda: pytest.fail("waits")):
+        pass

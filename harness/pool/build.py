@@ -70,8 +70,12 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
     key = campaign_pool_key(resolved, order)
     if (cached := cached_pool(resolved, order)) is not None:
         return cached
-    pool = build_pool(resolved, key, progress, order)
-    cache.keep(pool_name(key), pool_content(pool))
+    progress = progress or Progress()
+    with cache.made_once(pool_name(key), lambda: progress.stage("waiting for a pool that another run builds", None)):
+        if (cached := cached_pool(resolved, order)) is not None:
+            return cached
+        pool = build_pool(resolved, key, progress, order)
+        cache.keep(pool_name(key), pool_content(pool))
     return pool
 
 
