@@ -206,10 +206,15 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     if as_json:
         print_json(content)
         return
-    print_table(f"What moves the answer: {content['environment']}", list(map(_bar, content["bars"])))
+    bars = list(map(_bar, content["bars"]))
+    if not any(bar["remark"] for bar in bars):
+        bars = [{key: value for key, value in bar.items() if key != "remark"} for bar in bars]
+    print_table(f"What moves the answer: {content['environment']}", bars)
     say(
-        "The share of crashes in each shell is assumed to stay the same; 'off by' is the error of that for a reference "
-        "driver.",
+        "With a number at the one or the other end of what is known of it, the rate, and the ratio to the competent "
+        "driver, are so many times as high.",
+        "That takes the share of crashes in each shell for the same; 'error' is by how much this is wrong for a "
+        "reference driver.",
         f"report  {page}",
     )
 
@@ -223,7 +228,7 @@ def _bar(bar: dict[str, Any]) -> dict[str, str]:
     values = "" if bar["values"] is None else " … ".join(map(plain, bar["values"]))
     told = {"number": bar["what"], "known": f"{bar['known']} {values}", "rate": ends(bar["rate"])}
     off = " … ".join(map(share, bar["off"])) if bar["off"] != [None, None] else ""
-    return {**told, "ratio": ends(bar["ratio"]), "off by": off, "remark": bar_note(bar)}
+    return {**told, "ratio": ends(bar["ratio"]), "error": off, "remark": bar_note(bar)}
 
 
 @click.command(
