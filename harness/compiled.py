@@ -65,7 +65,11 @@ def source_hash(patterns: tuple[str, ...] = KERNEL_SOURCES) -> str:
 
 os.environ.setdefault("NUMBA_DISABLE_INTEL_SVML", "1")
 
-import numba  # noqa: E402  (its settings are read at import)
+try:
+    import numba  # (its settings are read at import)
+except Exception as error:
+    mend = "Correct .numba_config.yaml, if this folder has one, or install the harness again."
+    raise HarnessError("numba", f"{type(error).__name__}: {error}", "numba, which compiles kernels", mend) from error
 import numpy as np  # noqa: E402
 from llvmlite import ir  # noqa: E402
 from numba import extending, types  # noqa: E402

@@ -104,6 +104,16 @@ def test_a_numba_that_compiles_nothing_is_refused(tmp_path):
     assert refused.stderr.startswith("error: NUMBA_DISABLE_JIT\n")
 
 
+def test_a_numba_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
+    (tmp_path / ".numba_config.yaml").write_text("- 3")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(SMOKE.parents[1]))
+    refused = of_another_process("import sys; from harness.cli import main; sys.exit(main(['check', 'idm']))")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("error: numba\n")
+    assert ".numba_config.yaml" in refused.stderr
+
+
 @pytest.mark.slow
 def test_a_copy_of_the_package_finds_what_another_has_compiled_unless_it_is_damaged(tmp_path):
     (tmp_path / "of_a_user.py").write_text("import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n")
