@@ -71,7 +71,7 @@ def crash_gallery(
     for reason, ranked in rankings.items():
         chosen = sorted(enumerate(ranked, 1), key=lambda item: episode[item[1]] not in traced)[:SHOWN]
         for rank, place in sorted(chosen):
-            reasons.setdefault(place, []).append(reason.format(rank) if "{}" in reason else f"{reason} no. {rank}")
+            reasons.setdefault(place, []).append(f"{reason} no. {rank}")
     total, stored = float(crashes["weight"].sum()), rows_of(run, {int(episode[place]) for place in reasons} & traced)
     rows, shown = list[GalleryRow](), list[Scene]()
     for place, why in reasons.items():
@@ -100,7 +100,7 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
         keys["outermost"] = crashes["component"]
     elif not summary.all_weights_one:
         keys["weight"] = weight
-    first = {"crash {} that r157-cc would have avoided": worst_crashes(impact, episode, avoided[:, 0])}
+    first = {"avoidable by r157-cc": worst_crashes(impact, episode, avoided[:, 0])}
     return first | {name: worst_crashes(key, episode, among) for name, key in keys.items()}
 
 
