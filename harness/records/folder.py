@@ -288,7 +288,7 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     path = folder / MANIFEST
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
-        if runs := sorted(folder.glob("*/" + MANIFEST)):
+        if runs := sorted(folder.glob("*/" + MANIFEST)) or sorted(folder.glob("*/*/" + MANIFEST)):
             several = "a run of several scenarios" if (folder / FAMILIES).is_file() else "a folder of several runs"
             one = f"Name one of them, such as {runs[0].parent}; one of all scenarios that is not done takes --resume."
             raise RunFolderError(str(folder), several, "the run folder of one", one)

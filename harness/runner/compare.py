@@ -27,17 +27,18 @@ from harness.estimators.pairs import Pairs, PairsPerHour, PairVerdict, contrast,
 from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
+from harness.files import read_bytes
 from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
-from harness.records.folder import CAMPAIGN, read_manifest, write_sealed
+from harness.records.folder import CAMPAIGN, read_manifest, require_sum, write_sealed
 from harness.records.origin import code_of, require_trust
 from harness.resolved import require_ready
-from harness.runner.families import exposure_of, hour_answer, require_no_other
+from harness.runner.families import MEND, exposure_of, hour_answer, read_families, require_no_other
 from harness.runner.paired import SIDES, Both, Scenario, copy_stored, drive_pairs, together
 from harness.sampling.shells import PairRounds
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
-from harness.vocabulary import COMPARISON
+from harness.vocabulary import COMPARISON, FAMILIES
 
 if TYPE_CHECKING:
     from harness.report.summary import RunFolder
@@ -134,9 +135,7 @@ def compare_campaigns(
     folders = {name: name for name in a.scenarios} if a.scenarios else {a.scenario: ""}
     if stored is not None:
         stored = Path(stored)
-        for folder in folders.values():
-            mend = f"Read that code; then name {stored / CAMPAIGN} for A, which drives it anew."
-            require_trust(stored / folder, read_manifest(stored / folder), code_of(a.av), mend)
+        _require_stored(stored, [*folders.values()], a)
     if margin is not None and rhw is not None:
         expected = "one end of the comparison"
         raise CampaignError("--margin", f"stop.rhw={rhw:g} beside it", expected, "Leave out --margin or stop.rhw.")
@@ -176,6 +175,16 @@ def compare_campaigns(
         each[of.name] = asdict(own.decision)
         _written(of, {"decision": each[of.name], "to_decide": None, "ended": "sum"}, *told, code)
     return _sum_written(out, a, pairs, scenarios, ended, each, told[0], code)
+
+
+def _require_stored(stored: Path, folders: Sequence[str], campaign: Campaign) -> None:
+    """Refuse a run of A whose code may be a stranger's, or whose campaign is damaged."""
+    for folder in folders:
+        mend = f"Read that code; then name {stored / CAMPAIGN} for A, which drives it anew."
+        require_trust(stored / folder, read_manifest(stored / folder), code_of(campaign.av), mend)
+    if (stored / FAMILIES).is_file():  # that of one scenario is known by its hash
+        known = read_families(stored).get("campaign_crc32")
+        require_sum(stored / CAMPAIGN, known, read_bytes(stored / CAMPAIGN), MEND)
 
 
 def _written(of: Scenario, ended: Mapping[str, Any], labels: tuple[str, str], asked: str, code: int) -> Comparison:

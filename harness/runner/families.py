@@ -6,6 +6,7 @@ So everything that there is for a run, from replay to export, is there for each 
 from __future__ import annotations
 
 import time
+import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
@@ -79,7 +80,8 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
         begins = {
             name: begun(out / name, each, earlier[name], workers, progress, len(names)) for name, each in ready.items()
         }
-        write_bytes(out / CAMPAIGN, dump_campaign(campaign).encode())
+        yaml = dump_campaign(campaign).encode()
+        write_bytes(out / CAMPAIGN, yaml)
         hour, results = _run(campaign, begins, rule, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
@@ -93,7 +95,8 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     from harness.report.words import vehicle_words  # noqa: PLC0415
 
     asked = {
-        "format": 1, "name": campaign.name, "seed": campaign.seed, "engine": campaign.world.engine,
+        "format": 1, "name": campaign.name, "campaign_crc32": zlib.crc32(yaml),
+        "seed": campaign.seed, "engine": campaign.world.engine,
         "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
         "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
         "vehicle": vehicle_words(campaign.av)[0], "wall_time_s": round(time.monotonic() - began, 3),

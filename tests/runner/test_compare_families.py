@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 
@@ -69,9 +70,13 @@ def test_pages_are_written_anew(done):
     assert [page.read_text() for page in pages] == before
 
 
-def test_what_is_there_is_not_driven_again(done, tmp_path, monkeypatch, capsys):
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return harness.run(campaign(), tmp_path_factory.mktemp("stored") / "run", workers=1)
+
+
+def test_what_is_there_is_not_driven_again(done, run, tmp_path, monkeypatch, capsys):
     """Neither an earlier call's tests nor those of a stored run of A in the same scenarios."""
-    run = harness.run(campaign(), tmp_path / "stored", workers=1)
     call = ["compare", str(run.folder), "late-600ms", "--out", str(tmp_path / "out"), "--workers", "1", "--json"]
     assert main(call) in (0, 4)  # so small a pool may be used up
     found = json.loads(capsys.readouterr().out)
@@ -86,6 +91,16 @@ def test_what_is_there_is_not_driven_again(done, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("harness.runner.workers.ShardRunner.run", None)
     again = compare_campaigns(campaign(), campaign(HARDER), done.folder, workers=1)
     assert again.content == done.content
+
+
+def test_a_stored_campaign_that_is_damaged_is_not_believed(run, tmp_path):
+    stored = tmp_path / "stored"
+    shutil.copytree(run.folder, stored)
+    file = stored / "campaign.yaml"
+    file.write_text(file.read_text().replace("exposure: {}", "exposure: {lead_brakes: 7.0}"))
+    with pytest.raises(RunFolderError, match="checksum"):
+        compare_campaigns(campaign(), campaign(HARDER), tmp_path / "out", stored=stored)
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_cannot_be_compared_is_refused(done, tmp_path):
