@@ -79,7 +79,7 @@ def of_scenario(text: str | None, alone: str = "") -> list[str]:
         return []
     names = R157 if text == "all" else tuple(name.strip() for name in text.split(","))
     for name in names:
-        family_named(name, f"--scenario {text}")
+        family_named(name, f"--scenario {text}", more=("all",))
     if len(names) == 1:
         return [f"scenario={names[0]}", "scenarios=null"]
     if alone:

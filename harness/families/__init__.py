@@ -15,6 +15,8 @@ from harness.campaign.sections import listed
 from harness.errors import CampaignError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from harness.families.protocol import Family
 
 R157 = ("cut_in", "lead_brakes", "cut_out")
@@ -35,13 +37,14 @@ def families() -> dict[str, Family]:
     return {each.name: each.load() for each in entry_points(group=GROUP)} | {each.name: each for each in own}
 
 
-def family_named(name: str, where: str = "scenario") -> Family:
-    """The family that a campaign names.
+def family_named(name: str, where: str = "scenario", more: Sequence[str] = ()) -> Family:
+    """The family that a campaign names; ``more`` is what might have been named instead.
 
     Raises `CampaignError`: none has that name.
     """
     known = families()
     if name not in known:
-        mend = did_you_mean(name, list(known)) or "Write one of them, or install the package that brings it."
-        raise CampaignError(where, f"'{name}'", f"a kind of events: {listed(known)}", mend)
+        names = [*known, *more]
+        mend = did_you_mean(name, names) or "Write one of them, or install the package that brings it."
+        raise CampaignError(where, f"'{name}'", f"a kind of events: {listed(names)}", mend)
     return known[name]

@@ -290,8 +290,7 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
         expected = "a run folder, which holds a manifest.json"
         if runs := sorted(folder.glob("*/" + MANIFEST)) or sorted(folder.glob("*/*/" + MANIFEST)):
             several = "a run of several scenarios" if (folder / FAMILIES).is_file() else "a folder of several runs"
-            one = f"Name one of them, such as {runs[0].parent}; one of all scenarios that is not done takes --resume."
-            raise RunFolderError(str(folder), several, "the run folder of one", one)
+            raise RunFolderError(str(folder), several, "the run folder of one", f"Name one, such as {runs[0].parent}.")
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     found = read_as(StoredManifest, path, mend=mend)
     return {**found.model_dump(exclude_unset=True), "parts": found.parts, "before": found.before}

@@ -150,7 +150,8 @@ def shells_plot(found: ShownShells) -> Plot:
     )
     orange = " (orange outside the boundary)" if (rate[~inside] > 0.0).any() else ""
     caption = (
-        f"From careful (top) to careless. The rate: what each shell adds, with its limits{orange}. {source} The "
+        "A shell holds the events on which its driver is the most careful to crash (top: careful). "
+        f"The rate: what each shell adds, with its limits{orange}. {source} The "
         "uncertainty: how wide each shell alone would leave the interval; the per cent add up to the whole. "
         f"{open_question}"
     )
@@ -179,8 +180,8 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
     panel.add("line", "muted", [1.0, 1.0], [y.low, y.high], dash=DASHED, width=1.0)
     text = (
         "Fitted numbers move over nine tenths of what their data leave open, assumed ones over the stated range. "
-        f"The rate depends most on {names[0]}: × {number(rate[0][0], 2)} to × {number(rate[1][0], 2)}; the ratio moves "
-        f"by × {number(ratio[0][0], 3)} to × {number(ratio[1][0], 3)}."
+        f"The rate depends most on {names[0]}: × {number(rate[0][0], 2)} to × {number(rate[1][0], 2)}; of the ratio "
+        f"this makes × {number(ratio[0][0], 3)} to × {number(ratio[1][0], 3)}."
     )
     return Plot("sensitivity", [panel], text, text)
 
