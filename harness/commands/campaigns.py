@@ -84,6 +84,7 @@ def check(
     "--independent", type=click.IntRange(min=0, max=2**63 - 1), metavar="N",
     help="Repeat the run with other random numbers throughout: sets seed and pool.seed to N.",
 )  # fmt: skip
+@options.exposure_option
 @options.junit_option
 @options.av_option
 @options.set_option
@@ -95,6 +96,7 @@ def run(
     folder: Path | None,
     *,
     scenario: str | None,
+    exposures: Sequence[str],
     workers: int | None,
     executor: str | None,
     resume: bool,
@@ -121,7 +123,8 @@ def run(
     limit = [] if accept is None else options.accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
     seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
-    given = [*options.of_scenario(scenario), *seeds, *overrides]
+    met = [f"exposure.{each}" for each in exposures]
+    given = [*options.of_scenario(scenario), *met, *seeds, *overrides]
     if limit and (own := harness.load_campaign(campaign_file, given, av=av).accept) is not None:
         asked = own.model_dump(exclude_defaults=True)
         say(f"note: --accept {accept} replaces the limit of {campaign_file}: {asked}", err=True)

@@ -60,6 +60,10 @@ scenario_option = click.option(
     help="What happens in the tests: cut_in (default), lead_brakes or cut_out. `harness run` and `harness compare` "
     "also take several, with commas, or 'all': their answer is crashes per hour of driving.",
 )  # fmt: skip
+exposure_option = click.option(
+    "--exposure", "exposures", metavar="SCENARIO=N", multiple=True,
+    help="Events per hour of driving, of one of several scenarios. May be given several times.",
+)  # fmt: skip
 executor_option = click.option(
     "--executor", type=click.Choice(["local", "ray"]),
     help="Where tests run: on this machine, or on a Ray cluster ($RAY_ADDRESS, or run.ray.address of the campaign).",

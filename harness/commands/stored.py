@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 import harness
-from harness.commands.options import FILE, FOLDER, RUN_FOLDER, examples, json_option, progress_bar
+from harness.commands.options import FILE, FOLDER, RUN_FOLDER, examples, exposure_option, json_option, progress_bar
 from harness.commands.printing import print_either, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share
@@ -37,10 +37,7 @@ LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_tt
     "--environment", metavar="NAME|FILE",
     help="Answer for other traffic from the same tests (testing.method shells): a shipped environment, or a file.",
 )  # fmt: skip
-@click.option(
-    "--exposure", "exposures", metavar="SCENARIO=N", multiple=True,
-    help="Events per hour of driving, where DIR holds several scenarios. May be given several times.",
-)  # fmt: skip
+@exposure_option
 @click.option(
     "--exposure-uncertainty", "counts", is_flag=True,
     help="Of several scenarios: let the interval include the error of counted exposures.",

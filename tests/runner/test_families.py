@@ -221,3 +221,12 @@ def test_what_the_answer_of_one_scenario_depends_on(run, monkeypatch):
     assert 1.5 < rates["braking.peak_scale_mps2"][1] < 3.0
     assert 1.2 < rates["braking.held_log_sd"][1] < 3.0
     assert rates["exposure.per_hour"] == [1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"), [("lead_brakes=abc", "exposure.lead_brakes"), ("cut_off=1", "not among scenarios")]
+)
+def test_an_exposure_on_the_command_line_is_one_of_the_campaign(given, said, tmp_path, capsys):
+    assert main(["run", "idm", "--scenario", "all", "--exposure", given, "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
