@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import RunFolderError, shortened
 from harness.files import read_bytes, write_atomically
-from harness.vocabulary import FAMILIES
+from harness.vocabulary import COMPARISON, FAMILIES
 
 T = TypeVar("T")
 Tables = Mapping[str, pa.Table | None]
@@ -289,8 +289,12 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         if runs := sorted(folder.glob("*/" + MANIFEST)) or sorted(folder.glob("*/*/" + MANIFEST)):
-            several = "a run of several scenarios" if (folder / FAMILIES).is_file() else "a folder of several runs"
-            raise RunFolderError(str(folder), several, "the run folder of one", f"Name one, such as {runs[0].parent}.")
+            several, mend = "a folder of several runs", f"Name one, such as {runs[0].parent}."
+            if (folder / FAMILIES).is_file():
+                several = "a run of several scenarios"
+            elif not (folder / COMPARISON).is_file():
+                mend += " If it is an unfinished run of several scenarios, `harness run` with --resume goes on."
+            raise RunFolderError(str(folder), several, "the run folder of one", mend)
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     found = read_as(StoredManifest, path, mend=mend)
     return {**found.model_dump(exclude_unset=True), "parts": found.parts, "before": found.before}

@@ -123,7 +123,7 @@ def test_a_folder_of_runs_that_is_not_whole_is_told(run, tmp_path, capsys):
     (folder / "families.json").rename(tmp_path / "families.json")
     for command in (["estimate", str(folder)], ["replay", str(folder), "1"]):
         assert main(command) == 2
-        assert f"such as {folder}/cut_in; one of all scenarios that is not done" in capsys.readouterr().err
+        assert f"such as {folder}/cut_in. If it is an unfinished run" in capsys.readouterr().err
     (tmp_path / "families.json").rename(folder / "families.json")
     for name in NAMES:
         (folder / name / "manifest.json").unlink()
