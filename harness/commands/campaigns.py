@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,9 +15,13 @@ import harness
 from harness.commands import options
 from harness.commands.options import CAMPAIGN, FOLDER, examples, progress_bar
 from harness.commands.printing import print_either, print_json, print_table, prints_kept_in, say
+from harness.errors import HarnessError
 from harness.numbers import leaves, words
 from harness.processes import start_server
 from harness.vocabulary import MOST_ASKED
+
+if TYPE_CHECKING:
+    from harness.campaign.campaign import Campaign
 
 
 @click.command(
@@ -135,6 +140,8 @@ def run(
         folder is None,
         folder or options.run_folder(campaign.name, sorted(campaign.scenarios or [campaign.scenario]), resume=resume),
     )
+    if resume:
+        _note_other_stop(folder, campaign)
     if campaign.run.executor == "local":
         start_server()
     with named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
@@ -154,6 +161,15 @@ def run(
         write_junit(junit, campaign.name, case, [result.report])
     print_either(content, [result], as_json=as_json)
     ctx.exit(result.exit_code)
+
+
+def _note_other_stop(folder: Path, campaign: Campaign) -> None:
+    """Say where a run that goes on is to end otherwise than was asked before."""
+    with suppress(HarnessError):  # a folder that cannot be gone on in is refused by the run
+        before = harness.load_campaign(folder / "campaign.yaml", check_files=False).stop.model_dump()
+        for key, value in campaign.stop.model_dump().items():
+            if value != before[key]:
+                say(f"note: stop.{key} is {words(value)} now; before it was {words(before[key])}", err=True)
 
 
 @contextmanager

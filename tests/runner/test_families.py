@@ -230,3 +230,12 @@ def test_an_exposure_on_the_command_line_is_one_of_the_campaign(given, said, tmp
     assert main(["run", "idm", "--scenario", "all", "--exposure", given, "--out", str(tmp_path / "out")]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_run_that_goes_on_to_another_end_says_so(run, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(run.folder, folder)
+    given = [part for each in QUICK[1:] for part in ("--set", each)]
+    call = ["run", "idm", "--scenario", ",".join(NAMES), "--out", str(folder), "--resume", "--workers", "1", *given]
+    assert main([*call, "--set", "stop.rhw=0.9"]) == 0
+    assert "note: stop.rhw is 0.9 now; before it was 0.6\n" in capsys.readouterr().err
