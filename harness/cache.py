@@ -137,7 +137,8 @@ def _make_room(kept: Path) -> None:
 def made_once(name: str, waits: Callable[[], object]) -> Iterator[None]:
     """Keep other processes from making the same meanwhile; ``waits`` is called where one of them is at it already."""
     with ExitStack() as held:
-        with suppress(OSError):  # a cache that may only be read, or a file system without locks
+        # Without a lock is a cache that may only be read or does not exist yet, and a file system that has none.
+        with suppress(OSError, StopIteration):
             path = next(places(name)).with_suffix(".lock")
             path.parent.mkdir(parents=True, exist_ok=True)
             file = held.enter_context(path.open("wb"))

@@ -183,7 +183,9 @@ def test_what_another_makes_is_waited_for(folder):
     assert len(waited) == 2
 
 
-def test_where_no_lock_can_be_had_nobody_waits(folder):
+def test_where_no_lock_can_be_had_nobody_waits(folder, monkeypatch):
     folder.write_text("no folder")
-    with cache.made_once(NAME, lambda: pytest.fail("waits")):
-        pass
+    for own in (folder, None):  # or neither a home nor yet a folder in its place
+        monkeypatch.setattr(cache, "own_folder", lambda own=own: own)
+        with cache.made_once(NAME, lambda: pytest.fail("waits")):
+            pass
