@@ -63,7 +63,7 @@ def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path])
     if case.outcome != "passed":
         answer = told.pop(0)
         verdict = answer.splitlines()[:2] or [""]  # below what was tested
-        ET.SubElement(element, case.outcome, message=verdict[-1].strip()).text = answer
+        ET.SubElement(element, case.outcome, message=" ".join(verdict[-1].split())).text = answer
     ET.SubElement(element, "system-out").text = "\n".join([*told, *attached, ""])
     ET.indent(root)
     text = printable(ET.tostring(root, encoding="unicode", xml_declaration=True))

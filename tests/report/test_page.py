@@ -130,7 +130,7 @@ def test_what_no_run_has_written_is_named(run_folder, file, damage, said):
 # -- JUnit XML as a CI system reads it --
 
 
-ABOVE = "REJECTED  <above> & beyond\x1b[31m"
+ABOVE = "REJECTED <above> & beyond\x1b[31m"
 
 
 def content(**within):
@@ -149,9 +149,9 @@ def test_what_was_asked_decides_and_the_rest_is_shown(tmp_path, code, kind):
     (asked,) = suite
     assert (asked.name, "no crash in 9 tests outside it" in asked.system_out) == ("crash rate", True)
     assert [type(each).__name__ for each in asked.result] == ([] if kind is None else [kind])
-    assert all("REJECTED  <above> & beyond\\u001b[31m" in each.message for each in asked.result)
+    assert all("REJECTED <above> & beyond\\u001b[31m" in each.message for each in asked.result)
     assert f"[[ATTACHMENT|{report}]]" in asked.system_out
-    assert [each.text for each in asked.result] == ([] if kind is None else ["REJECTED  <above> & beyond\\u001b[31m"])
+    assert [each.text for each in asked.result] == ([] if kind is None else ["REJECTED <above> & beyond\\u001b[31m"])
 
 
 NO_SHELLS = {**content(), "estimates": {"shells": {"details": {}}}}
