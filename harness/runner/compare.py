@@ -34,7 +34,7 @@ from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, require_sum, write_sealed
 from harness.records.origin import code_of, require_trust
 from harness.resolved import require_ready
-from harness.runner.families import MEND, exposure_of, hour_answer, read_families, require_no_other
+from harness.runner.families import MEND, hour_answer, read_families, require_no_other
 from harness.runner.paired import SIDES, Both, Scenario, copy_stored, drive_pairs, together
 from harness.sampling.shells import PairRounds
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
@@ -221,9 +221,7 @@ def _sum_written(
     for i, side in enumerate(SIDES):
         ready = {of.name: of.runs[i].run.resolved for of in scenarios}
         told = {of.name: (of.results[i].estimates, of.results[i].shown.manifest) for of in scenarios}
-        families = [
-            OfFamily(of.name, exposure_of(ready[of.name], campaign.exposure), of.tests_of_pairs(i)) for of in scenarios
-        ]
+        families = [OfFamily(of.name, of.exposure, of.tests_of_pairs(i)) for of in scenarios]
         sides[side] = hour_answer(PerHour(families), ready, told, confidence)
     of_each = zip(scenarios, pairs.each, pairs.tests_per_hour, strict=True)
     content = finite_json({

@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from harness.estimators.block import joined
 from harness.estimators.pairs import PairCounts, PairedShells, Pairs, PairsPerHour
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule
+from harness.families.protocol import Exposure
 from harness.files import read_bytes
 from harness.pool.shells import Draw
 from harness.progress import Progress
@@ -42,8 +44,8 @@ class Scenario:
 
     results: tuple[RunResult, RunResult]  # once all is driven
 
-    def __init__(self, folder: Path, a: Underway, b: Underway) -> None:
-        self.folder, self.runs = folder, (a, b)
+    def __init__(self, folder: Path, a: Underway, b: Underway, exposures: Mapping[str, float]) -> None:
+        self.folder, self.runs, self._exposures = folder, (a, b), exposures
         self._tests = PairedShells(a.prescribed.design)  # as B's: one environment and one library make one pool
         self._n = np.zeros_like(self._tests.tests(0))
         self.pairs: PairCounts = self._tests.first(self._n)
@@ -53,9 +55,15 @@ class Scenario:
         """That of the scenario."""
         return self.runs[0].run.resolved.campaign.scenario
 
-    def tests_per_hour(self, campaign: Campaign) -> float:
+    @cached_property
+    def exposure(self) -> Exposure:
+        """How often its events are met."""
+        return exposure_of(self.runs[0].run.resolved, self._exposures)
+
+    @property
+    def tests_per_hour(self) -> float:
         """Tests that an hour of driving stands for."""
-        return exposure_of(self.runs[0].run.resolved, campaign.exposure).per_hour / self.pairs.design.p_event
+        return self.exposure.per_hour / self.pairs.design.p_event
 
     def take_over(self, rule: PairRule) -> None:
         """Take what the folders hold."""
@@ -98,7 +106,7 @@ def drive_pairs(
             runs.append(working.enter_context(begun(*each, found, workers, progress, len(places))))
             runs[-1].drive_before_tests()
         progress.remark = ""
-        scenarios = [Scenario(*each) for each in zip(ready, runs[::2], runs[1::2], strict=True)]
+        scenarios = [Scenario(*each, campaign.exposure) for each in zip(ready, runs[::2], runs[1::2], strict=True)]
         available = [of.runs[0].prescribed.available for of in scenarios]
         rounds = PairRounds(campaign, together(scenarios, campaign), available, rule)
         progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
@@ -123,7 +131,7 @@ def together(scenarios: list[Scenario], campaign: Campaign) -> Pairs:
     """The pairs of one scenario, per test; of several, those of all, per hour."""
     if campaign.scenarios is None:
         return scenarios[0].pairs
-    return PairsPerHour(tuple(of.pairs for of in scenarios), tuple(of.tests_per_hour(campaign) for of in scenarios))
+    return PairsPerHour(tuple(of.pairs for of in scenarios), tuple(of.tests_per_hour for of in scenarios))
 
 
 def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:
