@@ -5,6 +5,7 @@ The pool makes both; estimators and the planner of a campaign use them, and need
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Annotated
@@ -120,6 +121,11 @@ class ShellDesign:
     def crashes_too(self, r: int) -> BoolArray:
         """In which cells a reference crashes, shape (C,)."""
         return np.asarray((np.array(self.cell_references) >> r) & 1, np.bool_)
+
+    def reference_error(self, r: int) -> float:
+        """Standard error of a reference's crash rate."""
+        rate, square = float(self.reference_rate[r]), float(self.reference_square[r])
+        return math.sqrt(max(square - rate * rate, 0.0) / self.n_independent)
 
     @property
     def first_reference(self) -> tuple[str, float] | None:

@@ -68,7 +68,7 @@ def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideRef
         ratio = own / rate if rate > 0.0 else math.nan, *beside(design, cells, r, design.p.size, level)
         prevented = ~design.crashes_too(r)
         preventable = preventable_share(design.cell_p, cells, prevented, design.n_independent, level)
-        error = math.sqrt(max(float(design.reference_square[r]) - rate * rate, 0.0) / design.n_independent)
+        error = design.reference_error(r)
         found.append(BesideReference(reference.name, reference.delay_s, rate, error, *ratio, *preventable))
     return tuple(found)
 

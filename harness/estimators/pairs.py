@@ -243,12 +243,9 @@ class PairCounts(Pairs):
     def reference(self) -> tuple[float, float] | None:
         """See `Pairs`: the first of the library that crashes at all."""
         crash = np.flatnonzero(self.design.reference_rate)
-        return self.of_reference(int(crash[0])) if crash.size else None
-
-    def of_reference(self, r: int) -> tuple[float, float]:
-        """Crash rate of a reference driver by its place in the library, and its standard error."""
-        rate, square = float(self.design.reference_rate[r]), float(self.design.reference_square[r])
-        return rate, math.sqrt(max(square - rate * rate, 0.0) / self.design.n_independent)
+        if not crash.size:
+            return None
+        return float(self.design.reference_rate[crash[0]]), self.design.reference_error(int(crash[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +291,7 @@ class PairsPerHour(Pairs):
         total, errors = 0.0, list[float]()
         for times, of in zip(self.tests_per_hour, self.each, strict=True):
             if of.design.references:
-                rate, error = of.of_reference(0)
+                rate, error = float(of.design.reference_rate[0]), of.design.reference_error(0)
                 total += times * rate
                 errors.append(times * math.hypot(error, of.design.p_event_error * rate))
         return (total, math.hypot(*errors)) if total else None

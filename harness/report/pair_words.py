@@ -66,9 +66,8 @@ def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def rates_of(side: Mapping[str, Any]) -> dict[str, Any]:
-    """Rate with limits, and counts, of A or B in ``compare.json``: per test, or per hour of several scenarios."""
-    found = side.get("per_hour") or {**side, "rate": side["crash_rate"]}
-    return {**found, "n_crashes": side["n_crashes"], "n_episodes": side["n_episodes"]}
+    """Rate with limits, and crashes, of A or B in ``compare.json``: per test, or per hour of several scenarios."""
+    return {**side, **side.get("per_hour", {"rate": side.get("crash_rate")})}
 
 
 def ratio_words(of: Mapping[str, Any]) -> tuple[str, str]:

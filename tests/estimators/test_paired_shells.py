@@ -69,10 +69,11 @@ def test_failed_tests_widen_both_ways():
     assert ratio.ci_high == pytest.approx(worst_a.ratio(LEVEL).ci_high)
     assert ratio.ci_low == pytest.approx(worst_b.ratio(LEVEL).ci_low)
     estimate = paired_estimate(failed, 0.9)
-    assert list(pair_warnings({**estimate, "scenario": "cut_in", "milder": dict.fromkeys("ab")}))[:2] == [
-        "3 tests of A FAILED",
-        "2 tests of B FAILED",
-    ]
+    milder = {"a": None, "b": {"n_crashes": 3, "n_failed": 0, "n_tests": 36, "per_hour": 0.1}}
+    told = list(pair_warnings({**estimate, "scenario": "cut_out", "milder": milder}))
+    assert told[:2] == ["3 tests of A FAILED", "2 tests of B FAILED"]
+    assert [each for each in told if "MILDER" in each] == [told[-1]]
+    assert told[-1].startswith("B: 3 of 36 MILDER cut-outs end in a crash, too")
     assert estimate["shells"][0]["n_failed_tests"] == 5
 
 

@@ -36,6 +36,13 @@ class Steady:
     def close(self): ...
 
 
+class Waits(Steady):
+    """Brakes for who is on its lane."""
+
+    def step(self, seen):
+        return -1.5 if seen.gap_m < 80.0 else 0.0
+
+
 class Noisy(Steady):
     """Random, but from the stream that it is given."""
 
@@ -192,6 +199,13 @@ def test_a_slow_constructor_is_measured_and_counted(name):
     found = check(name, "world.cells=8")
     assert found.speed.constructions == 8
     assert (found.speed.construction_s > 0.1, "calls it 8 times" in verdict(found)) == (name == "Slow",) * 2
+
+
+@pytest.mark.parametrize(("name", "late"), [("Waits", True), ("Steady", False)])
+def test_a_vehicle_that_waits_for_the_overlap_is_told_so(name, late):
+    found = check_av(load_campaign(f"{__name__}:{name}", ["world.engine=twin"]), 6)
+    assert (found.shows, "bv_lateral_m shows it some 2 s earlier" in verdict(found)) == (True, late)
+    assert verdict(found).startswith("READY")
 
 
 def test_failures_that_differ_in_digits_are_one_and_name_line_and_what_was_meant():
