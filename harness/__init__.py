@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from harness.fitting.files import fit_files as fit
     from harness.records.reader import read
     from harness.report.motion import write_motion
-    from harness.report.page import write_report
     from harness.runner.compare import compare_campaigns as compare
     from harness.runner.families import estimate_families
     from harness.runner.look import check_av as av_check
     from harness.runner.other_traffic import estimate_in_other_traffic
+    from harness.runner.pages import write_report
     from harness.runner.run import run_campaign as run
     from harness.runner.sensitivity import sensitivity
     from harness.runner.stored import estimate_run as estimate
@@ -50,7 +50,7 @@ _PLACES = {
     "run": ("harness.runner.run", "run_campaign"),
     "sensitivity": ("harness.runner.sensitivity", "sensitivity"),
     "write_motion": ("harness.report.motion", "write_motion"),
-    "write_report": ("harness.report.page", "write_report"),  # not "report": the package of that name takes that place
+    "write_report": ("harness.runner.pages", "write_report"),  # not "report": the package of that name takes that place
 }
 """Where each name is; imported when it is asked for, so that ``import harness`` and ``harness --help`` are quick."""
 

@@ -1,12 +1,20 @@
-"""What a look at a vehicle has found (`harness.runner.look.AvCheck`), in words."""
+"""What a look at a vehicle (`harness.runner.look`) has found, as numbers and in words."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
+from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.estimators.estimate import finite_json
 from harness.report.words import late_words
-from harness.runner.look import SLOW_S, AvCheck, Cause
 
+SLOW_S = 0.1
+"""Time of a constructor that is worth a word."""
+Cause = Literal["process", "clock", "random", "remembers", "shares"]
+"""Why a test is not the same again: which process it is in, what a clock says, nothing that is known (as random numbers
+of its own), another test before it, or beside it."""
 MOVES_MPS2 = 0.5
 """Change of a first answer that says: the warm-up leaves something behind."""
 IN_WORDS = {
@@ -37,6 +45,98 @@ CAUSES: dict[Cause, str] = {
     "the process, hash() of a text (the order of a set), or an id(). Draw from episode.random in start.",
     "clock": "It depends on the clock ({}): a test may run at any speed. Use time_s of what it sees, or step_s.",
 }
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """What the AV did in all steps in which it acted, and after the cut-ins.
+
+    ``reaction_s`` is the median time from the onset of the cut-in to the first braking beyond 0.1 m/s², over the
+    episodes that braked at all; their share is ``braking_share``. ``n_took_over_early`` did something before the
+    overlap.
+    """
+
+    mean_acceleration_mps2: float
+    min_acceleration_mps2: float
+    max_acceleration_mps2: float
+    share_at_min: float
+    share_at_max: float
+    reaction_s: float
+    braking_share: float
+    n_events: int
+    n_crashes: int
+    n_took_over_early: int
+
+
+@dataclass(frozen=True)
+class Follows:
+    """How the AV follows before the onset, in scenarios in which it does: of tests, the median and the least.
+
+    ``headway_s`` is that at the onset, ``smallest_gap_m`` the least gap of the approach, ``speed_mps`` the AV's speed
+    at the onset less the leader's. ``n_hit`` tests ended before it in a crash.
+    """
+
+    headway_s: float
+    smallest_gap_m: float
+    speed_mps: float
+    n_hit: int
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Time per episode step, episodes per second, and what a worker of a run constructs before its cells are full."""
+
+    us_per_step: float
+    episodes_per_s: float
+    construction_s: float
+    constructions: int
+
+
+@dataclass(frozen=True, repr=False)
+class AvCheck:
+    """What a few dozen episodes say about an AV, run on an engine with cut-ins that a method brought about.
+
+    ``failures`` are numbers of episodes of the first run by the cause that they failed with, where one stands for all
+    that differ from it in digits alone; ``differing`` are those whose motion was not the same bits in the two layouts,
+    with the ``likely_cause`` if there are any, and where a clock was read; ``limits_mps2`` are the accelerations that
+    count as its limits; ``moved_mps2`` says by how much first answers move at most if the warm-up takes so many seconds
+    (key) instead of ``av.warm_up_s``. The built-in IDM has driven the same episodes in the same cells. Cut-ins are of
+    one step, also where they ``show`` before in the campaign, for a vehicle that acts before them: a look makes no
+    baseline runs, which would tell the onset. ``events`` are what the scenario calls them; where the AV follows from
+    the start, ``follows`` says how.
+    """
+
+    source: str
+    engine: str
+    method: str
+    shows: bool
+    n_episodes: int
+    failures: dict[str, int]
+    differing: tuple[int, ...]
+    likely_cause: Cause | None
+    clock_read_at: Sequence[str]
+    limits_mps2: tuple[float, float]
+    moved_mps2: dict[float, float]
+    behaviour: Behaviour
+    idm_behaviour: Behaviour
+    speed: Speed
+    idm_speed: Speed
+    events: str = "cut-ins"
+    follows: Follows | None = None
+    idm_follows: Follows | None = None
+    controller: str | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """0 when all is well, 3 when episodes failed or were not reproduced."""
+        return EXIT_TOO_MANY_FAILED if self.failures or self.differing else EXIT_DONE
+
+    def __repr__(self) -> str:
+        return verdict(self)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain JSON content; undefined numbers become null."""
+        return finite_json({**asdict(self), "deterministic": not self.differing, "exit_code": self.exit_code})
 
 
 def verdict(found: AvCheck) -> str:

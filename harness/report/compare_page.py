@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,47 +14,27 @@ from harness.errors import HarnessError, RunFolderError
 from harness.families import family_named
 from harness.families.protocol import Family
 from harness.numbers import count, tenths
-from harness.records.folder import read_as
 from harness.report.crashes import rows_of
 from harness.report.drawing import Plot
 from harness.report.hour_words import beside_row, called
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words, ratio_words
-from harness.report.player import Scene, Scenes, beside_other
+from harness.report.player import ReplayResult, Scene, Scenes, beside_other
 from harness.report.plots import WHO, pairs_plot
-from harness.report.summary import RunFolder, read_run_folder, summarise
+from harness.report.summary import RunFolder, summarise
 from harness.report.templates import write_page
 from harness.report.words import short_answer
-from harness.runner.stored import replay_episode
 from harness.strata import weight_of_a_test
 from harness.vocabulary import COMPARISON, CRASH, FAILED, FloatArray, IntArray
 
 MEND = "Run `harness compare` again with the same --out."
 
+Replay = Callable[[Path, int], ReplayResult]
 SHOWN = 2
 """Crashes of each: a vehicle in foreign code is run again in a process of its own."""
 
 
-def write_comparison(folder: str | Path) -> Path:
-    """Write ``report.html`` into the folder of a comparison anew, and return the page, which is self-contained.
-
-    Raises `RunFolderError`: a file of the comparison or of one of its runs is missing, damaged, or of another run.
-    """
-    folder = Path(folder)
-    stored = read_as(dict[str, Any], folder / COMPARISON, mend=MEND)
-    if "families" in stored:
-        for name in stored["families"]:
-            write_comparison(folder / name)
-        return write_sum(folder, stored)
-    runs = [read_run_folder(folder / side) for side in ("a", "b")]
-    for run, of in zip(runs, stored["campaigns"].values(), strict=True):
-        if (found := run.manifest["campaign_hash"]) != of["campaign_hash"]:
-            expected = f"campaign {of['campaign_hash']} ({COMPARISON})"
-            raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, MEND)
-    return write_page_of(folder, stored, runs)
-
-
-def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder]) -> Path:
-    """Write the page of a comparison in hand."""
+def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder], replay: Replay) -> Path:
+    """Write the page of a comparison in hand; ``replay`` runs a test of one of its folders again."""
     pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
     family = family_named(runs[0].campaign.scenario)
     return write_page(
@@ -64,7 +44,7 @@ def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder
         above=runs[0].campaign.crash.counts_above_mps,
         sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
         family=family, words=family.words, plot=pairs.plot(family),
-        scenes=list(scenes_of(runs, pairs)), counts=pairs.counts,
+        scenes=list(scenes_of(runs, pairs, replay)), counts=pairs.counts,
     )  # fmt: skip
 
 
@@ -131,7 +111,7 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
     return Pairs(who, weight[kept], of_map, episode.astype(np.int64), impact)
 
 
-def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:
+def scenes_of(runs: Sequence[RunFolder], pairs: Pairs, replay: Replay) -> Iterator[Scene]:
     """The hardest crashes of B alone, then of A alone, beside the other vehicle on the same event."""
     family = family_named(runs[0].campaign.scenario)
     for side, other in ((1, 0), (0, 1)):
@@ -140,19 +120,19 @@ def scenes_of(runs: Sequence[RunFolder], pairs: Pairs) -> Iterator[Scene]:
         for place in places[np.argsort(-impact[places], kind="stable")][:SHOWN]:
             episodes = [int(each) for each in pairs.episode[:, place]]
             told = f"{tenths(float(impact[place]))} m/s"
-            row, trace = motion_of(runs[side], episodes[side])
+            row, trace = motion_of(runs[side], episodes[side], replay)
             if trace is None:
                 continue
             scene = Scenes(runs[side].campaign, None).scene(row, trace)
-            scene = beside_other(scene, name, "AB"[other], motion_of(runs[other], episodes[other])[1], family)
+            scene = beside_other(scene, name, "AB"[other], motion_of(runs[other], episodes[other], replay)[1], family)
             where = " and ".join(f"test {count(n)} of {of}" for n, of in zip(episodes, "AB", strict=True))
             yield {**scene, "episode": f"only {name}, {told}", "title": f"Only {name} crashes, at {told} ({where})"}
 
 
-def motion_of(run: RunFolder, episode: int) -> tuple[pa.Table, pa.Table | None]:
+def motion_of(run: RunFolder, episode: int, replay: Replay) -> tuple[pa.Table, pa.Table | None]:
     """Row of a crash, and the trace of any episode: the stored one, or of the test run again; None if it cannot be."""
     trace = run.traces({episode})
     if trace is None:
         with suppress(HarnessError):  # of another version, a vehicle that is gone or does not do the same again
-            trace = replay_episode(run.path, episode).trace
+            trace = replay(run.path, episode).trace
     return rows_of(run, {episode}), trace

@@ -12,9 +12,8 @@ from pyarrow import csv
 from harness.arguments import checked
 from harness.errors import HarnessError
 from harness.files import write_atomically
-from harness.report.player import write_player
+from harness.report.player import ReplayResult, write_player
 from harness.report.sumo_files import write_floating_car_data, write_sumo
-from harness.runner.stored import ReplayResult
 from harness.vehicles.kinematics import STEP_S
 
 SUFFIXES = ".html", ".csv", ".xosc", ".xml", ".sumocfg"

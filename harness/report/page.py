@@ -1,4 +1,4 @@
-"""Put the report together: read once, draw, write what is told in rows, fill the template."""
+"""Put the report of what was read together: draw, write what is told in rows, fill the template."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from harness.arguments import checked
 from harness.campaign.files import dump_campaign
 from harness.estimators.traffic import Sensitivity
 from harness.families import family_named
@@ -19,39 +18,12 @@ from harness.report.drawing import Plot
 from harness.report.hour_words import called, exposures, family_rows, reading_rows, scope, sum_rows, warnings
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.rows import decided
-from harness.report.summary import RunFolder, RunSummary, lateral_facts, read_run_folder, summarise
+from harness.report.summary import RunFolder, RunSummary, lateral_facts, summarise
 from harness.report.templates import write_page
 from harness.report.words import short_answer
-from harness.vocabulary import COMPARISON, FAMILIES, OUTCOMES
+from harness.vocabulary import OUTCOMES
 
 PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")
-
-
-@checked("harness.write_report")
-def write_report(folder: str | Path) -> Path:
-    """Write ``report.html`` and ``plots/`` (SVG) into a run folder anew, or the page of a comparison, or of scenarios.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Run folder, or the folder of a comparison, or of several scenarios.
-
-    The page is self-contained: it can be mailed, archived and opened offline. The same folder gives the same bytes if
-    it is reached from the working directory by the same relative path, by which the commands on the page name it;
-    outside the working directory they use its name alone. Plots of an earlier report that this one does not have are
-    removed.
-
-    Raises `RunFolderError`: if the folder misses a file, or a file is damaged or belongs to another run.
-    """
-    if (Path(folder) / COMPARISON).is_file():
-        from harness.report.compare_page import write_comparison  # noqa: PLC0415 - most folders are runs
-
-        return write_comparison(folder)
-    if (Path(folder) / FAMILIES).is_file():
-        from harness.runner.families import read_families  # noqa: PLC0415
-
-        return write_hours(Path(folder), read_families(Path(folder)))
-    return write_page_of(read_run_folder(Path(folder)))
 
 
 def write_page_of(run: RunFolder) -> Path:

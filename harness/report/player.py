@@ -7,6 +7,7 @@ there on. What the vehicle ahead does after it was hit is drawn as if it had not
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,28 @@ BEFORE, AFTER, LEFT, FEWEST = 20, 40, 5, 40
 
 Scene = dict[str, Any]
 """What the script reads. Moments are steps of the episode, positions (m) and speeds (m/s) those from ``first`` on."""
+
+
+@dataclass(frozen=True, repr=False)
+class ReplayResult:
+    """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
+
+    ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where
+    nothing is; ``suspects`` is what may be why if it was not. ``scene`` is what a page plays; its ``facts`` are what
+    happens, as pairs of a name and a phrase, and what is shown of it.
+    """
+
+    outcome: str
+    row: dict[str, Any]
+    trace: pa.Table
+    bit_equal: bool | None
+    compared: tuple[str, ...]
+    scene: dict[str, Any]
+    suspects: str | None = None
+
+    def __repr__(self) -> str:
+        facts = [f"  {name:<18} {fact}" for name, fact in self.scene["facts"]]
+        return "\n".join([f"test {self.row['episode']}: {self.outcome}", *facts])
 
 
 class Scenes:

@@ -19,8 +19,7 @@ import pyarrow as pa
 
 from harness.errors import CampaignError
 from harness.records.folder import write_bytes
-from harness.report.player import share_over, tracks_of
-from harness.runner.stored import ReplayResult
+from harness.report.player import ReplayResult, share_over, tracks_of
 from harness.vehicles.kinematics import STEP_S
 from harness.worlds.sumo import network_file, sumo_program
 

@@ -36,6 +36,7 @@ from harness.records.origin import code_of, require_trust
 from harness.resolved import require_ready
 from harness.runner.families import MEND, hour_answer, read_families, require_no_other
 from harness.runner.paired import SIDES, Both, Scenario, copy_stored, drive_pairs, together
+from harness.runner.stored import replay_episode
 from harness.sampling.shells import PairRounds
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import COMPARISON, FAMILIES
@@ -202,7 +203,7 @@ def _written(of: Scenario, ended: Mapping[str, Any], labels: tuple[str, str], as
     from harness.report.compare_page import write_page_of  # noqa: PLC0415 - draws
 
     shown = [each.shown for each in of.results]
-    return Comparison(of.folder, content, code, write_page_of(of.folder, content, shown), shown)
+    return Comparison(of.folder, content, code, write_page_of(of.folder, content, shown, replay_episode), shown)
 
 
 def _sum_written(

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -35,6 +34,9 @@ from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
 from harness.vocabulary import ESTIMATORS
 from harness.worlds import build_world
+
+if TYPE_CHECKING:
+    from harness.report.player import ReplayResult
 
 FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
 """Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
@@ -146,28 +148,6 @@ _TRUST = "Look at stored motion alone (--stored), which runs no code; or read th
 _UNLIKE_BITS = ("episode", "seed", "failure")
 
 
-@dataclass(frozen=True, repr=False)
-class ReplayResult:
-    """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
-
-    ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where
-    nothing is; ``suspects`` is what may be why if it was not. ``scene`` is what a page plays; its ``facts`` are what
-    happens, as pairs of a name and a phrase, and what is shown of it.
-    """
-
-    outcome: str
-    row: dict[str, Any]
-    trace: pa.Table
-    bit_equal: bool | None
-    compared: tuple[str, ...]
-    scene: dict[str, Any]
-    suspects: str | None = None
-
-    def __repr__(self) -> str:
-        facts = [f"  {name:<18} {fact}" for name, fact in self.scene["facts"]]
-        return "\n".join([f"test {self.row['episode']}: {self.outcome}", *facts])
-
-
 @checked("harness.replay")
 def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False, trust: bool = False) -> ReplayResult:
     """Replay an episode of a run; a user's own code in a process of its own.
@@ -224,7 +204,7 @@ def _result(
     compared: tuple[str, ...],
     suspected: str | None = None,
 ) -> ReplayResult:
-    from harness.report.player import Scenes, with_lateral  # noqa: PLC0415 - `run` and `estimate` draw nothing
+    from harness.report.player import ReplayResult, Scenes, with_lateral  # noqa: PLC0415 - `run` and `estimate` draw nothing
 
     (row,), traces = tables["episodes"].to_pylist(), tables["traces"]
     scene = Scenes(campaign, traffic).scene(tables["episodes"], traces)

@@ -73,7 +73,7 @@ def test_of_somebody_else_it_takes_trust(made, elsewhere, capsys, tmp_path):
     assert main(["replay", str(elsewhere), str(untraced), "--stored"]) == 2
     for command in ("estimate", "report"):
         assert main([command, str(elsewhere)]) == 0
-    assert motion_of(read_run_folder(elsewhere), untraced)[1] is None  # for the page of a comparison
+    assert motion_of(read_run_folder(elsewhere), untraced, harness.replay)[1] is None  # for the page of a comparison
     assert not has_run(made)
     assert main(["replay", str(elsewhere), str(traced), "--trust", "--out", str(tmp_path / "z.csv")]) == 0
     assert has_run(made)

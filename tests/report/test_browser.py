@@ -9,8 +9,9 @@ import pytest
 
 import harness
 from harness.fitting.files import fit_files
-from harness.report.compare_page import write_comparison, write_sum
-from harness.report.page import write_hours, write_report
+from harness.report.compare_page import write_sum
+from harness.report.page import write_hours
+from harness.runner.pages import write_report
 from tests.fitting.trajectories import overtaking
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of
@@ -148,7 +149,7 @@ def test_a_report_changes_between_crashes(opened, report):
 
 
 def test_a_comparison_plays_both_on_the_same_cut_in(opened, compared, tmp_path):
-    file = write_comparison(copy_of(compared, tmp_path / "out"))
+    file = write_report(copy_of(compared, tmp_path / "out"))
     page, scene = opened(file, 400, "dark"), scenes_in(file.read_text())[0]
     assert page.evaluate("document.documentElement.scrollWidth") <= 400
     for step, hit in ((scene["event"], False), (scene["tracks"][2]["crash"], True)):
@@ -170,7 +171,7 @@ def pages(report, replayed, crashing, compared, tmp_path_factory) -> list[Path]:
     """One of each kind: a run's in each scenario, of a comparison, of one test; without a player of a sum, of a fit."""
     place = tmp_path_factory.mktemp("pages")
     runs = [write_report(copy_of(crashing[name], place / name)) for name in ("lead_brakes", "cut_out")]
-    with_player = [report, replayed, *runs, write_comparison(copy_of(compared, place / "compared"))]
+    with_player = [report, replayed, *runs, write_report(copy_of(compared, place / "compared"))]
     overtaking(2.0).to_parquet(place / "rows.parquet", index=False)
     fit_files([place / "rows.parquet"], place / "mine.yaml", n_replicates=2)
     (place / "sums").mkdir()

@@ -11,10 +11,11 @@ import pytest
 import harness
 from harness.errors import RunFolderError
 from harness.numbers import interval, number, ratio
-from harness.report.compare_page import crashing_pairs, write_comparison
+from harness.report.compare_page import crashing_pairs
 from harness.report.pair_words import deciding_words
 from harness.report.plots import WHO
 from harness.report.summary import read_run_folder
+from harness.runner.pages import write_report
 from tests.report.page_text import Page
 from tests.report.test_player import motion, scenes_in
 from tests.stored_runs import answer_in, copy_of, stored_table
@@ -22,7 +23,7 @@ from tests.stored_runs import answer_in, copy_of, stored_table
 
 @pytest.fixture(scope="module")
 def page(compared):
-    write_comparison(compared)
+    write_report(compared)
     return Page(compared)
 
 
@@ -93,4 +94,4 @@ def test_runs_of_another_comparison_are_refused(compared, tmp_path):
     (folder / "b").rename(folder / "was")
     copy_of(folder / "a", folder / "b")
     with pytest.raises(RunFolderError, match="a run of campaign"):
-        write_comparison(folder)
+        write_report(folder)

@@ -13,7 +13,7 @@ from junitparser import JUnitXml
 from harness.errors import RunFolderError
 from harness.records.folder import write_sealed
 from harness.report.junit import statement_case, write_junit
-from harness.report.page import write_report
+from harness.runner.pages import write_report
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
 from tests.stored_runs import truncate
 

@@ -15,10 +15,10 @@ from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.words import STAND_INS
 from harness.records.reader import traffic_of
 from harness.report import crashes, player
-from harness.report.page import write_report
 from harness.report.player import UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
 from harness.resolved import resolve
+from harness.runner.pages import write_report
 from tests.stored_runs import copy_of, stored_table
 
 KINDS = ("shells-twin", "shells-lateral-sumo", "forced-lateral-twin", "shells-acting-twin", "forced-krauss", "nde-twin")

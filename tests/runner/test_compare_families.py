@@ -11,8 +11,8 @@ import harness
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import read_manifest
-from harness.report.page import write_report
 from harness.runner.compare import compare_campaigns
+from harness.runner.pages import write_report
 from tests.in_process import one_process
 from tests.runner.test_families import NAMES, QUICK
 
