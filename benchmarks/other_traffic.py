@@ -26,11 +26,11 @@ import yaml
 from harness.campaign.files import load_campaign
 from harness.errors import HarnessError
 from harness.families.cut_in.loading import load_parameters
-from harness.families.replicates import read_replicates
 from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths, environment_with
 from harness.pool.shells import design_shells
 from harness.progress import Progress
+from harness.records.replicates import read_replicates
 from harness.resolved import Resolved, resolve
 from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.runner.run import run_campaign

@@ -18,8 +18,8 @@ from typing import Annotated, Any, ParamSpec, TypeVar, Union, cast, get_args, ge
 from pydantic import ConfigDict, Field, InstanceOf, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from harness.campaign.problems import KINDS, describe_found, did_you_mean
 from harness.errors import HarnessError
+from harness.problems import KINDS, describe_found, did_you_mean
 from harness.vocabulary import MOST_ASKED
 
 P = ParamSpec("P")

@@ -20,6 +20,7 @@ EXIT_REFUTED = 5
 
 OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 """Errors of the system that tell of the disk, not of the file."""
+MEND_PART = "Delete this file and run again with --resume: the same tests are made anew."
 LONGEST_PART = 400
 """Characters of a part of a message: five lines of a terminal. What a user typed may be as long as they like."""
 LONGEST_ADVICE = 1200

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
 import time
 import uuid
@@ -79,3 +80,8 @@ def remove_unfinished(files: Iterable[Path]) -> None:
             found = path.stat()
             if found.st_size or time.time() - found.st_mtime > _ABOUT_TO_BE_S:
                 path.unlink()
+
+
+def content_hash(content: bytes) -> str:
+    """Hash of some bytes, as files name it."""
+    return hashlib.sha256(content).hexdigest()[:16]

@@ -56,6 +56,10 @@ def states_from(columns: Iterable[FloatArray]) -> RecordArray:
 
 Method = Literal["nde", "forced", "step_mixture", "episode_mixture", "shells"]
 EstimatorName = Literal["nde", "nade", "mixture_cv", "dr", "scv", "shells"]
+StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "pool_error", "sum"]
+"""The asked precision, a rate far enough below a reference driver's, a decision about the limit, the budget, the last
+event that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that; of one of
+several scenarios that their sum had ended."""
 
 METHODS: tuple[Method, ...] = get_args(Method)
 ESTIMATORS: tuple[EstimatorName, ...] = get_args(EstimatorName)

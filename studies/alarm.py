@@ -27,7 +27,7 @@ from scipy.special import logsumexp
 
 from harness.campaign.files import load_campaign
 from harness.compiled import compiled_inline, compiled_threads, unboxed
-from harness.errors import HarnessError, RunFolderError
+from harness.errors import MEND_PART, HarnessError, RunFolderError
 from harness.estimators.block import EPISODE_COLUMNS, Block, Drawn, block_from_tables
 from harness.estimators.estimate import finite_json
 from harness.families.cut_in.family import CUT_IN
@@ -39,7 +39,7 @@ from harness.pool.build import campaign_pool
 from harness.pool.kept import Pool
 from harness.processes import made_ahead
 from harness.progress import Progress
-from harness.records.folder import MEND_PART, Part, read_kept, read_manifest
+from harness.records.folder import Part, read_kept, read_manifest
 from harness.records.schemas import LEAD, chosen_from, path_columns
 from harness.resolved import Resolved, resolve
 from harness.vehicles.drivers import Followers

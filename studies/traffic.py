@@ -16,12 +16,12 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from harness.campaign.files import read_model
-from harness.campaign.problems import broken_rule
 from harness.campaign.sections import EnvironmentSettings, Section
 from harness.families.cut_in.events import write_maneuvers
 from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.protocol import Paths
+from harness.problems import broken_rule
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, BV, LV, FloatArray
 

@@ -17,7 +17,6 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from harness.campaign.drivers import NATURAL, Surrogate, default_surrogates
-from harness.campaign.problems import NAME_PATTERN, broken_rule, did_you_mean
 from harness.campaign.sections import (
     DEFAULT,
     Accept,
@@ -33,10 +32,10 @@ from harness.campaign.sections import (
     Testing,
     Whole,
     World,
-    listed,
 )
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.families import DEFAULT_FAMILY
+from harness.problems import NAME_PATTERN, broken_rule, did_you_mean, listed
 from harness.vocabulary import SAMPLING, Sampling
 
 

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import ConfigDict, Field, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 from pydantic_core import PydanticKnownError
 
-from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Positive, Probability, Section, StepTime
+from harness.problems import broken_rule
 
 MAX_CONFIGURED_SPEED_MPS = 60.0
 PERCEIVES_LATERAL_M = 0.375

@@ -18,14 +18,14 @@ from pydantic_core import CoreSchema, core_schema
 from harness.arguments import checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import ModelName, default_surrogates
-from harness.campaign.problems import MOST_SHOWN, describe_found, did_you_mean, file_meant, in_words
 from harness.campaign.python_files import in_python_file, is_script
 from harness.campaign.sections import DEFAULT, Section
 from harness.campaign.vehicle import AV_SOURCES, Panel, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml, yaml_text
 from harness.errors import CampaignError
-from harness.families import DEFAULT_FAMILY
+from harness.families import DEFAULT_FAMILY, family_named
 from harness.files import real_path
+from harness.problems import MOST_SHOWN, describe_found, did_you_mean, file_meant, in_words
 
 Model = TypeVar("Model", bound=BaseModel)
 SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"
@@ -72,8 +72,6 @@ def load_campaign(
     folder = Path(path).parent
     campaign = _with_real_paths(campaign, place, folder if of_file else Path.cwd(), check_files=check_files)
     if check_files:
-        from harness.families import family_named  # noqa: PLC0415 - families read campaigns' sections
-
         shipped = family_named(campaign.scenario, place(("scenario",))).shipped
         if campaign.environment.parameters != DEFAULT:
             shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))

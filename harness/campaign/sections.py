@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from harness.campaign.problems import SURROGATE_PATTERN, broken_rule, did_you_mean, in_words
+from harness.problems import SURROGATE_PATTERN, broken_rule, did_you_mean, in_words
 from harness.vocabulary import Method
 
 
@@ -91,11 +91,6 @@ def _whole_steps(seconds: float) -> float:
 StepTime = Annotated[float, AfterValidator(_whole_steps)]
 LeadTime = Annotated[float, Field(ge=0.0, le=10.0), AfterValidator(_whole_steps)]
 """Between the onset of a lane change and overlap."""
-
-
-def listed(names: Iterable[str]) -> str:
-    """Names in a message."""
-    return ", ".join(names) or "none"
 
 
 DEFAULT = "default"

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from harness.campaign.drivers import PARAMETERS, BuiltInParameters, ModelName, Parameters, Reaction, schema_by_model
-from harness.campaign.problems import NAME_PATTERN, broken_rule
-from harness.campaign.sections import Positive, Section, StepTime, Whole, listed
+from harness.campaign.sections import Positive, Section, StepTime, Whole
+from harness.problems import NAME_PATTERN, broken_rule, listed
 
 AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
 READS_NO_PARAMETERS = {

@@ -19,9 +19,9 @@ from yaml.error import MarkedYAMLError
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from yaml.reader import ReaderError
 
-from harness.campaign.problems import did_you_mean
 from harness.errors import CampaignError
 from harness.files import opened
+from harness.problems import did_you_mean
 
 YamlPath = Sequence[str | int]
 Lines = dict[tuple[str | int, ...], int]

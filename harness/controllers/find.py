@@ -15,7 +15,6 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar, get_type_hints
 
-from harness.campaign.problems import did_you_mean
 from harness.campaign.python_files import files_imported, in_python_file, is_script
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.from_source import FromSource, import_from, is_users
@@ -23,6 +22,7 @@ from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Gua
 from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.files import real_path
+from harness.problems import did_you_mean
 from harness.processes import Child, WorkerDeath, first_to_answer, tell
 
 _Answer = TypeVar("_Answer")

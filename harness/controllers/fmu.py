@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from harness import cache
-from harness.campaign.problems import did_you_mean
 from harness.campaign.vehicle import FmuController
 from harness.controllers.protocol import BatchObservation, EpisodeStart, Observation, VehicleController
 from harness.errors import OF_THE_DISK, CampaignError, HarnessError, writing
 from harness.files import checksum
+from harness.problems import did_you_mean
 from harness.vehicles.kinematics import STEP_S
 
 OBSERVATIONS: dict[str, Callable[[Observation], float]] = {

@@ -24,7 +24,6 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from harness.campaign.problems import did_you_mean
 from harness.campaign.vehicle import AutomatedVehicle, Limits
 from harness.controllers.process_state import CHANGED_MODES, FloatingPointModes, OtherModules
 from harness.controllers.protocol import (
@@ -36,6 +35,7 @@ from harness.controllers.protocol import (
     VehicleController,
 )
 from harness.errors import CampaignError
+from harness.problems import did_you_mean
 from harness.processes import CLOSED_PIPE_EXIT_CODE
 from harness.random_stream import controller_random
 from harness.vehicles.kinematics import STEP_S

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, ClassVar, NoReturn
 
-from harness.campaign.problems import did_you_mean
 from harness.controllers.protocol import Observation
+from harness.problems import did_you_mean
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 VEH_ID = "AV"

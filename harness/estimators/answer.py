@@ -21,9 +21,8 @@ from harness.estimators.stopping import RoundRule, Rule
 from harness.estimators.traffic import TrafficError
 from harness.families import family_named
 from harness.numbers import two_digits_up
-from harness.records.folder import StoppedBy
 from harness.strata import Assumed, weight_of_a_test
-from harness.vocabulary import ESTIMATORS
+from harness.vocabulary import ESTIMATORS, StoppedBy
 
 ROOM = 1.25
 """Tests go in steps, and not to all shells alike: beyond those that would just do [measured: 1.15 at most]."""

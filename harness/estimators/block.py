@@ -17,8 +17,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from harness.campaign.campaign import Campaign
-from harness.errors import RunFolderError
-from harness.records.folder import MEND_PART
+from harness.errors import MEND_PART, RunFolderError
 from harness.strata import ShellDesign
 from harness.vocabulary import (
     CRASH,

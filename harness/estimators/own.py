@@ -17,14 +17,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.problems import did_you_mean
-from harness.campaign.sections import listed
 from harness.controllers.find import own_code
 from harness.controllers.hosts import cause_of
 from harness.errors import CampaignError, HarnessError
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, note
 from harness.estimators.weighted import Nade
+from harness.problems import did_you_mean, listed
 from harness.vocabulary import ESTIMATORS, METHODS, SAMPLING, EstimatorName
 
 

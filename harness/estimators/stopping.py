@@ -2,7 +2,7 @@
 
 A run ends (`harness.runner.run.Underway`) when a rule of this file says so; or when no test is left to be asked for:
 ``stop.episodes`` are spent or, of shells, what the pool keeps (`harness.sampling.allocation`). Which of these it was
-says `harness.records.folder.StoppedBy`.
+says `harness.vocabulary.StoppedBy`.
 
 Whatever the tests were drawn from, a rule looks at them now and then, leaves what it has found in ``look``, and says
 whether to go on. Looking after every test and stopping at the first narrow interval favours runs that were narrow by

@@ -10,9 +10,8 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
-from harness.campaign.problems import did_you_mean
-from harness.campaign.sections import listed
 from harness.errors import CampaignError
+from harness.problems import did_you_mean, listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,10 +11,10 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
-from harness.campaign.problems import broken_rule, describe_found
 from harness.campaign.sections import Section
 from harness.campaign.yaml_text import read_yaml
-from harness.families.replicates import content_hash
+from harness.files import content_hash
+from harness.problems import broken_rule, describe_found
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2
 

@@ -20,8 +20,8 @@ from harness.campaign.drivers import Surrogate
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError
 from harness.families.numbers import ParameterFile
+from harness.families.script import Script
 from harness.families.words import Shown, Words
-from harness.loop.cells import Script
 from harness.vehicles.drivers import Followers
 from harness.vocabulary import BoolArray, FloatArray, IntArray, Method, RecordArray
 

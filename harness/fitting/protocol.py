@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from harness.families.replicates import content_hash
+from harness.files import content_hash
 from harness.fitting.recording import Recording
 from harness.fitting.table import Mapping as Columns
 from harness.progress import Progress

@@ -22,10 +22,10 @@ import pyarrow.parquet as pq
 from pydantic import Field
 
 from harness.campaign.files import read_model, shipped_or_own
-from harness.campaign.problems import did_you_mean, file_meant
 from harness.campaign.sections import Section
 from harness.errors import TrajectoryError, printable
 from harness.fitting.recording import NAMES, NO_LENGTH, NUMBERS, UNITS, Recording, Unit, recording_of, require
+from harness.problems import did_you_mean, file_meant
 
 Needed = Literal["vehicle_id", "time_s", "s_m", "speed_mps", "lane", "length_m"]
 Measured = Literal["time_s", "s_m", "speed_mps", "length_m", "lateral_m"]

@@ -9,7 +9,8 @@ import numpy as np
 
 from harness.compiled import compiled, compiled_inline
 from harness.controllers.protocol import BatchObservation
-from harness.loop.cells import NEVER, KernelState
+from harness.families.script import NEVER
+from harness.loop.cells import KernelState
 from harness.vehicles.following import Ahead, braking_seen_after, follow_on, headway_of, seen_after
 from harness.vehicles.kinematics import STEP_S, gap, next_speed
 from harness.vehicles.references import Memory, react, reaction_steps, still_cruises

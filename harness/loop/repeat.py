@@ -6,7 +6,8 @@ import math
 from typing import Any
 
 from harness.compiled import compiled, compiled_inline
-from harness.loop.cells import KernelState, Script
+from harness.families.script import Script
+from harness.loop.cells import KernelState
 from harness.vehicles.kinematics import gap
 from harness.vehicles.sideways import onset_of
 from harness.vocabulary import RecordArray

@@ -14,15 +14,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from harness.errors import RunFolderError, shortened
+from harness.errors import MEND_PART, RunFolderError, shortened
 from harness.files import read_bytes, write_atomically
-from harness.vocabulary import COMPARISON, FAMILIES
+from harness.vocabulary import COMPARISON, FAMILIES, StoppedBy
 
 T = TypeVar("T")
 Tables = Mapping[str, pa.Table | None]
@@ -36,7 +36,6 @@ SENSITIVITY = "sensitivity.json"
 TABLES = ("episodes", "moments", "traces")
 SHADOW, MILDER = BEFORE = ("shadow", "milder")
 """Tables of what comes before tests that count: baseline runs, which keep their first name, and milder events."""
-MEND_PART = "Delete this file and run again with --resume: the same tests are made anew."
 SEAL = "crc32"
 """Key of a JSON file's checksum."""
 ROWS_FOR_THREADS = 10_000
@@ -218,10 +217,6 @@ def no_episodes(folder: Path) -> RunFolderError:
     return RunFolderError(str(folder), found, "tests on record", "Let `harness run` go on with --resume.")
 
 
-StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "pool_error", "sum"]
-"""The asked precision, a rate far enough below a reference driver's, a decision about the limit, the budget, the last
-event that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that; of one of
-several scenarios that their sum had ended."""
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 TablePath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
 

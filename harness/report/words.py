@@ -36,7 +36,7 @@ ENDED = {
     "pool_error": "the pool’s own error is too wide",
     "sum": "with the sum of all scenarios",
 }
-"""Why a campaign ended (`harness.records.folder.StoppedBy`), in words."""
+"""Why a campaign ended (`harness.vocabulary.StoppedBy`), in words."""
 GO_ON = "; raise it and go on with --resume"
 """What to do where a verdict is open."""
 

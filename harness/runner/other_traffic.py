@@ -22,9 +22,9 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
 from harness.estimators.traffic import ONE_LAW, Ends, TrafficError, Uncertain, Unseen, uncertain
 from harness.families.protocol import Parameters
-from harness.families.replicates import read_replicates
 from harness.pool.moved import assumed
 from harness.progress import Progress
+from harness.records.replicates import read_replicates
 from harness.resolved import resolve
 from harness.runner.stored_shells import ELSEWHERE, OPTION, Nearby, StoredShells, moved_to, require_shares
 from harness.vocabulary import EstimatorName, FloatArray

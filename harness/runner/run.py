@@ -24,7 +24,7 @@ from harness.files import remove_unfinished
 from harness.pool.moved import assumed
 from harness.pool.shells import PrescribedEpisodes
 from harness.progress import Progress
-from harness.records.folder import MILDER, SHELLS, StoppedBy, parquet, sole_use, write_sealed
+from harness.records.folder import MILDER, SHELLS, parquet, sole_use, write_sealed
 from harness.records.shown import ShownTests
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import (
@@ -45,7 +45,7 @@ from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import Shells, round_requests
 from harness.signals import uninterrupted
 from harness.strata import STORED_DESIGN
-from harness.vocabulary import IntArray
+from harness.vocabulary import IntArray, StoppedBy
 
 if TYPE_CHECKING:
     from harness.report.summary import RunFolder
@@ -61,7 +61,7 @@ class RunResult:
 
     Shown, it is the short answer.
 
-    ``stopped_by`` is explained at `harness.records.folder.StoppedBy`. The exit code is 0, or 4 when the budget or the
+    ``stopped_by`` is explained at `harness.vocabulary.StoppedBy`. The exit code is 0, or 4 when the budget or the
     pool was spent before the asked precision or decision, or 5 where the crash rate is above the limit that was to be
     kept.
     """

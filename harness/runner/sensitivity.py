@@ -22,9 +22,9 @@ from harness.errors import CampaignError
 from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.families.protocol import Parameters
-from harness.families.replicates import read_replicates
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, write_sealed
+from harness.records.replicates import read_replicates
 from harness.runner.stored_shells import Nearby, StoredShells, require_shares
 
 N_REPLICATES = 50

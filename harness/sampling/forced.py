@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from harness.families.protocol import HOLDING, Paths, Recorded
-from harness.loop.cells import Script
+from harness.families.script import Script
 from harness.loop.judge import motion_hashes
 from harness.loop.loop import EpisodeLoop, Shard
 from harness.loop.repeat import Traffic

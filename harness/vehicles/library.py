@@ -12,9 +12,9 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from harness.campaign.drivers import NATURAL, Surrogate
 from harness.campaign.files import read_model, shipped_or_own
-from harness.campaign.problems import broken_rule, did_you_mean
-from harness.campaign.sections import Section, SurrogateName, listed
+from harness.campaign.sections import Section, SurrogateName
 from harness.errors import CampaignError
+from harness.problems import broken_rule, did_you_mean, listed
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import RecordArray
 

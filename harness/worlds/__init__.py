@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from harness.families import family_named
 from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 
 if TYPE_CHECKING:
@@ -73,9 +74,6 @@ def build_world(campaign: Campaign, n_cells: int | None = None) -> World:
 
     An AV whose SUMO model keeps hidden state gets one cell in any case.
     """
-    # A run needs one of them, and not what the others import.
-    from harness.families import family_named  # noqa: PLC0415 - families read what worlds are asked
-
     av, cells, family = campaign.av, n_cells or campaign.world.cells, family_named(campaign.scenario)
     vehicles = family.vehicles
     if campaign.world.engine == "twin":

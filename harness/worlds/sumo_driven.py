@@ -15,8 +15,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from harness.campaign.problems import did_you_mean
 from harness.errors import CampaignError
+from harness.problems import did_you_mean
 from harness.processes import SharedFile
 from harness.random_stream import controller_random
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M

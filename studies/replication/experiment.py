@@ -11,11 +11,11 @@ from pydantic import Field, field_validator, model_validator
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.files import parse_override, read_model
-from harness.campaign.problems import NAME_PATTERN, broken_rule
 from harness.campaign.sections import Positive, Section, Whole
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError
 from harness.families.cut_in.loading import load_environment
+from harness.problems import NAME_PATTERN, broken_rule
 from harness.vehicles.library import OF_TRAFFIC
 from harness.vocabulary import SAMPLING, EstimatorName
 from studies.chains.chain import CHAINS

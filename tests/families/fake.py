@@ -10,7 +10,7 @@ import pyarrow as pa
 from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
 from harness.families.numbers import ParameterFile
 from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, Family
-from harness.loop.cells import natural_script
+from harness.families.script import natural_script
 
 AT = np.array([5, 7])
 """Steps of the two events."""

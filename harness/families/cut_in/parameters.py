@@ -11,10 +11,10 @@ import numpy as np
 from pydantic import model_validator
 
 from harness.campaign.drivers import MAX_CONFIGURED_SPEED_MPS
-from harness.campaign.problems import broken_rule
 from harness.families.cut_in import sections
 from harness.families.cut_in.sections import REPLACED, SMALLEST_SHARE, STEP
 from harness.families.numbers import FitRange, LeftOpen, ParameterFile
+from harness.problems import broken_rule
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import Record
 

@@ -11,7 +11,7 @@ from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.laws import Environment, acceleration
 from harness.families.cut_in.path import place
 from harness.families.protocol import Chosen
-from harness.loop.cells import Script, natural_script
+from harness.families.script import Script, natural_script
 from harness.vehicles.kinematics import next_speed
 from harness.vocabulary import AV, BV, LV, STATE_COLUMNS, FloatArray, Int8Array, IntArray, RecordArray, states_from
 

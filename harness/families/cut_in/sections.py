@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 from scipy.special import gammainc, gammaincinv
 
-from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
 from harness.families.cut_in.lateral import LateralMotion, constant_lead, log_normal_speed
 from harness.families.cut_in.laws import Wish
@@ -35,6 +34,7 @@ from harness.families.numbers import (
     within,
 )
 from harness.numbers import plain
+from harness.problems import broken_rule
 from harness.vocabulary import FloatArray
 
 LONGEST_LEAD_S = 10.0

@@ -11,7 +11,6 @@ import pyarrow as pa
 from pydantic import model_validator
 from scipy.special import ndtr, ndtri
 
-from harness.campaign.problems import broken_rule
 from harness.campaign.sections import Section
 from harness.families.cut_out.words import CLOSING, TTC, WORDS
 from harness.families.following.approach import Following
@@ -19,7 +18,8 @@ from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import FollowingParameters, grid_of
 from harness.families.numbers import Number, Share, ordered, within
 from harness.families.protocol import Column
-from harness.loop.cells import NEVER
+from harness.families.script import NEVER
+from harness.problems import broken_rule
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import FloatArray, RecordArray

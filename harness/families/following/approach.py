@@ -10,7 +10,7 @@ from scipy import special
 
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.flow import Flow
-from harness.loop.cells import NEVER
+from harness.families.script import NEVER
 from harness.random_stream import LV_DRAWS, uniform
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M, next_position, next_speed

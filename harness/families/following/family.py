@@ -28,7 +28,7 @@ from harness.families.following.follow import DRIVING_DTYPE, STATE, Tests, drive
 from harness.families.following.parameters import EVENT_DTYPE, NO_EVENT, FollowingParameters
 from harness.families.following.words import STAND_INS
 from harness.families.protocol import HOLDING, Chosen, Column, Driven, Events, Exposure, Family, Paths, Recorded
-from harness.loop.cells import Script, natural_script
+from harness.families.script import Script, natural_script
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S

@@ -10,7 +10,7 @@ import numpy as np
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.following.approach import AV_START_M, LEAD, REVEALED, Following, Motion, happen, in_scope, walk
 from harness.families.protocol import Events
-from harness.loop.cells import NEVER
+from harness.families.script import NEVER
 from harness.vehicles.drivers import Followers
 from harness.vehicles.following import Ahead, braking_seen_after, follow_on, headway_of, seen_after
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, next_position, next_speed

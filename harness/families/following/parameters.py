@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from harness.campaign.problems import broken_rule
 from harness.campaign.sections import EXPOSURES, Section
 from harness.families.numbers import (
     Acceleration,
@@ -24,6 +23,7 @@ from harness.families.numbers import (
     within,
 )
 from harness.families.protocol import Exposure
+from harness.problems import broken_rule
 from harness.vocabulary import FloatArray, RecordArray
 
 ROAD_S = 55.0

@@ -15,12 +15,13 @@ from harness.families.cut_in.fitting.laws import Traffic
 from harness.families.cut_in.fitting.observations import Observations, Tally, observe, require_distinct, require_enough
 from harness.families.cut_in.fitting.page import CONFIDENCE, page
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
-from harness.families.replicates import OF_REPLICATES, content_hash
+from harness.files import content_hash
 from harness.fitting.files import OF_YAML, environment_text
 from harness.fitting.protocol import Asked, Fitted
 from harness.fitting.recording import Recording
 from harness.fitting.table import places
 from harness.records.folder import parquet
+from harness.records.replicates import OF_REPLICATES
 from harness.report.rows import too_few
 
 OF_PAGE = b"Traffic fitted to trajectories"

@@ -16,7 +16,8 @@ from harness.families.cut_in.nade.functions import Importance, build_importance
 from harness.families.cut_in.nade.own import own_challenge
 from harness.families.cut_in.nade.tables import Tables, build_tables, tables_name
 from harness.families.cut_in.script import beginning, facts_of
-from harness.loop.cells import KernelState, natural_script
+from harness.families.script import natural_script
+from harness.loop.cells import KernelState
 from harness.loop.repeat import Traffic
 from harness.progress import Progress
 from harness.resolved import Resolved

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ import pyarrow as pa
 
 from harness.campaign.files import shipped_or_own
 from harness.errors import RunFolderError
+from harness.files import content_hash
 from harness.records.folder import read_table
 
 if TYPE_CHECKING:
@@ -17,11 +17,6 @@ if TYPE_CHECKING:
 
 OF_REPLICATES = b"harness fit"
 """Key in the metadata of a file: hash of the numbers that they belong to."""
-
-
-def content_hash(content: bytes) -> str:
-    """Hash of some bytes, as files name it."""
-    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def read_replicates(name: str, parameters: ParameterFile, shipped: Path) -> list[dict[str, float]]:

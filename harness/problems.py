@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -109,6 +109,11 @@ def did_you_mean(word: object, words: Sequence[str]) -> str:
     asked = str(word)[:_LONGEST]
     cutoff = 0.75 if len(asked) > 4 else 0.6  # of three letters a wrong one leaves 0.67
     return next((f"Did you mean '{close}'?" for close in difflib.get_close_matches(asked, words, 1, cutoff)), "")
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names in a message."""
+    return ", ".join(names) or "none"
 
 
 def file_meant(file: Path) -> str:
