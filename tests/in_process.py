@@ -18,7 +18,7 @@ from harness import run
 from harness.campaign.campaign import Campaign
 from harness.resolved import Resolved
 from harness.runner import kept, workers
-from harness.runner.run import RunResult
+from harness.runner.underway import RunResult
 from harness.runner.workers import ShardResult, ShardRunner
 from harness.sampling.protocol import ShardRequest
 

@@ -146,7 +146,7 @@ def run(
         start_server()
     with named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
-    from harness.runner.run import RunResult
+    from harness.runner.underway import RunResult
 
     content = result.estimates if isinstance(result, RunResult) else result.content
     if junit is not None:

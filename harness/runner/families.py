@@ -33,8 +33,8 @@ from harness.records.folder import CAMPAIGN, read_as, read_manifest, sole_use, w
 from harness.records.reader import read_campaign
 from harness.resolved import Resolved, require_ready, resolve
 from harness.runner.kept import require_no_fewer, require_own_folder
-from harness.runner.run import ESTIMATES, EXIT_OF, RunResult, Underway, begun
 from harness.runner.stored import stored_blocks
+from harness.runner.underway import ESTIMATES, EXIT_OF, RunResult, Underway, begun
 from harness.sampling.hours import HourRounds
 from harness.sampling.milder import beyond_scope, n_left_out
 from harness.vocabulary import FAMILIES

@@ -1,91 +1,18 @@
-"""Run a campaign: rounds of tests, shards in order through the stop rule, then estimates and report."""
+"""Run a campaign into a folder: what was asked for, whether it can be had, and then until it is enough."""
 
 from __future__ import annotations
 
-import time
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import pyarrow as pa
 
 from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
-from harness.estimators.answer import ended_by, estimate_blocks, expected_for, pool_remedy
-from harness.estimators.stopping import Rule, Verdict
-from harness.files import remove_unfinished
-from harness.pool.moved import assumed
-from harness.pool.shells import PrescribedEpisodes
 from harness.progress import Progress
-from harness.records.folder import MILDER, SHELLS, parquet, sole_use, write_sealed
-from harness.records.shown import ShownTests
+from harness.records.folder import sole_use
 from harness.resolved import Resolved, require_ready
-from harness.runner.kept import (
-    Run,
-    cpu_name,
-    require_few_failed,
-    require_no_fewer,
-    require_own_folder,
-    require_same_pool,
-    take_over,
-)
-from harness.runner.stored import even
-from harness.runner.workers import LocalWorkers, ShardResult, Workers
-from harness.sampling import prepare
-from harness.sampling.baseline import IN_WORDS, begin, requests_before, stored_baseline, stored_table
-from harness.sampling.milder import N_TESTS, beyond_scope, milder_of, n_left_out
-from harness.sampling.protocol import ShardRequest
-from harness.sampling.shells import Shells, round_requests
-from harness.signals import uninterrupted
-from harness.strata import STORED_DESIGN
-from harness.vocabulary import IntArray, StoppedBy
-
-if TYPE_CHECKING:
-    from harness.report.summary import RunFolder
-    from harness.runner.families import Hours
-
-EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
-ESTIMATES = "estimates.json"
-
-
-@dataclass(frozen=True, repr=False)
-class RunResult:
-    """What a finished campaign left in its folder, ``estimates.json`` and the page ``report.html`` among it.
-
-    Shown, it is the short answer.
-
-    ``stopped_by`` is explained at `harness.vocabulary.StoppedBy`. The exit code is 0, or 4 when the budget or the
-    pool was spent before the asked precision or decision, or 5 where the crash rate is above the limit that was to be
-    kept.
-    """
-
-    folder: Path
-    report: Path
-    estimates: dict[str, Any]
-    stopped_by: StoppedBy
-    exit_code: int
-    shown: RunFolder
-    """What its page is made of."""
-
-    def __repr__(self) -> str:
-        from harness.report.lines import lines  # noqa: PLC0415 - draws
-        from harness.report.words import short_answer  # noqa: PLC0415
-
-        answer = short_answer(self.shown.campaign, self.shown.manifest, self.shown.estimates)
-        return "\n".join(lines(answer, self.shown.manifest["wall_time_s"], self.report))
-
-    def _repr_html_(self) -> str:
-        """The short answer, and the map of the share of cut-ins that crash, as a notebook shows them."""
-        from harness.report.page import shown_with, where_plot_of  # noqa: PLC0415 - draws
-
-        return shown_with(repr(self), where_plot_of(self.shown))
+from harness.runner.families import Hours, run_families
+from harness.runner.kept import require_no_fewer, require_own_folder
+from harness.runner.underway import RunResult, begun
 
 
 @checked("harness.run")
@@ -131,8 +58,6 @@ def run_campaign(
     if not isinstance(campaign, Resolved):
         campaign = campaign_of(campaign)
         if campaign.scenarios is not None:
-            from harness.runner.families import run_families  # noqa: PLC0415 - runs of this file, for several
-
             return run_families(campaign, out, workers=workers, resume=resume, progress=progress)
         campaign = require_ready(campaign)
     resolved = campaign
@@ -144,166 +69,3 @@ def run_campaign(
             rule = underway.drive_tests()
         require_no_fewer(out, earlier["n_episodes"], underway.run.n_episodes)
         return underway.finish(rule)
-
-
-@dataclass
-class Underway:
-    """A run with the workers that drive it, and who is told how far it is."""
-
-    run: Run
-    crew: Workers
-    progress: Progress
-
-    @property
-    def prescribed(self) -> PrescribedEpisodes:
-        """The tests of a run of shells."""
-        assert isinstance(self.run.source, Shells)
-        return self.run.source.prescribed
-
-    def keep_design(self) -> None:
-        """Write the strata, without which nothing can be estimated, where the folder has no others."""
-        require_same_pool(self.run.folder, self.run.source)
-        if self.run.source.design is not None:
-            write_sealed(self.run.folder / SHELLS, STORED_DESIGN.dump_python(self.run.source.design, mode="json"))
-
-    def drive_before_tests(self) -> None:
-        """Drive the vehicle along all paths without an event, if tests follow from some.
-
-        Where there are events too mild to count, it meets a few of them.
-        """
-        run, paths, resolved = self.run, self.run.source.baseline_paths, self.run.resolved
-        if resolved.family.milder(resolved.environment) is not None:
-            driven = self._before(MILDER, N_TESTS)
-            self.run = self.run.noting(milder=milder_of(resolved, driven))
-        if paths is None:
-            return
-        table, runs = begin(run.source, self._before)
-        self.crew.follow_from(parquet(table))
-        self.run = self.run.noting(distance_per_test_m=runs.mean_distance_m(paths.weight)).written()
-        self.keep_design()
-
-    def _before(self, name: str, n: int) -> pa.Table:
-        """What comes before tests that count, but for what an earlier run has done of it."""
-        what, causes = IN_WORDS[name], Counter[str]()
-        self.progress.stage(f"{what}{self.crew.where}", n)
-        stored = stored_table(self.run.folder, self.run.parts_before, name)
-        known = partial(stored_baseline, stored, self.run.source.baseline_paths)
-        for result in self.crew.run(requests_before(name, n), known):
-            with uninterrupted():
-                self.run = self.run.with_baseline(name, result)
-            causes += result.failures
-            self.progress.advance(result.request.n_episodes)
-        if name != MILDER:  # one of few that fails is told, as if it had crashed
-            require_few_failed(causes, n, self.run.resolved.campaign, what, f"the run folder's {name}/ table")
-        return pa.concat_tables(self.run.before[name])
-
-    def drive_tests(self) -> Rule:
-        """Drive round after round until it is enough; returns the rule that says why."""
-        campaign, n_held = self.run.resolved.campaign, self.run.earlier.n_episodes
-        # Until a precision or a decision nobody knows how many.
-        most = campaign.stop.episodes if campaign.accept is None and campaign.stop.rhw is None else None
-        self.progress.stage(f"tests{self.crew.where}", most, done=n_held)
-        rounds = self.run.source.rounds(n_held)
-        for shard in chain.from_iterable(self.drive(requests, rounds.rule) for requests in rounds):
-            if rounds.enough(shard.block):
-                break
-        self.run.require_few_failed()
-        return rounds.rule
-
-    def drive(self, requests: Iterable[ShardRequest], rule: Rule) -> Iterator[ShardResult]:
-        """Shards in order, each part of the run by the time that it is handed out."""
-        for shard in self.crew.run(iter(requests), self.run.known):
-            with uninterrupted():
-                self.run = self.run.with_shard(shard)
-            n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
-            self.progress.advance(min(n_new, shard.request.n_episodes))
-            self.progress.status(crashes=self.run.n_crashes, rhw=rule.look.rhw)
-            yield shard
-
-    def drive_added(self, tested: IntArray, added: IntArray, rule: Rule) -> Iterator[ShardResult]:
-        """The same of ``added`` tests per stratum, (S,), of which so many are ``tested``."""
-        run = self.run
-        places = len(run.blocks), run.n_episodes, run.resolved.campaign.run.smallest_shard
-        return self.drive(round_requests(tested, added, *places) if added.any() else (), rule)
-
-    def require_tests(self) -> None:
-        """Refuse a run of few tests that did not fail, or without any (`HarnessError`)."""
-        if not self.run.n_episodes:
-            campaign = self.run.resolved.campaign
-            found = f"{campaign.stop.episodes}, spent before a test of {campaign.scenario}"
-            mend = "Raise it and go on with --resume, or lower testing.shells.first_tests."
-            raise CampaignError("stop.episodes", found, "some tests of each scenario", mend)
-        self.run.require_few_failed()
-
-    def finish(self, rule: Rule, *, of_sum: bool = False) -> RunResult:
-        """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left.
-
-        Of one of several scenarios the rule, and so its decision, is about their sum.
-        """
-        run, campaign, decided = self.run, self.run.resolved.campaign, dict[str, Any]()
-        stopped_by: StoppedBy = "sum" if of_sum else ended_by(campaign, rule, run.n_episodes)
-        missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
-        code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
-        if (decision := rule.look.decision) is not None and not of_sum:
-            n_early = sum(each.n_crashes_before_event for each in run.blocks)
-            decision = replace(decision, n_milder=n_left_out(campaign, n_early) + beyond_scope(run.facts.get("milder")))
-            code = EXIT_OF[decision.verdict]
-            decided["decision"] = decision.to_json()
-        decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
-        decided["remedy"] = pool_remedy(rule, campaign, stopped_by) or None
-        if cpus := self.crew.cpus():  # bits may have come from any of them
-            run = run.noting(cpu=", ".join(sorted({cpu_name(), *cpus})))
-        ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
-        ended["wall_time_s"] = run.took_s  # told as it is written
-        run = run.written("done", **ended)
-        self.progress.stage("writing estimates and report", None)
-        manifest = run.content("done", **ended)
-        estimates = estimate_blocks(even(run.blocks), campaign, manifest)
-        write_sealed(run.folder / ESTIMATES, estimates)
-        from harness.report.page import write_page_of  # noqa: PLC0415 - draws
-        from harness.report.summary import RunFolder  # noqa: PLC0415
-
-        tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
-        shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
-        return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
-
-
-@contextmanager
-def begun(
-    out: Path, resolved: Resolved, earlier: dict[str, Any], workers: int | None, progress: Progress, n_runs: int = 1
-) -> Iterator[Underway]:
-    """A run that begins in a folder, or goes on there; the folder can be read wherever it is interrupted.
-
-    Its workers end with it; those of ``n_runs`` take turns.
-    """
-    with closing(workers_of(resolved, workers, n_runs=n_runs)) as crew:
-        began = time.monotonic()
-        remove_unfinished(out.rglob(".*.part"))
-        source, family, environment = prepare(resolved, progress), resolved.family, resolved.environment
-        shows, distance_m = family.shows(environment), family.mean_distance_m(environment)
-        facts = {"workers": crew.n_workers, "events_show": shows, "distance_per_test_m": distance_m}
-        underway = Underway(take_over(out, resolved, source, earlier, began, **facts), crew, progress)
-        try:
-            underway.keep_design()
-            underway.run = underway.run.noting(assumed=assumed(resolved, source.pool, source.design, progress))
-            yield underway
-        except BaseException:
-            underway.run.written("interrupted")
-            raise
-
-
-def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:
-    """Where a campaign's shards are run; ``n_runs`` campaigns share it and take turns.
-
-    Raises `HarnessError`: the package, the cluster or room in it is missing.
-    """
-    if resolved.campaign.run.executor == "local":
-        return LocalWorkers(resolved, n_workers)
-    try:
-        from harness.runner.ray import RayWorkers  # noqa: PLC0415 - an extra
-    except ModuleNotFoundError as error:
-        if error.name != "ray":
-            raise
-        mend = "Install it in the harness's folder, on all machines: pip install -c requirements.lock -e '.[ray]'."
-        raise CampaignError("run.executor", "ray, but no package ray", "the extra for clusters", mend) from error
-    return RayWorkers(resolved, n_workers, n_runs=n_runs)

@@ -15,7 +15,8 @@ from harness.estimators.likelihood import Level
 from harness.estimators.limits import clopper_pearson
 from harness.records.folder import read_table
 from harness.resolved import resolve
-from harness.runner.run import RunResult, run_campaign
+from harness.runner.run import run_campaign
+from harness.runner.underway import RunResult
 from harness.sampling import prepare
 from harness.vocabulary import FloatArray, Method
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in

@@ -12,7 +12,8 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.pool import moved
-from harness.runner.run import RunResult, run_campaign
+from harness.runner.run import run_campaign
+from harness.runner.underway import RunResult
 from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL
 from tests.stored_runs import MIXTURE_FILE

@@ -19,7 +19,7 @@ from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
 from harness.resolved import resolve
-from harness.runner import run as running
+from harness.runner import underway as running
 from harness.runner import workers
 from harness.runner.workers import WorkerLostError
 from harness.sampling.protocol import ShardRequest
