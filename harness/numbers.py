@@ -44,14 +44,14 @@ def number(value: float | None, digits: int = 3, *, exponent: int | None = None,
     return text if exponent is not None or power == 0 else f"{text} × {power_of_ten(power)}"
 
 
-def interval(low: float | None, high: float | None, point: float | None = None) -> str:
-    """``(1.17 to 1.29) × 10⁻⁷``, or ``1.23 (1.17 to 1.29) × 10⁻⁷``: in one power of ten, with the same decimals.
+def interval(low: float | None, high: float | None, point: float | None = None, *, beside: float | None = None) -> str:
+    """``(1.17 to 1.29) × 10⁻⁷``, or ``1.23 (1.17 to 1.29) × 10⁻⁷``: in one power of ten.
 
-    Ends that are far apart have each their own power of ten.
+    It is that of the rate that stands ``beside`` it; ends that are far apart have each their own.
     """
     if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
         return f"{number(low)} to {number(high)}"
-    like = point or max(abs(low), abs(high))
+    like = point or beside or max(abs(low), abs(high))
     exponent = exponent_of(like)
     if exponent and 0.0 < abs(low) * FAR_APART <= abs(high):
         return (
@@ -59,7 +59,7 @@ def interval(low: float | None, high: float | None, point: float | None = None) 
             if point is None
             else f"{number(point)} ({number(low)} to {number(high)})"
         )
-    ends = " to ".join(number(end, exponent=exponent, like=like) for end in (low, high))
+    ends = " to ".join(number(end, exponent=exponent, like=max(like, abs(end))) for end in (low, high))
     if point is not None:
         ends = f"{number(point, exponent=exponent)} ({ends})"
     elif exponent:

@@ -1,6 +1,6 @@
 """When tests are enough: a precision asked for beforehand, looked for at places fixed beforehand; or a decision.
 
-A run ends (`harness.runner.underway.Underway`) when a rule of this file says so; or when no test is left to be asked for:
+A run ends (`harness.runner.underway`) when a rule of this file says so; or when no test is left to be asked for:
 ``stop.episodes`` are spent or, of shells, what the pool keeps (`harness.sampling.allocation`). Which of these it was
 says `harness.vocabulary.StoppedBy`.
 

@@ -37,7 +37,12 @@ def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     hour, beside = content["per_hour"], content["beside"]
     per_km = f"{number(content['per_1e6_km'])} per million km"
     if content["n_crashes"]:
-        yield "crashes", f"{number(hour['rate'])} per hour", between(hour["ci_low"], hour["ci_high"]), per_km
+        yield (
+            "crashes",
+            f"{number(hour['rate'])} per hour",
+            between(hour["ci_low"], hour["ci_high"], hour["rate"]),
+            per_km,
+        )
     else:
         yield "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen", ""
     yield beside_row("× competent driver", beside, seen=content["n_crashes"] > 0)
@@ -67,7 +72,7 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     for name, of in order:
         if of["n_crashes"]:
             part = "" if of["share"] is None else share(of["share"])
-            rate = f"{number(of['rate_per_hour'])}  {between(of['ci_low'], of['ci_high'])}"
+            rate = f"{number(of['rate_per_hour'])}  {between(of['ci_low'], of['ci_high'], of['rate_per_hour'])}"
             beside = "–" if of["ratio"] is None else f"× {ratio(of['ratio'])}"
         else:
             part, rate, beside = "0 %", f"< {number(of['upper_bound'])}", "–"
@@ -95,11 +100,11 @@ def exposures(content: Mapping[str, Any]) -> str:
     return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
 
 
-def between(low: float, high: float | None) -> str:
-    """An interval; its ends apart where they are far apart, "no limit" where it is open."""
+def between(low: float, high: float | None, rate: float) -> str:
+    """The interval of a rate; its ends apart where they are far apart, "no limit" where it is open."""
     if high is None:
         return f"≥ {number(low)}"
-    return interval(low, high) if low > 0.0 and high < 100.0 * low else f"{number(low)} to {number(high)}"
+    return interval(low, high, beside=rate) if low > 0.0 and high < 100.0 * low else f"{number(low)} to {number(high)}"
 
 
 def _short(value: float) -> str:

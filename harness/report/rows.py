@@ -54,7 +54,7 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) ->
     counted, wide = f"crash rate > {plain(from_mps)} m/s" if from_mps else "crash rate", best.is_wide
     from_below = wide and (best.is_open_above or (decision is not None and decision["verdict"] == "rejected"))
     unseen = assumed if assumed is not None and assumed.no_lower_limit else None
-    less, shown, ends = "", best.crash_rate, interval(best.ci_low, best.ci_high)
+    less, shown, ends = "", best.crash_rate, interval(best.ci_low, best.ci_high, beside=best.crash_rate)
     seen = f"estimate {number(best.crash_rate)}" if best.n_crashes else "no crash seen"
     if unseen is not None:
         less, shown, ends = "< ", unseen.most * high, f"{number(best.crash_rate)} as fitted"
@@ -163,7 +163,8 @@ def within(found: Mapping[str, Any]) -> Row:
     beyond = f"no crash in {outside} tests outside it" if found["n_episodes_outside"] else "no tests outside it"
     if not found["n_crashes"]:
         return Row("within", what, f"< {number(found['ci_high'])}", "", beyond)
-    return Row("within", what, number(found["crash_rate"]), interval(found["ci_low"], found["ci_high"]), beyond)
+    rate = found["crash_rate"]
+    return Row("within", what, number(rate), interval(found["ci_low"], found["ci_high"], beside=rate), beyond)
 
 
 # -- what replicates of the traffic leave open --

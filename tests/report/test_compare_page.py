@@ -35,7 +35,7 @@ def test_the_numbers_are_those_of_the_comparison(compared, page):
     found, shown = content_of(compared), page.words.partition("Pairs of tests by shell")[0]
     for side in (found["a"], found["b"], {"crash_rate": found["difference"], **found}):
         assert number(side["crash_rate"]) in shown
-        assert interval(side["ci_low"], side["ci_high"]) in shown
+        assert interval(side["ci_low"], side["ci_high"], beside=side["crash_rate"]) in shown
     for side in ("a", "b"):
         assert f"{found[side]['n_crashes']:,} in {found[side]['n_episodes']:,}" in shown
         assert number(found[f"only_{side}"]["value"]) in shown
