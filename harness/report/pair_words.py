@@ -98,7 +98,9 @@ def pair_lines(
         rows.append((f"{name} {label}", rate, ends, f"{count(of['n_crashes'])} crashes"))
     if asked["ratio"] is not None:
         rows.append(("A / B", *ratio_words(asked), ""))
-    rows.append(("A − B", number(asked["difference"]), interval(asked["ci_low"], asked["ci_high"]), alone_words(asked)))
+    apart = asked["difference"]
+    ends = interval(asked["ci_low"], asked["ci_high"], beside=apart)
+    rows.append(("A − B", number(apart), ends, alone_words(asked)))
     families = content.get("families", {})
     parts = columns(
         [(called(name), f"A / B {' '.join(ratio_words(of))}", alone_words(of)) for name, of in families.items()]
