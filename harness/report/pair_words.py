@@ -12,7 +12,7 @@ from harness.report.hour_words import called
 from harness.report.hour_words import warnings as hour_warnings
 from harness.report.lines import LABEL, columns, wrapped
 from harness.report.notes import note_words
-from harness.report.words import ENDED, milder_words, scope_words, unseen_words
+from harness.report.words import ENDED, doubt_words, early_words, milder_words, scope_words, unseen_words
 from harness.strata import LIBRARY_STATEMENT
 
 
@@ -35,11 +35,10 @@ def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
             yield from (f"{name}, {text}" for text in hour_warnings(of))
         return
     for name, of in sides.items():
-        if n := of["details"]["n_failed"]:
-            yield f"{count(n)} tests of {name} FAILED"
-    for name, of in sides.items():
-        yield from (f"{name}: {note_words(each)}" for each in of["warnings"])
-        yield from (f"{name}: {text}" for text in milder_words(content["scenario"], content["milder"][name.lower()]))
+        told = doubt_words({**of, "rate": of["crash_rate"], "n_failed": of["details"]["n_failed"]}, " per test")
+        more = [each for each in of["warnings"] if each["key"] != "failed" and each not in of["cautions"]]
+        left_out = *milder_words(content["scenario"], of["milder"]), *early_words(of["n_crashes_before_event"])
+        yield from (f"{name}: {text}" for text in (*told, *map(note_words, more), *left_out))
     if where := content.get("unseen"):
         yield unseen_words(where)
 

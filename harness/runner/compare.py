@@ -34,7 +34,7 @@ from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, require_sum, write_sealed
 from harness.records.origin import code_of, require_trust
 from harness.resolved import require_ready
-from harness.runner.families import MEND, hour_answer, read_families, require_no_other
+from harness.runner.families import MEND, doubts_of, hour_answer, read_families, require_no_other
 from harness.runner.paired import SIDES, Both, Scenario, copy_stored, drive_pairs, together
 from harness.runner.stored import replay_episode
 from harness.sampling.shells import PairRounds
@@ -197,8 +197,9 @@ def _written(of: Scenario, ended: Mapping[str, Any], labels: tuple[str, str], as
         "campaigns": {side: {"label": label, "campaign_hash": own.content_hash} for side, label, own in told},
         **paired_estimate(of.pairs, campaign.stop.confidence), **ended, "asked": asked,
         "unseen": resolved[0].parameters.unseen,
-        "milder": {side: each.estimates["milder"] for side, each in zip(SIDES, of.results, strict=True)},
     }  # fmt: skip
+    for side, each in zip(SIDES, of.results, strict=True):
+        content[side] |= doubts_of(each.shown.campaign, each.estimates, each.shown.manifest)
     write_sealed(of.folder / COMPARISON, content)
     from harness.report.compare_page import write_page_of  # noqa: PLC0415 - draws
 

@@ -158,14 +158,23 @@ def hour_answer(
     speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
     found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
     for name, (estimates, manifest) in told.items():
-        of, best = found["families"][name], estimates["estimates"][estimates["headline"]]
+        of = found["families"][name]
         per_test = of["exposure"]["per_hour"] / of["p_event"]
         of["median_impact_mps"] = (estimates["severity"] or {}).get("median_mps")
-        of[EARLY] = n_left_out(ready[name].campaign, estimates["diagnostics"].get(EARLY, 0))
-        of["if_failed_had_crashed"] = per_test * best["details"]["crash_rate_if_failed_had_crashed"]
-        of["cut_off"] = per_test * estimates["cut_off"]
-        of |= {"milder": estimates["milder"], "cautions": best["cautions"], "repeated": manifest.get("repeated")}
+        of |= doubts_of(ready[name].campaign, estimates, manifest, per_test)
     return found
+
+
+def doubts_of(
+    campaign: Campaign, estimates: Mapping[str, Any], manifest: Mapping[str, Any], times: float = 1.0
+) -> dict[str, Any]:
+    """What may make the rate of a run doubtful, for its reader to be told: rates per test, or ``times`` as large."""
+    best = estimates["estimates"][estimates["headline"]]
+    return {
+        EARLY: n_left_out(campaign, estimates["diagnostics"].get(EARLY, 0)), "milder": estimates["milder"],
+        "if_failed_had_crashed": times * best["details"]["crash_rate_if_failed_had_crashed"],
+        "cut_off": times * estimates["cut_off"], "cautions": best["cautions"], "repeated": manifest.get("repeated"),
+    }  # fmt: skip
 
 
 def read_families(folder: Path) -> dict[str, Any]:

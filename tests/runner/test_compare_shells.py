@@ -12,7 +12,7 @@ import pytest
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.records.reader import read
-from harness.report.pair_words import pair_words
+from harness.report.pair_words import pair_warnings, pair_words
 from harness.runner.compare import compare_campaigns
 from harness.runner.workers import ShardRunner, Workers
 from tests.in_process import one_process, without_page
@@ -82,6 +82,24 @@ def test_both_meet_the_same_cut_ins_and_the_difference_is_that_of_the_records(do
     inside = done.content["conditional"]
     assert inside["ci_low"] > 0.0
     assert inside["ratio_low"] < 1.35e-7 / 7.5e-8 < inside["ratio_high"]
+
+
+def test_what_makes_a_rate_doubtful_is_told_of_each_vehicle(done):
+    """As its own run tells it."""
+    for side in "ab":
+        estimates = json.loads((done.folder / side / "estimates.json").read_text())
+        assert done.content[side]["cut_off"] == estimates["cut_off"]
+        assert done.content[side]["repeated"] == manifest(done.folder / side).get("repeated")
+    doubts = {
+        "a": {"repeated": {"differing": [1, 2], "n_episodes": 3}},
+        "b": {"n_crashes_before_event": 4, "cut_off": 1.0, "details": {"n_failed": 5}},
+    }
+    told = list(pair_warnings({**done.content, **{side: {**done.content[side], **doubts[side]} for side in "ab"}}))
+    assert [text for text in told if text.startswith("A: NOT REPRODUCIBLE: 2 of 3 tests")]
+    assert len([text for text in told if text.startswith("B: 4 tests crashed BEFORE the event")]) == 1
+    assert len([text for text in told if "still closing in" in text]) == 1
+    assert len([text for text in told if "tests FAILED" in text]) == 1
+    assert all(": no test in outside" in text for text in pair_warnings(done.content))
 
 
 def test_a_stored_run_of_a_is_taken_over(done, campaigns, run_here, campaign, tmp_path, driven):
