@@ -114,6 +114,8 @@ SAFE = population({"a": 1.0}, {"b": 0.1}, {})
         ("library", ALIKE, (0.0,), {}, "accept", "proven"),
         ("assumption_free", SAFE, (), {"rhw": 0.3, "below_reference": 0.3}, "below_reference", "open"),
         ("assumption_free", SAFE, (), {"rhw": 0.3, "below_reference": 0.3, "episodes": 2_000}, None, "open"),
+        ("assumption_free", [SAFE, SAFE], (), {"rhw": 0.3, "below_reference": 0.3}, "below_reference", "open"),
+        ("assumption_free", [SAFE, APART], (), {"rhw": 0.3, "below_reference": 0.3}, "accept", "proven"),
         ("library", APART, (None, 0.05), {"rhw": 0.3, "below_reference": 3.0}, "rhw", "proven"),
     ],
 )
@@ -126,7 +128,7 @@ def test_what_ends_a_comparison(statement, shares, args, stop, ended, verdict):
     if ended == "rhw":
         assert watched.rhw(level) <= (0.05 if len(args) == 2 else 0.1)
     elif ended == "below_reference":
-        assert watched.highest_rate(level) < 0.3e-7 < 5 * watched.highest_rate(level)
+        assert watched.highest_rate(level) < 0.3 * pairs.reference[0] < 5 * watched.highest_rate(level)
 
 
 def test_pairs_that_would_decide_do():
