@@ -76,11 +76,12 @@ class ShownProgress(Progress):
             self._bars.stop()
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
-        """Begin a bar in the place of the last stage's; a log that has had a line is told at once."""
+        """Begin a bar in the place of the last one; a log that has had a line is told at once, as of what is done."""
         for task_id in self._bars.task_ids:
             self._bars.remove_task(task_id)
-        self._bars.add_task(name + self.remark, total=total, completed=done, before=done, figures={}, words="")
-        if self._told:
+        name += self.remark + (f" ({count(done)} kept)" if done else "")
+        self._bars.add_task(name, total=total, completed=done, before=done, figures={}, words="")
+        if self._told or done:
             self._print()
 
     def advance(self, n: int) -> None:

@@ -44,7 +44,9 @@ def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeyp
     with ShownProgress(stream=quick) as lines:
         lines.stage("episodes", total=10)
         lines.advance(10)
-    assert quick.getvalue() == ""
+        assert quick.getvalue() == ""
+        lines.stage("tests", None, done=1_184)
+    assert quick.getvalue().endswith("tests (1,184 kept): 1,184\n")
 
 
 # -- how numbers are written --
