@@ -51,7 +51,9 @@ def interval(low: float | None, high: float | None, point: float | None = None, 
     """
     if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
         return f"{number(low)} to {number(high)}"
-    like = point or beside or max(abs(low), abs(high))
+    like = point or max(abs(low), abs(high))
+    if beside and like < FAR_APART * abs(beside):
+        like = abs(beside)
     exponent = exponent_of(like)
     if exponent and 0.0 < abs(low) * FAR_APART <= abs(high):
         return (

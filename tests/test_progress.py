@@ -63,6 +63,7 @@ def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeyp
         (n.interval(9.67e-8, 1.11e-7), "(0.97 to 1.11) × 10⁻⁷"),
         (n.interval(9.67e-8, 1.11e-7, 1.04e-7), "1.04 (0.97 to 1.11) × 10⁻⁷"),
         (n.interval(9.67e-9, 1.44e-7, beside=1.22e-8), "(0.97 to 14.4) × 10⁻⁸"),
+        (n.interval(0.0, 6.641e-6, beside=2.45e-9), "(0.00 to 6.64) × 10⁻⁶"),
         (n.interval(1e-10, 2e-7), "1.00 × 10⁻¹⁰ to 2.00 × 10⁻⁷"),  # in one power of ten the lower end would be 0.00
         (n.share(1e-7, least=1e-3), "< 0.1 %"),
         (n.half_width(842.79), "> 10"),

@@ -34,9 +34,10 @@ def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
         for name, of in sides.items():
             yield from (f"{name}, {text}" for text in hour_warnings(of))
         return
+    elsewhere = ["failed"] if content["asked"] == LIBRARY_STATEMENT else ["failed", "refuted"]
     for name, of in sides.items():
         told = doubt_words({**of, "rate": of["crash_rate"], "n_failed": of["details"]["n_failed"]}, " per test")
-        more = [each for each in of["warnings"] if each["key"] != "failed" and each not in of["cautions"]]
+        more = [each for each in of["warnings"] if each["key"] not in elsewhere and each not in of["cautions"]]
         left_out = *milder_words(content["scenario"], of["milder"]), *early_words(of["n_crashes_before_event"])
         yield from (f"{name}: {text}" for text in (*told, *map(note_words, more), *left_out))
     if where := content.get("unseen"):
