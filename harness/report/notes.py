@@ -77,7 +77,7 @@ NOTES = {
     "runs_leave_nothing": "the lower limit is 0 in spite of {n:,} crashes: {runs:,} baseline runs alone leave "
     "±{alone:share} of the rate, as far as these can tell",
     "used_up": "all events that the pool has kept of {shells} were tested",
-    "refuted": "{n:,} crashes outside the library, beyond {boundary}: statements within it do not hold for this vehicle",
+    "refuted": "{n:,} crashes outside the library, beyond {boundary}: none of its statements holds for this vehicle",
     "own": "an estimator of your own: nobody has measured how often its interval covers",
     # why an estimator has no value
     "needs_own": "is for tests drawn by {methods}, as it says itself" + _DRAWN_BY,
