@@ -9,6 +9,7 @@ from __future__ import annotations
 import builtins
 import importlib
 import random
+import re
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -29,6 +30,7 @@ from harness.files import real_path
 from harness.vehicles.kinematics import STEP_S
 
 _ROUNDING = 1e-9
+_STEP_LENGTH = re.compile(r"(?:^| )--step-length[= ](\d*\.?\d+(?:[eE][-+]?\d+)?)(?= |$)")
 _PATIENCE = 100
 """Steps that a script may ask for when its simulation has ended; a loop that no error ends is left where it is."""
 _LEFT = list[greenlet]()
@@ -44,6 +46,7 @@ class _Simulation(SimulationDomain):
 
     over = False
     n_steps = 0
+    step_s = STEP_S
 
     def __init__(self, vehicles: VehicleDomain) -> None:
         self._vehicles = vehicles
@@ -54,6 +57,9 @@ class _Simulation(SimulationDomain):
 
     def getArrivedIDList(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.arrived
+
+    def getDeltaT(self) -> float:
+        return self.step_s
 
     def getMinExpectedNumber(self) -> int:
         return self._vehicles.getIDCount()
@@ -97,6 +103,8 @@ class ScriptTraci(Traci):
         self._listeners: dict[int, Any] = {}
         self._n_listeners = self._n_after = 0
         self.importing = False
+        self.every = 1
+        """Steps of the harness in one of the script's."""
 
     @property
     def StepListener(self) -> type:
@@ -115,12 +123,18 @@ class ScriptTraci(Traci):
         self.simulation.over, self.simulation.arrived = True, self.vehicle.getIDList()
         self.vehicle.leave()
 
-    def start(self, *_arguments: Any, **_named: Any) -> tuple[int, str]:
-        """Begin the run: the harness has begun the test."""
+    def start(self, cmd: Any = (), *_arguments: Any, **_named: Any) -> tuple[int, str]:
+        """Begin the run: the harness has begun the test. Of SUMO's options the step length counts."""
         if self.simulation.over:
             raise GreenletExit  # the next of a script that runs several: a test is one
         if self.simulation.n_steps:
             raise RefusedError("traci.start is refused after a step: each test is one run of the script.")
+        options = " ".join(map(str, cmd)) if isinstance(cmd, list | tuple) else ""
+        if (asked := _STEP_LENGTH.search(options)) is not None:
+            self.every = round(float(asked[1]) / STEP_S)
+            if self.every < 1 or abs(self.every * STEP_S - float(asked[1])) > _ROUNDING:
+                raise RefusedError(f"{asked[0].strip()} is refused: steps here are 0.1 s; ask for a multiple of it.")
+            self.vehicle.step_s = self.simulation.step_s = self.every * STEP_S
         return _VERSION
 
     init = load = start
@@ -181,7 +195,7 @@ class ScriptTraci(Traci):
         if simulation.n_steps:  # what comes after the first is seen already
             _hand_over()
         simulation.n_steps += 1
-        simulation.time_s = round(STEP_S * simulation.n_steps, 6)
+        simulation.time_s = round(simulation.step_s * simulation.n_steps, 6)
 
     def addStepListener(self, listener: Any) -> int:
         self._n_listeners += 1
@@ -299,20 +313,25 @@ class ScriptController:
     def __init__(self, script: Script, vehicle: Callable[[float, str, str], ScriptVehicles]) -> None:
         self._script, self._vehicle = script, vehicle
         self._run: greenlet | None = None
+        self._held, self._left = 0.0, 0
+        """Acceleration of the script's step under way (m/s²), and how many of the harness's are left of it."""
 
     def start(self, episode: EpisodeStart) -> None:
         """See `harness.controllers.VehicleController`."""
         with suppress(ScriptError):  # the last test's
             self.close()
         self._traci = ScriptTraci(self._vehicle(episode.set_speed_mps, episode.lv_name, episode.bv_name))
-        seed = partial(episode.random.integers, 2**63)
+        self._left, seed = 0, partial(episode.random.integers, 2**63)
         self._run = greenlet(partial(self._script.run, self._traci, lambda: int(seed())))
 
     def step(self, observation: Observation) -> float:
         """See `harness.controllers.VehicleController`."""
-        self._traci.see(observation)
-        self._turn()
-        return self._traci.vehicle.next_acceleration()
+        if not self._left:
+            self._traci.see(observation)
+            self._turn()
+            self._held, self._left = self._traci.vehicle.next_acceleration(), self._traci.every
+        self._left -= 1
+        return self._held
 
     def _turn(self) -> None:
         assert self._run is not None

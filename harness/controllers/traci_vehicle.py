@@ -21,9 +21,11 @@ MAX_SPEED_MPS = 100.0
 _ROUNDING = 1e-9
 _SAFE_SPEED, _ACCEL, _DECEL = 1, 2, 4
 """Bits of a speed mode."""
+_SUMOS_OWN = 31
+"""The speed mode of a script that sets none."""
 _CHANGES_LANE = 0b1100_1111_1111
 """Bits of a lane change mode that let SUMO change lanes, but for how much room it leaves."""
-_DEFAULT_VARIABLES, _VEHICLES = (0x50, 0x56), 0xA4
+_DEFAULT_VARIABLES, _VEHICLES, _LEADER = (0x50, 0x56), 0xA4, 0x68
 
 _WOULD_MOVE = "it would change vehicles unknown to the harness, and the crash rate would be wrong"
 _STEPS = "the harness itself starts, steps and ends the simulation"
@@ -31,8 +33,9 @@ _REFUSED = {
     **dict.fromkeys(("start", "init", "connect", "switch", "setOrder", "close", "load", "loadState"), _STEPS),
     **dict.fromkeys(("saveState", "simulationStep", "step", "executeMove"), _STEPS),
     "addStepListener": "name the listener in the campaign, as av.controller",
-    "changeLane": "the AV stays on its lane; " + _WOULD_MOVE,
+    "changeLane": "the AV stays on its lane",
 }
+_NO_MODEL = "no model of SUMO's drives the AV: setSpeed, setAcceleration, slowDown do, bounded by setAccel and setDecel"
 _REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")
 
 
@@ -62,7 +65,8 @@ class Domain:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(name)
-        why = _REFUSED.get(name, _WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None)
+        why = _REFUSED.get(name, _NO_MODEL if name.startswith("set") else None)
+        why = why or (_WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None)
         if why is None:
             public = [entry for entry in dir(type(self)) if entry[0] != "_" and entry != "see"]
             domains = [entry for entry in vars(self) if isinstance(getattr(self, entry), Domain) and entry[0] != "_"]
@@ -108,7 +112,7 @@ _QUESTIONS: dict[str, tuple[int, Callable[[Seen], Any]]] = {
     "getLateralLanePosition": (0xB8, lambda of: of.sideways),
 }
 """Questions about a vehicle: their numbers in ``traci.constants``, and what answers them. Front bumpers count."""
-_VARIABLES = {number: name for name, (number, _) in _QUESTIONS.items()} | {0x68: "getLeader", 0x78: "getFollower"}
+_VARIABLES = {number: name for name, (number, _) in _QUESTIONS.items()} | {_LEADER: "getLeader", 0x78: "getFollower"}
 """What can be subscribed to, by number."""
 _OF_THE_AV = {"getSpeedMode": "_speed_mode", "getAccel": "_accel", "getDecel": "_decel"}
 """What has been set of it, and where that is kept: bounds of its commands (m/s²) are infinite without."""
@@ -150,12 +154,14 @@ class VehicleDomain(Domain):
         self._others = {name: other for name, other in ((lv_name, self._lv), (bv_name, self._bv)) if name}
         self._seen = {**self._others, ego: self._own}
         self._begun = False
+        self.step_s = STEP_S
+        """How often the script is asked, whose commands hold until then."""
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""
         for other, there in ((self._lv, now.lv), (self._bv, now.bv)):
             change = there.speed_mps - other.speed if self._begun else math.nan  # also where it was not seen before
-            other.acceleration = 0.0 if math.isnan(change) else change / STEP_S
+            other.acceleration = 0.0 if math.isnan(change) else change / self.step_s
             other.position, other.speed, other.lane = there
         for name, other in self._others.items():
             if math.isnan(other.position):
@@ -187,7 +193,7 @@ class VehicleDomain(Domain):
             acceleration = max(acceleration, -self._decel)
         if self._speed_mode & _ACCEL:
             acceleration = min(acceleration, self._accel)
-        self._told = max(0.0, self._own.speed + acceleration * STEP_S)
+        self._told = max(0.0, self._own.speed + acceleration * self.step_s)
         return acceleration
 
     def _of(self, vehID: str) -> Seen:
@@ -211,6 +217,11 @@ class VehicleDomain(Domain):
         """Ask for variables (numbers of ``traci.constants``), for the whole test; by default road and position."""
         self._of(objectID)
         self._subscribed[objectID] = _variables(varIDs)
+
+    def subscribeLeader(self, vehID: str, *_when: float) -> None:
+        """Ask for the vehicle ahead, beside what has been asked for."""
+        self._of(vehID)
+        self._subscribed[vehID] = *self._subscribed.get(vehID, ()), _LEADER
 
     def unsubscribe(self, objectID: str) -> None:
         """Ask for nothing more."""
@@ -303,26 +314,26 @@ class VehicleDomain(Domain):
 
     def _begin(self, command: Callable[[], Iterator[float]] | None, duration: float) -> None:
         self._plan = iter(()) if command is None else command()
-        self._command = command if duration > STEP_S + _ROUNDING else None
+        self._command = command if duration > self.step_s + _ROUNDING else None
 
     def _hold(self, speed: float) -> Iterator[float]:
         """Until further notice."""
         while True:
-            yield (speed - self._own.speed) / STEP_S
+            yield (speed - self._own.speed) / self.step_s
 
     def _accelerate(self, acceleration: float, duration: float) -> Iterator[float]:
         """For whole steps, and a share of a last one."""
-        left = duration / STEP_S
+        left = duration / self.step_s
         while left >= _ROUNDING:
             yield acceleration if left > 1.0 - _ROUNDING else acceleration * left
             left -= 1.0
 
     def _approach(self, target: float, duration: float) -> Iterator[float]:
-        start, steps, done = self._own.speed, max(duration / STEP_S, 1.0), 0
+        start, steps, done = self._own.speed, max(duration / self.step_s, 1.0), 0
         while done <= steps - _ROUNDING:
             done += 1
             share = min(1.0, done / steps)
-            yield (start + (target - start) * share - self._own.speed) / STEP_S
+            yield (start + (target - start) * share - self._own.speed) / self.step_s
 
     def setAccel(self, vehID: str, accel: float) -> None:
         """Bound the acceleration (m/s²) that later commands lead to."""
@@ -337,7 +348,7 @@ class VehicleDomain(Domain):
     def setSpeedMode(self, vehID: str, speedMode: int) -> None:
         """Whether `setAccel` (bit 2) and `setDecel` (bit 4) bound commands."""
         self._require_own(vehID, "setSpeedMode")
-        if speedMode & _SAFE_SPEED:
+        if speedMode & _SAFE_SPEED and speedMode != _SUMOS_OWN:
             why = "SUMO's safe speeds (bit 1) do not bound the AV here: what it is told it does, as under speed mode 32"
             raise RefusedError(f"vehicle.setSpeedMode('{vehID}', {speedMode}) is refused: {why}.")
         self._speed_mode = speedMode

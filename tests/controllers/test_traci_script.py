@@ -6,6 +6,7 @@ import shutil
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
@@ -134,6 +135,9 @@ AT_THE_DOOR = {
         "traci.vehicle.setSpeed('ego', 9.0); traci.trafficlight.getIDList()"
     ),
     r"which is no Python.*invalid syntax in line 2": "import traci\ndef x(:\n",
+    r"--step-length 0.25 is refused: steps here are 0.1 s.*\(my.py:3\)": text("").replace(
+        '"sumo"', '"sumo", "--step-length", "0.25"'
+    ),
     "does not import traci.*Name its class or function: .*my.py:Mine": "class Mine:\n    def step(self, seen): ...\n",
 }
 
@@ -179,6 +183,30 @@ def test_bounds_are_those_of_its_vehicle_type(given, hardest, tmp_path):
     shard = drive(f"av={{controller: '{tmp_path}/my.py'}}", *given, n=20)
     assert shard.failures == {}
     assert min(shard.traces[row][:-1, 2, 2].min() for row in range(20)) == hardest
+
+
+PER_SECOND = """
+traci.start(["sumo", "-c", "no.sumocfg", {option}])
+while traci.simulation.getMinExpectedNumber() > 0:
+    traci.simulationStep()
+    if traci.simulation.getMinExpectedNumber() and traci.vehicle.getLeader("ego"):
+        traci.vehicle.setSpeed("ego", max(0.0, traci.vehicle.getSpeed("ego") - 3.0))
+        assert traci.simulation.getDeltaT() == {step_s}
+"""
+
+
+def test_a_step_of_the_script_is_as_long_as_it_asks_for(tmp_path):
+    """What it does once a second it does once a second, and a command leads there in that time."""
+    hardest = []
+    for option, step_s in (('"--step-length", "1"', 1.0), ("'--step-length=0.5'", 0.5), ('"--no-warnings"', 0.1)):
+        (tmp_path / "my.py").write_text(text("", PER_SECOND.format(option=option, step_s=step_s)), "utf-8")
+        shard = drive(f"av={{controller: '{tmp_path}/my.py'}}", HELD, n=12)
+        assert shard.failures == {}
+        hardest.append(min(shard.traces[row][:-1, 2, 2].min() for row in range(12)))
+        braking = shard.traces[0][:-1, 2, 2]
+        begins = int(np.flatnonzero(braking < 0.0)[0])
+        assert set(braking[begins : begins + round(10 * step_s)]) == {braking[begins]}
+    assert hardest == pytest.approx([-3.0, -4.5, -4.5], abs=1e-9)
 
 
 def test_its_end_is_that_of_sumo(tmp_path, monkeypatch):

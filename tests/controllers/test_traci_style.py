@@ -130,9 +130,9 @@ REFUSED = [
         for name, rest in COMMANDS.items()
         for of in ("LV", "BV")
     ),
-    *((RATIOS, f"vehicle.{name}", "AV", 1, 2) for name in MOVES),
+    *((f"stays on its lane|no model of SUMO|{RATIOS}", f"vehicle.{name}", "AV", 1, 2) for name in MOVES),
     *(("the harness itself", name) for name in ("simulationStep", "close")),
-    ("as under speed mode 32", "vehicle.setSpeedMode", "AV", 31),
+    ("as under speed mode 32", "vehicle.setSpeedMode", "AV", 7),
     ("stays on its lane", "vehicle.setLaneChangeMode", "AV", 1621),
     ("bumper to bumper", "vehicle.setMinGap", "AV", 2.5),
     (f"setColor.*BV.*{RATIOS}", "vehicle.setColor", "BV", (255, 0, 0)),
