@@ -279,12 +279,10 @@ def compare(
     --margin is decided; or, with --set stop.rhw=R, until that half-width is R.
 
     B is a vehicle, which is driven as A's campaign says, or a campaign that is equal but for the vehicle.
-
-    With --scenario all the difference is in crashes per hour, summed over three scenarios.
+    With --scenario all the difference is in crashes per hour, summed over three scenarios, each in a folder of its own.
 
     A may be a run folder: its tests are copied, not run again. So are finished tests of an earlier call with the same
-    --out. The folder receives the run folders a and b, compare.json and report.html; of several scenarios, each in a
-    folder of its own.
+    --out. The folder receives the run folders a and b, compare.json and report.html.
 
     Exit code 5: B is worse than A by more than --margin; 4: tests or pool were used up before that was known.
     """
@@ -306,6 +304,8 @@ def compare(
         a = a.model_copy(update={"stop": b.stop})
     label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
     labels = (a.name, label_b) if a.name != label_b else (str(source_a), str(file_b))
+    if junit is not None and margin is None:
+        say("note: without --margin the JUnit file says only whether it came to an end, whichever is worse", err=True)
     if chosen := folder is None:
         folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b.removeprefix(f'{a.name}, '))}"
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
@@ -314,9 +314,9 @@ def compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )
     if junit is not None:
-        from harness.report.junit import Case, outcome_of, write_junit
+        from harness.report.junit import difference_case, write_junit
 
-        case = Case("difference", repr(found), outcome_of(found.exit_code))
+        case = difference_case(found.content, repr(found), found.exit_code)
         write_junit(junit, " and ".join(labels), case, [found.report, folder / "compare.json"])
     print_either(found.content, [found], as_json=as_json)
     ctx.exit(found.exit_code)

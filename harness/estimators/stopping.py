@@ -75,7 +75,8 @@ class Decision:
     ``limit`` is in crashes per test, or in crash rates of a reference ``driver``, as are ``low`` and ``high``, between
     which the rate lies after ``n_episodes`` tests. Even where the limit is the rate itself, at most 1 - ``confidence``
     of campaigns take the wrong side, whatever the budget.
-    With ``n_milder`` crashes on events too mild to count, or before events, nothing is accepted.
+    With ``n_milder`` crashes on events too mild to count, or before events, nothing is accepted; nor with
+    ``n_differing`` tests that were not the same when they ran twice.
     """
 
     limit: float
@@ -86,13 +87,15 @@ class Decision:
     n_episodes: int = 0
     driver: str | None = None
     n_milder: int = 0
+    n_differing: int = 0
 
     @property
     def verdict(self) -> Verdict:
         """On which side of the limit the interval lies, if that can be said."""
         if self.low > self.limit:
             return "rejected"
-        return "accepted" if self.high < self.limit and not self.n_milder else "undecided"
+        doubted = self.n_milder or self.n_differing
+        return "accepted" if self.high < self.limit and not doubted else "undecided"
 
     def to_json(self) -> dict[str, Any]:
         """All of it."""

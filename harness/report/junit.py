@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
 from harness.records.folder import write_bytes
+from harness.report.pair_words import pair_words
 from harness.report.rows import limit_words, within
 from harness.strata import LIBRARY_STATEMENT
 
@@ -27,6 +28,8 @@ class Case:
     message: str
     outcome: Outcome
     besides: tuple[str, ...] = ()
+    verdict: str = ""
+    """In one line; by default the message's second row, below what was tested."""
 
 
 def outcome_of(exit_code: int) -> Outcome:
@@ -52,6 +55,13 @@ def statement_case(content: dict[str, Any], message: str, asked: str, exit_code:
     return Case(f"{name}, given the {LIBRARY_STATEMENT}" if asks else name, message, outcome, besides)
 
 
+def difference_case(content: dict[str, Any], message: str, exit_code: int) -> Case:
+    """Case of ``compare.json``, which the ``message`` tells: that B is not worse by more than the margin, if any."""
+    decision = content["decision"]
+    name = pair_words({**decision, "verdict": "proven"}) if decision["margin"] else "difference"
+    return Case(name, message, outcome_of(exit_code), verdict=pair_words(decision))
+
+
 def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path]) -> None:
     """Write a suite of one case; attachments are named as CI systems look for them, in its output."""
     counted = {f"{kind}s": str(int(case.outcome == kind)) for kind in ("failure", "error")}
@@ -62,8 +72,8 @@ def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path])
     told = [case.message, *case.besides]
     if case.outcome != "passed":
         answer = told.pop(0)
-        verdict = answer.splitlines()[:2] or [""]  # below what was tested
-        ET.SubElement(element, case.outcome, message=" ".join(verdict[-1].split())).text = answer
+        rows = answer.replace("\n    ", " ").splitlines()[:2] or [""]  # those too long go on below
+        ET.SubElement(element, case.outcome, message=case.verdict or " ".join(rows[-1].split())).text = answer
     ET.SubElement(element, "system-out").text = "\n".join([*told, *attached, ""])
     ET.indent(root)
     text = printable(ET.tostring(root, encoding="unicode", xml_declaration=True))

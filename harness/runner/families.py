@@ -89,7 +89,9 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     answer = hour_answer(hour, ready, told, campaign.stop.confidence)
     if (decision := rule.look.decision) is not None:
         of_each = answer["families"].values()
-        decision = replace(decision, n_milder=sum(beyond_scope(of["milder"]) + of[EARLY] for of in of_each))
+        n_milder = sum(beyond_scope(of["milder"]) + of[EARLY] for of in of_each)
+        n_differing = sum(len(of["repeated"]["differing"]) for of in of_each if of["repeated"])
+        decision = replace(decision, n_milder=n_milder, n_differing=n_differing)
         code = EXIT_OF[decision.verdict]
     from harness.report.page import write_hours  # noqa: PLC0415 - draws
     from harness.report.words import vehicle_words  # noqa: PLC0415

@@ -176,7 +176,9 @@ class Underway:
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
         if (decision := rule.look.decision) is not None and not of_sum:
             n_early = sum(each.n_crashes_before_event for each in run.blocks)
-            decision = replace(decision, n_milder=n_left_out(campaign, n_early) + beyond_scope(run.facts.get("milder")))
+            n_milder = n_left_out(campaign, n_early) + beyond_scope(run.facts.get("milder"))
+            n_differing = len(run.repeated.differing) if run.repeated else 0
+            decision = replace(decision, n_milder=n_milder, n_differing=n_differing)
             code = EXIT_OF[decision.verdict]
             decided["decision"] = decision.to_json()
         decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None

@@ -115,6 +115,15 @@ def test_a_vehicle_that_crashes_on_them_is_told_so_and_not_accepted(tmp_path, ca
     assert estimate_run(out)["milder"] == estimates["milder"]
 
 
+def test_one_that_does_not_do_the_same_again_is_not_accepted(tmp_path, capsys):
+    out, _, code = gate(tmp_path, "tests.controllers.misbehaving:Global")
+    decision = json.loads((out / "estimates.json").read_text())["decision"]
+    assert (code, decision["verdict"], decision["n_milder"]) == (4, "undecided", 0)
+    assert decision["high"] < 0.9
+    assert decision["n_differing"] > 0
+    assert "! NOT REPRODUCIBLE: " in capsys.readouterr().out
+
+
 def test_one_that_does_not_is_not_told_of_them(tmp_path, capsys):
     out, _, code = gate(tmp_path, "idm")
     assert code == 0

@@ -12,7 +12,7 @@ from junitparser import JUnitXml
 
 from harness.errors import RunFolderError
 from harness.records.folder import write_sealed
-from harness.report.junit import statement_case, write_junit
+from harness.report.junit import difference_case, statement_case, write_junit
 from harness.runner.pages import write_report
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
 from tests.stored_runs import truncate
@@ -170,3 +170,19 @@ NO_SHELLS = {**content(), "estimates": {"shells": {"details": {}}}}
 def test_a_refuted_assumption_fails_and_no_gate_passes_because_nothing_was_asked(told, code, name, outcome):
     case = statement_case(told, "", "library", code)
     assert (case.name, case.outcome) == (name, outcome)
+
+
+def test_the_verdict_is_whole_and_of_a_comparison_its_own(tmp_path):
+    """A row too long for a terminal goes on below."""
+    answer = (
+        "idm · 9 tests\n  UNDECIDED  0 is the limit;\n    it may be 1.12 × 10⁻⁷ to 1.09\n    × 10⁻⁶\n  crash rate  1"
+    )
+    decision = {"margin": 0.1, "verdict": "refuted", "confidence": 0.95}
+    worse = difference_case({"decision": decision}, "B is more …\n  A a  1", 5)
+    told = statement_case(content(), answer, "assumption_free", 4), worse
+    for case, verdict in zip(told, ("UNDECIDED 0 is the limit; it may be 1.12 × 10⁻⁷ to 1.09 × 10⁻⁶", ""), strict=True):
+        write_junit(tmp_path / "gate.xml", "x", case, [])
+        ((asked,),) = JUnitXml.fromfile(str(tmp_path / "gate.xml"))
+        assert asked.result[0].message == (verdict or "B is more than 10 % worse than A")
+    assert (worse.name, worse.outcome) == ("B is at most 10 % worse than A", "failure")
+    assert difference_case({"decision": {**decision, "margin": 0.0}}, "", 0).name == "difference"
