@@ -254,10 +254,10 @@ def test_a_run_without_a_folder_gets_a_new_one_and_resumes_the_last(tmp_path, mo
 
 def test_a_run_resumes_the_last_of_its_scenarios(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    several = [(f"mine-3/{name}", name) for name in ("cut_in", "cut_out")]
-    for held, scenarios in (("mine", "cut_in"), ("mine-2", "lead_brakes"), *several):
+    several = ("mine-3", "scenarios: [cut_out, cut_in]")
+    for held, scenarios in (("mine", "scenario: cut_in"), ("mine-2", "scenario: lead_brakes"), several):
         Path("runs", held).mkdir(parents=True)
-        Path("runs", held, "campaign.yaml").write_text(f"name: mine\nscenario: {scenarios}\n", "utf-8")
+        Path("runs", held, "campaign.yaml").write_text(f"name: mine\n{scenarios}\n", "utf-8")
     asked = (
         (["cut_in"], "mine"),
         (["lead_brakes"], "mine-2"),

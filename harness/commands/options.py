@@ -135,9 +135,8 @@ def _scenarios_of(folder: Path) -> list[str]:
     from harness.campaign.files import load_campaign
     from harness.records.folder import CAMPAIGN
 
-    if not (stored := folder / CAMPAIGN).exists():
-        return sorted(each.parent.name for each in folder.glob(f"*/{CAMPAIGN}"))
     try:
-        return [load_campaign(stored, check_files=False).scenario]
+        campaign = load_campaign(folder / CAMPAIGN, check_files=False)
+        return sorted(campaign.scenarios or [campaign.scenario])
     except HarnessError:
         return []
