@@ -271,9 +271,20 @@ def require_controller(av: AutomatedVehicle) -> str | None:
     if not has_foreign_code(av):
         return None
     try:
-        return run_apart(av, _sources_of_made, av)
+        made_of = run_apart(av, _sources_of_made, av)
     except AvEndedProcessError as error:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
+    if av.controller is not None and is_script(av.controller):
+        _note_step_length(Path(f"{av.controller.partition('.py')[0]}.py"))
+    return made_of
+
+
+@cache
+def _note_step_length(script: Path) -> None:
+    """Say once that a script is asked more often than it may expect: for each step it commands the next speed."""
+    if "step-length" not in script.read_text("utf-8", errors="replace"):
+        told = "names no --step-length (a .sumocfg is not read): it is asked every 0.1 s; SUMO's default is 1 s"
+        sys.stderr.write(f"note: {script.name} {told}.\n")
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:

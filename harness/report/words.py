@@ -98,7 +98,8 @@ def vehicle_words(av: AutomatedVehicle) -> tuple[str, list[tuple[str, str]]]:
         given |= av.sumo
         name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
     elif av.controller and is_script(av.controller):  # SUMO would know its vehicle's type
-        given |= {"accel_mps2": av.traci_style.accel_mps2, "decel_mps2": av.traci_style.decel_mps2}
+        style = av.traci_style
+        given["initial bounds"] = f"{plain(style.accel_mps2)} and −{plain(style.decel_mps2)} m/s²"
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
     elif av.fmu is not None:

@@ -12,6 +12,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.cli import main
+from harness.controllers.find import require_controller
 from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
 from harness.resolved import resolve
@@ -207,6 +208,16 @@ def test_a_step_of_the_script_is_as_long_as_it_asks_for(tmp_path):
         begins = int(np.flatnonzero(braking < 0.0)[0])
         assert set(braking[begins : begins + round(10 * step_s)]) == {braking[begins]}
     assert hardest == pytest.approx([-3.0, -4.5, -4.5], abs=1e-9)
+
+
+def test_one_that_names_none_is_told_so_once(tmp_path, capsys):
+    body = text("traci.vehicle.setSpeed('ego', 20.0)")
+    for name, script in (("none.py", body), ("some.py", body.replace('"sumo"', '"sumo", "--step-length=0.1"'))):
+        (tmp_path / name).write_text(script, "utf-8")
+        for _ in range(2):
+            assert require_controller(load_campaign(str(tmp_path / name)).av)
+    (note,) = capsys.readouterr().err.splitlines()
+    assert note.startswith("note: none.py names no --step-length")
 
 
 def test_its_end_is_that_of_sumo(tmp_path, monkeypatch):
