@@ -141,7 +141,7 @@ def made_once(name: str, waits: Callable[[], object]) -> Iterator[None]:
         with suppress(OSError, StopIteration):
             path = next(places(name)).with_suffix(".lock")
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = held.enter_context(path.open("wb"))
+            file = held.enter_context(path.open("wb+"))  # a pipe would wait for who reads it
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

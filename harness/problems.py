@@ -118,7 +118,7 @@ def listed(names: Iterable[str]) -> str:
 
 def file_meant(file: Path) -> str:
     """The same of the files beside one that is not there, by their names without the suffix."""
-    beside = sorted(each.name for each in file.parent.glob(f"*{file.suffix}"))
+    beside = sorted(each.name for each in file.parent.glob(f"*{file.suffix}") if each.is_file())
     meant = did_you_mean(file.stem, [Path(name).stem for name in beside])
     return meant.replace("'?", f"{file.suffix}'?")
 

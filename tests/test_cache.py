@@ -185,7 +185,9 @@ def test_what_another_makes_is_waited_for(folder):
 
 def test_where_no_lock_can_be_had_nobody_waits(folder, monkeypatch):
     folder.write_text("no folder")
-    for own in (folder, None):  # or neither a home nor yet a folder in its place
+    (piped := folder.with_name("piped") / NAME).parent.mkdir(parents=True)
+    os.mkfifo(piped.with_suffix(".lock"))
+    for own in (folder, folder.with_name("piped"), None):  # or neither a home nor yet a folder in its place
         monkeypatch.setattr(cache, "own_folder", lambda own=own: own)
         with cache.made_once(NAME, lambda: pytest.fail("waits")):
             pass

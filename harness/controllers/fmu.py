@@ -111,8 +111,11 @@ def _unpack(archive: zipfile.ZipFile, folder: Path) -> None:
             fresh.mkdir(parents=True)
             archive.extractall(fresh)
             shutil.rmtree(folder, ignore_errors=True)  # what is there is damaged
-        with suppress(OSError):  # another worker was faster
-            fresh.rename(folder)
+            try:
+                fresh.rename(folder)
+            except OSError:
+                if not _is_whole(folder, archive):  # else another worker was faster
+                    raise
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
 

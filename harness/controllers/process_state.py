@@ -7,16 +7,21 @@ either changes numbers of the harness, or breaks it elsewhere.
 from __future__ import annotations
 
 import ctypes
+import os
 import platform
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 WATCHED = (
     *("builtins", "math", "json", "os", "pickle", "signal", "struct", "time"),
     *("numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
 )
+SPARE_FILES = 16
+"""That the harness may have open at a time [assumed]."""
 CHANGED_MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
 
 _CONTROL, _MXCSR, _MODES = 0, 7, 0xFFC0
@@ -67,6 +72,17 @@ class OtherModules:
             changed += [f"{name}.{key}" for key, value in kept.items() if there.get(key, self) is not value]
             there.update(kept)
         return changed
+
+
+def closed_to_files() -> str:
+    """Why `SPARE_FILES` cannot be opened in this process any more; empty where they can."""
+    try:
+        with ExitStack() as files:
+            for _ in range(SPARE_FILES):
+                files.enter_context(Path(os.devnull).open("rb"))
+    except OSError as error:
+        return str(error.strerror)
+    return ""
 
 
 def _functions_and_numbers(held: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import yaml
 from harness.arguments import AtLeastTwo, checked
 from harness.errors import HarnessError, printable
 from harness.families import families
+from harness.files import read_bytes
 from harness.fitting.protocol import Asked, Fitted, Fitter
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
@@ -122,7 +123,7 @@ def _require_ours(out: Path, written: Mapping[Path, bytes], inputs: Sequence[Pat
 
 def _may_replace(path: Path, mark: bytes) -> bool:
     try:
-        return mark in path.read_bytes()
+        return mark in read_bytes(path)
     except OSError:
         return not os.path.lexists(path)
 

@@ -24,6 +24,7 @@ from pydantic import Field
 from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.sections import Section
 from harness.errors import TrajectoryError, printable
+from harness.files import opened
 from harness.fitting.recording import NAMES, NO_LENGTH, NUMBERS, UNITS, Recording, Unit, recording_of, require
 from harness.problems import did_you_mean, file_meant
 
@@ -308,7 +309,8 @@ def _from_highd(rows: pd.DataFrame, path: Path) -> pd.DataFrame:
 def _highd_meta(path: Path, columns: list[str]) -> pd.DataFrame:
     """Columns of one of highD's two files about a recording, as text."""
     try:
-        return pd.read_csv(path, usecols=columns, dtype=str)
+        with opened(path) as file:
+            return pd.read_csv(file, usecols=columns, dtype=str)
     except (ValueError, OSError) as error:
         mend = "highD has it beside the tracks: use the file as published."
         raise TrajectoryError(str(path), str(error), f"a CSV file with {', '.join(columns)}", mend) from None

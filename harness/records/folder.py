@@ -204,11 +204,13 @@ def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
         raise RunFolderError(str(folder), found, expected, "Run the campaign again into a new folder.") from error
 
 
-def damaged(path: Path, error: Exception, mend: str = MEND_PART) -> RunFolderError:
-    """What to say of a Parquet file of a run that cannot be read."""
-    missing = isinstance(error, FileNotFoundError)
+def damaged(
+    path: Path, error: Exception, mend: str = MEND_PART, expected: str = "a complete Parquet file"
+) -> RunFolderError:
+    """What to say of a file of a run that cannot be read; one that may not be read is nothing to delete."""
+    missing, closed = isinstance(error, FileNotFoundError), isinstance(error, PermissionError)
     found = "no such file" if missing else f"a file that cannot be read ({str(error).splitlines()[0]})"
-    return RunFolderError(str(path), found, "a complete Parquet file", mend)
+    return RunFolderError(str(path), found, expected, "Change its permissions." if closed else mend)
 
 
 def no_episodes(folder: Path) -> RunFolderError:
@@ -303,8 +305,7 @@ def read_as(kind: type[T], path: Path, *, mend: str) -> T:
         value = TypeAdapter(kind).validate_json(content, strict=True)
         values = json.loads(content)
     except (OSError, UnicodeDecodeError) as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
-        raise RunFolderError(str(path), found, expected, mend) from error
+        raise damaged(path, error, mend, expected) from error
     except ValidationError as error:
         first, *others = error.errors(include_url=False)
         where = ".".join(map(str, first["loc"])) or "content"

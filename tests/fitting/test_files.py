@@ -104,6 +104,9 @@ def test_what_no_fit_has_written_stays_unless_forced(tmp_path, monkeypatch, caps
         assert f"{name}, which harness fit has not written" in capsys.readouterr().err
         assert (tmp_path / name).read_text() == "of my own"
         (tmp_path / name).unlink()
+        os.mkfifo(name)
+        assert main(command) == 2
+        (tmp_path / name).unlink()
     assert main(command) == main(command) == 0
     (tmp_path / "my.yaml").write_text("of my own")
     assert main([*command, "--force"]) == 0

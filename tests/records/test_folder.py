@@ -228,6 +228,18 @@ def test_going_on_with_a_damaged_file_names_it_and_its_mend_works(table, stored,
     assert told(stored) == told(stored_run(NAME))
 
 
+@pytest.mark.parametrize("name", ["manifest.json", "estimates.json", "episodes"])
+def test_what_may_not_be_read_is_nothing_to_delete(name, stored, monkeypatch):
+    def closed(path):
+        if name in path.parts:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return path.read_bytes()
+
+    monkeypatch.setattr("harness.records.folder.read_bytes", closed)
+    with pytest.raises(RunFolderError, match=f"{name}.*Permission denied.* Change its permissions"):
+        summarise(read_run_folder(stored)) if name == "estimates.json" else estimate_run(stored)
+
+
 @pytest.mark.parametrize("crc32", [True, False])
 def test_the_campaign_of_another_run_is_refused(crc32, stored, stored_run):
     """With its checksum, and, in folders of before, by what changes an episode's bits."""
