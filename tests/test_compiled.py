@@ -76,14 +76,6 @@ def test_every_file_that_kernels_come_from_is_hashed():
     assert KERNELS.endswith(f"-numba-{numba.__version__}")
 
 
-def test_of_what_numba_does_not_document_the_cache_alone_hangs_on():
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.rglob("*.py")]
-    imports = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
-    parts = {f"{node.module}.{each.name}" for node in imports for each in node.names}
-    undocumented = {part for part in parts if part.startswith("numba.core.")}
-    assert undocumented == {"numba.core.caching", "numba.core.compiler", "numba.core.serialize"}
-
-
 def of_another_process(lines: str, **environment: str) -> subprocess.CompletedProcess:
     command, variables = [sys.executable, "-c", lines], {**os.environ, **environment}
     return subprocess.run(command, env=variables, capture_output=True, text=True, check=False)

@@ -83,7 +83,7 @@ def test_what_is_read_is_neither_counted_twice_nor_written_over(files, out, foun
     assert [file.name for file in tmp_path.iterdir()] == ["map.yaml"]
 
 
-@pytest.mark.parametrize("copied", [os.symlink, shutil.copy])
+@pytest.mark.parametrize("copied", [os.symlink, pytest.param(shutil.copy, marks=pytest.mark.slow)])
 def test_a_file_that_comes_twice_is_refused(copied, tmp_path):
     rows = tmp_path / "rows.parquet"
     overtaking(2.0).to_parquet(rows, index=False)

@@ -114,8 +114,12 @@ def simulated(file: Path, tmp_path: Path) -> tuple[dict, list]:
 
 @pytest.mark.parametrize(
     ("name", "scenario"),
-    [("shells-twin", "cut_in"), ("shells-lateral-twin", "cut_in"), ("", "lead_brakes"), ("", "cut_out")],
-    ids=["at once", "comes over", "lead brakes", "cut-out"],
+    [
+        pytest.param("shells-twin", "cut_in", id="at once", marks=pytest.mark.slow),
+        pytest.param("shells-lateral-twin", "cut_in", id="comes over"),
+        pytest.param("", "lead_brakes", id="lead brakes", marks=pytest.mark.slow),
+        pytest.param("", "cut_out", id="cut-out"),
+    ],
 )
 def test_plain_sumo_repeats_the_motion_and_the_crash(name, scenario, crashing, stored_run, tmp_path, capsys):
     folder = stored_run(name) if name else crashing[scenario]

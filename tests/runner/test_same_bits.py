@@ -13,13 +13,11 @@ from pathlib import Path
 import pytest
 
 from harness.processes import CLOSED_PIPE_EXIT_CODE, Child, first_to_answer, start_server
-from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner import workers
 from harness.runner.kept import Run
 from tests.golden.campaigns import BASE, IN_BOTH_WORLDS, quick
 from tests.in_process import run_here as run_golden
-from tests.in_process import run_with_workers, workers_alive
 from tests.runner import bad_workers
 from tests.stored_runs import MORE, ROOT, golden, manifest, part_files, sets, stored_table, unlike_columns
 
@@ -48,27 +46,6 @@ def test_any_number_of_cells(name, cells, stored_run, tmp_path):
 def test_any_split_into_shards(name, size, stored_run, tmp_path):
     run_golden(golden(name, f"run.shard_size={size}"), tmp_path / "run")
     assert set(unlike_columns(stored_run(name), tmp_path / "run")) <= {"estimates.json"}
-
-
-class KillOneWorker(Progress):
-    """Kills a worker process when the fourth shard is handed back."""
-
-    def __init__(self) -> None:
-        self.calls, self.killed = 0, []
-
-    def advance(self, n: int = 1) -> None:
-        self.calls += 1
-        if self.calls == 4:
-            self.killed = [workers_alive()[0]]
-            os.kill(self.killed[0], signal.SIGKILL)
-
-
-@pytest.mark.slow
-def test_two_workers_of_which_one_is_killed(stored_run, tmp_path):
-    progress = KillOneWorker()
-    run_with_workers(golden(SEVEN, "world.cells=64"), tmp_path / "run", workers=2, progress=progress)
-    assert progress.killed
-    assert unlike_columns(stored_run(SEVEN), tmp_path / "run") == []
 
 
 # -- processes of their own: each costs seconds of imports --
