@@ -230,12 +230,3 @@ def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(width, scheme, b
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         page.close()
     context.close()
-
-
-def test_a_cut_out_shows_when_the_revealed_vehicle_becomes_visible(opened, crashing):
-    file = write_report(copy_of(crashing["cut_out"], crashing["cut_out"].parent / "shown"))
-    page, scene = opened(file), scenes_in(file.read_text())[0]
-    [step] = [step for step, name in scene["moments"] if name == "SV becomes visible"]
-    assert scene["onset"] <= step <= scene["event"]
-    page.get_by_role("button", name="SV becomes visible", exact=True).click()
-    assert seconds(page) == pytest.approx(STEP_S * step)

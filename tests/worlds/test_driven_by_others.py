@@ -224,13 +224,6 @@ def test_a_client_of_another_machine_ends_the_run():
         require_neighbour("0A01A8C0:B267", "0B01A8C0:A6BC")
 
 
-@pytest.mark.parametrize("command", ["x {port.x}", "x {ports}", "x {", "x '", " "])
-def test_only_port_and_cells_stand_in_braces(command):
-    with pytest.raises(CampaignError, match="the only things in braces"):
-        load(command.replace("'", "''"))
-    assert load("x {{}} {port} {cells}").av.traci.words(1, 2) == ["x", "{}", "1", "2"]
-
-
 # -- driven from the start: baseline runs, and tests that find the same motion --
 
 
