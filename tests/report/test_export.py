@@ -8,8 +8,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from qc_baselib import Configuration, Result
-from qc_openscenario.main import run_checks
 
 import harness
 from harness.cli import main
@@ -24,6 +22,9 @@ from tests.stored_runs import copy_of, part_files, truncate
 
 def complaints(file):
     """Of ASAM's own checker: schema, references, names."""
+    from qc_baselib import Configuration, Result  # half a second, for whoever runs this
+    from qc_openscenario.main import run_checks
+
     config, result = Configuration(), Result()
     config.set_config_param("InputFile", str(file))
     result.register_checker_bundle(name="xoscBundle", description="", version="1.0.0")

@@ -47,42 +47,17 @@ def test_it_is_short_and_says_what_changes_the_meaning(name, stored_run):
     assert [each for each in SAID[name] if each not in re.sub(r"\n    ", " ", "\n".join(text))] == []
 
 
-def answered(stored_run, name="shells-twin", blocks=None, more=("stop.rhw=0.1",), **manifest):
-    """The answer of a run's tests, or of others, with other settings and keys of the manifest."""
-    folder, campaign = stored_run(name), golden(name, *more)
-    known = {**read_manifest(folder), **manifest}
-    return answer_of(campaign, known, estimate_blocks(blocks or blocks_of(folder), campaign, known))
-
-
-def blocks_of(folder):
-    return list(stored_blocks(folder, moments=False))
-
-
 def said(run, best=None, campaign=None, manifest=None, **changes):
     """The answer of a run, had its estimate, or others of its numbers, been other ones."""
     found = {run.estimates.headline: best or run.estimates.best}
     return short_answer(campaign or run.campaign, manifest or {}, replace(run.estimates, estimates=found, **changes))
 
 
-def test_a_vehicle_that_is_not_reproducible_and_a_precision_that_was_not_reached(stored_run):
-    answer = answered(stored_run, repeated={"n_episodes": 16, "differing": [3, 4, 5]})
-    told = "NOT REPRODUCIBLE: 3 of 16 tests that ran twice differed: see `harness av-check`"
-    assert list(answer.warnings) == [told]
-    assert re.search(r"stopped: budget of tests \(stop.episodes\) used up, at ± \d+ % \(asked: ± 10 %\)$", answer.scope)
-
-
-@pytest.mark.parametrize(("verdict", "value"), [("rejected", "rate above"), ("undecided", "limit")])
-def test_a_limit_that_is_rejected_or_open(verdict, value, stored_run):
-    decision = {**read_manifest(stored_run("shells-accepted"))["decision"], "verdict": verdict}
-    answer = answered(stored_run, decision=decision)
-    assert (answer.rows[0].what, answer.rows[0].value) == (verdict.upper(), f"{value} 4 × 10⁻⁷ per test")
-    assert len([line for line in lines(answer, 1.0) if not line.startswith("    ")]) <= LINES
-
-
 def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     """Of the same tests had none crashed: above 50 m/s none did."""
-    blocks = [block.harder_than(50.0) for block in blocks_of(stored_run("shells-twin"))]
-    rows = {row.key: row for row in answered(stored_run, blocks=blocks, more=["crash.counts_above_mps=50"]).rows}
+    folder, campaign = stored_run("shells-twin"), golden("shells-twin", "crash.counts_above_mps=50")
+    blocks, known = [block.harder_than(50.0) for block in stored_blocks(folder, moments=False)], read_manifest(folder)
+    rows = {row.key: row for row in answer_of(campaign, known, estimate_blocks(blocks, campaign, known)).rows}
     assert set(rows) == {"rate", "ratio"}
     assert (rows["rate"].what, rows["rate"].interval) == ("crash rate > 50 m/s", "no crash seen")
     assert rows["rate"].value.startswith("< ")
