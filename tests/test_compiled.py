@@ -81,6 +81,7 @@ def of_another_process(lines: str, **environment: str) -> subprocess.CompletedPr
     return subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_numba_with_a_vector_library_is_refused():
     refused = of_another_process("import numba; numba.config.USING_SVML = True; import harness.compiled")
     assert refused.returncode != 0
@@ -96,6 +97,7 @@ def test_a_numba_that_compiles_nothing_is_refused(tmp_path):
     assert refused.stderr.startswith("error: NUMBA_DISABLE_JIT\n")
 
 
+@pytest.mark.slow
 def test_a_numba_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
     (tmp_path / ".numba_config.yaml").write_text("- 3")
     monkeypatch.chdir(tmp_path)

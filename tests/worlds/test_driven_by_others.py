@@ -170,6 +170,7 @@ def test_a_program_lost_in_mid_run_fails_what_ran_and_is_started_again(fault, ca
     assert_same_motion(shard, expected, np.flatnonzero(outcome != FAILED))
 
 
+@pytest.mark.slow
 def test_a_program_that_never_connects_fails_its_episodes():
     shard = run(program(MISBEHAVING, "never_connects", connect_time_s=1.0, restarts=0), 0, 6, cells=2)
     assert len(shard.failures) == 6
