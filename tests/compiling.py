@@ -8,14 +8,13 @@ import tempfile
 from pathlib import Path
 
 import harness
-from tests.episode.twin_runs import prepared
 from tests.families.test_same_bits import CARELESS, resolved_of
 from tests.golden.record import record
 from tests.in_process import run_here
 
 GOLDEN = (
-    ("nde-sumo", "step-recursive-twin", "mixture-twin", "forced-lateral-sumo"),
-    ("shells-sumo", "shells-acting-twin", "shells-lateral-sumo"),
+    ("nde-sumo", "step-recursive-twin", "mixture-twin", "forced-lateral-sumo", "shells-lateral-sumo"),
+    ("shells-sumo", "shells-acting-twin"),
 )
 
 
@@ -32,5 +31,3 @@ if __name__ == "__main__":
     if half:
         follow("lead_brakes")
         follow("cut_out")
-    else:
-        prepared("step_mixture", "immediate", surrogates="SM-I")

@@ -76,19 +76,12 @@ def test_every_file_that_kernels_come_from_is_hashed():
     assert KERNELS.endswith(f"-numba-{numba.__version__}")
 
 
-def test_of_what_numba_does_not_document_the_cache_alone_hangs_on():
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.rglob("*.py")]
-    imports = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
-    parts = {f"{node.module}.{each.name}" for node in imports for each in node.names}
-    undocumented = {part for part in parts if part.startswith("numba.core.")}
-    assert undocumented == {"numba.core.caching", "numba.core.compiler", "numba.core.serialize"}
-
-
 def of_another_process(lines: str, **environment: str) -> subprocess.CompletedProcess:
     command, variables = [sys.executable, "-c", lines], {**os.environ, **environment}
     return subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_numba_with_a_vector_library_is_refused():
     refused = of_another_process("import numba; numba.config.USING_SVML = True; import harness.compiled")
     assert refused.returncode != 0
@@ -104,6 +97,7 @@ def test_a_numba_that_compiles_nothing_is_refused(tmp_path):
     assert refused.stderr.startswith("error: NUMBA_DISABLE_JIT\n")
 
 
+@pytest.mark.slow
 def test_a_numba_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
     (tmp_path / ".numba_config.yaml").write_text("- 3")
     monkeypatch.chdir(tmp_path)

@@ -4,7 +4,6 @@ import json
 import re
 import runpy
 import shlex
-import subprocess
 from pathlib import Path
 
 import click
@@ -17,11 +16,6 @@ from harness.cli import cli
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 PAGES = [README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-FIRST = (
-    "python3 -m venv .venv && .venv/bin/pip install -c requirements.lock -e . && "
-    ".venv/bin/harness setup && .venv/bin/harness run scenarios/smoke.yaml --out runs/smoke"
-)
-SECOND = ".venv/bin/pip install -c requirements.lock -e '.[test]' && .venv/bin/python -m pytest -n 2"
 
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _CODE_SPAN = re.compile(r"`(harness [^`\n]+)`")
@@ -44,12 +38,6 @@ def _commands():
         for file in sorted(ROOT.glob(pattern)):
             text = file.read_text(encoding="utf-8").replace("\\\n#", " ")
             yield from ((file, re.split(r"\s{3,}", line)[0]) for line in re.findall(line_of, text, re.MULTILINE))
-
-
-def test_ci_runs_readmes_two_commands():
-    assert [block.strip() for block in _blocks(README, "bash")] == [FIRST, SECOND]
-    done = subprocess.run(["bash", str(ROOT / ".ci/run"), "--commands"], capture_output=True, text=True, check=True)
-    assert done.stdout == f"{FIRST}\n{SECOND}\n"
 
 
 def test_shown_command_lines_parse(tmp_path, monkeypatch):

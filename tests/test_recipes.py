@@ -106,16 +106,3 @@ def test_a_new_controller_kind_is_three_files(tmp_path):
     assert diff.count("\n+++ ") == 3
     subprocess.run(["git", "apply", "--unidiff-zero", "-"], cwd=own, input=diff, text=True, check=True)
     assert "profile · 500 tests" in ran(recipe, tmp_path, own)
-
-
-def test_a_newcomers_ten_questions_are_answered_in_three_files_each_that_say_what_the_table_says():
-    table = TEXT.partition("| where is … ")[2].partition("\n\n")[0]
-    rows = re.findall(r"^\| ([^|]+) \| (.*`[^|]*) \|$", table, re.MULTILINE)
-    assert len(rows) == 10
-    for question, answer in rows:
-        spans = re.findall(r"`([^`]+)`", answer)
-        files = [ROOT / "harness" / span for span in spans if span.endswith(".py")]
-        assert 1 <= len(files) <= 3, question
-        content = "\n".join(file.read_text(encoding="utf-8") for file in files)
-        for name in (span for span in spans if not span.endswith(".py")):
-            assert re.search(rf"^ *(def {name}\b|class {name}\b|{name}\b.* = )", content, re.MULTILINE), name

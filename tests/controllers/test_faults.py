@@ -186,7 +186,10 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("av", "where", "words"), REFUSED)
+@pytest.mark.parametrize(
+    ("av", "where", "words"),
+    [pytest.param(*each, marks=[pytest.mark.slow] * ("hangs_for_good" in each[0])) for each in REFUSED],
+)
 def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, where, words, tmp_path, capsys):
     complaints, harmless = [], "construct" not in av
     for command in ("check", "run", "av-check") if words.startswith("Popen") else ("check", "run"):
@@ -296,6 +299,12 @@ def test_what_a_controller_prints_does_not_reach_stdout(tmp_path, capfd):
     assert (tmp_path / "run" / PRINTED).read_text() == text
     assert "made, in Python" in text
     assert "made, below Python" in text
+
+
+@pytest.mark.slow
+def test_nor_does_what_it_prints_in_a_replay_or_a_check(tmp_path, capfd):
+    assert _run(tmp_path, _of("Prints")) == EXIT_DONE
+    capfd.readouterr()
     assert main(["replay", str(tmp_path / "run"), "3", "--json"]) == EXIT_DONE
     printed = capfd.readouterr()
     assert json.loads(printed.out)["bit_equal"] is True

@@ -39,19 +39,16 @@ class Brakes:
 """
 
 
-def test_what_python_has_kept_of_other_versions_is_not_run(rewritten):
-    rewritten("beside_of_brakes.py", "HARDEST = 4", "HARDEST = 7")
-    before, now = (VEHICLE.format(beside="beside_of_brakes", own=own) for own in (4, 7))
-    file = rewritten("brakes.py", before, now)
-    assert own_code(f"{file}:Brakes").hardest == (7, 7)
-
-
-def test_pythons_own_loader_runs_it(rewritten, monkeypatch):
-    monkeypatch.delattr(FromSource, "get_code")
-    rewritten("beside_of_others.py", "HARDEST = 4", "HARDEST = 7")
-    before, now = (VEHICLE.format(beside="beside_of_others", own=own) for own in (4, 7))
-    file = rewritten("others.py", before, now)
-    assert own_code(f"{file}:Brakes").hardest == (4, 4)
+@pytest.mark.parametrize(("name", "hardest"), [("brakes", 7), ("others", 4)])
+def test_what_python_has_kept_of_other_versions_is_not_run_unlike_by_its_own_loader(
+    name, hardest, rewritten, monkeypatch
+):
+    if name == "others":
+        monkeypatch.delattr(FromSource, "get_code")
+    rewritten(f"beside_of_{name}.py", "HARDEST = 4", "HARDEST = 7")
+    before, now = (VEHICLE.format(beside=f"beside_of_{name}", own=own) for own in (4, 7))
+    file = rewritten(f"{name}.py", before, now)
+    assert own_code(f"{file}:Brakes").hardest == (hardest, hardest)
 
 
 def test_nor_of_what_lies_beside_a_script(rewritten):

@@ -85,7 +85,3 @@ def test_a_recipe_is_the_same_vehicle_in_whatever_package(name, tmp_path, monkey
         monkeypatch.chdir(tmp_path)
         assert main(["av-check", f"{name}.py:Policy", f"--set=av.parameters.file={file}", "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["deterministic"]
-
-
-def test_the_page_has_no_other_recipe():
-    assert set(BLOCKS) == {"observation.py", "network.py", *(f"{name}.py" for name in RECIPES)}

@@ -149,11 +149,6 @@ def test_what_is_not_the_avs_or_not_possible_is_refused(traci, reason, name, arg
     assert traci.vehicle.next_acceleration() == 0.0
 
 
-def test_an_unknown_name_lists_what_there_is(traci):
-    with pytest.raises(AttributeError, match=r"has no getCO2Emission here; it has .*getLeader.*setSpeed"):
-        _ = traci.vehicle.getCO2Emission
-
-
 def start(episode=0):
     return EpisodeStart(episode, 0.1, np.random.default_rng(episode))
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from examples.idm import IDM, idm_acceleration
-from harness.controllers.protocol import BatchObservation
 from harness.controllers.traci_style import TraciStyleController
 from harness.worlds.sumo import SumoWorld
 from tests.worlds.running import LATERAL, drive, motion
@@ -146,22 +145,6 @@ def test_what_is_shown_is_what_was_and_before_the_test_nobody_changed_speed(epis
         assert (each.gap_m, each.bv.lane, each.lv.lane, each.acceleration_mps2) == (math.inf, 1, 1, 0.0)
         assert (each.bv_lateral_m, each.bv_lateral_speed_mps, each.bv_overlaps) == (0.0, 0.0, False)
         assert math.isnan(each.lead_speed_mps)
-
-
-# -- examples that make room: what they do before the cut-in, how hard they brake after it, and by how much late --
-
-
-def seen(speed, gap, *, ahead=np.inf):
-    """Two AVs, the second far from everything; BV drives 30 m/s, its rear ``gap`` ahead, and ``ahead`` in the lane."""
-    columns = dict.fromkeys(BatchObservation._fields, np.zeros(2)) | {
-        "cell": np.arange(2),
-        "speed_mps": np.array([speed, speed]),
-        "gap_m": np.array([ahead, np.inf]),
-        "lead_speed_mps": np.array([30.0, np.nan]),
-        "bv_position_m": np.array([gap + 5.0, 500.0]),
-        "bv_speed_mps": np.full(2, 30.0),
-    }
-    return BatchObservation(**columns)
 
 
 def test_a_command_of_the_warm_up_begins_anew_at_the_hand_over():

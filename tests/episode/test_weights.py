@@ -60,7 +60,7 @@ def fully_recorded(done):
 @pytest.mark.parametrize(
     ("method", "challenge", "surrogates"),
     [
-        ("step_mixture", "immediate", "SM-I"),
+        pytest.param("step_mixture", "immediate", "SM-I", marks=pytest.mark.slow),
         ("step_mixture", "recursive", "default"),
         ("episode_mixture", "recursive", "default"),
     ],
@@ -85,7 +85,7 @@ def test_mean_ratio_of_every_component_is_one():
 
 
 PREDICTED = [
-    ("step_mixture", "immediate", 0.99),
+    pytest.param("step_mixture", "immediate", 0.99, marks=pytest.mark.slow),
     ("step_mixture", "recursive", 0.5),
     ("episode_mixture", "recursive", 0.5),
 ]

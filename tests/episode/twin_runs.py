@@ -34,8 +34,6 @@ SURROGATES = {
     **{name: {name: DEFAULT_SURROGATES[name]} for name in ("SM-I", "SM-III")},
     "brakes with 2 g": {"hard": Surrogate(model="idm", parameters=IDMParameters(min_acceleration_mps2=-20.0))},
 }
-SM_I = "surrogates={SM-I: {model: idm}}"
-"""One of them, as an override of a campaign's file."""
 
 
 def campaign(

@@ -149,6 +149,7 @@ def test_where_somebody_changes_lanes_it_is_not_known_what_came_first():
     assert [n_left_out(harness.load_campaign("idm", each), 3) for each in asked] == [3, 0, 0, 0]
 
 
+@pytest.mark.slow
 def test_the_sum_warns_of_what_a_scenario_alone_would(tmp_path):
     """Tests that failed, that differed when run twice, that crashed before the event: each says of which scenario."""
     (tmp_path / "my_av.py").write_text(AV)

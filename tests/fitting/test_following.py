@@ -61,9 +61,8 @@ def test_cut_outs_of_a_known_law_are_found_again():
     hours = 0.0
     for rows in recordings[:3]:
         wide = rows.set_index(["time_s", "vehicle_id"])[["s_m", "lane"]].unstack()
-        for frame in range(len(wide)):
-            s, lane = wide.s_m.iloc[frame], wide.lane.iloc[frame]
-            on_lane = np.sort(s[lane == 0].to_numpy())
+        for s, lane in zip(wide.s_m.to_numpy(), wide.lane.to_numpy(), strict=True):
+            on_lane = np.sort(s[lane == 0])
             gaps = np.diff(on_lane) - 4.5
             hours += ((gaps > 0) & (gaps <= 115) & (on_lane[1:] + 100 <= rows.s_m.max())).sum() / RATE_HZ / 3600
     assert seen(CutOutFitter(), recordings[:3]).hours == pytest.approx(hours, rel=1e-9)

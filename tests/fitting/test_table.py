@@ -117,13 +117,9 @@ REFUSED = {
     "misspelt": (lambda: ROWS.rename(columns={"speed_mps": "sped_mps"}), "Did you mean 'sped_mps'"),
     "without lengths": (lambda: ROWS.drop(columns="length_m"), "Gaps need lengths"),
     "of highD": (lambda: ROWS.rename(columns={"speed_mps": "xVelocity"}), "--mapping highd"),
-    "of NGSIM": (lambda: ROWS.rename(columns={"s_m": "Local_Y"}), "--mapping ngsim"),
     "text": (changed(lane="left"), "invalid value .left|cannot be read"),
-    "dates": (changed(time_s=pd.Timestamp(0)), "cannot be read .*timestamp"),
     "nobody's row": (with_value(7, "vehicle_id", None), "row 8, vehicle_id: found nothing"),
     "the end of time": (with_value(7, "time_s", 1e12), r"row 8 .*found time_s 1e\+12"),
-    "lanes": (with_value(7, "lane", 1e12), r"row 8 .*found lane 1e\+12"),
-    "long": (with_value(7, "length_m", 70.0), r"row 8 .*found length_m 70"),
     "km/h of one vehicle": (
         lambda: ROWS.assign(**{c: ROWS[c] * np.where(ROWS.vehicle_id == 2, 3.6, 1.0) for c in ("s_m", "speed_mps")}),
         r"vehicle 2 of .*found speed_mps 1\d\d\.\d*; expected at most 60 from the median",
@@ -137,7 +133,6 @@ REFUSED = {
         lambda: pd.concat([ROWS, ROWS[(ROWS.vehicle_id == 1) & (ROWS.recording_id == 3)].assign(vehicle_id=9)]),
         "vehicle 9 of recording 3, t = 0 s.: found the time, lane and s_m of another vehicle",
     ),
-    "no rows": (lambda: ROWS[:0], "no rows"),
 }
 
 

@@ -16,8 +16,6 @@ from tests.chains.seed import SEED
 from tests.episode.twin_runs import Mean, prepared, run
 from tests.kernels import tabulated
 
-pytestmark = pytest.mark.slow  # at night
-
 BRAKES = np.linspace(-4.0, -1.0, 16)
 BRAKE_SHARES = np.exp(0.18 * BRAKES) / np.exp(0.18 * BRAKES).sum()
 SURROGATES = "SM-I", "SM-II", "SM-III"
@@ -107,7 +105,8 @@ def disagreement(name, states, maneuver, interpolated):
     return ((crash != (interpolated < CONTACT_M)) & (np.abs(smallest) > 0.3)).mean()
 
 
-@pytest.mark.parametrize("name", ["SM-I", pytest.param("SM-III", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SM-I", "SM-III"])
 @pytest.mark.parametrize("maneuver", [0, 10, KEEP_SPEED, 30])
 def test_same_answer_as_a_roll_out(name, states, maneuver):
     tables = prepared("step_mixture", "immediate", surrogates=name).tables
@@ -132,6 +131,7 @@ def simulated(name, states, level, n, rng):
     return np.array([crash_shares(name, state, 12, n, rng)[level - 1] for state in states])
 
 
+@pytest.mark.slow
 @each_surrogate
 @pytest.mark.parametrize("level", [2, 12])
 def test_between_grid_points(tables, j, level):
@@ -144,6 +144,7 @@ def test_between_grid_points(tables, j, level):
     assert (np.abs(error) > 0.1).mean() < 0.1
 
 
+@pytest.mark.slow
 def test_another_surrogates_table_would_be_noticed(tables):
     """The check has teeth: against SM-I's simulation, SM-III's table errs ten times as much."""
     rng = np.random.default_rng(SEED)
@@ -155,6 +156,7 @@ def test_another_surrogates_table_would_be_noticed(tables):
 # -- before the cut-in: G, what not cutting in now is worth --
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("j", "av", "low", "high"),
     [(0, "idm", 0.95, 1.1), (1, "SM-II", 0.95, 1.4), (2, "SM-III", 0.95, 2.5)],

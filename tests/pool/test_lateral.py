@@ -13,7 +13,7 @@ from harness.resolved import resolve
 from harness.vehicles.library import load_library
 from harness.vocabulary import CRASH, PASSED
 from harness.worlds.twin import TwinWorld
-from tests.pool.conftest import MIXTURE_FILE, SMALL_POOL, enumerated
+from tests.pool.conftest import GOLDEN_POOL, MIXTURE_FILE, enumerated
 
 LIBRARY = load_library("ladder-lateral-1")
 NAMES = list(LIBRARY.surrogates)
@@ -22,7 +22,7 @@ ENVELOPE = NAMES.index(LIBRARY.envelope)
 
 def of(*overrides: str):
     return load_campaign(
-        MIXTURE_FILE, ["testing.method=shells", *SMALL_POOL, "pool.library=ladder-lateral-1", *overrides]
+        MIXTURE_FILE, ["testing.method=shells", *GOLDEN_POOL, "pool.library=ladder-lateral-1", *overrides]
     )
 
 

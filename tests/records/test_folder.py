@@ -212,7 +212,7 @@ def test_a_flipped_bit_of_a_baseline_run_changes_no_test(stored_run, tmp_path):
     assert n_refused == 2
 
 
-@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("table", ["episodes", *(pytest.param(each, marks=pytest.mark.slow) for each in TABLES[1:])])
 def test_going_on_with_a_damaged_file_names_it_and_its_mend_works(table, stored, stored_run):
     damaged = part_files(stored, table)[1]
     content = bytearray(damaged.read_bytes())

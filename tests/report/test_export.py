@@ -8,8 +8,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from qc_baselib import Configuration, Result
-from qc_openscenario.main import run_checks
 
 import harness
 from harness.cli import main
@@ -24,6 +22,9 @@ from tests.stored_runs import copy_of, part_files, truncate
 
 def complaints(file):
     """Of ASAM's own checker: schema, references, names."""
+    from qc_baselib import Configuration, Result  # half a second, for whoever runs this
+    from qc_openscenario.main import run_checks
+
     config, result = Configuration(), Result()
     config.set_config_param("InputFile", str(file))
     result.register_checker_bundle(name="xoscBundle", description="", version="1.0.0")
@@ -114,8 +115,12 @@ def simulated(file: Path, tmp_path: Path) -> tuple[dict, list]:
 
 @pytest.mark.parametrize(
     ("name", "scenario"),
-    [("shells-twin", "cut_in"), ("shells-lateral-twin", "cut_in"), ("", "lead_brakes"), ("", "cut_out")],
-    ids=["at once", "comes over", "lead brakes", "cut-out"],
+    [
+        pytest.param("shells-twin", "cut_in", id="at once", marks=pytest.mark.slow),
+        pytest.param("shells-lateral-twin", "cut_in", id="comes over"),
+        pytest.param("", "lead_brakes", id="lead brakes", marks=pytest.mark.slow),
+        pytest.param("", "cut_out", id="cut-out"),
+    ],
 )
 def test_plain_sumo_repeats_the_motion_and_the_crash(name, scenario, crashing, stored_run, tmp_path, capsys):
     folder = stored_run(name) if name else crashing[scenario]

@@ -75,8 +75,14 @@ def run(tmp_path_factory):
     return harness.run(campaign(), tmp_path_factory.mktemp("stored") / "run", workers=1)
 
 
-def test_what_is_there_is_not_driven_again(done, run, tmp_path, monkeypatch, capsys):
-    """Neither an earlier call's tests nor those of a stored run of A in the same scenarios."""
+def test_what_an_earlier_call_has_driven_is_not_driven_again(done, monkeypatch):
+    monkeypatch.setattr("harness.runner.workers.ShardRunner.run", None)
+    again = compare_campaigns(campaign(), campaign(HARDER), done.folder, workers=1)
+    assert again.content == done.content
+
+
+@pytest.mark.slow
+def test_nor_are_tests_of_a_stored_run_of_a_in_the_same_scenarios(run, tmp_path, capsys):
     call = ["compare", str(run.folder), "late-600ms", "--out", str(tmp_path / "out"), "--workers", "1", "--json"]
     assert main(call) in (0, 4)  # so small a pool may be used up
     found = json.loads(capsys.readouterr().out)
@@ -88,9 +94,6 @@ def test_what_is_there_is_not_driven_again(done, run, tmp_path, monkeypatch, cap
     a, b = (found[side] for side in "ab")
     assert a["per_hour"]["rate"] - b["per_hour"]["rate"] == pytest.approx(found["difference"])
     assert a["n_episodes"] == b["n_episodes"] == found["n_pairs"]  # further tests that are held do not count
-    monkeypatch.setattr("harness.runner.workers.ShardRunner.run", None)
-    again = compare_campaigns(campaign(), campaign(HARDER), done.folder, workers=1)
-    assert again.content == done.content
 
 
 def test_a_stored_campaign_that_is_damaged_is_not_believed(run, tmp_path):

@@ -148,14 +148,11 @@ def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
     assert estimate_families(run.folder, {"lead_brakes": 1e-6})["decision"] is None
 
 
-@pytest.mark.parametrize("wrong", ["1e300", "1e-320", "nan", "x", ""])
+@pytest.mark.parametrize("wrong", ["1e300", "1e-320", "nan", "x", 0.0, 1e300, True])
 def test_exposures_out_of_all_bounds_are_refused(wrong, run, capsys):
-    assert main(["estimate", str(run.folder), "--exposure", "cut_in=1", "--exposure", f"cut_in={wrong}"]) == 2
-    assert f"found:    {wrong or 'nothing'}, of cut_in" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("wrong", [0.0, 1e300, float("nan"), True, "1"])
-def test_exposures_are_checked_from_python(wrong, run):
+    """On the command line, and from Python."""
+    assert main(["estimate", str(run.folder), "--exposure", f"cut_in={wrong}"]) == 2
+    assert f"found:    {wrong}, of cut_in" in capsys.readouterr().err
     with pytest.raises(HarnessError, match="exposures"):
         estimate_families(run.folder, {"cut_in": wrong})
 

@@ -90,7 +90,9 @@ def test_two_processes_do_not_run_into_one_folder(stored, complaint_of, whole):
     ("module", "named", "imports"),
     [
         ("versioned_controller", "{}.py", "import beside_it"),
-        ("versioned_package", "{}/__init__.py", "from versioned_package import beside_it"),
+        pytest.param(
+            *("versioned_package", "{}/__init__.py", "from versioned_package import beside_it"), marks=pytest.mark.slow
+        ),
     ],
 )
 def test_another_version_of_the_controller_is_refused(module, named, imports, tmp_path, monkeypatch):

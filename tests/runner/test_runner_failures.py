@@ -26,7 +26,7 @@ from harness.sampling.protocol import ShardRequest
 from tests.in_process import one_process, workers_alive
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SMALL, TWIN
-from tests.stored_runs import copy_of, golden, manifest, part_files, sets, unlike_columns
+from tests.stored_runs import golden, manifest, part_files, sets, unlike_columns
 
 PARTS_BEFORE_FAILURE = 3
 
@@ -145,20 +145,3 @@ def test_memory_of_a_worker_stays_within_ten_percent():
     with ProcessPoolExecutor(1, get_context("spawn")) as process:
         early, late = process.submit(resident_mb).result()
     assert late <= 1.1 * early
-
-
-@pytest.mark.slow
-def test_a_disk_that_is_full_at_the_very_end(run_here, campaign, twin_run, tmp_path, monkeypatch):
-    out = copy_of(twin_run, tmp_path / "run")
-    (out / "estimates.json").unlink()
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "estimates.json")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(running, "write_sealed", full)
-        with pytest.raises(OSError, match="No space left"):
-            run_here(campaign(*TWIN), out, resume=True)
-    assert not (out / "estimates.json").exists()
-    run_here(campaign(*TWIN), out, resume=True)
-    assert unlike_columns(twin_run, out) == []

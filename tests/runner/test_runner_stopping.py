@@ -84,11 +84,16 @@ def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campa
     ("changes", "code", "verdict"),
     [
         (("accept.crash_rate_below=4e-7",), 0, "accepted"),
-        (("accept.crash_rate_below=5e-8",), 5, "rejected"),
+        pytest.param(("accept.crash_rate_below=5e-8",), 5, "rejected", marks=pytest.mark.slow),
         (("accept.crash_rate_below=1.4e-7", "stop.episodes=300"), 4, "undecided"),
-        (("testing.shells.statement=library", "accept.crash_rate_below=4e-7"), 0, "accepted"),
-        (("accept.times_reference={driver: r157-cc, at_most: 2}",), 0, "accepted"),
         (("accept.times_reference={driver: r157-cc, at_most: 0.3}",), 5, "rejected"),
+        *(
+            pytest.param(changes, 0, "accepted", marks=pytest.mark.slow)
+            for changes in (
+                ("testing.shells.statement=library", "accept.crash_rate_below=4e-7"),
+                ("accept.times_reference={driver: r157-cc, at_most: 2}",),
+            )
+        ),
     ],
 )
 def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, code, verdict):

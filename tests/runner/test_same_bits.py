@@ -13,18 +13,15 @@ from pathlib import Path
 import pytest
 
 from harness.processes import CLOSED_PIPE_EXIT_CODE, Child, first_to_answer, start_server
-from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner import workers
 from harness.runner.kept import Run
-from tests.golden.campaigns import BASE, IN_BOTH_WORLDS, quick
+from tests.golden.campaigns import IN_BOTH_WORLDS, quick
 from tests.in_process import run_here as run_golden
-from tests.in_process import run_with_workers, workers_alive
 from tests.runner import bad_workers
-from tests.stored_runs import MORE, ROOT, golden, manifest, part_files, sets, stored_table, unlike_columns
+from tests.stored_runs import ROOT, golden, manifest, part_files, sets, unlike_columns
 
 PATIENCE_S, POLL_S = 300.0, 0.01
-SEVEN = "mixture-seven"
 
 
 @pytest.mark.parametrize("name", quick(IN_BOTH_WORLDS))
@@ -50,68 +47,7 @@ def test_any_split_into_shards(name, size, stored_run, tmp_path):
     assert set(unlike_columns(stored_run(name), tmp_path / "run")) <= {"estimates.json"}
 
 
-class KillOneWorker(Progress):
-    """Kills a worker process when the fourth shard is handed back."""
-
-    def __init__(self) -> None:
-        self.calls, self.killed = 0, []
-
-    def advance(self, n: int = 1) -> None:
-        self.calls += 1
-        if self.calls == 4:
-            self.killed = [workers_alive()[0]]
-            os.kill(self.killed[0], signal.SIGKILL)
-
-
-@pytest.mark.slow
-def test_two_workers_of_which_one_is_killed(stored_run, tmp_path):
-    progress = KillOneWorker()
-    run_with_workers(golden(SEVEN, "world.cells=64"), tmp_path / "run", workers=2, progress=progress)
-    assert progress.killed
-    assert unlike_columns(stored_run(SEVEN), tmp_path / "run") == []
-
-
 # -- processes of their own: each costs seconds of imports --
-
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from harness.cli import main
-from harness.runner import kept
-
-kept.PART_TESTS = 80
-n_writes, write = 0, Path.write_bytes
-
-def half_then_killed(path, content):
-    global n_writes
-    n_writes += (of_part := path.parent.name == "moments")
-    if of_part and n_writes == 4:
-        write(path, content[: len(content) // 2])
-        os.kill(os.getpid(), signal.SIGKILL)
-    return write(path, content)
-
-Path.write_bytes = half_then_killed
-sys.exit(main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.slow
-def test_killed_while_it_writes_then_resumed(stored_run, tmp_path):
-    out, temporary = tmp_path / "run", tmp_path / ("t" * 100)  # longer than the path of a socket may be
-    temporary.mkdir()
-    command = [sys.executable, "-c", KILLED, "run", BASE, "--out", out, *sets(*MORE[SEVEN]), "--workers", "1"]
-    environment = {**os.environ, "TMPDIR": str(temporary)}
-    killed = subprocess.run(command, check=False, timeout=PATIENCE_S, env=environment)
-    assert killed.returncode == -signal.SIGKILL
-    assert [path.name[:5] for path in temporary.iterdir()] == ["pymp-"]  # where the fork server has listened
-    assert manifest(out)["status"] != "done"
-    assert (manifest(out)["n_episodes"], len(list(out.rglob("*.part")))) == (240, 1)
-
-    run_golden(golden(SEVEN), out, resume=True)
-    assert manifest(out)["status"] == "done"
-    assert stored_table(out, "episodes")["episode"].to_pylist() == list(range(560))
-    assert unlike_columns(stored_run(SEVEN), out) == []
-    assert not list(out.rglob("*.part"))
 
 
 def wait_for(process: subprocess.Popen, condition) -> None:
@@ -142,12 +78,14 @@ def as_under_nohup() -> None:
 
 
 def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in_order(tmp_path):
-    out = tmp_path / "run"
+    out, temporary = tmp_path / "run", tmp_path / ("t" * 100)  # longer than the path of a socket may be
+    temporary.mkdir()
     settings = ("world.engine=twin", "stop.episodes=1000000000", "stop.rhw=null", "run.shard_size=500")
     asked = ["run", "scenarios/overtaking_forced.yaml", "--out", out, "--workers", "2", *sets(*settings)]
     process = subprocess.Popen(
         [sys.executable, "-m", "harness", *asked],
         cwd=ROOT,
+        env={**os.environ, "TMPDIR": str(temporary)},
         start_new_session=True,
         preexec_fn=as_under_nohup,  # noqa: PLW1509 - no thread here
         stdout=subprocess.DEVNULL,
@@ -165,7 +103,7 @@ def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in
     assert "Traceback" not in complaints
     assert manifest(out)["status"] == "interrupted"
     assert manifest(out)["n_episodes"] >= 500
-    assert not list(out.rglob(".*"))
+    assert not [*out.rglob(".*"), *temporary.iterdir()]
 
 
 def test_an_interruption_as_tests_are_written_loses_none_of_them(campaign, run_here, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.report.rows import bar_note
 from harness.runner.sensitivity import Move, bar_of, moves, sensitivity
 from harness.runner.stored_shells import Nearby
-from tests.stored_runs import copy_of, edit, manifest
+from tests.stored_runs import copy_of, manifest
 from tests.traffic.tables import TEXT, fitted
 
 pytestmark = pytest.mark.usefixtures("few_paths")
@@ -45,17 +45,6 @@ def test_of_traffic_in_which_nobody_crashes_nothing_is_said(folder, capsys):
     assert main(["sensitivity", str(folder), "--range", "scenario.duration_s=1:2", "--json"]) == 0
     (bar,) = (each for each in json.loads(capsys.readouterr().out)["bars"] if each["what"] == "scenario.duration_s")
     assert (bar["rate"], bar["ratio"], bar_note(bar)) == ([None, None], [None, None], "unlike what was tested")
-
-
-@pytest.mark.slow
-def test_the_page_shows_the_tornado_of_these_tests_and_of_no_others(folder):
-    assert main(["sensitivity", str(folder), "--range", "cut_in.ignore_share=0.005:0.02", "--json"]) == 0
-    page = folder / "report.html"
-    assert "plot-sensitivity" in page.read_text()
-    assert (folder / "plots" / "sensitivity.svg").is_file()
-    edit(folder, "sensitivity.json", campaign_hash="0" * 16)
-    assert main(["report", str(folder)]) == 0
-    assert "plot-sensitivity" not in page.read_text()
 
 
 def test_what_was_fitted_together_moves_together(tmp_path):

@@ -150,6 +150,7 @@ def test_a_forced_test_fails_where_its_shadow_run_did(campaign, run_here, tmp_pa
     assert all(np.isfinite(row["log_weight"]) and row["log_weight"] < 0.0 for row in rows)
 
 
+@pytest.mark.slow
 def test_shadow_runs_that_are_gone_or_damaged_are_named(stored_run, tmp_path):
     folder = copy_of(stored_run(ACTS), tmp_path / "run")
     files_of(folder)[0].write_bytes(b"PAR1")

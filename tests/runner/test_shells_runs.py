@@ -131,6 +131,7 @@ def test_the_boundary_is_passed_when_what_lies_within_is_known():
     assert hopeless.tolist() == [0, 0, 12]
 
 
+@pytest.mark.slow
 def test_what_is_traced_may_change_when_a_run_goes_on(campaign, run_here, tmp_path):
     traced, untraced = ("records.traces=all",), ("records.traces=none", "records.trace_share=0")
     out = tmp_path / "run"

@@ -159,6 +159,7 @@ def test_floating_car_data_hold_the_episodes_motion(sumo_run, tmp_path):
 
 
 # -- the twin retraces what was driven: to the last bit where nothing is wrong, and no further where anything is --
+# -- at night: the fast tests replay paths in plain Python, which compiles nothing (tests/episode/test_path.py) --
 
 
 RETRACED = (
@@ -167,6 +168,7 @@ RETRACED = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RETRACED)
 def test_every_episode_is_retraced(name, stored_run):
     table = stored_table(stored_run(name), "episodes")
@@ -174,6 +176,7 @@ def test_every_episode_is_retraced(name, stored_run):
     assert retraced(table, resolve(golden(name))) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("column", "value", "named"),
     [

@@ -27,7 +27,7 @@ from tests.studies.here import wrong_shell
 
 CONFIDENCE = 0.9
 LARGEST_BIAS = 0.01
-FEW, MANY = 60, 300
+FEW = 60
 
 
 def campaign(method: str, episodes: int) -> Campaign:

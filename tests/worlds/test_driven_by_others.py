@@ -35,7 +35,7 @@ def fresh_bits(av, first, n):
     return [bits(in_one_simulation(av, [(first + i, 1)], cells=1)[0], 0) for i in range(n)]
 
 
-@pytest.mark.parametrize("model", ["Krauss", "ACC"])
+@pytest.mark.parametrize("model", [pytest.param("Krauss", marks=pytest.mark.slow), "ACC"])
 def test_recyclable_models_move_after_many_episodes_as_in_a_fresh_simulation(model):
     av = sumo_av(carFollowModel=model)
     assert recyclable(av.sumo)
@@ -170,6 +170,7 @@ def test_a_program_lost_in_mid_run_fails_what_ran_and_is_started_again(fault, ca
     assert_same_motion(shard, expected, np.flatnonzero(outcome != FAILED))
 
 
+@pytest.mark.slow
 def test_a_program_that_never_connects_fails_its_episodes():
     shard = run(program(MISBEHAVING, "never_connects", connect_time_s=1.0, restarts=0), 0, 6, cells=2)
     assert len(shard.failures) == 6
@@ -177,7 +178,9 @@ def test_a_program_that_never_connects_fails_its_episodes():
     assert "is not started again" in shard.failures[5]
 
 
-@pytest.mark.parametrize(("fault", "vehicle"), [("moves_bv", "BV1"), ("changes_lane", "AV")])
+@pytest.mark.parametrize(
+    ("fault", "vehicle"), [("moves_bv", "BV1"), pytest.param("changes_lane", "AV", marks=pytest.mark.slow)]
+)
 def test_moving_what_is_not_the_clients_stops_the_run(fault, vehicle):
     with pytest.raises(WorldDisagreementError, match=f"SUMO, {vehicle}") as caught:
         run(program(MISBEHAVING, fault), 0, 8, cells=4)
@@ -222,26 +225,19 @@ def test_a_client_of_another_machine_ends_the_run():
         require_neighbour("0A01A8C0:B267", "0B01A8C0:A6BC")
 
 
-@pytest.mark.parametrize("command", ["x {port.x}", "x {ports}", "x {", "x '", " "])
-def test_only_port_and_cells_stand_in_braces(command):
-    with pytest.raises(CampaignError, match="the only things in braces"):
-        load(command.replace("'", "''"))
-    assert load("x {{}} {port} {cells}").av.traci.words(1, 2) == ["x", "{}", "1", "2"]
-
-
 # -- driven from the start: baseline runs, and tests that find the same motion --
 
 
+FIRST = "SUMO's ACC"
 FORMS = {
-    "SUMO's ACC": "{sumo: {carFollowModel: ACC}",
+    FIRST: "{sumo: {carFollowModel: ACC}",
     "SUMO's Krauss with seeded noise": "{sumo: {carFollowModel: Krauss, sigma: 0.5}",
     "TraCI style": "{controller: 'tests.controllers.early:SpeedsTraci'",
     "a program": f"{{traci: {{command: {program(EXAMPLE).traci.command!r}}}",
 }
-QUICK = "SUMO's ACC", "TraCI style"
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in FORMS])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != FIRST)) for name in FORMS])
 def test_it_does_in_tests_what_it_did_in_its_baseline_runs(name):
     av, sizes = (
         f"av={FORMS[name]}, before_event: controller}}",

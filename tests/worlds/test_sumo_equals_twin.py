@@ -1,7 +1,7 @@
 """SUMO and twin agree in every bit of every position, speed and command, in every lane and in every collision flag.
 
 SUMO runs in a spawned process and is asked by its own getters; the twin runs here. The campaigns are real ones: the
-recursive episode mixture for crashes, forced cut-ins for those that end well, the published method, and vehicles that
+recursive episode mixture for crashes, forced cut-ins for those that end well, the step mixture, and vehicles that
 hardly brake, or react late, smoothly or not at all. Vanilla SUMO, which plans in every step, is a cell at a time. Where
 the compiled shim is installed, it drives SUMO wherever it is not switched off.
 """
@@ -27,7 +27,6 @@ from harness.sampling import prepare
 from harness.vehicles.kinematics import STEP_S, next_position
 from harness.vocabulary import AV, BV, CONTACT, CRASH, LV, PASSED, STATE_DTYPE, VEHICLES
 from harness.worlds.twin import TwinWorld
-from tests.episode.twin_runs import SM_I
 from tests.traffic.tables import tabled
 from tests.worlds.running import smoke
 
@@ -172,12 +171,11 @@ HOPELESS = np.array(
     STATE_DTYPE,
 )
 """Starts from which no braking of BV can avoid LV, which it runs into before AV is past."""
-PUBLISHED = (STEP, "testing.challenge=immediate", SM_I, "av.parameters.min_acceleration_mps2=-1", "seed=7")
 METHODS = {
     "mixture": Job((), 600, 64),
     "forced_without_shim": Job((FORCED,), 250, 64, shim=False),
     "forced_drawn_in_every_step": Job((FORCED, "environment.acceleration_hold_s=0.1", "seed=5"), 64, 64),
-    "published": Job(PUBLISHED, 200, 32),
+    "step": Job((STEP, "av.parameters.min_acceleration_mps2=-1", "seed=7"), 200, 32),
     "bv_into_lv": Job((NDE,), 16, 5, states=HOPELESS),
 }
 JOBS = {

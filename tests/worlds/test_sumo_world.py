@@ -205,6 +205,7 @@ def run(world) -> Shard:
     return loop_in(world, "idm").run(0, at_once(STATES))
 
 
+@pytest.mark.slow
 def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes():
     campaign = smoke("testing.method=shells")
     environment, library = load_environment(campaign.environment), load_library("ladder-1")

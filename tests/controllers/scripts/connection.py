@@ -1,18 +1,25 @@
-"""A labelled connection in the place of the module; several episodes in a loop."""
+"""A labelled connection in the place of the module, and a context subscription; several episodes in a loop."""
 
 import traci
+from traci.constants import CMD_GET_VEHICLE_VARIABLE, VAR_LANE_INDEX, VAR_LANEPOSITION, VAR_SPEED
+
+AROUND = [VAR_LANE_INDEX, VAR_LANEPOSITION, VAR_SPEED]
 
 for episode in range(3):
     traci.start(["sumo"], port=8813 + episode, label=f"sim{episode}", numRetries=3)
     connection = traci.getConnection(f"sim{episode}")
     traci.switch(f"sim{episode}")
+    connection.vehicle.subscribeContext("ego", CMD_GET_VEHICLE_VARIABLE, 1000.0, AROUND)
     while connection.simulation.getMinExpectedNumber() > 0:
         connection.simulationStep()
-        try:
-            leader = connection.vehicle.getLeader("ego")
-        except traci.exceptions.TraCIException:
-            continue
-        if leader is not None:
-            closing = connection.vehicle.getSpeed("ego") - connection.vehicle.getSpeed(leader[0])
-            connection.vehicle.setAcceleration("ego", -4.0 if 4.0 * closing > leader[1] else 0.0, 0.1)
+        around = connection.vehicle.getContextSubscriptionResults("ego")
+        own = around.pop("ego")
+        ahead = [
+            (other[VAR_LANEPOSITION] - 5.0 - own[VAR_LANEPOSITION], other[VAR_SPEED])
+            for other in around.values()
+            if other[VAR_LANE_INDEX] == own[VAR_LANE_INDEX] and other[VAR_LANEPOSITION] >= own[VAR_LANEPOSITION]
+        ]
+        if ahead:
+            gap, speed = min(ahead)
+            connection.vehicle.setAcceleration("ego", -4.0 if 4.0 * (own[VAR_SPEED] - speed) > gap else 0.0, 0.1)
     connection.close()

@@ -1,10 +1,11 @@
-"""A class that runs the simulation, with settings in a dataclass."""
+"""A class that runs the simulation, with settings in a dataclass; subscriptions, by numbers of traci.constants."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 import traci
+import traci.constants as tc
 
 
 @dataclass
@@ -27,16 +28,20 @@ class Simulation:
 
     @property
     def closing(self):
-        name, _ = self.leader
-        return traci.vehicle.getSpeed(self.settings.ego) - traci.vehicle.getSpeed(name)
+        name, _ = self.own[tc.VAR_LEADER]
+        return self.own[tc.VAR_SPEED] - self.seen[name][tc.VAR_SPEED]
 
     def run(self):
         while traci.simulation.getMinExpectedNumber():
             traci.simulationStep()
-            self.leader = traci.vehicle.getLeader(self.settings.ego)
-            self.history.append(self.leader)
-            if self.leader is not None:
-                brakes = self.settings.horizon_s * self.closing > self.leader[1]
+            for name in traci.simulation.getDepartedIDList():
+                more = [tc.VAR_LEADER] * (name == self.settings.ego)
+                traci.vehicle.subscribe(name, [tc.VAR_SPEED, tc.VAR_LANEPOSITION, *more])
+            self.seen = traci.vehicle.getAllSubscriptionResults()
+            self.own = traci.vehicle.getSubscriptionResults(self.settings.ego)
+            self.history.append(self.own)
+            if self.own and self.own[tc.VAR_LEADER] is not None:
+                brakes = self.settings.horizon_s * self.closing > self.own[tc.VAR_LEADER][1]
                 traci.vehicle.setAcceleration(self.settings.ego, -4.0 if brakes else 0.0, 0.1)
 
 
