@@ -8,12 +8,14 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Self, TextIO
 
-from harness.numbers import count, duration, words
+from harness.numbers import count, duration, share, words
 
 if TYPE_CHECKING:
     from rich.progress import Task
 
 Figure = float | int | str
+_SIGNS = {"rhw": "±", "asked": "asked ±"}
+"""What is a share of the rate."""
 
 
 class Progress:
@@ -121,7 +123,7 @@ def _words(task: Task) -> str:
     Shares of the rate (half-widths) that are no smaller than it say nothing yet.
     """
     figures = [
-        f"{name.replace('_', ' ').replace('rhw', 'RHW')} {words(figure, 2)}"
+        f"{_SIGNS[name]} {share(figure)}" if name in _SIGNS else f"{name.replace('_', ' ')} {words(figure, 2)}"
         for name, figure in task.fields["figures"].items()
         if not isinstance(figure, float) or figure < 1.0
     ]

@@ -136,7 +136,7 @@ class Rule:
     _needed = 1  # looks in a row that must find it
 
     def __init__(self, target: float | None, min_crashes: int) -> None:
-        self._target, self._min_crashes = target, min_crashes
+        self.target, self._min_crashes = target, min_crashes
         self._passes = 0
         self.look = Look()
 
@@ -157,7 +157,7 @@ class Rule:
         what was waited for besides, if nothing is unmet; ``pool`` has the half-widths that the pool's own error would
         leave by itself, as it was seen, and at least.
         """
-        if (target := self._target) is None:
+        if (target := self.target) is None:
             self.look = Look(rhw)
             return False
         met = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -147,7 +148,7 @@ class Underway:
                 self.run = self.run.with_shard(shard)
             n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
             self.progress.advance(min(n_new, shard.request.n_episodes))
-            self.progress.status(crashes=self.run.n_crashes, rhw=rule.look.rhw)
+            self.progress.status(crashes=self.run.n_crashes, rhw=rule.look.rhw, asked=rule.target or math.inf)
             yield shard
 
     def drive_added(self, tested: IntArray, added: IntArray, rule: Rule) -> Iterator[ShardResult]:
