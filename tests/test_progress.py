@@ -35,9 +35,7 @@ def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeyp
         lines.status(crashes=12, rhw=0.0812, asked=0.05)
         assert log.came.wait(60)
         lines._interval_s = 60.0
-    text = (
-        r"\d\d:\d\d:\d\d episodes: 5,000 of 13,187 · [\d,]+/s · crashes 12 · ± 8.1 % · asked ± 5.0 % · 0.\d s left"
-    )
+    text = r"\d\d:\d\d:\d\d episodes: 5,000 of 13,187 · [\d,]+/s · crashes 12 · ± 8.1 % · asked ± 5.0 % · 0.\d s left"
     assert re.fullmatch(text, next(lines.lines()))
     assert re.match(r"\d\d:\d\d:\d\d ", log.getvalue())
     lines.stage("writing estimates and report", None)  # at once: it may be a while until the next line

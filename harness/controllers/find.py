@@ -288,6 +288,9 @@ def _note_step_length(script: Path) -> None:
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:
+    given = av.parameters.values() if isinstance(av.parameters, dict) else ()
+    # A file that it writes when it is made is not what it is made of.
+    named = {value: _hash_of(value) for value in given if isinstance(value, str)}
     build_host(av, n_cells=1, seed=0)  # what it holds ends with the process
     if av.controller is None:
         return None
@@ -297,10 +300,14 @@ def _sources_of_made(av: AutomatedVehicle) -> str | None:
         name = getattr(own_code(av.controller), "__module__", "")
         file, above = getattr(sys.modules.get(name), "__file__", None) or "", name.count(".")
         above += file.endswith("__init__.py")  # which stands within the package that it is
-    given = av.parameters.values() if isinstance(av.parameters, dict) else ()
-    files = {str(real_path(file)), *(value for value in given if isinstance(value, str))}
+    files = {str(real_path(file)), *(name for name, was in named.items() if was == _hash_of(name))}
     if is_users(root := str(real_path(file).parents[above])):
         files |= {str(each) for each in files_imported(real_path(file), Path(root))}
-    known = filter(os.path.isfile, files)  # a parameter may be no path: too long, or with a zero in it
-    contents = sorted(hashlib.sha256(Path(each).read_bytes()).hexdigest() for each in known)
+    contents = sorted(filter(None, map(_hash_of, files)))
     return hashlib.sha256("".join(contents).encode()).hexdigest() if contents else None
+
+
+def _hash_of(file: str) -> str | None:
+    """Of what a file holds; None of what is none: a parameter may be no path, too long, or with a zero in it."""
+    there = os.path.isfile(file)  # noqa: PTH113 - to pathlib a name too long is an error
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if there else None

@@ -311,7 +311,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         raise refusal("this campaign, already begun", "a new or empty folder", mend)
     if manifest.get("controller_sha256") != resolved.controller_sha256:
         found = "tests of this campaign; since then its controller, or a file that it is made of, has been changed"
-        mend = "Restore it; or drive the vehicle as it is now, into a new folder."
+        mend = "Restore it, as any file that av.parameters names; or drive the vehicle as it is now, into a new folder."
         raise refusal(found, "the same controller for all tests of a run", mend)
     return manifest
 

@@ -119,6 +119,19 @@ def test_another_version_of_the_controller_is_refused(module, named, imports, tm
     assert run_here(golden("forced-twin", *settings, "stop.episodes=40"), out, resume=True).exit_code == 0
 
 
+def test_what_a_vehicle_writes_when_it_is_made_does_not_count(run_here, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "notes_it.py").write_text(
+        "from examples.idm import IDM\nclass Notes(IDM):\n"
+        "    def __init__(self, note):\n        super().__init__()\n        with open(note, 'a') as file: file.write('made ')"
+    )
+    note = tmp_path / "note.txt"
+    settings = (f"av={{controller: 'notes_it:Notes', parameters: {{note: {note}}}}}", "world.engine=twin")
+    for n in (20, 40):
+        done = run_here(golden("forced-twin", *settings, f"stop.episodes={n}"), tmp_path / "run", resume=n > 20)
+        assert (done.exit_code, "made" in note.read_text()) == (0, True)
+
+
 # -- records that are not as they were left --
 
 SECOND = "000000080-000000160.parquet"
