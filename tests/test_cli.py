@@ -159,6 +159,14 @@ def test_errors_that_can_be_mended_are_told_in_words_and_keep_their_exit_code(ra
     assert err.startswith("error: episodes/0.parquet\n") == (code != 130)
 
 
+def test_a_current_folder_that_is_gone_is_told(tmp_path, monkeypatch, capsys):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert main(["check", "idm"]) == 2
+    assert capsys.readouterr().err.startswith("error: current folder\n  found:    that it has been removed\n")
+
+
 def test_an_interrupted_estimate_has_nothing_to_go_on_with(raising, capsys):
     assert raising(KeyboardInterrupt(), "harness.runner.stored.estimate_run", "estimate") == 130
     assert "--resume" not in capsys.readouterr().err
