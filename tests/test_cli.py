@@ -218,6 +218,20 @@ def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_pat
     assert "nothing can be written" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("command", "work"),
+    [
+        (["sensitivity"], "harness.runner.sensitivity.StoredShells.of"),
+        (["estimate", "--write"], "harness.estimate"),
+        (["estimate", "--write", "--environment", "ndd-overtaking-1"], "harness.estimate_in_other_traffic"),
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_refused_before_work_is_spent(raising, capsys, monkeypatch, command, work):
+    monkeypatch.setattr("tempfile.TemporaryFile", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))
+    assert raising(ZeroDivisionError(), work, *command) == 2
+    assert "nothing can be written (Permission denied)" in capsys.readouterr().err
+
+
 def test_schema_prints_what_is_committed(capsys):
     assert main(["schema"]) == 0
     committed = (SCENARIOS / "campaign.schema.json").read_text(encoding="utf-8")
