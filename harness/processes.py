@@ -200,8 +200,8 @@ def start_server() -> None:
 def _server() -> Iterator[None]:
     """The fork server as workers need it: nobody's main script runs again, neither there nor in them."""
     try:
-        os.getcwd()  # noqa: PTH109 - one call
-    except FileNotFoundError:  # a vehicle has gone where there is no folder any more, and Python does not start there
+        os.chdir(os.getcwd())  # noqa: PTH109 - as workers will
+    except OSError:  # a folder that is gone, maybe a vehicle's doing, or one that this user may not go to
         os.chdir(os.sep)
     forkserver.set_forkserver_preload([_PRELOADED])
     short = _in_short(temporary_folder())

@@ -158,6 +158,14 @@ def test_errors_that_can_be_mended_are_told_in_words_and_keep_their_exit_code(ra
     assert err.startswith("error: episodes/0.parquet\n") == (code != 130)
 
 
+def test_a_current_folder_that_is_gone_is_told(tmp_path, monkeypatch, capsys):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert main(["check", "idm"]) == 2
+    assert capsys.readouterr().err.startswith("error: current folder\n  found:    that it has been removed\n")
+
+
 @pytest.mark.parametrize("then", [lambda: Progress().advance(1), Mock(side_effect=RunFolderError(*WRONG))])
 @pytest.mark.parametrize(("number", "code"), [("SIGHUP", 129), ("SIGINT", 130), ("SIGTERM", 143)])
 def test_what_a_signal_ends_has_its_exit_code_whatever_becomes_of_the_interruption(capsys, then, number, code):
@@ -202,6 +210,20 @@ def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_pat
     never = ZeroDivisionError(), "harness.runner.stored.replay_episode", "replay"
     assert raising(*never, more=["17", "--out", str(tmp_path / "file" / "x.html")]) == 2
     assert "nothing can be written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "work"),
+    [
+        (["sensitivity"], "harness.runner.sensitivity.StoredShells.of"),
+        (["estimate", "--write"], "harness.estimate"),
+        (["estimate", "--write", "--environment", "ndd-overtaking-1"], "harness.estimate_in_other_traffic"),
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_refused_before_work_is_spent(raising, capsys, monkeypatch, command, work):
+    monkeypatch.setattr("tempfile.TemporaryFile", Mock(side_effect=PermissionError(errno.EACCES, "Permission denied")))
+    assert raising(ZeroDivisionError(), work, *command) == 2
+    assert "nothing can be written (Permission denied)" in capsys.readouterr().err
 
 
 def test_schema_prints_what_is_committed(capsys):

@@ -1,5 +1,6 @@
 import os
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -43,3 +44,18 @@ def test_the_share_of_cpus_is_what_affinity_and_the_quotas_of_all_control_groups
     monkeypatch.setattr(processes, "_OWN_GROUPS", tmp_path / "own")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     assert usable_cpus.__wrapped__() == n_cpus
+
+
+def test_workers_start_where_this_user_may_go_to(tmp_path, monkeypatch):
+    """As with ``su`` in a folder of root's."""
+    go = os.chdir
+
+    def closed(folder):
+        if folder == str(tmp_path):
+            raise PermissionError(13, "Permission denied", folder)
+        go(folder)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "chdir", closed)
+    with processes._server():
+        assert str(Path.cwd()) == os.sep

@@ -88,8 +88,7 @@ def read_text(path: Path) -> str:
         found, mend = f"bytes that are not UTF-8 (at byte {error.start})", "Save the file as UTF-8 text."
     except (OSError, ValueError) as error:
         found, mend = f"a file that cannot be read ({error})", "Check its name and permissions."
-    kind = "Python" if path.suffix == ".py" else "YAML"
-    raise CampaignError(str(path), found, f"a readable {kind} file in UTF-8", mend)
+    raise CampaignError(str(path), found, f"a {'Python' if path.suffix == '.py' else 'YAML'} file in UTF-8", mend)
 
 
 def _load(text: str, name: str) -> tuple[Any, Lines]:

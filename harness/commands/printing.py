@@ -108,6 +108,8 @@ _OF_THE_SYSTEM = (
 def system_error(error: OSError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
     name, where = errno.errorcode.get(error.errno or 0), str(error.filename or "disk of the output folder")
+    if name == "ENOENT" and error.filename is None:  # so says os.getcwd
+        return HarnessError("current folder", "that it has been removed", "a folder", "Go to one that is there (cd).")
     for names, found, expected, mend in _OF_THE_SYSTEM:
         if name in names:
             return HarnessError(where, found.format(error.strerror), expected, mend)

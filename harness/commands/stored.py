@@ -72,13 +72,15 @@ def estimate(
         raise click.UsageError("-e and --environment are for the folder of one scenario, such as DIR/cut_in.")
     if estimators and environment is not None:
         raise click.UsageError("--environment does not go with -e: tests of shells alone can be moved.")
+    if write:
+        from harness.records.folder import require_place, write_sealed
+
+        require_place(folder)
     if several:
         _estimate_hours(folder, exposures, confidence, counts=counts, write=write, as_json=as_json)
         return
     if environment is not None and (folder / COMPARISON).is_file():
-        if write:
-            raise click.UsageError("--write does not go with the folder of a comparison.")
-        _compared_elsewhere(folder, environment, confidence, as_json=as_json)
+        _compared_elsewhere(folder, environment, confidence, write=write, as_json=as_json)
         return
     if environment is not None:
         with progress_bar() as bar:
@@ -92,8 +94,6 @@ def estimate(
         estimators = list(map(str, asked))
         content = harness.estimate(folder, estimators=asked or None, confidence=confidence)
     if write:
-        from harness.records.folder import write_sealed
-
         write_sealed(folder / "estimates.json", content)
     if as_json:
         print_json(content)
@@ -146,8 +146,12 @@ def _estimate_hours(
     print_either(content, hour_lines(content, page, readings=True), as_json=as_json)
 
 
-def _compared_elsewhere(folder: Path, environment: str, confidence: float | None, *, as_json: bool) -> None:
+def _compared_elsewhere(
+    folder: Path, environment: str, confidence: float | None, *, write: bool, as_json: bool
+) -> None:
     """What two vehicles' stored tests say of other traffic."""
+    if write:
+        raise click.UsageError("--write does not go with the folder of a comparison.")
     with progress_bar() as bar:
         from harness.runner.other_traffic import compare_in_other_traffic
 

@@ -20,8 +20,6 @@ WATCHED = (
     *("builtins", "math", "json", "os", "pickle", "signal", "struct", "time"),
     *("numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
 )
-SPARE_FILES = 16
-"""That the harness may have open at a time [assumed]."""
 CHANGED_MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
 
 _CONTROL, _MXCSR, _MODES = 0, 7, 0xFFC0
@@ -75,10 +73,10 @@ class OtherModules:
 
 
 def closed_to_files() -> str:
-    """Why `SPARE_FILES` cannot be opened in this process any more; empty where they can."""
+    """Why 16 files, more than the harness has open at a time, cannot be opened any more; empty where they can."""
     try:
         with ExitStack() as files:
-            for _ in range(SPARE_FILES):
+            for _ in range(16):
                 files.enter_context(Path(os.devnull).open("rb"))
     except OSError as error:
         return str(error.strerror)

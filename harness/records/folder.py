@@ -204,13 +204,11 @@ def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
         raise RunFolderError(str(folder), found, expected, "Run the campaign again into a new folder.") from error
 
 
-def damaged(
-    path: Path, error: Exception, mend: str = MEND_PART, expected: str = "a complete Parquet file"
-) -> RunFolderError:
+def damaged(path: Path, error: Exception, mend: str = MEND_PART, kind: str = "a whole Parquet file") -> RunFolderError:
     """What to say of a file of a run that cannot be read; one that may not be read is nothing to delete."""
     missing, closed = isinstance(error, FileNotFoundError), isinstance(error, PermissionError)
     found = "no such file" if missing else f"a file that cannot be read ({str(error).splitlines()[0]})"
-    return RunFolderError(str(path), found, expected, "Change its permissions." if closed else mend)
+    return RunFolderError(str(path), found, kind, "Change its permissions." if closed else mend)
 
 
 def no_episodes(folder: Path) -> RunFolderError:

@@ -23,7 +23,7 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.families.protocol import Parameters
 from harness.progress import Progress
-from harness.records.folder import SENSITIVITY, write_sealed
+from harness.records.folder import SENSITIVITY, require_place, write_sealed
 from harness.records.replicates import read_replicates
 from harness.runner.stored_shells import Nearby, StoredShells, require_shares
 
@@ -60,6 +60,7 @@ def sensitivity(
     Raises `HarnessError`: the folder is no run of shells, a number is not there, or nothing is said to be uncertain.
     """
     folder, progress = Path(folder), progress or Progress()
+    require_place(folder)
     tested = StoredShells.of(folder, progress, _OPTION)
     require_shares(tested)
     settings = tested.here.campaign.environment

@@ -269,7 +269,7 @@ def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, ow
     [
         ("my_av.py", "Name its class or function: my_av.py:MyAV or my_av.py:step"),
         ("my_aw.py:MyAV", r"^av\.controller \(my_aw.py:MyAV\): found no file \S*my_aw.py;.* Did you mean 'my_av.py'"),
-        ("latin.py", "not UTF-8 .* a readable Python file"),
+        ("latin.py", "not UTF-8 .* a Python file"),
         ("pipe.py:MyAV", r"found no file \S*pipe.py;.* Correct the path"),
         ("mine", "no campaign file, and no vehicle.* Did you mean 'mine.yaml'"),
         ("gone.py", "no such file"),
