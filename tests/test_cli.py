@@ -300,6 +300,21 @@ def test_a_limit_by_hand_replaces_that_of_the_campaign_and_says_so(asked, at_mos
     assert f"--accept {asked} replaces the limit of idm: {{'times_reference'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("asked", "mend"),
+    [
+        ("0.5r157-cc", "Write --accept 0.5*r157-cc."),
+        ("r157cc", "Did you mean 'r157-cc'?"),
+        ("-1", "Correct it; the key means: crashes per test"),
+    ],
+)
+def test_a_wrong_limit_is_told_as_it_was_typed(asked, mend, tmp_path, capsys):
+    assert main(["run", "idm", "--out", str(tmp_path / "run"), "--accept", asked]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: --accept {asked}\n")
+    assert f"fix:      {mend}" in said
+
+
 def test_estimate_writes_only_when_asked(folder, capsys):
     before, command = estimates(folder), ["estimate", str(folder), "--confidence", "0.5", "--json"]
     assert main(command) == 0

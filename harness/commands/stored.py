@@ -210,8 +210,8 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     say(
         "With a number at the one or the other end of what is known of it, the rate, and the ratio to the competent "
         "driver, are so many times as high.",
-        "That takes the share of crashes in each shell for the same; 'error' is by how much this is wrong for a "
-        "reference driver.",
+        "This assumes that the same share of each shell's events end in a crash; 'error' is by how much that is wrong "
+        "for a reference driver.",
         f"report  {page}",
     )
 
@@ -279,7 +279,7 @@ def replay(
     """Simulate test number TEST of the run in DIR again, bit for bit, and say what happens when.
 
     It also says how two others would have fared in the vehicle's place: the careful and competent driver of UN
-    Regulation No. 157 (r157-cc), and one that brakes at once, at up to 8 m/s2 (brakes-8).
+    Regulation No. 157 (r157-cc), and one that brakes as soon as it sees the event, at up to 8 m/s2 (brakes-8).
 
     If the run has kept the test's motion, the replay is compared with it; a difference ends with exit code 3.
 

@@ -178,7 +178,7 @@ def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False
       AV brakes          3.2 s, 0.1 s after BV entered the lane: at up to 4.0 m/s²
       AV                 avoids it, 12.1 m at the closest
       r157-cc            a careful and competent driver: avoids it, 9.1 m at the closest
-      brakes-8           braking at once, at up to 8 m/s²: avoids it, 18.7 m at the closest
+      brakes-8           braking as soon as it sees BV come over, at up to 8 m/s²: avoids it, 18.7 m at the closest
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
