@@ -17,7 +17,7 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.cli import cli, main
 from harness.commands.options import run_folder
-from harness.commands.printing import say
+from harness.commands.printing import print_table, say
 from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.progress import Progress
 from harness.report.lines import lines
@@ -78,6 +78,7 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
         ["run"],
         ["nothing"],
         ["estimat"],
+        ["export"],
         ["--nothing"],
         ["pool", SMOKE, "--quite"],
         ["check", SMOKE, "--nothing"],
@@ -97,6 +98,7 @@ def test_wrong_calls_end_with_2(capsys, arguments):
         assert err.startswith("error: ")
         assert [line.split()[0] for line in err.splitlines()[1:]] == ["found:", "expected:", "fix:"]
         assert ("Did you mean" in err) == (arguments[-1] in ("estimat", "--quite"))
+        assert ("harness replay DIR TEST --out" in err) == (arguments == ["export"])
     else:
         assert "Usage: harness" in err
 
@@ -298,6 +300,13 @@ def test_a_limit_by_hand_replaces_that_of_the_campaign_and_says_so(asked, at_mos
         main(["run", "idm", "--out", str(tmp_path / "run"), "--set", own, "--accept", asked])
     assert run.call_args.args[0].accept.times_reference.at_most == at_most
     assert f"--accept {asked} replaces the limit of idm: {{'times_reference'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("columns", "width"), [("60", 60), ("", 140)])
+def test_a_table_in_a_file_is_as_wide_as_columns_says(columns, width, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", columns)
+    print_table("Title", [{"what": "word " * 50}])
+    assert max(map(len, capsys.readouterr().out.splitlines())) == width
 
 
 @pytest.mark.parametrize(

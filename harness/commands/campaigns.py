@@ -180,9 +180,8 @@ def _told_as_typed(limit: str | None) -> Iterator[None]:
         yield
     except HarnessError as error:
         if limit is not None and re.match(r"(--set )?accept\.(times_reference|crash_rate_below)", error.where):
-            error.where = f"--accept {limit}"
-            if times := re.fullmatch(r"([\d.]+) ?([a-zA-Z].*)", limit):
-                error.mend = f"Write --accept {times[1]}*{times[2]}."
+            times = re.sub(r"^([\d.]+) ?([a-zA-Z].*)", r"\1*\2", limit)
+            error.where, error.mend = f"--accept {limit}", error.mend if times == limit else f"Write --accept {times}."
         raise
 
 

@@ -196,6 +196,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
 
     Fitted numbers move by their standard errors, or together by replicates; assumed ones over their ranges. Nothing is
     simulated in SUMO: each move takes a second, once. The result is kept in DIR/sensitivity.json and shown on the page.
+    Of several scenarios DIR is the folder of one, such as runs/all/cut_in.
     """
     with progress_bar() as bar:
         content = harness.sensitivity(folder, ranges=ranges, progress=bar)
@@ -252,8 +253,8 @@ def report(folder: Path) -> None:
 @click.option(
     "--out", "files", metavar="FILE", type=FILE, multiple=True,
     help="Write the motion. The suffix says how: .html, a page that plays it; .csv, a row for each vehicle and step; "
-    ".xosc, OpenSCENARIO XML 1.2 and its road (.xodr; extra 'export'); .xml, SUMO's floating car data. May be given "
-    "several times.",
+    ".xosc, OpenSCENARIO XML 1.2 and its road (.xodr; extra 'export'); .xml, SUMO's floating car data; "
+    ".sumocfg, as --sumo. May be given several times.",
 )  # fmt: skip
 @click.option("--gui", is_flag=True, help="Show it in sumo-gui, halted at the onset (extra 'sumo').")
 @click.option(
@@ -308,6 +309,8 @@ def replay(
     words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
+    if result.suspects is not None and result.bit_equal is not False:
+        say(f"note: {result.suspects}", err=True)
     if program is not None:
         watch(result, program)
     if result.bit_equal is False:

@@ -89,10 +89,9 @@ def pair_lines(
     Of the ``campaign`` it says which scenario was driven, and which crashes count.
     """
     asked, rows = pair_asked(content), []
-    of_a = content["campaigns"]["a"]["label"]
     for name in "AB":
         of, label = rates_of(content[name.lower()]), content["campaigns"][name.lower()]["label"]
-        label = label.removeprefix(f"{of_a}, ").replace("av.parameters.", "")  # what differs is not to be cut
+        label = label.removeprefix(f"{content['campaigns']['a']['label']}, ").replace("av.parameters.", "")
         rate, ends = number(of["rate"]), interval(of["ci_low"], of["ci_high"], beside=of["rate"])
         if not of["n_crashes"]:
             rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
