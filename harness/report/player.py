@@ -293,7 +293,7 @@ def _ending(track: Scene, bv: Scene, scene: Scene, family: Family) -> str:
         gap = f"{tenths(closest)} m" if closest >= 0.05 else "< 0.1 m"
         if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:
             return f"no crash until the test ends, {gap} behind {name} and still {tenths(rate)} m/s faster"
-        return f"avoids it, {gap} at the closest" + f" since {family.words.since}" * (scene["onset"] < cut)
+        return f"avoids it, {gap} at the closest" + f" since {family.words.since}" * bool(scene["onset"] < cut)
     v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
     from_the_side = family.crosses == family.principal and scene["onset"] < cut and crash == cut + 1
     who = f"{name} strikes its side" if from_the_side else f"strikes {name} from behind"
