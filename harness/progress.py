@@ -79,9 +79,11 @@ class ShownProgress(Progress):
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
         """Begin a bar in the place of the last one; a log that has had a line is told at once, as of what is done."""
+        name += self.remark + (f" ({count(done)} kept)" if done else "")
+        if total is None and [name] == [task.description for task in self._bars.tasks]:
+            return  # it goes on, as of the next scenario
         for task_id in self._bars.task_ids:
             self._bars.remove_task(task_id)
-        name += self.remark + (f" ({count(done)} kept)" if done else "")
         self._bars.add_task(name, total=total, completed=done, before=done, figures={}, words="")
         if self._told or done:
             self._print()

@@ -16,7 +16,7 @@ import pytest
 from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.commands.options import run_folder
-from harness.commands.printing import say
+from harness.commands.printing import print_table, say
 from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.progress import Progress
 from harness.report.lines import lines
@@ -77,6 +77,7 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
         ["run"],
         ["nothing"],
         ["estimat"],
+        ["export"],
         ["--nothing"],
         ["pool", SMOKE, "--quite"],
         ["check", SMOKE, "--nothing"],
@@ -96,6 +97,7 @@ def test_wrong_calls_end_with_2(capsys, arguments):
         assert err.startswith("error: ")
         assert [line.split()[0] for line in err.splitlines()[1:]] == ["found:", "expected:", "fix:"]
         assert ("Did you mean" in err) == (arguments[-1] in ("estimat", "--quite"))
+        assert ("harness replay DIR TEST --out" in err) == (arguments == ["export"])
     else:
         assert "Usage: harness" in err
 
@@ -294,6 +296,28 @@ def test_a_limit_by_hand_replaces_that_of_the_campaign_and_says_so(asked, at_mos
         main(["run", "idm", "--out", str(tmp_path / "run"), "--set", own, "--accept", asked])
     assert run.call_args.args[0].accept.times_reference.at_most == at_most
     assert f"--accept {asked} replaces the limit of idm: {{'times_reference'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("columns", "width"), [("60", 60), ("", 140)])
+def test_a_table_in_a_file_is_as_wide_as_columns_says(columns, width, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", columns)
+    print_table("Title", [{"what": "word " * 50}])
+    assert max(map(len, capsys.readouterr().out.splitlines())) == width
+
+
+@pytest.mark.parametrize(
+    ("asked", "mend"),
+    [
+        ("0.5r157-cc", "Write --accept 0.5*r157-cc."),
+        ("r157cc", "Did you mean 'r157-cc'?"),
+        ("-1", "Correct it; the key means: crashes per test"),
+    ],
+)
+def test_a_wrong_limit_is_told_as_it_was_typed(asked, mend, tmp_path, capsys):
+    assert main(["run", "idm", "--out", str(tmp_path / "run"), "--accept", asked]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: --accept {asked}\n")
+    assert f"fix:      {mend}" in said
 
 
 def test_estimate_writes_only_when_asked(folder, capsys):

@@ -40,6 +40,8 @@ def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeyp
     assert re.match(r"\d\d:\d\d:\d\d ", log.getvalue())
     lines.stage("writing estimates and report", None)  # at once: it may be a while until the next line
     assert log.getvalue().endswith("writing estimates and report\n")
+    lines.stage("writing estimates and report", None)  # of another scenario
+    assert log.getvalue().count("writing estimates and report\n") == 1
     quick = Log()
     with ShownProgress(stream=quick) as lines:
         lines.stage("episodes", total=10)

@@ -66,7 +66,7 @@ class Campaign(Section):
     seed: Whole = Field(1, ge=0, lt=2**63)
     """random numbers of the tests follow from it; those of the pool from pool.seed"""
     scenario: str = DEFAULT_FAMILY
-    """kind of events that are tested: cut_in, or one that a package brings"""
+    """kind of events that are tested: cut_in, lead_brakes, cut_out, or one that a package brings; several: scenarios"""
     scenarios: Annotated[list[str], Field(min_length=1)] | None = None
     """several kinds of events in one answer per hour, in place of scenario"""
     exposure: dict[str, EventsPerHour] = Field(

@@ -73,6 +73,8 @@ def load_campaign(
     campaign = _with_real_paths(campaign, place, folder if of_file else Path.cwd(), check_files=check_files)
     if check_files:
         shipped = family_named(campaign.scenario, place(("scenario",))).shipped
+        for i, family in enumerate(campaign.scenarios or ()):
+            family_named(family, place(("scenarios", i)))
         if campaign.environment.parameters != DEFAULT:
             shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))
         for family, file in campaign.environments.items():

@@ -133,7 +133,8 @@ def run(
     if limit and (own := harness.load_campaign(campaign_file, given, av=av).accept) is not None:
         asked = own.model_dump(exclude_defaults=True)
         say(f"note: --accept {accept} replaces the limit of {campaign_file}: {asked}", err=True)
-    campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
+    with _told_as_typed(accept):
+        campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)
     chosen, folder = (
@@ -144,7 +145,7 @@ def run(
         _note_other_stop(folder, campaign)
     if campaign.run.executor == "local":
         start_server()
-    with named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
+    with _told_as_typed(accept), named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
     from harness.runner.underway import RunResult
 
@@ -170,6 +171,18 @@ def _note_other_stop(folder: Path, campaign: Campaign) -> None:
         for key, value in campaign.stop.model_dump().items():
             if value != before[key]:
                 say(f"note: stop.{key} is {words(value)} now; before it was {words(before[key])}", err=True)
+
+
+@contextmanager
+def _told_as_typed(limit: str | None) -> Iterator[None]:
+    """Let an error of what ``--accept`` has set name that; of 0.5r157-cc the driver alone would be twice the limit."""
+    try:
+        yield
+    except HarnessError as error:
+        if limit is not None and re.match(r"(--set )?accept\.(times_reference|crash_rate_below)", error.where):
+            times = re.sub(r"^([\d.]+) ?([a-zA-Z].*)", r"\1*\2", limit)
+            error.where, error.mend = f"--accept {limit}", error.mend if times == limit else f"Write --accept {times}."
+        raise
 
 
 @contextmanager
@@ -335,7 +348,7 @@ def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str],
 
     With VEHICLE it is the pool that `harness run VEHICLE` draws from; the vehicle itself does not matter. Shown are the
     surrogates from careful to careless, with their crash rates and the probabilities of their shells: the events on
-    which a surrogate is the most careful to crash. A pool is built once and kept; `harness run` builds it, too.
+    which a surrogate crashes and no more careful one does. A pool is built once and kept; `harness run` builds it, too.
     """
     campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario, "pool"), *overrides])
     with progress_bar() as bar:

@@ -57,7 +57,7 @@ workers_option = click.option(
 )  # fmt: skip
 scenario_option = click.option(
     "--scenario", metavar="NAME",
-    help="What happens in the tests: cut_in (default), lead_brakes or cut_out. `harness run` and `harness compare` "
+    help="What happens in the tests: cut_in (default), lead_brakes or cut_out. `harness run`, `compare` and `check` "
     "also take several, with commas, or 'all': their answer is crashes per hour of driving.",
 )  # fmt: skip
 exposure_option = click.option(

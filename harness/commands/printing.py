@@ -119,8 +119,10 @@ def system_error(error: OSError) -> HarnessError | None:
 def usage_error(error: click.UsageError, context: click.Context) -> HarnessError:
     """Put what click says of a wrong call into the words of all errors."""
     usage = " ".join(context.get_usage().removeprefix("Usage: ").split())
-    mend = f"See `{context.command_path} --help`."
-    return HarnessError(context.command_path, error.format_message().rstrip("."), f"a call of the form: {usage}", mend)
+    mend, found = f"See `{context.command_path} --help`.", error.format_message().rstrip(".")
+    if "'export'" in found:  # which is like no command that exports
+        found, mend = found.partition(".")[0], "Write the motion of a test by `harness replay DIR TEST --out FILE.csv`."
+    return HarnessError(context.command_path, found, f"a call of the form: {usage}", mend)
 
 
 def print_json(content: Any) -> None:
@@ -148,7 +150,7 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     for row in rows:
         table.add_row(*(printable(words(cell, 4)) for cell in row.values()))
     console = Console()
-    if not console.is_terminal:
+    if not console.is_terminal and not os.environ.get("COLUMNS"):
         console.width = _WIDTH_OF_FILES
     console.print(table)
 

@@ -200,6 +200,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
 
     Fitted numbers move by their standard errors, or together by replicates; assumed ones over their ranges. Nothing is
     simulated in SUMO: each move takes a second, once. The result is kept in DIR/sensitivity.json and shown on the page.
+    Of several scenarios DIR is the folder of one, such as runs/all/cut_in.
     """
     with progress_bar() as bar:
         content = harness.sensitivity(folder, ranges=ranges, progress=bar)
@@ -214,8 +215,8 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     say(
         "With a number at the one or the other end of what is known of it, the rate, and the ratio to the competent "
         "driver, are so many times as high.",
-        "That takes the share of crashes in each shell for the same; 'error' is by how much this is wrong for a "
-        "reference driver.",
+        "This assumes that the same share of each shell's events end in a crash; 'error' is by how much that is wrong "
+        "for a reference driver.",
         f"report  {page}",
     )
 
@@ -256,8 +257,8 @@ def report(folder: Path) -> None:
 @click.option(
     "--out", "files", metavar="FILE", type=FILE, multiple=True,
     help="Write the motion. The suffix says how: .html, a page that plays it; .csv, a row for each vehicle and step; "
-    ".xosc, OpenSCENARIO XML 1.2 and its road (.xodr; extra 'export'); .xml, SUMO's floating car data. May be given "
-    "several times.",
+    ".xosc, OpenSCENARIO XML 1.2 and its road (.xodr; extra 'export'); .xml, SUMO's floating car data; "
+    ".sumocfg, as --sumo. May be given several times.",
 )  # fmt: skip
 @click.option("--gui", is_flag=True, help="Show it in sumo-gui, halted at the onset (extra 'sumo').")
 @click.option(
@@ -283,7 +284,7 @@ def replay(
     """Simulate test number TEST of the run in DIR again, bit for bit, and say what happens when.
 
     It also says how two others would have fared in the vehicle's place: the careful and competent driver of UN
-    Regulation No. 157 (r157-cc), and one that brakes at once, at up to 8 m/s2 (brakes-8).
+    Regulation No. 157 (r157-cc), and one that brakes as soon as it sees the event, at up to 8 m/s2 (brakes-8).
 
     If the run has kept the test's motion, the replay is compared with it; a difference ends with exit code 3.
 
@@ -312,6 +313,8 @@ def replay(
     words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
+    if result.suspects is not None and result.bit_equal is not False:
+        say(f"note: {result.suspects}", err=True)
     if program is not None:
         watch(result, program)
     if result.bit_equal is False:

@@ -91,6 +91,7 @@ def pair_lines(
     asked, rows = pair_asked(content), []
     for name in "AB":
         of, label = rates_of(content[name.lower()]), content["campaigns"][name.lower()]["label"]
+        label = label.removeprefix(f"{content['campaigns']['a']['label']}, ").replace("av.parameters.", "")
         rate, ends = number(of["rate"]), interval(of["ci_low"], of["ci_high"], beside=of["rate"])
         if not of["n_crashes"]:
             rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"

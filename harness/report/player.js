@@ -202,7 +202,7 @@
         const name = `${x < 8 ? "◂ " : ""}${called(track)}${crashed ? " crashed" : ""}`;
         label.textContent = beyond ? `${name} ${far} m ▸` : name;
         const aside = beyond && ghost < 0, edge = aside ? ends : width - 6, from = beyond ? edge : clamp(rear, 4, width - 130);
-        const height = ghost >= 0 ? low + 18 + 14 * ghost : top - 5;
+        const height = ghost >= 0 ? low + 18 + 14 * ghost : y + 4;
         if (aside && seen) ends -= 9 * label.textContent.length;
         set(label, { x: from, y: height, "text-anchor": beyond ? "end" : "start" });
       }

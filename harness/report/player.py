@@ -276,7 +276,11 @@ def _facts(scene: Scene, bv: Scene, av: Scene, family: Family, event: str) -> li
     facts += [("AV brakes", "never")] if av["brakes"] is None else []
     facts.append(("AV", _ending(av, bv, scene, family)))
     for each in scene["ghosts"]:
-        facts.append((each["name"], f"{family.stand_ins[each['name']][0]}: {_ending(each, bv, scene, family)}"))
+        who, at = family.stand_ins[each["name"]][0], onset - first
+        if family.follows:  # how it ends may hang on nothing else
+            ahead = min(_gap(each, other, at) for other in scene["tracks"][:-1])
+            who += f", {tenths(ahead / each['v'][at])} s behind at the onset"
+        facts.append((each["name"], f"{who}: {_ending(each, bv, scene, family)}"))
     return facts
 
 
@@ -289,7 +293,7 @@ def _ending(track: Scene, bv: Scene, scene: Scene, family: Family) -> str:
         gap = f"{tenths(closest)} m" if closest >= 0.05 else "< 0.1 m"
         if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:
             return f"no crash until the test ends, {gap} behind {name} and still {tenths(rate)} m/s faster"
-        return f"avoids it, {gap} at the closest"
+        return f"avoids it, {gap} at the closest" + f" since {family.words.since}" * bool(scene["onset"] < cut)
     v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
     from_the_side = family.crosses == family.principal and scene["onset"] < cut and crash == cut + 1
     who = f"{name} strikes its side" if from_the_side else f"strikes {name} from behind"

@@ -150,7 +150,7 @@ def shells_plot(found: ShownShells) -> Plot:
     )
     orange = " (orange outside the boundary)" if (rate[~inside] > 0.0).any() else ""
     caption = (
-        "A shell holds the events on which its driver is the most careful to crash (top: careful). "
+        "A shell holds the events on which its driver crashes and no more careful one does (top: careful). "
         f"The rate: what each shell adds, with its limits{orange}. {source} The "
         "uncertainty: how wide each shell alone would leave the interval; the per cent add up to the whole. "
         f"{open_question}"
@@ -176,12 +176,13 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
             left, at = np.maximum(rate[0][kind], low), rows[kind]
             panel.add("boxes", colour, left, rate[1][kind], at - 0.3, at + 0.3, opacity=0.85, label=label)
     thin = rows - 0.06, rows + 0.06
+    most = int(np.abs(np.log(np.maximum(ratio, low))).max(axis=0).argmax())  # what moves one need not move the other
     panel.add("boxes", "ink", np.maximum(ratio[0], low), ratio[1], *thin, label=f"its ratio to {found.driver}")
     panel.add("line", "muted", [1.0, 1.0], [y.low, y.high], dash=DASHED, width=1.0)
     text = (
         "Fitted numbers move over nine tenths of what their data leave open, assumed ones over the stated range. "
-        f"The rate depends most on {names[0]}: × {number(rate[0][0], 2)} to × {number(rate[1][0], 2)}; of the ratio "
-        f"this makes × {number(ratio[0][0], 3)} to × {number(ratio[1][0], 3)}."
+        f"The rate depends most on {names[0]}: × {number(rate[0][0], 2)} to × {number(rate[1][0], 2)}; its ratio to "
+        f"{found.driver} on {names[most]}: × {number(ratio[0][most], 3)} to × {number(ratio[1][most], 3)}."
     )
     return Plot("sensitivity", [panel], text, text)
 

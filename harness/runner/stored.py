@@ -178,7 +178,7 @@ def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False
       AV brakes          3.2 s, 0.1 s after BV entered the lane: at up to 4.0 m/s²
       AV                 avoids it, 12.1 m at the closest
       r157-cc            a careful and competent driver: avoids it, 9.1 m at the closest
-      brakes-8           braking at once, at up to 8 m/s²: avoids it, 18.7 m at the closest
+      brakes-8           braking as soon as it sees BV come over, at up to 8 m/s²: avoids it, 18.7 m at the closest
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
@@ -222,7 +222,7 @@ def _simulated(
     again = run_apart(campaign.av, _replay, resolved, folder, episode, stored["episodes"])
     compared = tuple(name for name in again if name in stored and stored[name].num_rows)
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
-    why = None if bit_equal is not False else suspects(manifest, campaign)
+    why = suspects(manifest, campaign, differed=bit_equal is False)
     return _result(campaign, resolved.environment, again, bit_equal, compared, why)
 
 
@@ -238,15 +238,17 @@ def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) ->
     return {"episodes": tables.episodes, "traces": tables.traces}
 
 
-def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
-    """What may have made a replay differ, by what the manifest knows."""
+def suspects(manifest: dict[str, Any], campaign: Campaign, *, differed: bool = True) -> str | None:
+    """What may have made a replay differ, by what the manifest knows; of one that did not, whether the code has."""
+    changed = manifest.get("controller_sha256") != require_controller(campaign.av)
+    now = [f"{campaign.av.controller}, or a file that it is made of, has been changed since the run."] * changed
+    if not differed:
+        return "".join(now) or None
     here = {**versions(), "CPU": cpu_name()}
     there = {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
     other = [f"{name} {there[name]} (here {here.get(name)})" for name in there if there[name] != here.get(name)]
-    found = [f"The run was made with {', '.join(other)}; bits are promised for equal ones."] if other else []
-    if manifest.get("controller_sha256") != require_controller(campaign.av):
-        found.append("The controller, or a file that it is made of, has been changed since the run.")
-    elif campaign.av.model is None:
+    found = [f"The run was made with {', '.join(other)}; bits are promised for equal ones."] * bool(other) + now
+    if not changed and campaign.av.model is None:
         same = "Versions, CPU and the controller's files are the run's. " if not other else ""
         found.append(
             f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier tests, "

@@ -54,10 +54,19 @@ def has_run(folder):
 
 def test_a_run_of_ones_own_is_run_again_wherever_it_was_moved_to(made, tmp_path, capsys):
     folder = copy_of(made, tmp_path / "moved")
-    assert main(["replay", str(folder), str(crashed(folder)[0])]) == 0
+    call = ["replay", str(folder), str(crashed(folder)[0])]
+    assert main(call) == 0
     out, err = capsys.readouterr()
     assert "bit for bit" in out
-    assert err.startswith(f"The vehicle is {made.parent}/av.py:Av.")
+    assert err == (told := f"The vehicle is {made.parent}/av.py:Av.\n")
+    code = (file := made.with_name("av.py")).read_text()
+    try:
+        file.write_text(f"{code}# another version\n")
+        assert main(call) == 0
+    finally:
+        file.write_text(code)
+    changed = f"note: {file}:Av, or a file that it is made of, has been changed since the run.\n"
+    assert capsys.readouterr().err == told + changed
 
 
 @pytest.mark.slow

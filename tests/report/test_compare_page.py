@@ -12,7 +12,7 @@ import harness
 from harness.errors import RunFolderError
 from harness.numbers import interval, number, ratio
 from harness.report.compare_page import crashing_pairs
-from harness.report.pair_words import deciding_words
+from harness.report.pair_words import deciding_words, pair_lines
 from harness.report.plots import WHO
 from harness.report.summary import read_run_folder
 from harness.runner.pages import write_report
@@ -46,6 +46,14 @@ def test_the_numbers_are_those_of_the_comparison(compared, page):
     assert f"alone in pairs {found['n_only_a']:,} {found['n_only_b']:,}" in shown
     assert deciding_words(found) is None or "to decide, repeat the command" in shown.lower()
     assert len(page.ids) == len(set(page.ids))
+
+
+def test_what_differs_is_never_cut_off_in_a_terminal(compared):
+    found = content_of(compared)
+    found["campaigns"] = {"a": {"label": "my_av-MyAV"}, "b": {"label": "my_av-MyAV, av.parameters.hardest_mps2=9"}}
+    _, a, b, *_ = pair_lines(found, read_run_folder(compared / "a").campaign, compared)
+    assert a.startswith("  A my_av-MyAV  ")
+    assert b.startswith("  B hardest_mps2=9  ")
 
 
 def test_the_map_holds_each_pair_with_a_crash(compared, page):

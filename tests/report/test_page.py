@@ -15,7 +15,7 @@ from harness.records.folder import write_sealed
 from harness.report.junit import difference_case, statement_case, write_junit
 from harness.runner.pages import write_report
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
-from tests.stored_runs import truncate
+from tests.stored_runs import copy_of, truncate
 
 SEEN = {
     "weighted": ({"severity"}, ["defensive_share: 0.1"]),
@@ -32,6 +32,11 @@ def edit(path: Path, **changes) -> dict:
     content = json.loads(path.read_text())
     write_sealed(path, content | changes)
     return content
+
+
+def test_a_verdict_is_said_first(stored_run, tmp_path):
+    page = write_report(copy_of(stored_run("shells-accepted"), tmp_path / "run"))
+    assert 'Answer</h2>\n<p class="big accepted">ACCEPTED <small>' in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -19,6 +19,7 @@ from harness.report.player import UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
 from harness.resolved import resolve
 from harness.runner.pages import write_report
+from harness.vehicles.kinematics import VEHICLE_LENGTH_M
 from tests.stored_runs import copy_of, stored_table
 
 KINDS = ("shells-twin", "shells-lateral-sumo", "forced-lateral-twin", "shells-acting-twin", "forced-krauss", "nde-twin")
@@ -119,15 +120,26 @@ def test_replay_says_what_happens_and_writes_the_page(stored_run, tmp_path, caps
 
 
 @pytest.mark.parametrize(
-    ("speed", "ahead", "said"),
+    ("speed", "ahead", "onset", "said"),
     [
-        (21.0, 7.0, "no crash until the test ends, 1.5 m behind BV and still 1.0 m/s"),
-        (20.0, 7.0, "avoids it, 2.0 m at"),
-        (20.0, 5.02, "avoids it, < 0.1 m at"),
+        (21.0, 7.0, 0, "no crash until the test ends, 1.5 m behind BV and still 1.0 m/s faster"),
+        (20.0, 7.0, 0, "avoids it, 2.0 m at the closest"),
+        (20.0, 7.0, -1, "avoids it, 2.0 m at the closest since BV entered the lane"),
+        (20.0, 5.02, 0, "avoids it, < 0.1 m at the closest"),
     ],
 )
-def test_a_test_that_ends_while_the_vehicle_closes_in_has_avoided_nothing(speed, ahead, said):
+def test_a_test_that_ends_while_the_vehicle_closes_in_has_avoided_nothing(speed, ahead, onset, said):
     time_s = np.arange(6) / 10
     bv = {"name": "BV", "x": ahead + 20.0 * time_s, "v": np.full(6, 20.0)}
     av = {"x": speed * time_s, "v": np.full(6, speed), "crash": None}
-    assert player._ending(av, bv, {"first": 0, "event": 0, "onset": 0}, CUT_IN).startswith(said)
+    assert player._ending(av, bv, {"first": 0, "event": 0, "onset": onset}, CUT_IN) == said
+
+
+@pytest.mark.parametrize("scenario", ["lead_brakes", "cut_out"])
+def test_others_who_follow_are_told_with_their_headway(scenario, crashing, tmp_path):
+    page = write_report(copy_of(crashing[scenario], tmp_path / "run"))
+    scene = scenes_in(page.read_text(encoding="utf-8"))[0]
+    at, lead = scene["onset"] - scene["first"], scene["tracks"][0]
+    for ghost in scene["ghosts"]:
+        headway_s = (lead["x"][at] - VEHICLE_LENGTH_M - ghost["x"][at]) / ghost["v"][at]
+        assert f", {headway_s:.1f} s behind at the onset: " in dict(scene["facts"])[ghost["name"]]

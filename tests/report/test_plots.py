@@ -7,10 +7,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from harness.estimators.traffic import Bar, Sensitivity
 from harness.families import family_named
 from harness.records.reader import traffic_of
 from harness.report.drawing import Axis, Panel
-from harness.report.plots import POOL, limits_of_others, severity_plot, shells_plot
+from harness.report.plots import POOL, limits_of_others, sensitivity_plot, severity_plot, shells_plot
 from harness.report.summary import summarise
 from harness.vocabulary import CRASH, OUTCOMES
 
@@ -85,3 +86,11 @@ def test_weights_of_a_shells_run_add_up_to_the_rate(runs, name):
     run, summary = runs[name], summarise(runs[name])
     assert summary.per_test(float(summary.weight[CRASH])) == pytest.approx(run.estimates.best.crash_rate, rel=1e-12)
     assert summary.crashes["weight"].sum() == pytest.approx(run.estimates.best.crash_rate, rel=1e-12)
+
+
+def test_what_moves_the_rate_most_need_not_move_its_ratio():
+    gaps = Bar("cut_in.ignore_share", "assumed", (0.001, 0.25), (0.1, 25.0), (1.004, 0.9996), (0.0, 0.0))
+    speeds = Bar("lateral.speed_median_mps", "assumed", (0.6, 1.3), (1.003, 1.08), (3.69, 0.519), (0.0, 0.0))
+    said = sensitivity_plot(Sensitivity("", "smoke", "r157-cc", (gaps, speeds))).caption
+    assert "The rate depends most on cut_in.ignore_share: × 0.10 to × 25;" in said
+    assert "its ratio to r157-cc on lateral.speed_median_mps: × 0.519 to × 3.69." in said

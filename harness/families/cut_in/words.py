@@ -53,7 +53,7 @@ STAND_INS = MappingProxyType(
     {
         "r157-cc": ("a careful and competent driver", Surrogate(model="r157-cc")),
         "brakes-8": (
-            "braking at once, at up to 8 m/s²",
+            "braking as soon as it sees BV come over, at up to 8 m/s²",
             Surrogate.model_validate({"model": "idm", "parameters": {"min_acceleration_mps2": -8.0}}),
         ),
     }

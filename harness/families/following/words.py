@@ -15,7 +15,7 @@ STAND_INS = MappingProxyType(
             Surrogate.model_validate({"model": "r157-cc", "parameters": {"time_headway_s": "natural"}}),
         ),
         "brakes-8": (
-            "at a headway of 1 s, braking at once, at up to 8 m/s²",
+            "braking as soon as it sees the danger, at up to 8 m/s²",
             Surrogate.model_validate({"model": "idm", "parameters": {"min_acceleration_mps2": -8.0}}),
         ),
     }
