@@ -11,7 +11,8 @@ from collections.abc import Sequence
 
 import click
 
-from harness.commands.campaigns import av_check, check, compare, pool, run, schema, setup
+from harness.commands.campaigns import av_check, check, pool, run, schema, setup
+from harness.commands.compare import compare
 from harness.commands.fitting import fit
 from harness.commands.options import examples, quiet_option
 from harness.commands.printing import go_on_unread, show_error, show_interrupted, system_error, usage_error

@@ -178,3 +178,14 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
     if shells := shown.get("shells", {}).get("details", {}).get("shells"):
         names = ("shell", "inside", "p", "n_episodes", "n_crashes", "contribution")
         print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])
+
+
+@contextmanager
+def named_if_written(folder: Path, *, chosen: bool) -> Iterator[None]:
+    """Say where an unfinished run is, if its folder was ``chosen`` here and exists."""
+    try:
+        yield
+    except BaseException:
+        if chosen and folder.exists():
+            say(f"Run folder: {folder}", err=True)
+        raise

@@ -24,8 +24,9 @@ from greenlet import GreenletExit, getcurrent, greenlet
 from harness.campaign.python_files import TRACI_MODULES
 from harness.controllers.from_source import FromSource
 from harness.controllers.protocol import EpisodeStart, Observation
+from harness.controllers.traci_refused import Domain, FatalTraCIError, RefusedError
 from harness.controllers.traci_style import SimulationDomain, Traci
-from harness.controllers.traci_vehicle import Domain, FatalTraCIError, RefusedError, VehicleDomain
+from harness.controllers.traci_vehicle import VehicleDomain
 from harness.files import real_path
 from harness.vehicles.kinematics import STEP_S
 

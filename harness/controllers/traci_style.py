@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from harness.controllers.protocol import EpisodeStart, Observation
-from harness.controllers.traci_vehicle import VEH_ID, Domain, FatalTraCIError, TraCIException, VehicleDomain
+from harness.controllers.traci_refused import Domain, FatalTraCIError, TraCIException
+from harness.controllers.traci_vehicle import VEH_ID, VehicleDomain
 from harness.vehicles.kinematics import STEP_S
 
 __all__ = ["StepListenerController", "TraCIException", "TraciStyleController"]

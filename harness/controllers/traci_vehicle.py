@@ -1,17 +1,14 @@
-"""What stands for ``traci.vehicle`` (see `harness.controllers.traci_style`): questions and commands.
-
-What a script may not do here is refused with the reason.
-"""
+"""What stands for ``traci.vehicle`` (see `harness.controllers.traci_style`): questions and commands."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, ClassVar, NoReturn
+from typing import Any, NoReturn
 
 from harness.controllers.protocol import Observation
-from harness.problems import did_you_mean
+from harness.controllers.traci_refused import WOULD_MOVE, Domain, RefusedError, TraCIException
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 VEH_ID = "AV"
@@ -26,57 +23,6 @@ _SUMOS_OWN = 31
 _CHANGES_LANE = 0b1100_1111_1111
 """Bits of a lane change mode that let SUMO change lanes, but for how much room it leaves."""
 _DEFAULT_VARIABLES, _VEHICLES, _LEADER = (0x50, 0x56), 0xA4, 0x68
-
-_WOULD_MOVE = "it would change vehicles unknown to the harness, and the crash rate would be wrong"
-_STEPS = "the harness itself starts, steps and ends the simulation"
-_REFUSED = {
-    **dict.fromkeys(("start", "init", "connect", "switch", "setOrder", "close", "load", "loadState"), _STEPS),
-    **dict.fromkeys(("saveState", "simulationStep", "step", "executeMove"), _STEPS),
-    "addStepListener": "name the listener in the campaign, as av.controller",
-    "changeLane": "the AV stays on its lane",
-}
-_NO_MODEL = "no model of SUMO's drives the AV: setSpeed, setAcceleration, slowDown do, bounded by setAccel and setDecel"
-_REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")
-
-
-class TraCIException(Exception):  # noqa: N818 - TraCI's own name
-    """A command or question that TraCI, or the harness, does not answer."""
-
-
-class FatalTraCIError(Exception):
-    """The simulation has ended."""
-
-
-class RefusedError(TraCIException):
-    """What the harness cannot do: the ``last`` of a turn fails its test also where a script catches it."""
-
-    last: ClassVar[RefusedError | None] = None
-
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        RefusedError.last = self
-
-
-class Domain:
-    """Part of the facade: what it lacks is refused with the reason, or unknown with a list of what there is."""
-
-    _path: ClassVar[str]
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        why = _REFUSED.get(name, _NO_MODEL if name.startswith("set") else None)
-        why = why or (_WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None)
-        if why is None:
-            public = [entry for entry in dir(type(self)) if entry[0] != "_" and entry != "see"]
-            domains = [entry for entry in vars(self) if isinstance(getattr(self, entry), Domain) and entry[0] != "_"]
-            there = "" if did_you_mean(name, public) else f"; it has {', '.join(domains or public)}"
-            raise AttributeError(f"{self._path} has no {name} here{there}", name=name, obj=self)
-
-        def refused(*_arguments: Any, **_named: Any) -> NoReturn:
-            raise RefusedError(f"{self._path}.{name} is refused: {why}.")
-
-        return refused
 
 
 class Seen:
@@ -353,7 +299,7 @@ class VehicleDomain(Domain):
             raise RefusedError(f"vehicle.setSpeedMode('{vehID}', {speedMode}) is refused: {why}.")
         self._speed_mode = speedMode
 
-    def _require_own(self, vehID: str, name: str, why: str = _WOULD_MOVE) -> None:
+    def _require_own(self, vehID: str, name: str, why: str = WOULD_MOVE) -> None:
         if vehID != self._ego:
             self._of(vehID)
             raise RefusedError(f"vehicle.{name}('{vehID}') is refused: {why}. Commands are for '{self._ego}' only.")

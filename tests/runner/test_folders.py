@@ -123,7 +123,8 @@ def test_what_a_vehicle_writes_when_it_is_made_does_not_count(run_here, tmp_path
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "notes_it.py").write_text(
         "from examples.idm import IDM\nclass Notes(IDM):\n"
-        "    def __init__(self, note):\n        super().__init__()\n        with open(note, 'a') as file: file.write('made ')"
+        "    def __init__(self, note):\n        super().__init__()\n"
+        "        with open(note, 'a') as file: file.write('made ')"
     )
     note = tmp_path / "note.txt"
     settings = (f"av={{controller: 'notes_it:Notes', parameters: {{note: {note}}}}}", "world.engine=twin")
