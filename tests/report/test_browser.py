@@ -1,5 +1,6 @@
 """The player in a real browser, the system's own: it plays, follows the slider and the keys, and says no error."""
 
+import json
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -278,3 +279,16 @@ def test_a_cut_out_shows_when_the_revealed_vehicle_becomes_visible(opened, crash
     assert scene["onset"] <= step <= scene["event"]
     page.get_by_role("button", name="SV becomes visible", exact=True).click()
     assert seconds(page) == pytest.approx(STEP_S * step)
+
+
+def test_a_vehicle_out_of_view_is_named_beside_its_lane(opened, crashing):
+    file = write_report(copy_of(crashing["lead_brakes"], crashing["lead_brakes"].parent / "far"))
+    text, scenes = file.read_text(), scenes_in(file.read_text())
+    data = re.search(r'<script type="application/json">(.*?)</script>', text, re.DOTALL)[1]
+    for scene in scenes:
+        scene["tracks"][0]["x"] = [x + 200.0 for x in scene["tracks"][0]["x"]]
+    file.write_text(text.replace(data, json.dumps(scenes)))
+    page = opened(file)
+    label, road = page.get_by_text(re.compile(r"^LV \d+ m")), page.locator(".asphalt").bounding_box()
+    lower = label.bounding_box()["y"] - road["y"] - road["height"] / 2
+    assert 0.0 < lower < road["height"] / 2
