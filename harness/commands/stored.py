@@ -296,12 +296,15 @@ def replay(
     from harness.records.reader import read_campaign
     from harness.report.motion import writer_of
     from harness.report.sumo_files import gui_program, watch
+    from harness.runner.stored import changed_code
 
     files = [*files, *([] if sumo_folder is None else [sumo_folder / "test.sumocfg"])]
     for file in files:  # can be written, before anything is simulated for them
         writer_of(file)
         require_place(file.parent)
-    if not stored and (code := code_of(read_campaign(folder, read_manifest(folder)).av)) is not None:
+    manifest = read_manifest(folder)
+    campaign = read_campaign(folder, manifest, check_files=not stored)
+    if not stored and (code := code_of(campaign.av)) is not None:
         say(f"The vehicle is {code}.", err=True)
     program = gui_program() if gui else None
     result = harness.replay(folder, episode, stored=stored, trust=trust)
@@ -313,8 +316,9 @@ def replay(
     words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
-    if result.suspects is not None and result.bit_equal is not False:
-        say(f"note: {result.suspects}", err=True)
+    if not stored and result.bit_equal is not False:
+        for changed in changed_code(manifest, campaign):
+            say(f"note: {changed}", err=True)
     if program is not None:
         watch(result, program)
     if result.bit_equal is False:

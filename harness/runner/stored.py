@@ -222,7 +222,7 @@ def _simulated(
     again = run_apart(campaign.av, _replay, resolved, folder, episode, stored["episodes"])
     compared = tuple(name for name in again if name in stored and stored[name].num_rows)
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
-    why = suspects(manifest, campaign, differed=bit_equal is False)
+    why = None if bit_equal is not False else suspects(manifest, campaign)
     return _result(campaign, resolved.environment, again, bit_equal, compared, why)
 
 
@@ -238,16 +238,20 @@ def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) ->
     return {"episodes": tables.episodes, "traces": tables.traces}
 
 
-def suspects(manifest: dict[str, Any], campaign: Campaign, *, differed: bool = True) -> str | None:
-    """What may have made a replay differ, by what the manifest knows; of one that did not, whether the code has."""
-    changed = manifest.get("controller_sha256") != require_controller(campaign.av)
-    now = [f"{campaign.av.controller}, or a file that it is made of, has been changed since the run."] * changed
-    if not differed:
-        return "".join(now) or None
+def changed_code(manifest: dict[str, Any], campaign: Campaign) -> list[str]:
+    """Whether the vehicle's code has been changed since the run, in a sentence if so."""
+    if manifest.get("controller_sha256") == require_controller(campaign.av):
+        return []
+    return [f"{campaign.av.controller}, or a file that it is made of, has been changed since the run."]
+
+
+def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
+    """What may have made a replay differ, by what the manifest knows."""
+    changed = changed_code(manifest, campaign)
     here = {**versions(), "CPU": cpu_name()}
     there = {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
     other = [f"{name} {there[name]} (here {here.get(name)})" for name in there if there[name] != here.get(name)]
-    found = [f"The run was made with {', '.join(other)}; bits are promised for equal ones."] * bool(other) + now
+    found = [f"The run was made with {', '.join(other)}; bits are promised for equal ones."] * bool(other) + changed
     if not changed and campaign.av.model is None:
         same = "Versions, CPU and the controller's files are the run's. " if not other else ""
         found.append(

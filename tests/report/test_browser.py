@@ -1,5 +1,6 @@
 """The player in a real browser, the system's own: it plays, follows the slider and the keys, and says no error."""
 
+import json
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -231,3 +232,16 @@ def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(width, scheme, b
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         page.close()
     context.close()
+
+
+def test_a_vehicle_out_of_view_is_named_beside_its_lane(opened, crashing):
+    file = write_report(copy_of(crashing["lead_brakes"], crashing["lead_brakes"].parent / "far"))
+    text, scenes = file.read_text(), scenes_in(file.read_text())
+    data = re.search(r'<script type="application/json">(.*?)</script>', text, re.DOTALL)[1]
+    for scene in scenes:
+        scene["tracks"][0]["x"] = [x + 200.0 for x in scene["tracks"][0]["x"]]
+    file.write_text(text.replace(data, json.dumps(scenes)))
+    page = opened(file)
+    label, road = page.get_by_text(re.compile(r"^LV \d+ m")), page.locator(".asphalt").bounding_box()
+    lower = label.bounding_box()["y"] - road["y"] - road["height"] / 2
+    assert 0.0 < lower < road["height"] / 2
