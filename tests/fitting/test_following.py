@@ -47,6 +47,7 @@ def test_brakings_of_a_known_law_are_found_again(scale):
     assert off(number, 1.5 - scale) > 3.0  # the other law is told from it
 
 
+@pytest.mark.slow
 def test_cut_outs_of_a_known_law_are_found_again():
     recordings = leaving(250, 0.6, 4)
     found = seen(CutOutFitter(), recordings)

@@ -208,6 +208,7 @@ def test_a_pipe_is_refused_at_once(tmp_path):
         judged(tmp_path / "rows.csv")
 
 
+@pytest.mark.slow
 def test_csv_and_parquet_say_the_same_however_they_are_cut(tmp_path):
     """Also with semicolons and decimal commas, compressed, in two files, and with lengths of the mapping."""
     rows = ROWS.assign(length_m=4.6, vehicle_id="car " + ROWS.vehicle_id.astype(str))

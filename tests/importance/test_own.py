@@ -30,6 +30,7 @@ def campaign(name):
     return harness.load_campaign("idm", [*FEW, f"testing.challenge={name}"])
 
 
+@pytest.mark.slow
 def test_tables_hold_what_it_says(tmp_path):
     tables = own_challenge(own(tmp_path))(environment(), DRIVER, "")
     v, gap, rate = (points[at] for points, at in zip(points_of(AFTER), (3, 20, 40), strict=True))
