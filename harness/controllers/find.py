@@ -275,13 +275,19 @@ def require_controller(av: AutomatedVehicle) -> str | None:
     except AvEndedProcessError as error:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
     if av.controller is not None and is_script(av.controller):
-        _note_step_length(Path(f"{av.controller.partition('.py')[0]}.py"))
+        _note_step_length(_file_of_script(av.controller))
     return made_of
 
 
+def _file_of_script(name: str) -> str:
+    """Of ``file.py`` or ``file.py:main``."""
+    return name.removesuffix(":" + name.rpartition(":")[2])
+
+
 @cache
-def _note_step_length(script: Path) -> None:
-    """Say once that a script is asked more often than it may expect: for each step it commands the next speed."""
+def _note_step_length(file: str) -> None:
+    """Say once that a script may be asked more often than by SUMO, for which it may have been written."""
+    script = real_path(file)
     if "step-length" not in script.read_text("utf-8", errors="replace"):
         told = "names no --step-length (a .sumocfg is not read): it is asked every 0.1 s; SUMO's default is 1 s"
         sys.stderr.write(f"note: {script.name} {told}.\n")
@@ -295,7 +301,7 @@ def _sources_of_made(av: AutomatedVehicle) -> str | None:
     if av.controller is None:
         return None
     if is_script(av.controller):
-        file, above = av.controller.removesuffix(":" + av.controller.rpartition(":")[2]), 0
+        file, above = _file_of_script(av.controller), 0
     else:
         name = getattr(own_code(av.controller), "__module__", "")
         file, above = getattr(sys.modules.get(name), "__file__", None) or "", name.count(".")

@@ -73,7 +73,7 @@ class OtherModules:
 
 
 def closed_to_files() -> str:
-    """Why 16 files, more than the harness has open at a time, cannot be opened any more; empty where they can."""
+    """Why 16 files [assumed: more than the harness needs at a time] cannot be opened; empty where they can."""
     try:
         with ExitStack() as files:
             for _ in range(16):

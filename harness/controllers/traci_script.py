@@ -31,7 +31,7 @@ from harness.files import real_path
 from harness.vehicles.kinematics import STEP_S
 
 _ROUNDING = 1e-9
-_STEP_LENGTH = re.compile(r"(?:^| )--step-length[= ](\d*\.?\d+(?:[eE][-+]?\d+)?)(?= |$)")
+_STEP_LENGTH = re.compile(r"(?:^| )--step-length[= ](\S+)")
 _PATIENCE = 100
 """Steps that a script may ask for when its simulation has ended; a loop that no error ends is left where it is."""
 _LEFT = list[greenlet]()

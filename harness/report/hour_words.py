@@ -37,12 +37,8 @@ def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     hour, beside = content["per_hour"], content["beside"]
     per_km = f"{number(content['per_1e6_km'])} per million km"
     if content["n_crashes"]:
-        yield (
-            "crashes",
-            f"{number(hour['rate'])} per hour",
-            between(hour["ci_low"], hour["ci_high"], hour["rate"]),
-            per_km,
-        )
+        ends = between(hour["ci_low"], hour["ci_high"], hour["rate"])
+        yield "crashes", f"{number(hour['rate'])} per hour", ends, per_km
     else:
         yield "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen", ""
     yield beside_row("× competent driver", beside, seen=content["n_crashes"] > 0)

@@ -204,11 +204,12 @@ def test_a_step_of_the_script_is_as_long_as_it_asks_for(tmp_path):
 
 
 def test_one_that_names_none_is_told_so_once(tmp_path, capsys):
-    body = text("traci.vehicle.setSpeed('ego', 20.0)")
+    body, folder = text("traci.vehicle.setSpeed('ego', 20.0)"), tmp_path / "my.pyenv"
+    folder.mkdir()
     for name, script in (("none.py", body), ("some.py", body.replace('"sumo"', '"sumo", "--step-length=0.1"'))):
-        (tmp_path / name).write_text(script, "utf-8")
+        (folder / name).write_text(script, "utf-8")
         for _ in range(2):
-            assert require_controller(load_campaign(str(tmp_path / name)).av)
+            assert require_controller(load_campaign(str(folder / name)).av)
     (note,) = capsys.readouterr().err.splitlines()
     assert note.startswith("note: none.py names no --step-length")
 
