@@ -49,12 +49,22 @@ class PairDecision:
     """Whether B's rate is at most 1 + ``margin`` times A's: at no margin, who crashes less often.
 
     It holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
+    No margin is kept by a B with ``n_milder`` crashes that its rate leaves out, nor where ``n_differing`` tests of
+    either were not the same when they ran twice.
     """
 
     margin: float
     verdict: PairVerdict
     confidence: float
     given_the_library: bool
+    n_milder: int = 0
+    n_differing: int = 0
+
+    def doubted(self, n_milder: int, n_differing: int) -> PairDecision:
+        """The same after what was seen besides the crashes that count."""
+        kept = self.margin and self.verdict == "proven"
+        verdict: PairVerdict = "open" if kept and (n_milder or n_differing) else self.verdict
+        return replace(self, verdict=verdict, n_milder=n_milder, n_differing=n_differing)
 
 
 class Interval(NamedTuple):

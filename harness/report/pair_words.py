@@ -46,7 +46,10 @@ def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
 
 def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) -> str | None:
     """What would decide a comparison (``compare.json``) that was left open, and its cost; None of a decided one."""
-    if content["decision"]["verdict"] != "open" or content.get("ended") == "sum":
+    decision = content["decision"]
+    if decision["verdict"] != "open" or content.get("ended") == "sum":
+        return None
+    if decision["margin"] and (decision["n_milder"] or decision["n_differing"]):  # which no more pairs would mend
         return None
     if (needed := content["to_decide"]) is None:
         return "how many pairs would decide is not known: so far the two are too alike"
@@ -54,7 +57,7 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     n = two_digits_up(needed["pairs"] - done)
     cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
     settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
-    options = f"--margin {content['decision']['margin']:g}{settings}"
+    options = f"--margin {decision['margin']:g}{settings}"
     return f"to decide, repeat the command with {options}{where}: some {count(n)} more pairs{cost}"
 
 

@@ -23,7 +23,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.likelihood import Level
-from harness.estimators.pairs import Pairs, PairsPerHour, PairVerdict, contrast, paired_estimate
+from harness.estimators.pairs import PairDecision, Pairs, PairsPerHour, PairVerdict, contrast, paired_estimate
 from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
@@ -159,11 +159,11 @@ def compare_campaigns(
     rule = PairRule(a, margin, rhw)
     rounds, scenarios = drive_pairs(a, ready, rule, workers, progress or Progress())
     pairs = together(scenarios, a)
-    code = EXIT_DONE if rule.look.stopped else EXIT_BUDGET_SPENT
+    code, decision = EXIT_DONE if rule.look.stopped else EXIT_BUDGET_SPENT, _decided(rule, scenarios)
     if margin is not None:
-        code = EXIT_OF[rule.decision.verdict]
+        code = EXIT_OF[decision.verdict]
     ended = {
-        "decision": asdict(rule.decision), "to_decide": _to_decide(a, rounds, pairs),
+        "decision": asdict(decision), "to_decide": _to_decide(a, rounds, pairs),
         "ended": ended_by(a, rule, int(pairs.tests.sum())),
     }  # fmt: skip
     told = labels or (a.name, b.name), LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE
@@ -173,7 +173,7 @@ def compare_campaigns(
     for of in scenarios:
         own = PairRule(a, margin, rhw)
         own.observe(of.pairs)
-        each[of.name] = asdict(own.decision)
+        each[of.name] = asdict(_decided(own, [of]))
         _written(of, {"decision": each[of.name], "to_decide": None, "ended": "sum"}, *told, code)
     return _sum_written(out, a, pairs, scenarios, ended, each, told[0], code)
 
@@ -240,6 +240,12 @@ def _sum_written(
 
     shown = [each.shown for of in scenarios for each in of.results]
     return Comparison(out, content, code, write_sum(out, content), shown)
+
+
+def _decided(rule: PairRule, scenarios: Sequence[Scenario]) -> PairDecision:
+    """What a rule has found, after what was seen besides in these scenarios."""
+    of_a, of_b = ([of.runs[side].doubted() for of in scenarios] for side in (0, 1))
+    return rule.decision.doubted(sum(n for n, _ in of_b), sum(n for _, n in (*of_a, *of_b)))
 
 
 def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: Pairs) -> dict[str, Any] | None:

@@ -166,6 +166,13 @@ class Underway:
             raise CampaignError("stop.episodes", found, "some tests of each scenario", mend)
         self.run.require_few_failed()
 
+    def doubted(self) -> tuple[int, int]:
+        """What keeps a limit from being accepted: crashes that the rate leaves out, tests that were not the same."""
+        run = self.run
+        n_early = sum(each.n_crashes_before_event for each in run.blocks)
+        n_milder = n_left_out(run.resolved.campaign, n_early) + beyond_scope(run.facts.get("milder"))
+        return n_milder, len(run.repeated.differing) if run.repeated else 0
+
     def finish(self, rule: Rule, *, of_sum: bool = False) -> RunResult:
         """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left.
 
@@ -176,9 +183,7 @@ class Underway:
         missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
         if (decision := rule.look.decision) is not None and not of_sum:
-            n_early = sum(each.n_crashes_before_event for each in run.blocks)
-            n_milder = n_left_out(campaign, n_early) + beyond_scope(run.facts.get("milder"))
-            n_differing = len(run.repeated.differing) if run.repeated else 0
+            n_milder, n_differing = self.doubted()
             decision = replace(decision, n_milder=n_milder, n_differing=n_differing)
             code = EXIT_OF[decision.verdict]
             decided["decision"] = decision.to_json()

@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import os
 from collections import defaultdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
+from harness.estimators.pairs import PairDecision
 from harness.records.reader import read
-from harness.report.pair_words import pair_warnings, pair_words
-from harness.runner.compare import compare_campaigns
+from harness.report.pair_words import deciding_words, pair_warnings, pair_words
+from harness.runner.compare import _decided, compare_campaigns
 from harness.runner.workers import ShardRunner, Workers
 from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL
@@ -139,6 +142,27 @@ def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_c
     assert (found.content["decision"]["verdict"], found.exit_code) == (verdict, exit_code)
     assert "10 %" in pair_words(found.content["decision"])
     assert manifest(tmp_path / "a")["unmet"] == [{"key": "margin", "numbers": {"margin": 0.1}}]
+
+
+@pytest.mark.parametrize(
+    ("margin", "of_a", "of_b", "verdict"),
+    [
+        (0.1, (0, 0), (0, 0), "proven"),
+        (0.1, (3, 0), (0, 0), "proven"),  # A crashes more often than its rate says
+        (0.1, (0, 0), (1, 0), "open"),
+        (0.1, (0, 1), (0, 0), "open"),
+        (0.1, (0, 0), (0, 1), "open"),
+        (0.0, (0, 0), (1, 1), "proven"),  # who crashes less often is told, with the warnings
+    ],
+)
+def test_no_margin_is_kept_by_a_vehicle_in_doubt(margin, of_a, of_b, verdict):
+    """Doubts are crashes that a rate leaves out, and tests that were not the same when they ran twice."""
+    sides = [SimpleNamespace(doubted=lambda doubts=doubts: doubts) for doubts in (of_a, of_b)]
+    rule = SimpleNamespace(decision=PairDecision(margin, "proven", 0.95, given_the_library=False))
+    found = _decided(rule, [SimpleNamespace(runs=sides)])
+    assert found.verdict == verdict
+    assert deciding_words({"decision": asdict(found), "to_decide": None}) is None  # more pairs would not help
+    assert replace(found, verdict="refuted").doubted(1, 1).verdict == "refuted"
 
 
 def test_it_ends_when_it_is_known_who_crashes_less_often(campaigns, done, tmp_path):
