@@ -30,8 +30,8 @@ class Progress:
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
         """Begin a stage of ``total`` units (None: not known), ``done`` of which were finished by an earlier run."""
 
-    def advance(self, n: int) -> None:  # noqa: ARG002 - for those who show it
-        """Report ``n`` more units as finished; a KeyboardInterrupt where nobody wants the rest."""
+    def advance(self, n: int, **counts: int) -> None:  # noqa: ARG002 - for those who show it
+        """Report ``n`` more units as finished, and what else is counted; KeyboardInterrupt if cancelled."""
         if self.cancelled:
             raise KeyboardInterrupt
 
@@ -88,11 +88,12 @@ class ShownProgress(Progress):
         if self._told or done:
             self._print()
 
-    def advance(self, n: int) -> None:
-        """Move the bar on."""
+    def advance(self, n: int, **counts: int) -> None:
+        """Move the bar on, and add up figures beside it."""
         super().advance(n)
         for task in self._bars.tasks:  # one, or none before the first stage
             self._bars.update(task.id, advance=n)
+            task.fields["figures"] |= {name: task.fields["figures"].get(name, 0) + m for name, m in counts.items()}
         self.status()
 
     def status(self, **figures: Figure) -> None:

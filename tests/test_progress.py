@@ -31,8 +31,9 @@ def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeyp
     assert isinstance(shown_progress(), ShownProgress)
     with ShownProgress(interval_s=1e-3) as lines:
         lines.stage("episodes", total=13_187)
-        lines.advance(5_000)
-        lines.status(crashes=12, rhw=0.0812, asked=0.05)
+        lines.advance(5_000, crashes=5)
+        lines.advance(0, crashes=7)
+        lines.status(rhw=0.0812, asked=0.05)
         assert log.came.wait(60)
         lines._interval_s = 60.0
     text = r"\d\d:\d\d:\d\d episodes: 5,000 of 13,187 · [\d,]+/s · crashes 12 · ± 8.1 % · asked ± 5.0 % · 0.\d s left"

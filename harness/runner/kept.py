@@ -110,7 +110,6 @@ class Run:
     """What the page shows of them."""
     n_rows: int = 0
     """Of all tables of those that are open."""
-    n_crashes: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     repeated: Repeated | None = None
     before: Mapping[str, tuple[pa.Table, ...]] = field(default_factory=dict)
@@ -154,7 +153,6 @@ class Run:
             blocks=(*self.blocks, replace(shard.block, drawn=drawn)),
             shown=(*self.shown, ShownTests.of(shard.tables.episodes, self.resolved.family)),
             n_rows=self.n_rows + sum(table.num_rows for table in shard.tables if table is not None),
-            n_crashes=self.n_crashes + int(shard.block.crash.sum()),
             failures=self.failures + shard.failures,
             repeated=shard.repeated or self.repeated,
         )

@@ -147,8 +147,8 @@ class Underway:
             with uninterrupted():
                 self.run = self.run.with_shard(shard)
             n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
-            self.progress.advance(min(n_new, shard.request.n_episodes))
-            self.progress.status(crashes=self.run.n_crashes, rhw=rule.look.rhw, asked=rule.target or math.inf)
+            self.progress.advance(min(n_new, shard.request.n_episodes), crashes=int(shard.block.crash.sum()))
+            self.progress.status(rhw=rule.look.rhw, asked=rule.target or math.inf)
             yield shard
 
     def drive_added(self, tested: IntArray, added: IntArray, rule: Rule) -> Iterator[ShardResult]:
