@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from functools import cache
 from inspect import getmembers, isfunction
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text[-1:] in ".!?" else ".")
 
 
+@cache
 def templates(package: str = "harness.report") -> Environment:
     """Templates of a package, which may include those of this one."""
     place = Path(__file__).parent
