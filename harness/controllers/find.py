@@ -289,7 +289,7 @@ def _note_step_length(file: str) -> None:
     """Say once that a script may be asked more often than by SUMO, for which it may have been written."""
     script = real_path(file)
     if "step-length" not in script.read_text("utf-8", errors="replace"):
-        told = "names no --step-length (a .sumocfg is not read): it is asked every 0.1 s; SUMO's default is 1 s"
+        told = "names no --step-length: without one in its .sumocfg it is asked every 0.1 s; SUMO's default is 1 s"
         sys.stderr.write(f"note: {script.name} {told}.\n")
 
 

@@ -9,15 +9,16 @@ from __future__ import annotations
 import builtins
 import importlib
 import random
-import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from itertools import pairwise
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
+from xml.etree import ElementTree
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
@@ -31,7 +32,6 @@ from harness.files import real_path
 from harness.vehicles.kinematics import STEP_S
 
 _ROUNDING = 1e-9
-_STEP_LENGTH = re.compile(r"(?:^| )--step-length[= ](\S+)")
 _PATIENCE = 100
 """Steps that a script may ask for when its simulation has ended; a loop that no error ends is left where it is."""
 _LEFT = list[greenlet]()
@@ -130,11 +130,10 @@ class ScriptTraci(Traci):
             raise GreenletExit  # the next of a script that runs several: a test is one
         if self.simulation.n_steps:
             raise RefusedError("traci.start is refused after a step: each test is one run of the script.")
-        options = " ".join(map(str, cmd)) if isinstance(cmd, list | tuple) else ""
-        if (asked := _STEP_LENGTH.search(options)) is not None:
-            self.every = round(float(asked[1]) / STEP_S)
-            if self.every < 1 or abs(self.every * STEP_S - float(asked[1])) > _ROUNDING:
-                raise RefusedError(f"{asked[0].strip()} is refused: steps here are 0.1 s; ask for a multiple of it.")
+        if isinstance(cmd, list | tuple) and (asked := _step_length([*map(str, cmd)])) is not None:
+            self.every = round(float(asked) / STEP_S)
+            if self.every < 1 or abs(self.every * STEP_S - float(asked)) > _ROUNDING:
+                raise RefusedError(f"--step-length {asked} is refused: steps here are 0.1 s; ask for a multiple of it.")
             self.vehicle.step_s = self.simulation.step_s = self.every * STEP_S
         return _VERSION
 
@@ -208,6 +207,19 @@ class ScriptTraci(Traci):
         listener = self._listeners.pop(listenerID, None)
         getattr(listener, "cleanUp", lambda: None)()
         return listener is not None
+
+
+def _step_length(options: Sequence[str]) -> str | None:
+    """What SUMO's options say (s), or else the configuration file that they name, if it is there."""
+    given = {**dict(pairwise(options)), **dict(each.split("=", 1) for each in options if "=" in each)}
+    if "--step-length" in given:
+        return given["--step-length"]
+    for name in (each.rpartition("=")[2] for each in options):
+        if name.endswith("cfg") and Path(name).is_file():
+            with suppress(ElementTree.ParseError):
+                found = ElementTree.parse(name).find(".//step-length")  # noqa: S314 - the user's own
+                return None if found is None else found.get("value")
+    return None
 
 
 def _hand_over() -> None:

@@ -192,7 +192,14 @@ while traci.simulation.getMinExpectedNumber() > 0:
 def test_a_step_of_the_script_is_as_long_as_it_asks_for(tmp_path):
     """What it does once a second it does once a second, and a command leads there in that time."""
     hardest = []
-    for option, step_s in (('"--step-length", "1"', 1.0), ("'--step-length=0.5'", 0.5), ('"--no-warnings"', 0.1)):
+    (tmp_path / "a file.sumocfg").write_text('<c><time><step-length value="0.5"/></time></c>', "utf-8")
+    (tmp_path / "damaged.sumocfg").write_text("<c", "utf-8")
+    for option, step_s in (
+        ('"--step-length", "1"', 1.0),
+        ("'--step-length=0.5'", 0.5),
+        (f"'-c', '{tmp_path}/a file.sumocfg'", 0.5),
+        (f"'-c={tmp_path}/damaged.sumocfg', \"--no-warnings\"", 0.1),
+    ):
         (tmp_path / "my.py").write_text(text("", PER_SECOND.format(option=option, step_s=step_s)), "utf-8")
         shard = drive(f"av={{controller: '{tmp_path}/my.py'}}", HELD, n=12)
         assert shard.failures == {}
@@ -200,7 +207,7 @@ def test_a_step_of_the_script_is_as_long_as_it_asks_for(tmp_path):
         braking = shard.traces[0][:-1, 2, 2]
         begins = int(np.flatnonzero(braking < 0.0)[0])
         assert set(braking[begins : begins + round(10 * step_s)]) == {braking[begins]}
-    assert hardest == pytest.approx([-3.0, -4.5, -4.5], abs=1e-9)
+    assert hardest == pytest.approx([-3.0, -4.5, -4.5, -4.5], abs=1e-9)
 
 
 def test_one_that_names_none_is_told_so_once(tmp_path, capsys):
