@@ -21,7 +21,7 @@ from harness.commands.options import (
     written_file,
 )
 from harness.commands.printing import print_json, print_table
-from harness.errors import HarnessError, WorldDisagreementError
+from harness.errors import HarnessError
 
 if TYPE_CHECKING:
     from studies.rnot import RnotEstimator
@@ -36,7 +36,6 @@ _workers_option = click.option("--workers", type=click.IntRange(min=1), help="Pr
         f"{_ME} validate scenarios/validate/shells_panel.yaml --out runs/shells_panel",
         f"{_ME} case scenarios/case_study/study.yaml --out runs/quick --quick",
         f"{_ME} rnot runs/nde runs/forced",
-        f"{_ME} alarm runs/mixture",
         f"{_ME} traffic",
     ),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
@@ -45,7 +44,7 @@ def cli() -> None:
     """Studies of the methods behind `harness`, for those who develop or doubt them; run from a checkout.
 
     Exit codes are those of `harness`: 0 done; 1 traffic is not as published; 2 the file or the call is wrong, or the
-    records do not allow what was asked for; 3 the alarm is raised; 130 interrupted by Ctrl-C.
+    records do not allow what was asked for; 130 interrupted by Ctrl-C.
     """
 
 
@@ -192,33 +191,6 @@ def rnot(folders: Sequence[Path], *, estimators: Sequence[RnotEstimator], as_jso
     for row in content["rows"]:
         for remark in [*row.get("remarks", ()), *filter(None, [row.get("reason")])]:
             click.echo(f"{row['run']} {row['estimator']}: {remark}")
-
-
-@cli.command(
-    short_help="Do weights, traffic and pool of a run belong together?",
-    epilog=examples(f"{_ME} alarm runs/mixture   # builds the campaign's pool where it is not there"),
-)
-@click.argument("folder", metavar="RUN", type=RUN_FOLDER)
-@json_option
-@click.pass_context
-def alarm(ctx: click.Context, folder: Path, *, as_json: bool) -> None:
-    """Put the pool's surrogates in the AV's place in all tests of RUN, and see if they crash as the pool says.
-
-    The alarm is raised, and the exit code is 3, where they do not, which a sound run shows once in 10,000 times: then a
-    weight, a maneuver on record, the twin or the pool is wrong.
-    """
-    from studies.alarm import alarm_of_run  # noqa: PLC0415 - slow to import
-
-    with (bar := progress_bar()):
-        found = alarm_of_run(folder, bar)
-    if as_json:
-        print_json(found)
-    else:
-        print_table(f"Weighted crashes of surrogates in {found['n_episodes']:,} tests", found["surrogates"])
-        verdict = found["no_verdict"] or ("ALARM: weights, maneuvers, twin or pool are wrong" * found["raised"])
-        click.echo(f"{verdict or 'nothing is wrong that these tests could show'} (p-value {found['p_value']:.2g})")
-    if found["raised"]:
-        ctx.exit(WorldDisagreementError.exit_code)
 
 
 @cli.command(

@@ -17,7 +17,7 @@ from harness.vehicles.kinematics import STEP_S
 from harness.vehicles.references import reaction_steps
 from harness.vehicles.sideways import onset_of
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, PASSED, RUNNING, TIMEOUT, Record, RecordArray
-from studies.alarm import approach, approach_cut_in, stored_paths
+from tests.in_its_place import approach, approach_cut_in, stored_paths
 
 RETRACED_DTYPE = np.dtype(
     [(name, np.int64) for name in ("outcome", "n_steps")]

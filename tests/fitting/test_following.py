@@ -147,6 +147,7 @@ def test_a_cut_out_that_reveals_nobody_slower_is_none():
     assert not CutOutFitter().seen(recording(alone)).events.size  # nobody follows
 
 
+@pytest.mark.slow
 def test_what_a_fit_writes_is_what_a_campaign_reads(tmp_path, monkeypatch, capsys):
     """Counted exposures and laws where there are enough; where not, what is missing, and the default."""
     monkeypatch.chdir(tmp_path)

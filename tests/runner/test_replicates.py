@@ -153,6 +153,7 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
     assert content["assumed"]["times"][1] == pytest.approx(high / stored["ci_high"], rel=0.03)
 
 
+@pytest.mark.slow
 def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
     """The rate is in proportion to the share that does not look, in its range; without a crash its limit is."""
     text = SHIPPED.replace("{value: 0.01, source: assumed}", "{value: 0.01, source: assumed, range: [0.005, 0.08]}")

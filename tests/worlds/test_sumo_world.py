@@ -25,8 +25,8 @@ from harness.worlds import sumo
 from harness.worlds.shim import open_shim, shim_library
 from harness.worlds.sumo import committed_file
 from harness.worlds.twin import TwinWorld
-from studies.alarm import replay_surrogates, stored_paths
 from tests.episode.test_lateral import BESIDE, at_once, beside
+from tests.in_its_place import replay_surrogates, stored_paths
 from tests.retracing import retraced
 from tests.worlds.running import smoke
 

@@ -1,0 +1,99 @@
+"""Surrogates in the place of the AV crash, weighted, as the pool says: weights, traffic, twin and pool belong together.
+
+Four standard errors miss with a probability of 6e-5 per surrogate and method.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from harness.campaign.campaign import Campaign
+from harness.campaign.files import load_campaign
+from harness.estimators.block import Block, block_from_tables
+from harness.pool.build import campaign_pool
+from harness.pool.kept import Pool
+from harness.records.schemas import episodes_table
+from harness.resolved import resolve
+from harness.sampling import prepare
+from harness.vocabulary import BoolArray
+from harness.worlds.twin import TwinWorld
+from tests.chains.seed import SEED
+from tests.in_its_place import drivers_crash, surrogates_crash
+from tests.pool.conftest import SMALL_POOL
+from tests.stored_runs import MIXTURE_FILE
+
+pytestmark = pytest.mark.slow
+
+
+N = 10_000
+LATE = "av={model: idm, parameters: {min_acceleration_mps2: -3}, reaction: {delay_s: 0.7}}"
+
+
+def campaign(method: str, *more: str) -> Campaign:
+    return load_campaign(MIXTURE_FILE, [f"testing.method={method}", f"seed={SEED}", *SMALL_POOL, *more])
+
+
+def drive(campaign: Campaign, n: int = N) -> pa.Table:
+    ready = prepare(resolve(campaign))
+    return episodes_table(ready.loop(TwinWorld(256)).run(0, ready.tests(0, n)), campaign.seed)
+
+
+def replayed(campaign: Campaign, table: pa.Table, pool: Pool) -> tuple[Block, BoolArray]:
+    """The episodes, and which surrogates would have crashed in them."""
+    return block_from_tables(campaign, table), surrogates_crash(table, resolve(campaign), pool)
+
+
+@pytest.fixture(scope="module")
+def forced() -> tuple[Campaign, pa.Table, Pool]:
+    one = campaign("forced", LATE)
+    return one, drive(one), campaign_pool(resolve(one))
+
+
+def test_a_surrogate_that_is_the_av_crashes_where_the_av_did(forced):
+    one, table, pool = forced
+    block, crashes = replayed(one, table, pool)
+    own = crashes[:, pool.names.index("brakes-3-late-700ms")]
+    assert block.crash.sum() > 30
+    np.testing.assert_array_equal(own, block.crash)
+    assert not np.array_equal(crashes[:, pool.names.index("brakes-3")], block.crash)
+
+
+@pytest.mark.parametrize("hold_s", [1.0, 0.1])
+def test_other_draws_after_the_end_do_not_change_what_was_driven(hold_s):
+    """The AV never brakes: its crashes cut the paths short, and careful surrogates need what comes after."""
+    one, other = (
+        campaign("forced", f"environment.acceleration_hold_s={hold_s}", av)
+        for av in ("av.model=constant", "av.model=idm")
+    )
+    environment, tables = resolve(one).environment, [drive(each, 400) for each in (one, other)]
+    followers = resolve(one).library.followers(environment.lateral.present)
+    short, long = (drivers_crash(paths, one.seed, environment, followers) for paths in tables)
+    assert tables[0].column("outcome").to_pylist().count("crash") > 100
+    np.testing.assert_array_equal(short, long)
+
+
+@pytest.mark.parametrize(
+    ("method", "level", "n"), [("nde", 1e5, 4 * N), ("forced", 1.0, 2 * N), ("episode_mixture", 1.0, 2 * N)]
+)
+def test_weighted_crashes_of_surrogates_have_the_rates_of_the_pool(method, level, n):
+    one = campaign(method, f"environment.lane_change_level={level}")
+    pool = campaign_pool(resolve(one))
+    assert furthest(*replayed(one, drive(one, n), pool), pool) < 4.0
+
+
+def furthest(block: Block, crashes: BoolArray, pool: Pool) -> float:
+    """Distance of a weighted rate from the pool's, in standard errors, of surrogates that crash often enough."""
+    h = crashes * block.weights()[:, None]
+    error = np.sqrt(h.var(axis=0) / len(block) + np.diag(pool.mu_covariance))
+    many = h.sum(axis=0) ** 2 >= 100.0 * (h * h).sum(axis=0)
+    assert np.count_nonzero(many) >= 4
+    return float(np.max(np.abs(h.mean(axis=0) - pool.mu)[many] / error[many]))
+
+
+@pytest.mark.parametrize("wrong", [0.5, 2.0])
+def test_weights_that_are_all_wrong_are_found_out(forced, wrong):
+    block, crashes = replayed(*forced)
+    assert furthest(replace(block, log_weight=block.log_weight + np.log(wrong)), crashes, forced[2]) > 4.0
+    assert furthest(block, crashes, forced[2]) < 4.0
