@@ -48,12 +48,15 @@ _QUESTIONS: dict[str, tuple[int, Callable[[Seen], Any]]] = {
     "getPosition": (0x42, lambda of: (of.position, LANE_CENTRES_M[of.lane] + of.sideways)),
     "getAngle": (0x43, lambda _: 90.0),  # degrees: along x
     "getLength": (0x44, lambda _: VEHICLE_LENGTH_M),
+    "getVehicleClass": (0x49, lambda _: "passenger"),
     "getMinGap": (0x4C, lambda _: 0.0),  # gaps are bumper to bumper
+    "getWidth": (0x4D, lambda _: 1.8),  # SUMO's of passenger cars
     "getTypeID": (0x4F, lambda _: "exact"),
     "getRoadID": (0x50, lambda _: ROAD),
     "getLaneID": (0x51, lambda of: f"{ROAD}_{of.lane}"),
     "getLaneIndex": (0x52, lambda of: of.lane),
     "getLanePosition": (0x56, lambda of: of.position),
+    "getSpeedFactor": (0x5E, lambda _: 1.0),
     "getAcceleration": (0x72, lambda of: of.acceleration),
     "getLateralLanePosition": (0xB8, lambda of: of.sideways),
 }

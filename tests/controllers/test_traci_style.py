@@ -43,6 +43,7 @@ def test_readings(traci):
     assert (vehicle.getPosition("AV"), vehicle.getLanePosition("AV")) == ((100.0, -1.6), 100.0)
     assert (vehicle.getLaneID("BV"), vehicle.getRoadID("BV"), vehicle.getAngle("BV")) == ("cell0_0", "cell0", 90.0)
     assert (vehicle.getLength("AV"), vehicle.getMinGap("AV")) == (5.0, 0.0)
+    assert (vehicle.getWidth("LV"), vehicle.getVehicleClass("BV")) == (1.8, "passenger")
     assert (traci.simulation.getTime(), traci.simulation.getDeltaT()) == (0.0, 0.1)
     assert vehicle.getAcceleration("BV") == 0.0
     traci.see(seen(0.1, lead_speed=19.8))  # accelerations of traffic are differences of speeds
