@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks.one_at_a_time import OverTraci, in_libsumo
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.families.cut_in.nade import in_loop
 from harness.loop import loop
 from harness.loop.loop import Shard
 from harness.records.folder import write_part
@@ -112,8 +113,9 @@ class WithParts(Recorded):
     def __init__(self, settings: Campaign, world: Callable[[Campaign], World]) -> None:
         super().__init__(settings, world)
         self._seconds: dict[str, float] = {}
-        for kernel in ("decide", "judge"):
-            self._time(loop, kernel, "policy")
+        self._time(in_loop, "decide", "policy")
+        for kernel in ("refill", "drive", "command", "judge"):
+            self._time(loop, kernel, "dynamics of the AV, judge")
         self._time(self.world, "place", "refill")
         self._time(self.world, "_contacts", "collisions")
         self._time(self, "write", "recording")
@@ -133,7 +135,7 @@ class WithParts(Recorded):
         work = super().run(first, n)
         total = time.perf_counter() - started
         rest = total - sum(self._seconds.values())
-        return work._replace(part_s={**self._seconds, "dynamics, loop": rest})
+        return work._replace(part_s={**self._seconds, "loop": rest})
 
 
 def _timed(function: Callable[..., object], part: str, seconds: dict[str, float]) -> Callable[..., object]:

@@ -102,7 +102,7 @@ class SumoCells(World):
             stay: dict[int, int] = {}
             for vehicle, on in enumerate(to_lane):
                 if not changes[vehicle] and stay.setdefault(on, vehicle) != vehicle:
-                    self._move(to, k, vehicle, at[vehicle], driving[vehicle], 1 - on)
+                    to.moveTo(self._names[k][vehicle], f"cell{k}_{1 - on}", at[vehicle])
                     changes[vehicle] = True
             for vehicle in sorted(range(len(changes)), key=changes.__getitem__):
                 self._move(to, k, vehicle, at[vehicle], driving[vehicle], to_lane[vehicle])
