@@ -271,12 +271,17 @@ def require_controller(av: AutomatedVehicle) -> str | None:
     if not has_foreign_code(av):
         return None
     try:
-        made_of = run_apart(av, _sources_of_made, av)
+        return run_apart(av, _sources_of_made, av)
     except AvEndedProcessError as error:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
-    if av.controller is not None and is_script(av.controller):
-        _note_step_length(_file_of_script(av.controller))
-    return made_of
+
+
+def runs_script(av: AutomatedVehicle) -> bool:
+    """Whether an AV's controller is a TraCI script; a note is made of one that SUMO may have asked less often."""
+    if av.controller is None or not is_script(av.controller):
+        return False
+    _note_step_length(_file_of_script(av.controller))
+    return True
 
 
 def _file_of_script(name: str) -> str:
