@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.estimators.block import Block, Drawn
+from harness.estimators.block import Block, Drawn, joined
 from harness.estimators.doubly_robust import DoublyRobust
 from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Note, Point, Unavailable, note
 from harness.estimators.own import Asked, OwnEstimator, OwnState
@@ -36,6 +36,8 @@ docs/estimators.md). The number of tests decides, and nothing that is seen in th
 better than they are."""
 SPACING = 1.01
 """Prefixes closer than 1 % are one dot on a logarithmic axis; thinning them keeps long campaigns' files small."""
+FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
+"""Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
 UNKNOWN_MEAN = {"mean": math.nan, "std_error": math.inf}
 BEFORE_OVERLAP = ("took_over_early", "asked_to_speed_up")
 """What AVs do, or ask for in vain, while BV comes over; columns of blocks."""
@@ -116,6 +118,22 @@ class PassResult:
     convergence: list[Point]
     severity: Severity | None
     cut_off: float
+
+
+def even(blocks: Iterable[Block]) -> Iterator[Block]:
+    """The same tests in blocks whose sizes follow from the tests before them alone, not from how they were run."""
+    waiting: list[Block] = []
+    n, size = 0, FEWEST_TOGETHER
+    for block in blocks:
+        waiting.append(block)
+        while sum(map(len, waiting)) >= size:
+            whole = joined(waiting)
+            waiting = [whole.take(slice(size, len(whole)))] if len(whole) > size else []
+            yield whole.take(slice(0, size))
+            n += size
+            size = min(max(FEWEST_TOGETHER, round(n * (SPACING - 1.0))), MOST_TOGETHER)
+    if waiting:
+        yield joined(waiting)
 
 
 def one_pass(
