@@ -303,6 +303,11 @@ REFUSED = (
         f"at least {LEAST_TESTS['dr']:,}: below, its intervals miss too often",
         "Raise it, or delete testing.estimator.",
     ),
+    Combination(
+        "records.moments", lambda c, _: c.testing.estimator == "scv" and c.records.moments == "none",
+        "none, with testing.estimator scv", "first_9 or all: its control variates are of control steps",
+        "Write first_9, or delete testing.estimator.",
+    ),
     # -- cut-ins that take time --
     Combination(
         "testing.method", lambda c, use: use.shows and c.sampling.mixes,
