@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from harness.campaign.campaign import Campaign, Command, Use, refusal
-from harness.controllers.find import require_controller, source_of_own
+from harness.controllers.find import require_controller, runs_script, source_of_own
 from harness.errors import CampaignError
 from harness.estimators.one_pass import accumulator
 from harness.estimators.own import headline_of
@@ -31,7 +31,8 @@ class Resolved:
     built-in AV, (0,) of any other; ``surrogates`` (J,) are the drivers that challenges are computed for.
     ``challenge`` says how they are, one of the user's own by the hash of its file.
     ``content_hash`` is of all that changes an episode's bits, the environment's numbers included;
-    ``controller_sha256`` of the source of the AV's controller, None where there is none, or nobody has looked.
+    ``controller_sha256`` of the source of the AV's controller, None where there is none, or nobody has looked;
+    ``script`` says whether it is a TraCI script.
     """
 
     campaign: Campaign
@@ -42,6 +43,7 @@ class Resolved:
     challenge: str
     content_hash: str
     controller_sha256: str | None = None
+    script: bool = False
 
     @property
     def family(self) -> Family:
@@ -82,7 +84,8 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
         from harness.worlds.program import require_private  # noqa: PLC0415 - imports traci
 
         require_private(campaign.av.traci)
-    resolved = resolve(campaign, command, controller_sha256=controller_sha256)
+    script = runs_script(campaign.av)
+    resolved = replace(resolve(campaign, command), controller_sha256=controller_sha256, script=script)
     accumulator(headline_of(campaign))  # one of the user's own can be made
     if campaign.sampling.strata:
         library, accept = resolved.library, campaign.accept  # the file is read, and refused if it is wrong
@@ -97,7 +100,7 @@ def require_world(campaign: Campaign) -> None:
         require_libraries()
 
 
-def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: str | None = None) -> Resolved:
+def resolve(campaign: Campaign, command: Command = "run") -> Resolved:
     """Read what a campaign names, and refuse what does not go together (`harness.campaign.campaign.REFUSED`).
 
     Raises `CampaignError`: a file that it names is missing or wrong, or something of the campaign does not go with the
@@ -128,5 +131,4 @@ def resolve(campaign: Campaign, command: Command = "run", *, controller_sha256: 
         library_records([*campaign.surrogates.values()], see_onset=False),
         challenge,
         campaign.content_hash(parameters.content_hash(), challenge),
-        controller_sha256,
     )

@@ -19,6 +19,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from harness.campaign.drivers import NATURAL, Surrogate, default_surrogates
 from harness.campaign.sections import (
     DEFAULT,
+    LEAST_TESTS,
     Accept,
     CrashSettings,
     EnvironmentSettings,
@@ -295,6 +296,17 @@ REFUSED = (
         "{stop.below_reference:g}, where no stop.rhw is asked of tests from shells",
         "nothing: all it does is to end a run of shells before its stop.rhw is reached",
         "Write null; or ask for that limit alone, by accept.times_reference.",
+    ),
+    Combination(
+        "stop.episodes", lambda c, _: c.stop.episodes < LEAST_TESTS.get(c.testing.estimator or "", 0),
+        "{stop.episodes:g}, with testing.estimator {testing.estimator}",
+        f"at least {LEAST_TESTS['dr']:,}: below, its intervals miss too often",
+        "Raise it, or delete testing.estimator.",
+    ),
+    Combination(
+        "records.moments", lambda c, _: c.testing.estimator == "scv" and c.records.moments == "none",
+        "none, with testing.estimator scv", "first_9 or all: its control variates are of control steps",
+        "Write first_9, or delete testing.estimator.",
     ),
     # -- cut-ins that take time --
     Combination(

@@ -51,7 +51,9 @@ def own_code(name: str, where: str = "av.controller", what: str = _A_CONTROLLER)
     except (Exception, SystemExit) as error:
         cause = f"{name}, whose module cannot be imported ({cause_of(error)})"
         meant = did_you_mean(module_name, [file.stem for file in Path.cwd().glob("*.py")])
-        mend = "Fix the module." if is_file else "Name its file, my_av.py:Class, or install it beside the harness."
+        mend = "Name its file, my_av.py:Class, or install it beside the harness."
+        if is_file:
+            mend = "Fix the module." if Path(module_name).exists() else "Put it back, or name another."
         raise CampaignError(where, cause, "a Python module that can be imported", meant or mend) from error
     found = getattr(module, class_name, None)
     if not callable(found):
@@ -271,12 +273,17 @@ def require_controller(av: AutomatedVehicle) -> str | None:
     if not has_foreign_code(av):
         return None
     try:
-        made_of = run_apart(av, _sources_of_made, av)
+        return run_apart(av, _sources_of_made, av)
     except AvEndedProcessError as error:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
-    if av.controller is not None and is_script(av.controller):
-        _note_step_length(_file_of_script(av.controller))
-    return made_of
+
+
+def runs_script(av: AutomatedVehicle) -> bool:
+    """Whether an AV's controller is a TraCI script; a note is made of one that SUMO may have asked less often."""
+    if av.controller is None or not is_script(av.controller):
+        return False
+    _note_step_length(_file_of_script(av.controller))
+    return True
 
 
 def _file_of_script(name: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from harness.estimators.block import Block, Drawn
+from harness.campaign.sections import LEAST_TESTS
+from harness.errors import CampaignError
+from harness.estimators.block import Block, Drawn, joined
 from harness.estimators.doubly_robust import DoublyRobust
 from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Note, Point, Unavailable, note
 from harness.estimators.own import Asked, OwnEstimator, OwnState
@@ -30,12 +32,10 @@ ACCUMULATORS: dict[EstimatorName, Callable[[], Accumulator]] = {
     "scv": partial(Scv, leave_one_out=True),
     "shells": SeenShells,
 }
-LEAST_TESTS: dict[EstimatorName, int] = {"dr": 1_000}
-"""Below which intervals miss too often, as rare crashes that no surrogate predicts are not among the tests (measured:
-docs/estimators.md). The number of tests decides, and nothing that is seen in them: tests that lack such a crash look
-better than they are."""
 SPACING = 1.01
 """Prefixes closer than 1 % are one dot on a logarithmic axis; thinning them keeps long campaigns' files small."""
+FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
+"""Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
 UNKNOWN_MEAN = {"mean": math.nan, "std_error": math.inf}
 BEFORE_OVERLAP = ("took_over_early", "asked_to_speed_up")
 """What AVs do, or ask for in vain, while BV comes over; columns of blocks."""
@@ -118,12 +118,29 @@ class PassResult:
     cut_off: float
 
 
+def even(blocks: Iterable[Block]) -> Iterator[Block]:
+    """The same tests in blocks whose sizes follow from the tests before them alone, not from how they were run."""
+    waiting: list[Block] = []
+    n, size = 0, FEWEST_TOGETHER
+    for block in blocks:
+        waiting.append(block)
+        while sum(map(len, waiting)) >= size:
+            whole = joined(waiting)
+            waiting = [whole.take(slice(size, len(whole)))] if len(whole) > size else []
+            yield whole.take(slice(0, size))
+            n += size
+            size = min(max(FEWEST_TOGETHER, round(n * (SPACING - 1.0))), MOST_TOGETHER)
+    if waiting:
+        yield joined(waiting)
+
+
 def one_pass(
     blocks: Iterable[Block], names: Collection[Asked] = ESTIMATORS, best: Asked | None = None, confidence: float = 0.9
 ) -> PassResult:
     """Feed every block to every estimator that can use it; the ``best``, the headline, is by default the method's own.
 
-    Blocks are contiguous and in index order, from episode 0; a gap, or no episode at all, is a `ValueError`.
+    Blocks are contiguous and in index order, from episode 0; a gap, or no episode at all, is a `ValueError`. Too few
+    tests for the headline are a `CampaignError`.
     """
     blocks = iter(blocks)
     if (first := next(blocks, None)) is None:
@@ -150,6 +167,10 @@ def one_pass(
     few: dict[str, Note] = {
         name: note("needs_tests", n=n, least=least) for name, least in LEAST_TESTS.items() if n < least
     }
+    if own in few:  # a run that was interrupted: others are refused before a test
+        found, expected = f"{own}, with {n:,} tests", f"{LEAST_TESTS[own]:,}: below, its intervals miss too often"
+        mend = "Go on with --resume, or let another answer: --resume --set testing.estimator=nade."
+        raise CampaignError("testing.estimator", found, expected, mend)
     refusals = {name: few.get(name) if why is None else why for name, why in refusals.items()}
     if convergence[-1].n != n:
         convergence.append(_point(results[own]))

@@ -100,7 +100,8 @@ def _own(of: Any, where: str) -> OwnEstimator:
     if missing := [each for each in ("methods", "add", "result") if not hasattr(found, each)]:
         raise HarnessError(where, f"{name} without {' and '.join(missing)}", what, "Add what is missing.")
     if isinstance(found.methods, str) or not {*found.methods} <= {*METHODS} - {"shells"}:
-        expected = f"those of {listed(METHODS)} whose tests it can use, but shells, which have no weights"
+        weighted = listed(each for each in METHODS if each != "shells")
+        expected = f"those of {weighted} whose tests it can use; shells have no weights"
         mend = 'Write methods = ("forced",), say. Weights have mean 1 only where a method can draw every test.'
         raise HarnessError(where, f"{name} with methods {found.methods!r}", expected, mend)
     return OwnEstimator(name, found if isinstance(found, type) else partial(deepcopy, found), tuple(found.methods))

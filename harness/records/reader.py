@@ -58,7 +58,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
     Raises `RunFolderError`: ``campaign.yaml`` is missing or damaged, or is another campaign than the manifest's.
     """
     path = folder / CAMPAIGN
-    mend = "Restore the file as the run has written it, or run the campaign again."
+    mend = f"Restore {CAMPAIGN} as the run has written it, and files that it names, or run the campaign again."
     try:
         campaign = load_campaign(path, check_files=check_files)
     except CampaignError as error:
@@ -77,7 +77,7 @@ def require_campaign(path: Path, content_hash: str, manifest: Mapping[str, Any])
     """Refuse (`RunFolderError`) a campaign that has not made the records."""
     if content_hash != manifest["campaign_hash"]:
         expected = f"campaign {manifest['campaign_hash']}, which made the records (manifest.json)"
-        mend = "Restore campaign.yaml and the environment parameter file that it names."
+        mend = "Restore campaign.yaml and files that it names: environment.parameters, testing.challenge, an FMU."
         raise RunFolderError(str(path), f"campaign {content_hash}", expected, mend)
 
 

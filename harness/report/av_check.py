@@ -124,7 +124,7 @@ class AvCheck:
     events: str = "cut-ins"
     follows: Follows | None = None
     idm_follows: Follows | None = None
-    controller: str | None = None
+    script: bool = False
 
     @property
     def exit_code(self) -> int:
@@ -164,7 +164,7 @@ def verdict(found: AvCheck) -> str:
             f"{speed.constructions} times: what all may share, load once (`load`, see docs/controllers.md)."
         )
     if found.shows and found.source == "controller" and not seen.n_took_over_early:
-        advice += f" But {late_words(found.controller)}."
+        advice += f" But {late_words(script=found.script)}."
     return (
         f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
         f"{found.events}, {seen.reaction_s:.1f} s after they began (median; some leave time to wait); "

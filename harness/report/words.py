@@ -14,7 +14,6 @@ from typing import Any
 from pydantic import BaseModel, TypeAdapter
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.python_files import is_script
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.answer import Elsewhere, Estimates
 from harness.estimators.severity import TOUCH_MPS
@@ -66,7 +65,7 @@ def answer_of(campaign: Campaign, manifest: Mapping[str, Any], content: Mapping[
 
 def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> ShortAnswer:
     """The answer by a campaign's own estimate, with what the ``manifest`` of the run says besides."""
-    vehicle, parameters = vehicle_words(campaign.av)
+    vehicle, parameters = vehicle_words(campaign.av, script=bool(manifest.get("script")))
     engine = "SUMO" if campaign.world.engine == "sumo" else "SUMO’s twin"
     scenario = family_named(campaign.scenario).words.called
     return ShortAnswer(
@@ -83,8 +82,8 @@ def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimate
     )
 
 
-def vehicle_words(av: AutomatedVehicle) -> tuple[str, list[tuple[str, str]]]:
-    """Who drives the vehicle, and its parameters that are not defaults."""
+def vehicle_words(av: AutomatedVehicle, *, script: bool = False) -> tuple[str, list[tuple[str, str]]]:
+    """Who drives the vehicle, which may be a TraCI ``script``, and its parameters that are not defaults."""
     given = dict[str, Any]()
     for section, key in ((av.parameters, ""), (av.reaction, "reaction")):
         if isinstance(section, BaseModel):
@@ -97,7 +96,7 @@ def vehicle_words(av: AutomatedVehicle) -> tuple[str, list[tuple[str, str]]]:
     if av.sumo is not None:
         given |= av.sumo
         name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
-    elif av.controller and is_script(av.controller):  # SUMO would know its vehicle's type
+    elif script:  # SUMO would know its vehicle's type
         style = av.traci_style
         given["initial bounds"] = f"{plain(style.accel_mps2)} and −{plain(style.decel_mps2)} m/s²"
     elif av.traci is not None:
@@ -176,9 +175,9 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
         yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
 
 
-def late_words(controller: str | None) -> str:
+def late_words(*, script: bool) -> str:
     """That a vehicle does nothing before BV is in its lane, and what would show it."""
-    what = "getLateralLanePosition" if controller is not None and is_script(controller) else "bv_lateral_m"
+    what = "getLateralLanePosition" if script else "bv_lateral_m"
     return f"it reacted only once the other car (BV) was in its lane; {what} shows it some 2 s earlier"
 
 
@@ -189,7 +188,7 @@ def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Map
     if campaign.av.source in ("sumo", "traci"):
         yield "SUMO changes lanes in one step: this vehicle cannot see the other car (BV) coming over, as drivers can"
     elif counts.get("n_events") and not counts.get("n_took_over_early"):
-        yield late_words(campaign.av.controller)
+        yield late_words(script=bool(manifest.get("script")))
     if (n := counts.get("n_asked_to_speed_up")) and campaign.av.model is None:  # of our own it is known
         yield f"in {count(n)} tests it asked to speed up before BV was in its lane; its speed was held (av.takes_over)"
 

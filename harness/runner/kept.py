@@ -242,7 +242,7 @@ def take_over(
         "campaign_crc32": zlib.crc32(yaml), "signature": signature(yaml),
         "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": campaign.seed, "engine": campaign.world.engine, "versions": versions(), "cpu": cpu_name(),
-        "controller_sha256": resolved.controller_sha256, **facts,
+        "controller_sha256": resolved.controller_sha256, "script": resolved.script, **facts,
     }  # fmt: skip
     began -= float(earlier.get("wall_time_s") or 0.0)
     listed = earlier["before"].items()

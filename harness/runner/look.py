@@ -16,6 +16,7 @@ import numpy as np
 from harness.arguments import AtLeastTwo, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
+from harness.campaign.python_files import is_script
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.find import build_host, has_foreign_code
 from harness.controllers.hosts import ControllerHost, Failures
@@ -83,7 +84,7 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
         behaviour=_behaviour(first, limits, early=early), idm_behaviour=_behaviour(of_idm, limits, early=early),
         speed=own_speed, idm_speed=idm_speed, events=family.words.events,
         follows=_follows(first) if family.follows else None,
-        idm_follows=_follows(of_idm) if family.follows else None, controller=tested.av.controller,
+        idm_follows=_follows(of_idm) if family.follows else None, script=is_script(tested.av.controller or ""),
     )  # fmt: skip
 
 

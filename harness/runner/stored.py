@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,8 @@ from harness.campaign.sections import Confidence
 from harness.controllers.find import require_controller, run_apart
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import estimate_blocks
-from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables, joined
-from harness.estimators.one_pass import SPACING
+from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables
+from harness.estimators.one_pass import even
 from harness.estimators.own import asked_for
 from harness.families import family_named
 from harness.families.protocol import Environment
@@ -38,8 +38,6 @@ from harness.worlds import build_world
 if TYPE_CHECKING:
     from harness.report.player import ReplayResult
 
-FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
-"""Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
@@ -126,22 +124,6 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
         if n == n_counted:
             return
     raise RunFolderError(str(folder), f"{n} tests on record", f"{n_counted} (manifest.json)", _FINISH)
-
-
-def even(blocks: Iterable[Block]) -> Iterator[Block]:
-    """The same tests in blocks whose sizes follow from the tests before them alone, not from how they were run."""
-    waiting: list[Block] = []
-    n, size = 0, FEWEST_TOGETHER
-    for block in blocks:
-        waiting.append(block)
-        while sum(map(len, waiting)) >= size:
-            whole = joined(waiting)
-            waiting = [whole.take(slice(size, len(whole)))] if len(whole) > size else []
-            yield whole.take(slice(0, size))
-            n += size
-            size = min(max(FEWEST_TOGETHER, round(n * (SPACING - 1.0))), MOST_TOGETHER)
-    if waiting:
-        yield joined(waiting)
 
 
 _TRUST = "Look at stored motion alone (--stored), which runs no code; or read that code, and then add --trust."

@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import ended_by, estimate_blocks, expected_for, pool_remedy
+from harness.estimators.one_pass import even
 from harness.estimators.stopping import Rule, Verdict
 from harness.files import remove_unfinished
 from harness.pool.moved import assumed
@@ -26,7 +27,6 @@ from harness.records.folder import MILDER, SHELLS, parquet, write_sealed
 from harness.records.shown import ShownTests
 from harness.resolved import Resolved
 from harness.runner.kept import Run, cpu_name, require_few_failed, require_same_pool, take_over
-from harness.runner.stored import even
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
 from harness.sampling.baseline import IN_WORDS, begin, requests_before, stored_baseline, stored_table

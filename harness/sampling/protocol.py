@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.sections import LEAST_TESTS
 from harness.controllers.find import build_host
 from harness.controllers.hosts import BeforeTest
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
@@ -73,7 +74,8 @@ class KnownRounds(Rounds):
     def __init__(self, campaign: Campaign) -> None:
         self._total, self._confidence = campaign.stop.episodes, campaign.stop.confidence
         self._ends = campaign.run.shard_ends(self._total)
-        self.rule = self._rule = StopRule(campaign.stop, self._ends)
+        least = LEAST_TESTS.get(campaign.testing.estimator or "", 0)
+        self.rule = self._rule = StopRule(campaign.stop, [end for end in self._ends if end >= least])
         self._sums, self._n_episodes = accumulator(headline_of(campaign)), 0
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:

@@ -57,6 +57,7 @@ BROKEN_RULES = (
     ("surrogates:\n  A: my.py:Model", "surrogates.A", 3, "so no class of Python"),
     ("surrogates:\n  A: r157-c", "surrogates.A", 3, "Did you mean 'r157-cc'?"),
     ("testing: {method: episode_mixture}\nsurrogates: {}", "surrogates", 3, "at least one surrogate"),
+    ("testing: {method: step_mixture, estimator: scv}\nrecords: {moments: none}", "records.moments", 3, "first_9"),
     ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.2}", "testing.alpha", 3, "sum to 1.1"),
     ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
     ("scenarios:\n  - cut_in\n  - cutout", "scenarios.1", 4, "Did you mean 'cut_out'"),

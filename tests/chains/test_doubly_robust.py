@@ -5,11 +5,15 @@ import itertools
 import numpy as np
 import pytest
 
+from harness.campaign.files import load_campaign
+from harness.campaign.sections import LEAST_TESTS
+from harness.errors import CampaignError
 from harness.estimators.doubly_robust import FOLDS, DoublyRobust
 from harness.estimators.estimate import Unavailable
 from harness.estimators.limits import skewed_distances
-from harness.estimators.one_pass import LEAST_TESTS, one_pass
+from harness.estimators.one_pass import one_pass
 from harness.estimators.weighted import Nade
+from harness.sampling.protocol import KnownRounds
 from studies.case_study.theorems import small_chains
 from studies.chains.chain import CHAINS, DECISIVE, decisive, enumerate_episodes, overtaking
 from studies.chains.sampler import Sampler, blocks, draw
@@ -132,6 +136,16 @@ def test_it_is_refused_below_the_tests_from_which_on_it_covers():
     assert isinstance(few, Unavailable)
     assert (few.why.key, few.why.numbers) == ("needs_tests", {"n": least - 1, "least": least})
     assert enough.n_episodes == least
+
+
+def test_where_it_answers_it_is_refused_before_a_test_and_looked_at_from_there_on():
+    asked = ["testing={method: episode_mixture, estimator: dr}", "environment.parameters=ndd-overtaking-1"]
+    small = ["run.shard_size=100", "stop={rhw: 0.5, below_reference: null, episodes: 1999}"]
+    assert KnownRounds(load_campaign("idm", [*asked, *small])).rule.looks[0] == LEAST_TESTS["dr"]
+    with pytest.raises(CampaignError, match=r"stop\.episodes.*999, with testing\.estimator dr.*at least 1,000"):
+        load_campaign("idm", [*asked, *small, "stop.episodes=999"])
+    with pytest.raises(CampaignError, match=r"dr, with 999 tests.*--resume"):  # of a run that was interrupted
+        one_pass(blocks(DECISIVE[0], "step_mixture", [999], SEED), best="dr")
 
 
 def test_a_crash_that_is_due_and_was_not_drawn_is_said():

@@ -12,13 +12,15 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.cli import main
-from harness.controllers.find import require_controller
+from harness.controllers.find import runs_script
 from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.worlds.sumo import SumoWorld
 from harness.worlds.twin import TwinWorld
+from tests.in_process import run_here
+from tests.stored_runs import answer_in
 from tests.worlds.running import drive, motion
 
 SCRIPTS = Path(__file__).parent / "scripts"
@@ -216,9 +218,22 @@ def test_one_that_names_none_is_told_so_once(tmp_path, capsys):
     for name, script in (("none.py", body), ("some.py", body.replace('"sumo"', '"sumo", "--step-length=0.1"'))):
         (folder / name).write_text(script, "utf-8")
         for _ in range(2):
-            assert require_controller(load_campaign(str(folder / name)).av)
+            assert runs_script(load_campaign(str(folder / name)).av)
     (note,) = capsys.readouterr().err.splitlines()
     assert note.startswith("note: none.py names no --step-length")
+
+
+def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_path):
+    file, asked = tmp_path / "my.py", ["world.engine=twin", *FORCED, "stop.episodes=40"]
+    file.write_text(text("", PER_SECOND.format(option='"--step-length=0.1"', step_s=0.1)), "utf-8")
+    run_here(load_campaign(f"{file}", asked), tmp_path / "run")
+    told = answer_in(tmp_path / "run")
+    assert [name for name, _ in told["parameters"]] == ["initial bounds"]
+    assert "getLateralLanePosition shows it" in "".join(told["warnings"])
+    file.write_bytes(b"\xff")
+    assert answer_in(tmp_path / "run") == told
+    file.unlink()
+    assert answer_in(tmp_path / "run") == told
 
 
 def test_its_end_is_that_of_sumo(tmp_path, monkeypatch):
