@@ -27,7 +27,7 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
     verdict = [] if content["decision"] is None else [decided(content["decision"]).texts]
     rows = [*verdict, *sum_rows(content), *(reading_rows(content) if readings else ())]
     ends = [] if report is None else [f"  report  {report}"]
-    parts = columns([(row[1], f"{row[2]} of all", *row[3:]) for row in family_rows(content)])
+    parts = columns([(row[1], row[2] + " of all" * (i == 0), *row[3:]) for i, row in enumerate(family_rows(content))])
     under = wrapped([*(f"! {text}" for text in warnings(content)), exposures(content), scope(content)])
     return [" · ".join(head), *columns(rows), *parts, *under, *ends]
 
