@@ -10,7 +10,7 @@ from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
 from harness.report.rows import decided
-from harness.report.words import ENDED, GO_ON, doubt_words, early_words, milder_words, scope_words
+from harness.report.words import GO_ON, doubt_words, early_words, ended_words, milder_words, scope_words
 
 
 def called(family: str) -> str:
@@ -109,7 +109,7 @@ def _short(value: float) -> str:
 
 def scope(content: Mapping[str, Any]) -> str:
     """How far the interval goes, and why the tests ended."""
-    ended, target = ENDED.get(content["stopped_by"] or "", "interrupted"), content["asked_rhw"]
+    ended, target = ended_words(content["stopped_by"], content["decision"]), content["asked_rhw"]
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else f', at ± {share(rhw)}'} (asked: ± {share(target)})"
