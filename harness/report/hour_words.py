@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sized
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,15 @@ def called(family: str) -> str:
     return family_named(family).words.called
 
 
+def scenarios_words(families: Sized) -> str:
+    """How many scenarios."""
+    return f"{count(len(families))} scenario{'s' * (len(families) > 1)}"
+
+
 def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readings: bool = False) -> list[str]:
     """The answer for a terminal, at most ten lines of 100 columns; with ``readings`` two more."""
     n, engine = count(content["n_episodes"]), "SUMO" if content["engine"] == "sumo" else "SUMO’s twin"
-    scenarios = f"{len(content['families'])} scenarios"
+    scenarios = scenarios_words(content["families"])
     took = [] if readings else [duration(content["wall_time_s"])]  # of the run, not of an answer given anew
     head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", *took]
     verdict = [] if content["decision"] is None else [decided(content["decision"]).texts]
@@ -90,8 +95,9 @@ def exposures(content: Mapping[str, Any]) -> str:
     told: dict[str, list[str]] = {}
     for name, of in content["families"].items():
         found = of["exposure"]
-        ends = "" if found["low"] == found["high"] else f" ({_short(found['low'])}–{_short(found['high'])})"
-        kind = "counted" if found["counted"] else "given" if found["source"] == "given" else "assumed"
+        sure = found["low"] == found["high"]
+        ends = "" if sure else f" ({_short(found['low'])}–{_short(found['high'])})"
+        kind = "counted" if found["counted"] else "given" if sure and found["source"] != "assumed" else "assumed"
         told.setdefault(kind, []).append(f"{called(name)} {_short(found['per_hour'])}{ends}")
     return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
 
