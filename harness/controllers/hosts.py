@@ -67,6 +67,10 @@ def death_cause(exit_code: int | None, limits: Limits) -> str:
     return f"the controller ended the worker process (exit code {exit_code})"
 
 
+LONGEST_CAUSE = 240
+"""Characters: a message cuts its parts at `LONGEST_PART`, and at their end is the place."""
+
+
 def cause_of(error: BaseException) -> str:
     """One line for the record, which is UTF-8: the text is the user's, and so is the code that makes it.
 
@@ -82,7 +86,8 @@ def cause_of(error: BaseException) -> str:
             text += f". {did_you_mean(error.name, [name for name in dir(asked) if name[0] != '_'])}".rstrip(". ")
     except BaseException as again:  # noqa: BLE001 - whatever a user's code raises
         text = f"{type(error).__name__}, whose text raised {type(again).__name__}"
-    return text.encode("utf-8", "backslashreplace").decode().splitlines()[0][:500] + _place_of(error)
+    line = text.encode("utf-8", "backslashreplace").decode().splitlines()[0]
+    return (line if len(line) <= LONGEST_CAUSE else f"{line[:LONGEST_CAUSE]} …") + _place_of(error)
 
 
 NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), "<"

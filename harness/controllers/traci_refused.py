@@ -17,6 +17,8 @@ _REFUSED = {
 _NO_MODEL = "no model of SUMO's drives the AV: setSpeed, setAcceleration, slowDown do, bounded by setAccel and setDecel"
 _REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")
 
+_NOT_TRACIS = ("see", "leave", "end", "next_acceleration", "require_unfinished", "over", "n_steps", "step_s", "time_s")
+
 
 class TraCIException(Exception):  # noqa: N818 - TraCI's own name
     """A command or question that TraCI, or the harness, does not answer."""
@@ -47,7 +49,7 @@ class Domain:
         why = _REFUSED.get(name, _NO_MODEL if name.startswith("set") else None)
         why = why or (WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None)
         if why is None:
-            public = [entry for entry in dir(type(self)) if entry[0] != "_" and entry != "see"]
+            public = [entry for entry in dir(type(self)) if entry[0] != "_" and entry not in _NOT_TRACIS]
             domains = [entry for entry in vars(self) if isinstance(getattr(self, entry), Domain) and entry[0] != "_"]
             there = "" if did_you_mean(name, public) else f"; it has {', '.join(domains or public)}"
             raise AttributeError(f"{self._path} has no {name} here{there}", name=name, obj=self)

@@ -38,6 +38,14 @@ _LEFT = list[greenlet]()
 _VERSION = 22, "SUMO 1.28.0"
 
 
+_OF_SIMULATION = {
+    0x66: "getTime", 0x71: "getLoadedNumber", 0x72: "getLoadedIDList", 0x73: "getDepartedNumber",
+    0x74: "getDepartedIDList", 0x79: "getArrivedNumber", 0x7A: "getArrivedIDList", 0x7B: "getDeltaT",
+    0x7D: "getMinExpectedNumber", 0x80: "getCollidingVehiclesNumber", 0x81: "getCollidingVehiclesIDList",
+}  # fmt: skip
+"""What can be subscribed to, by numbers of ``traci.constants``."""
+
+
 class ScriptError(Exception):
     """A script that ends before its test does, or never."""
 
@@ -52,6 +60,17 @@ class _Simulation(SimulationDomain):
     def __init__(self, vehicles: VehicleDomain) -> None:
         self._vehicles = vehicles
         self.arrived: tuple[str, ...] = ()
+        self._subscribed: tuple[int, ...] = ()
+
+    def subscribe(self, varIDs: Sequence[int] = (0x74,), *_when: float) -> None:
+        """Ask for variables, for the whole test; by default who departs."""
+        if unknown := [hex(number) for number in varIDs if number not in _OF_SIMULATION]:
+            known = ", ".join(map(hex, _OF_SIMULATION))
+            raise RefusedError(f"Variable {unknown[0]} of the simulation is not known here: it has {known}.")
+        self._subscribed = tuple(varIDs)
+
+    def getSubscriptionResults(self) -> dict[int, Any]:
+        return {number: getattr(self, _OF_SIMULATION[number])() for number in self._subscribed}
 
     def getDepartedIDList(self) -> tuple[str, ...]:
         return self._vehicles.getIDList() if self.n_steps == 1 else ()
@@ -66,6 +85,14 @@ class _Simulation(SimulationDomain):
         return self._vehicles.getIDCount()
 
     getLoadedIDList = getDepartedIDList
+
+    def getDepartedNumber(self) -> int:
+        return len(self.getDepartedIDList())
+
+    def getArrivedNumber(self) -> int:
+        return len(self.arrived)
+
+    getLoadedNumber = getDepartedNumber
 
 
 class ScriptVehicles(VehicleDomain):

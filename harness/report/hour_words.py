@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sized
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
 from harness.report.rows import decided
-from harness.report.words import ENDED, GO_ON, doubt_words, early_words, milder_words, scope_words
+from harness.report.words import GO_ON, doubt_words, early_words, ended_words, milder_words, scope_words
 
 
 def called(family: str) -> str:
@@ -18,16 +18,21 @@ def called(family: str) -> str:
     return family_named(family).words.called
 
 
+def scenarios_words(families: Sized) -> str:
+    """How many scenarios."""
+    return f"{count(len(families))} scenario{'s' * (len(families) > 1)}"
+
+
 def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readings: bool = False) -> list[str]:
     """The answer for a terminal, at most ten lines of 100 columns; with ``readings`` two more."""
     n, engine = count(content["n_episodes"]), "SUMO" if content["engine"] == "sumo" else "SUMO’s twin"
-    scenarios = f"{len(content['families'])} scenarios"
+    scenarios = scenarios_words(content["families"])
     took = [] if readings else [duration(content["wall_time_s"])]  # of the run, not of an answer given anew
     head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", *took]
     verdict = [] if content["decision"] is None else [decided(content["decision"]).texts]
     rows = [*verdict, *sum_rows(content), *(reading_rows(content) if readings else ())]
     ends = [] if report is None else [f"  report  {report}"]
-    parts = columns([(row[1], f"{row[2]} of all", *row[3:]) for row in family_rows(content)])
+    parts = columns([(row[1], row[2] + " of all" * (i == 0), *row[3:]) for i, row in enumerate(family_rows(content))])
     under = wrapped([*(f"! {text}" for text in warnings(content)), exposures(content), scope(content)])
     return [" · ".join(head), *columns(rows), *parts, *under, *ends]
 
@@ -90,8 +95,9 @@ def exposures(content: Mapping[str, Any]) -> str:
     told: dict[str, list[str]] = {}
     for name, of in content["families"].items():
         found = of["exposure"]
-        ends = "" if found["low"] == found["high"] else f" ({_short(found['low'])}–{_short(found['high'])})"
-        kind = "counted" if found["counted"] else "given" if found["source"] == "given" else "assumed"
+        sure = found["low"] == found["high"]
+        ends = "" if sure else f" ({_short(found['low'])}–{_short(found['high'])})"
+        kind = "counted" if found["counted"] else "given" if sure and found["source"] != "assumed" else "assumed"
         told.setdefault(kind, []).append(f"{called(name)} {_short(found['per_hour'])}{ends}")
     return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
 
@@ -109,7 +115,7 @@ def _short(value: float) -> str:
 
 def scope(content: Mapping[str, Any]) -> str:
     """How far the interval goes, and why the tests ended."""
-    ended, target = ENDED.get(content["stopped_by"] or "", "interrupted"), content["asked_rhw"]
+    ended, target = ended_words(content["stopped_by"], content["decision"]), content["asked_rhw"]
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else f', at ± {share(rhw)}'} (asked: ± {share(target)})"

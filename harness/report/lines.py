@@ -45,14 +45,16 @@ def estimate_lines(content: Mapping[str, Any]) -> list[str]:
 
 
 def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Rows of equally many texts, each column as wide as its widest; a row too long for that is pushed together."""
+    """Rows of equally many texts, each column as wide as its widest; a row too long for that is narrower at its end."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
-        *others, last = (text.ljust(width) for text, width in zip(row, widths, strict=True))
-        left, remark = "  ".join(["", *others]).rstrip(), last.rstrip()
-        line = "  ".join(["", *others, remark]).rstrip()
+        padded = [text.ljust(width) for text, width in zip(row, widths, strict=True)]
+        left, remark = "  ".join(["", *padded[:-1]]).rstrip(), row[-1]
+        line = "  ".join(["", *padded]).rstrip()
         if len(line) > WIDTH:
             line = f"{left}  {remark:>{max(WIDTH - 2 - len(left), 0)}}"
+        for n in reversed(range(len(row) - 1)):
+            line = line if len(line) <= WIDTH else "  ".join(["", *padded[:n], *filter(None, row[n:])])
         yield from [line] if len(line) <= WIDTH else wrapped(["  ".join(filter(None, row))])
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.numbers import count, duration, interval, number, plain, ratio, share, two_digits_up
-from harness.report.hour_words import called
+from harness.report.hour_words import called, scenarios_words
 from harness.report.hour_words import warnings as hour_warnings
 from harness.report.lines import LABEL, columns, wrapped
 from harness.report.notes import note_words
@@ -116,7 +116,7 @@ def pair_lines(
     scope = scope_words(content["confidence"], ENDED.get(content.get("ended", ""), "interrupted"))
     above = campaign.crash.counts_above_mps
     counted = f" above {plain(above)} m/s" if above else ""
-    scenarios, unit = (f"{len(families)} scenarios", "hour") if families else (called(campaign.scenario), "test")
+    scenarios, unit = (scenarios_words(families), "hour") if families else (called(campaign.scenario), "test")
     pairs = f"{count(content['n_pairs'])} pairs of tests, {scenarios}"
     head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per {unit}"
     last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]

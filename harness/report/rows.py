@@ -121,6 +121,11 @@ def limit_words(decision: Mapping[str, Any]) -> str:
     return f"{plain(decision['limit'])} × {driver}" if driver else f"{plain(decision['limit'])} per test"
 
 
+def held_back(decision: Mapping[str, Any]) -> bool:
+    """Whether only what a warning tells of keeps a vehicle from being accepted."""
+    return bool(decision["verdict"] == "undecided" and decision["high"] < decision["limit"])
+
+
 def decided(decision: Mapping[str, Any]) -> Row:
     """The verdict on a limit, of one scenario or of several."""
     driver, verdict = decision.get("driver"), decision["verdict"]
@@ -130,6 +135,8 @@ def decided(decision: Mapping[str, Any]) -> Row:
         "accepted": (f"rate below {limit}", f"at most {high}"),
         "rejected": (f"rate above {limit}", f"at least {low}"),
     }.get(verdict, (f"limit {limit}", f"it may be {low} to {high}"))
+    if held_back(decision):
+        value, ends = f"rate below {limit}", "yet not accepted, see !"
     given = "" if decision["statement"] == ASSUMPTION_FREE else f", given {decision['statement']}"
     return Row(
         "verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])} over all looks{given}", ends

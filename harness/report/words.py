@@ -20,7 +20,7 @@ from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.numbers import WIDEST_RHW, count, leaves, number, plain, share, words
 from harness.report.notes import note_words
-from harness.report.rows import Row, end, rows_of, too_few, with_traffic
+from harness.report.rows import Row, end, held_back, rows_of, too_few, with_traffic
 from harness.sampling.milder import n_left_out
 from harness.strata import ASSUMPTION_FREE
 
@@ -38,6 +38,12 @@ ENDED = {
 """Why a campaign ended (`harness.vocabulary.StoppedBy`), in words."""
 GO_ON = "; raise it and go on with --resume"
 """What to do where a verdict is open."""
+
+
+def ended_words(stopped_by: str | None, decision: Mapping[str, Any] | None) -> str:
+    """Why the tests ended."""
+    held = stopped_by == "accept" and decision is not None and held_back(decision)
+    return "rate below the limit" if held else ENDED.get(stopped_by or "", "interrupted")
 
 
 @dataclass(frozen=True)
@@ -197,7 +203,7 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
     if told.elsewhere is not None:
         return elsewhere_words(told.elsewhere)
     best, stopped_by = told.best, told.stopped_by
-    ended, target = ENDED.get(stopped_by or "", "interrupted"), campaign.stop.rhw
+    ended, target = ended_words(stopped_by, told.decision), campaign.stop.rhw
     if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept", "sum"):
         within = campaign.testing.shells.statement != ASSUMPTION_FREE and best.details.get("within")
         asked = end(within["rhw"]) if within else best.precision

@@ -107,6 +107,8 @@ def test_a_vehicle_that_crashes_on_them_is_told_so_and_not_accepted(tmp_path, ca
     assert code == 4
     assert estimates["decision"]["verdict"] == "undecided"
     assert estimates["decision"]["high"] < 0.9
+    assert "yet not accepted, see !" in ET.parse(junit).getroot().find(".//error").get("message")
+    assert "stopped: rate below the limit" in told
     for text in (told, ET.parse(junit).getroot().find(".//error").text):
         assert f"{n} of 36 MILDER cut-outs end in a crash, too" in " ".join(text.split())
     assert "MILDER" in (out / "report.html").read_text()
@@ -121,7 +123,9 @@ def test_one_that_does_not_do_the_same_again_is_not_accepted(tmp_path, capsys):
     assert (code, decision["verdict"], decision["n_milder"]) == (4, "undecided", 0)
     assert decision["high"] < 0.9
     assert decision["n_differing"] > 0
-    assert "! NOT REPRODUCIBLE: " in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "! NOT REPRODUCIBLE: " in told
+    assert "yet not accepted, see !" in told
 
 
 def test_one_that_does_not_is_not_told_of_them(tmp_path, capsys):

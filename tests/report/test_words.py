@@ -8,7 +8,7 @@ import pytest
 from harness.estimators.answer import estimate_blocks
 from harness.numbers import number, plain
 from harness.records.folder import read_manifest
-from harness.report.lines import LINES, WIDTH, lines
+from harness.report.lines import LINES, WIDTH, columns, lines
 from harness.report.summary import read_run_folder
 from harness.report.words import answer_of, short_answer
 from harness.runner.stored import stored_blocks
@@ -151,3 +151,10 @@ def test_any_number_can_be_written(value):
         digits, _, power = text.replace("−", "-").replace(",", "").partition(" × 10")
         read = float(f"{digits}e{power.translate(str.maketrans('⁻⁰¹²³⁴⁵⁶⁷⁸⁹', '-0123456789')) or 0}")
         assert read == pytest.approx(value, rel=1e-2, abs=1e-323)
+
+
+def test_a_row_that_is_too_long_keeps_the_columns_before_what_is_long():
+    rows = [("lead brakes", "0.1", "×" * 40, "median"), ("cut-in", "2", "1", "×" * 45), ("cut-out", "3", "2", "×" * 22)]
+    shown = list(columns(rows))
+    assert max(map(len, shown)) <= WIDTH
+    assert [line.index(row[1]) for line, row in zip(shown, rows, strict=True)] == [15, 15, 15]

@@ -189,6 +189,12 @@ def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
     found = campaign(f"environments={{lead_brakes: {tmp_path / 'mine.yaml'}}}")
     exposures = {name: resolve(found.of_family(name)).parameters.exposure.per_hour.value for name in NAMES[1:]}
     assert exposures == {"lead_brakes": 0.3, "cut_out": 1.0}
+    alone = harness.run(
+        campaign("scenarios=[lead_brakes]", f"environments={{lead_brakes: {tmp_path / 'mine.yaml'}}}"), tmp_path / "run"
+    )
+    told = hour_lines(alone.content)
+    assert " in SUMO’s twin, 1 scenario · " in told[0]
+    assert "  events per hour of driving, given: lead brakes 0.3" in told
     with pytest.raises(CampaignError, match="no file"):
         campaign("environments={lead_brakes: ./none.yaml}")
     with pytest.raises(CampaignError, match="cut-out-1"):

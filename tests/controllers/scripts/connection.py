@@ -1,7 +1,14 @@
-"""A labelled connection in the place of the module, and a context subscription; several episodes in a loop."""
+"""A labelled connection in the place of the module; subscriptions, also of a context; several episodes in a loop."""
 
 import traci
-from traci.constants import CMD_GET_VEHICLE_VARIABLE, VAR_LANE_INDEX, VAR_LANEPOSITION, VAR_SPEED
+from traci.constants import (
+    CMD_GET_VEHICLE_VARIABLE,
+    VAR_DEPARTED_VEHICLES_IDS,
+    VAR_LANE_INDEX,
+    VAR_LANEPOSITION,
+    VAR_SPEED,
+    VAR_TIME,
+)
 
 AROUND = [VAR_LANE_INDEX, VAR_LANEPOSITION, VAR_SPEED]
 
@@ -9,9 +16,11 @@ for episode in range(3):
     traci.start(["sumo"], port=8813 + episode, label=f"sim{episode}", numRetries=3)
     connection = traci.getConnection(f"sim{episode}")
     traci.switch(f"sim{episode}")
-    connection.vehicle.subscribeContext("ego", CMD_GET_VEHICLE_VARIABLE, 1000.0, AROUND)
+    connection.simulation.subscribe([VAR_DEPARTED_VEHICLES_IDS, VAR_TIME])
     while connection.simulation.getMinExpectedNumber() > 0:
         connection.simulationStep()
+        if "ego" in connection.simulation.getSubscriptionResults()[VAR_DEPARTED_VEHICLES_IDS]:
+            connection.vehicle.subscribeContext("ego", CMD_GET_VEHICLE_VARIABLE, 1000.0, AROUND)
         around = connection.vehicle.getContextSubscriptionResults("ego")
         own = around.pop("ego")
         ahead = [
