@@ -29,7 +29,7 @@ class Resolved:
 
     ``parameters`` are the numbers of its ``environment``, as its family has them. ``av`` (1,) is the record of a
     built-in AV, (0,) of any other; ``surrogates`` (J,) are the drivers that challenges are computed for.
-    ``challenge`` says how they are, one of the user's own by the hash of its file.
+    ``challenge`` says how they are; a function or surrogates of the user's own by the hashes of their files.
     ``content_hash`` is of all that changes an episode's bits, the environment's numbers included;
     ``controller_sha256`` of the source of the AV's controller, None where there is none, or nobody has looked;
     ``script`` says whether it is a TraCI script.
@@ -118,6 +118,8 @@ def resolve(campaign: Campaign, command: Command = "run") -> Resolved:
     challenge = campaign.testing.challenge
     if campaign.testing.own_challenge is not None:
         challenge = source_of_own(challenge, "testing.challenge")
+    own = [source_of_own(code, f"surrogates.{name}") for name, code in campaign.own_surrogates.items()]
+    challenge = " ".join([challenge, *own])
     campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[shows])
     named = campaign.environment.named(family.default_parameters)
     campaign = campaign.replaced(("environment", "parameters"), named)

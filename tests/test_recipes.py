@@ -77,11 +77,11 @@ def test_a_new_estimator_is_a_class_in_a_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_new_surrogate_is_a_driver_by_name_or_by_numbers(tmp_path):
+def test_a_new_surrogate_is_a_driver_or_a_class_in_a_file(tmp_path):
     ran(laid_out("A new surrogate", tmp_path), tmp_path)
     estimates = json.loads((tmp_path / "runs/mine/estimates.json").read_text())
     ratios = estimates["diagnostics"]["mean_ratio"]
-    assert set(ratios) == {"forced", "careful", "late"}
+    assert set(ratios) == {"forced", "mine", "careful", "late"}
     assert 1.0e-7 < estimates["estimates"]["mixture_cv"]["crash_rate"] < 1.8e-7
 
 

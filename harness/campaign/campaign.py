@@ -14,9 +14,9 @@ import json
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
-from harness.campaign.drivers import NATURAL, Surrogate, default_surrogates
+from harness.campaign.drivers import NATURAL, OwnSurrogate, Surrogate, default_surrogates
 from harness.campaign.sections import (
     DEFAULT,
     LEAST_TESTS,
@@ -41,16 +41,15 @@ from harness.vocabulary import SAMPLING, Sampling
 
 
 def _shipped(value: Any) -> Any:
-    """What the name of a driver of the shipped libraries stands for; any other value as it is."""
+    """What the name of a driver of the shipped libraries, or of a class, stands for; any other value as it is."""
+    if isinstance(value, str) and ".py:" in value:
+        value = {"controller": value}
     if not isinstance(value, str):
-        return value
+        return OwnSurrogate.model_validate(value) if isinstance(value, dict) and "controller" in value else value
     from harness.vehicles.library import shipped_drivers  # noqa: PLC0415 - libraries read campaigns' sections
 
     if value not in (known := shipped_drivers()):
-        expected = (
-            "model, parameters and reaction of a driver, or the name of a shipped one: it is driven from millions "
-        )
-        expected += f"of states in compiled code, so no class of Python's ({listed(known)})"
+        expected = f"model and parameters of a driver, my.py:Model, or the name of a shipped one ({listed(known)})"
         mend = did_you_mean(value, list(known)) or "Write one that is like yours: any leaves rates unbiased."
         raise broken_rule("", f"'{value}'", expected, mend)
     return known[value].model_dump()
@@ -78,8 +77,10 @@ class Campaign(Section):
     """parameter files of the other scenarios, beside cut_in's environment: {lead_brakes: mine.lead_brakes.yaml}"""
     av: AutomatedVehicle = AutomatedVehicle()
     crash: CrashSettings = CrashSettings()
-    surrogates: dict[SurrogateName, Annotated[Surrogate, _Shipped]] = Field(default_factory=default_surrogates)
-    """stand-ins for the unknown AV, by name: each a driver, or the name of a shipped one, such as r157-cc"""
+    surrogates: dict[SurrogateName, Annotated[SerializeAsAny[Surrogate], _Shipped]] = Field(
+        default_factory=default_surrogates
+    )
+    """stand-ins for the unknown AV, by name: each a driver, the name of a shipped one (r157-cc), or my.py:Model"""
     testing: Testing = Testing()
     pool: PoolSettings = PoolSettings()
     world: World = World()
@@ -126,6 +127,11 @@ class Campaign(Section):
         if self.stop.min_crashes is not None:
             return self.stop.min_crashes
         return 1 if self.sampling.strata else 100
+
+    @property
+    def own_surrogates(self) -> dict[str, str]:
+        """Classes of the user's own among the surrogates, by name."""
+        return {name: of.controller for name, of in self.surrogates.items() if isinstance(of, OwnSurrogate)}
 
     def alpha(self) -> tuple[float, ...]:
         """Mixture weights of the surrogates, in their order, summing to 1."""
@@ -282,6 +288,12 @@ REFUSED = (
         "surrogates", lambda c, _: not c.surrogates and c.sampling.mixes,
         "none", "at least one surrogate for testing.method {testing.method}",
         "Leave surrogates out for the three of the paper, or choose method forced or nde.",
+    ),
+    Combination(
+        "surrogates", lambda c, _: bool(c.own_surrogates) and c.testing.challenge != "recursive",
+        "a class of your own, with testing.challenge {testing.challenge}",
+        "recursive: a class is driven for one hold period from each state, no more",
+        "Write recursive, or name drivers.",
     ),
     Combination(
         "stop.rhw", lambda c, _: c.stop.rhw is not None and not c.sampling.bounded and c.testing.epsilon < 1.0,

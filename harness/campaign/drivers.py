@@ -221,6 +221,17 @@ class Surrogate(Driver):
         return self.model_dump(exclude={"reaction"} if self.reaction == Reflexes() else None)
 
 
+class OwnSurrogate(Surrogate):
+    """A class of the user's own in the AV's place, ``my.py:Model``: a batch controller made without arguments."""
+
+    controller: str = Field(pattern=r"^.+\.py:\w+$")
+    model: ModelName = "constant"  # of the record that stands for it; nothing is asked of that
+
+    def identity(self) -> dict[str, Any]:
+        """Its file counts, wherever it lies (`harness.resolved`)."""
+        return {"controller": self.controller.rpartition(":")[2]}
+
+
 def default_surrogates() -> dict[str, Surrogate]:
     """Stand-ins of the paper, from careful to careless."""
     brakes_1, brakes_6 = (FVDMParameters(min_acceleration_mps2=limit) for limit in (-1.0, -6.0))

@@ -87,6 +87,7 @@ def load_campaign(
 def _with_real_paths(campaign: Campaign, place: Places, folder: Path, *, check_files: bool) -> Campaign:
     """The campaign with every file that it names by an absolute path; one typed after ``--set`` may lie here."""
     files = _FILES | {("environments", each): _FILES["environment", "parameters"] for each in campaign.environments}
+    files |= {("surrogates", each, "controller"): _FILES["av", "controller"] for each in campaign.own_surrogates}
     for where, expected in files.items():
         name, end = campaign.at(where), ""
         if where[-1] in ("controller", "estimator", "challenge") and name is not None and ".py:" in name:

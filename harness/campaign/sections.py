@@ -67,7 +67,7 @@ class Section(BaseModel):
         key, *rest = path
         value = getattr(self, key)
         if rest and isinstance(value, dict):
-            return value.get(rest[0])
+            value, rest = value.get(rest[0]), rest[1:]
         return value.at(rest) if rest and value is not None else value
 
     def replaced(self, path: Sequence[str], value: Any) -> Self:
@@ -75,7 +75,10 @@ class Section(BaseModel):
         key, *rest = path
         own = getattr(self, key)
         if rest:
-            value = own | {rest[0]: value} if isinstance(own, dict) else own.replaced(rest, value)
+            if isinstance(own, dict):
+                value = own | {rest[0]: own[rest[0]].replaced(rest[1:], value) if rest[1:] else value}
+            else:
+                value = own.replaced(rest, value)
         return self.model_copy(update={key: value})
 
 

@@ -169,7 +169,8 @@ def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False
     if not stored:
         _require_reproducible(manifest, campaign)
         if not trust:
-            for code in (code_of(campaign.av), campaign.testing.own_challenge):
+            own = campaign.testing.own_challenge, *campaign.own_surrogates.values()
+            for code in (code_of(campaign.av), *own):
                 require_trust(folder, manifest, code, _TRUST)
         return _simulated(folder, manifest, campaign, tables, episode)
     if "traces" not in tables or not tables["traces"].num_rows:

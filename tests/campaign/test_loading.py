@@ -54,7 +54,8 @@ MISTAKES = (
 )
 """Which an editor's schema refuses, too."""
 BROKEN_RULES = (
-    ("surrogates:\n  A: my.py:Model", "surrogates.A", 3, "so no class of Python"),
+    ("surrogates:\n  A: my.py:Model", "surrogates.A.controller", 3, "no file"),
+    ("testing: {challenge: immediate}\nsurrogates: {A: my.py:Model}", "surrogates", 3, "one hold period"),
     ("surrogates:\n  A: r157-c", "surrogates.A", 3, "Did you mean 'r157-cc'?"),
     ("testing: {method: episode_mixture}\nsurrogates: {}", "surrogates", 3, "at least one surrogate"),
     ("testing: {method: step_mixture, estimator: scv}\nrecords: {moments: none}", "records.moments", 3, "first_9"),

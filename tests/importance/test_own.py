@@ -1,4 +1,4 @@
-"""A challenge of the user's own: tabulated as it says, part of the hash, refused where it is none, run if trusted."""
+"""A challenge, or a surrogate, of the user's own: tabulated as it says, part of the hash, refused, run if trusted."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,9 @@ import pytest
 import harness
 from harness.campaign.drivers import IDMParameters
 from harness.errors import CampaignError, RunFolderError
-from harness.families.cut_in.nade.challenge import LEVELS
-from harness.families.cut_in.nade.grid import AFTER, points_of
-from harness.families.cut_in.nade.own import own_challenge
+from harness.families.cut_in.nade.challenge import COLLIDED, LEVELS, LONG, transitions
+from harness.families.cut_in.nade.grid import AFTER, GridPoints, points_of
+from harness.families.cut_in.nade.own import own_challenge, own_surrogate, states_after
 from harness.resolved import resolve
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import ACCELERATIONS_MPS2
@@ -71,10 +71,65 @@ def test_its_file_s_content_is_part_of_the_hash_and_its_place_is_not(tmp_path):
     assert first.content_hash != other.content_hash
 
 
+class Model:
+    """The intelligent driver model of `DRIVER`."""
+
+    def step_batch(self, seen):
+        speed, closing = seen.speed_mps, seen.speed_mps - seen.lead_speed_mps
+        desired = 2.0 + np.maximum(0.0, speed + speed * closing / (2.0 * np.sqrt(6.0)))
+        free = 1.0 - (speed / 40.0) ** 4
+        return np.clip(2.0 * (free - (desired / np.maximum(seen.gap_m, 0.1)) ** 2), -5.0, 2.0)
+
+
+def test_a_surrogate_of_ones_own_goes_where_the_built_in_model_goes():
+    points = GridPoints(np.array([25.0]), np.linspace(0.5, 60.0, 25), np.linspace(-15.0, 10.0, 21))
+    built_in = np.zeros((1, 25, 21, ACCELERATIONS_MPS2.size, 3), np.float32)
+    transitions(DRIVER, 10, LONG, points, built_in)
+    states = (each.ravel() for each in np.meshgrid(*points[1:], ACCELERATIONS_MPS2, indexing="ij"))
+    own = states_after(Model(), 25.0, *states, 10).reshape(built_in.shape)
+    crashed = built_in[..., 0] == COLLIDED
+    assert 1000 < crashed.sum() < 10_000
+    np.testing.assert_array_equal(own[..., 0] == COLLIDED, crashed)
+    np.testing.assert_allclose(own[~crashed], built_in[~crashed], rtol=1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("def step(self, seen): return 0.0", "no step_batch"),
+        ("def step_batch(self, seen): return seen.gap_m * np.nan", "an acceleration of nan"),
+        ("def step_batch(self, seen): seen.gap_m[:] = 1.0", "read-only"),
+        ("def step_batch(self, seen): return seen.gap_m[:5]", "broadcast"),
+    ],
+)
+def test_what_is_no_surrogate_is_refused(body, said, tmp_path):
+    (tmp_path / "model.py").write_text(f"import numpy as np\nclass Mine:\n    {body}\n")
+    with pytest.raises(CampaignError, match=said) as caught:
+        own_surrogate(f"{tmp_path}/model.py:Mine", "surrogates.A")(environment(), DRIVER, "")
+    assert caught.value.where == "surrogates.A"
+
+
+def test_a_surrogate_s_file_is_part_of_the_hash_and_its_place_is_not(tmp_path):
+    resolved = []
+    for i, braking in enumerate((-1.0, -1.0, -2.0)):
+        (tmp_path / f"{i}").mkdir()
+        (tmp_path / f"{i}/model.py").write_text(f"class Mine:\n    def step_batch(self, seen): return {braking}\n")
+        one = harness.load_campaign("idm", [*FEW, f"surrogates={{A: '{tmp_path}/{i}/model.py:Mine'}}"])
+        resolved.append(resolve(one))
+    first, same, other = ((each.content_hash, each.challenge) for each in resolved)
+    assert first == same
+    assert first[0] != other[0]
+    assert first[1] != other[1]
+
+
 @pytest.mark.slow
-def test_a_folder_from_elsewhere_runs_it_only_if_trusted(tmp_path):
-    name = own(tmp_path)
-    harness.run(campaign(name), tmp_path / "run", workers=1)
+@pytest.mark.parametrize("of", ["challenge", "surrogate"])
+def test_a_folder_from_elsewhere_runs_it_only_if_trusted(of, tmp_path):
+    asked = campaign(name := own(tmp_path))
+    if of == "surrogate":
+        (tmp_path / "my.py").write_text("class mine:\n    def step_batch(self, seen): return -4.0\n")
+        asked = harness.load_campaign("idm", [*FEW, f"surrogates={{A: '{name}'}}"])
+    harness.run(asked, tmp_path / "run", workers=1)
     assert harness.replay(tmp_path / "run", 3).bit_equal
     edit(tmp_path / "run", signature="of another user")
     with pytest.raises(RunFolderError, match=r"my\.py:mine, which would be run"):

@@ -135,15 +135,22 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
 
     U by remaining time (LEVELS + 1, v, R2, R2dot), level 0 being none; C(s, a) with the longest (v, R2, R2dot, 31).
     """
-    points, shape = points_of(AFTER), AFTER.shape
-    hold = int(environment.numbers["hold_steps"])
-    lagging = lags(driver.view(np.recarray)[0])
+    points, hold = points_of(AFTER), int(environment.numbers["hold_steps"])
+    after = np.empty((*AFTER.shape, N_ACCELERATIONS, 3), np.float32)
+    transitions(driver, hold, LONG, points, after)
+    late = None
+    if lags(driver.view(np.recarray)[0]):
+        transitions(driver, hold, 0, points, late := np.empty_like(after))
+    return induced(environment, after, late)
+
+
+def induced(
+    environment: Environment, after: Float32Array, late: Float32Array | None = None
+) -> tuple[Float32Array, Float32Array]:
+    """The same by the states ``after`` a hold period (v, R2, R2dot, 31, 3), and after a first one if it is ``late``."""
+    points, shape, hold = points_of(AFTER), AFTER.shape, int(environment.numbers["hold_steps"])
     at_speeds = np.pad(points.speed[:, None], ((0, 0), (0, 2)))  # R1 and R1dot do not matter
     pmf = evaluate_laws(environment, at_speeds).pmf[laws.FREE_DRIVING]
-    after = np.empty((*shape, N_ACCELERATIONS, 3), np.float32)
-    transitions(driver, hold, LONG, points, after)
-    if lagging:
-        transitions(driver, hold, 0, points, late := np.empty_like(after))
     value = np.zeros((LEVELS + 1, *shape), np.float32)
     current, following = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for level in range(1, LEVELS + 1):
@@ -151,7 +158,7 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
             backward_step(after, pmf, current, following)
             current, following = following, current
         value[level] = current
-        if lagging:
+        if late is not None:
             backward_step(late, pmf, following, value[level])  # from one period later on it has reacted
     maneuvers = np.empty((*shape, N_ACCELERATIONS), np.float32)
     maneuver_challenge(after, current, maneuvers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.nade.cells import empty_nade, with_more_room
 from harness.families.cut_in.nade.decide import decide, finish
 from harness.families.cut_in.nade.functions import Importance, build_importance
-from harness.families.cut_in.nade.own import own_challenge
-from harness.families.cut_in.nade.tables import Tables, build_tables, tables_name
+from harness.families.cut_in.nade.own import own_challenge, own_surrogate
+from harness.families.cut_in.nade.tables import Tables, build_one, build_tables, tables_name
 from harness.families.cut_in.script import beginning, facts_of
 from harness.families.script import natural_script
 from harness.loop.cells import KernelState
@@ -84,10 +85,15 @@ class InLoop(Source):
         if self.campaign.sampling.mixes:
             drivers = resolved.surrogates
             progress.stage("criticality tables", len(drivers))
-            name = self.campaign.testing.challenge
-            own = own_challenge(name) if self.campaign.testing.own_challenge else None
-            self.tables = build_tables(resolved.environment, drivers, resolved.challenge, progress.advance, own)
+            builds = [self._build_of(surrogate) for surrogate in self.campaign.surrogates]
+            self.tables = build_tables(resolved.environment, drivers, resolved.challenge, progress.advance, builds)
         self.importance = build_importance(self.campaign, self.tables)
+
+    def _build_of(self, surrogate: str) -> Callable[..., Tables]:
+        if (asked := self.campaign.testing.own_challenge) is not None:
+            return own_challenge(asked)
+        code = self.campaign.own_surrogates.get(surrogate)
+        return build_one if code is None else own_surrogate(code, f"surrogates.{surrogate}")
 
     @classmethod
     def cached_files(cls, resolved: Resolved) -> list[str]:

@@ -1,10 +1,11 @@
-"""Challenge by a function of a user's own, ``my.py:function``, in place of what a surrogate would do.
+"""Challenge by code of a user's own: by a function ``my.py:function``, or of a surrogate ``my.py:Model``.
 
     function(driver, v_bv_mps, gap_m, gap_rate_mps, acceleration_mps2, remaining_s) -> array in [0, 1]
 
 says how critical it is for a driver behind BV that BV holds an acceleration for a hold period from here. It is asked at
 the points of the grid, in arrays that broadcast, and tabulated as a recursive challenge is; what not cutting in is
-worth follows from it. It steers alone: likelihood ratios are of what is drawn, whatever it says.
+worth follows from it. A model, which is a batch controller, is put behind BV in the same states and driven for a hold
+period, as if it had just been made. Either steers alone: likelihood ratios are of what is drawn, whatever it says.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ import numpy as np
 
 from harness.controllers.find import own_code
 from harness.controllers.hosts import cause_of
+from harness.controllers.protocol import BatchController, BatchObservation
 from harness.errors import CampaignError
 from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.nade.challenge import LEVELS, build_before_cut_in, level_steps
+from harness.families.cut_in.nade.challenge import COLLIDED, LEVELS, build_before_cut_in, induced, level_steps
 from harness.families.cut_in.nade.grid import AFTER, points_of
 from harness.families.cut_in.nade.tables import Tables
-from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, RecordArray
+from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M
+from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, RecordArray, read_only
 
 WHERE = "testing.challenge"
 
@@ -59,3 +61,61 @@ def _asked(name: str, function: Callable[..., Any], *given: Any) -> Any:
         wrong = found[~((found >= 0.0) & (found <= 1.0))][0]
         raise CampaignError(WHERE, f"{name}, which gives {wrong:g}", "challenges from 0 to 1", mend)
     return found
+
+
+def own_surrogate(name: str, where: str) -> Callable[[Environment, RecordArray, str], Tables]:
+    """What builds tables of the surrogate of that ``name``, which the campaign has at ``where``.
+
+    It raises a `CampaignError` where there is no such class, or where it gives no accelerations.
+    """
+
+    def build(environment: Environment, _driver: RecordArray, _challenge: str) -> Tables:
+        expected = "a batch controller, which is made without arguments (docs/controllers.md)"
+        made, after = own_code(name, where, expected), np.empty((*AFTER.shape, N_ACCELERATIONS, 3), np.float32)
+        if not hasattr(made, "step_batch"):
+            mend = "It is asked for millions of states at once: write step_batch(seen)."
+            raise CampaignError(where, f"{name}, which has no step_batch", expected, mend)
+        points, hold = points_of(AFTER), int(environment.numbers["hold_steps"])
+        gap, rate, bv = (each.ravel() for each in np.meshgrid(*points[1:], ACCELERATIONS_MPS2, indexing="ij"))
+        try:
+            for i, speed in enumerate(points.speed):
+                after[i] = states_after(made(), speed, gap, rate, bv, hold).reshape(after.shape[1:])
+        except (Exception, SystemExit) as error:
+            raise CampaignError(where, f"{name}: {cause_of(error)}", expected, "Fix the class.") from error
+        value, maneuvers = induced(environment, after)
+        none = np.zeros((0, 2, 2, 2), np.float32)
+        return Tables(value, maneuvers, build_before_cut_in(environment, value), none)
+
+    return build
+
+
+def states_after(
+    model: BatchController, speed: float, gap: FloatArray, rate: FloatArray, bv: FloatArray, steps: int
+) -> FloatArray:
+    """States (v_BV, R2, R2dot), (n, 3), after ``steps`` steps in which a ``model`` follows; v_BV as in `hold_period`.
+
+    BV begins with one ``speed`` (m/s), gaps (m), gap rates (m/s) and accelerations ``bv`` (m/s²) are (n,).
+    """
+    lead, own, gap = np.full(gap.size, speed), np.maximum(speed - rate, 0.0), gap.copy()
+    none, cell = np.broadcast_to(0.0, gap.size), read_only(np.arange(gap.size))
+    set_speed, unknown, right = read_only(own.copy()), np.broadcast_to(np.nan, gap.size), np.zeros_like(cell)
+    asked, lost = np.zeros(gap.size), np.zeros(gap.size, np.bool_)
+    if begin := getattr(model, "start_batch", None):
+        begin(cell, cell, [np.random.default_rng(0)] * gap.size)
+    for step in range(steps):
+        seen = BatchObservation(
+            cell=cell, episode=cell, time_s=np.broadcast_to(step * STEP_S, gap.size), position_m=none,
+            speed_mps=read_only(own), acceleration_mps2=read_only(asked), gap_m=read_only(gap),
+            lead_speed_mps=read_only(lead), bv_position_m=read_only(gap + VEHICLE_LENGTH_M), bv_speed_mps=lead,
+            bv_lane=right, lv_position_m=unknown, lv_speed_mps=unknown, lv_lane=right, bv_lateral_m=none,
+            bv_lateral_speed_mps=none, bv_overlaps=right + 1, set_speed_mps=set_speed, lv_lateral_m=none,
+            lv_lateral_speed_mps=none,
+        )  # fmt: skip
+        asked = np.array(np.broadcast_to(np.asarray(model.step_batch(seen), np.float64), gap.shape))
+        if not np.isfinite(asked).all():
+            raise ValueError(f"an acceleration of {asked[~np.isfinite(asked)][0]}")
+        lead_after, own_after = np.maximum(lead + bv * STEP_S, 0.0), np.maximum(own + asked * STEP_S, 0.0)
+        gap = gap + 0.5 * (lead + lead_after - own - own_after) * STEP_S
+        lead, own = lead_after, own_after
+        lost |= gap < CONTACT_M
+    return np.stack([np.where(lost, COLLIDED, lead), gap, lead - own], axis=1)

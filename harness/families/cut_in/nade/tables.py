@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 from pathlib import Path
@@ -76,11 +76,11 @@ def build_tables(
     drivers: RecordArray,
     challenge: str,
     done: Callable[[int], None] = lambda _: None,
-    build: Callable[[Environment, RecordArray, str], Tables] | None = None,
+    builds: Sequence[Callable[[Environment, RecordArray, str], Tables]] = (),
 ) -> Tables:
     """Tables of all surrogates, ``drivers`` (J,), read-only, from the cache if they are there.
 
-    ``challenge`` is ``recursive`` or ``immediate``, or what is to be known of the user's own that others ``build``;
+    ``challenge`` is ``recursive`` or ``immediate``, or what is to be known of the user's own that ``builds`` tabulate;
     ``done`` is called with the number of those that have become ready.
     """
     name = tables_name(environment, drivers, challenge)
@@ -89,7 +89,7 @@ def build_tables(
         return _load(path)
 
     def one(j: int) -> Tables:
-        built = (build or build_one)(environment, drivers[j : j + 1], challenge)
+        built = (builds[j] if builds else build_one)(environment, drivers[j : j + 1], challenge)
         done(1)
         return built
 
