@@ -25,6 +25,7 @@ HELD_S, LOOK_S = 1e9, 1e-6
 _TRUE_DATETIME: TypeAlias = datetime.datetime
 _READ = ("time", "monotonic", "perf_counter", "process_time", "thread_time")
 _SHOWN = ("localtime", "gmtime", "ctime")
+_OTHERS = ("clock_gettime", "clock_gettime_ns", "strftime", "asctime")
 _LOADS = ("create_module", "exec_module")
 
 
@@ -62,7 +63,7 @@ class Clock:
     @contextmanager
     def shown(self) -> Iterator[None]:
         """In the place of the functions of ``time``, and of ``datetime``, that tell the time."""
-        kept: dict[tuple[Any, str], Any] = {(time, name): getattr(time, name) for name in (*_READ, *_SHOWN)}
+        kept: dict[tuple[Any, str], Any] = {(time, name): getattr(time, name) for name in (*_READ, *_SHOWN, *_OTHERS)}
         kept |= {(time, f"{name}_ns"): getattr(time, f"{name}_ns") for name in _READ}
         kept[datetime, "datetime"] = datetime.datetime
         kept |= {(ExtensionFileLoader, name): getattr(ExtensionFileLoader, name) for name in _LOADS}
@@ -73,6 +74,11 @@ class Clock:
         for name in _SHOWN:
             show = kept[time, name]
             setattr(time, name, lambda secs=None, show=show: show(now["time"]() if secs is None else secs))
+        gettime, strftime, asctime = kept[time, "clock_gettime"], kept[time, "strftime"], kept[time, "asctime"]
+        time.clock_gettime = lambda clock: self.function("clock_gettime", lambda: gettime(clock))()
+        time.clock_gettime_ns = lambda clock: round(1e9 * time.clock_gettime(clock))
+        time.strftime = lambda form, shown=None: strftime(form, time.localtime() if shown is None else shown)
+        time.asctime = lambda shown=None: asctime(time.localtime() if shown is None else shown)
         datetime.datetime = _datetime(now["time"])  # type: ignore[misc]
         for name in _LOADS:
             setattr(ExtensionFileLoader, name, _by_true_datetime(kept[ExtensionFileLoader, name]))

@@ -77,7 +77,7 @@ def require_campaign(path: Path, content_hash: str, manifest: Mapping[str, Any])
     """Refuse (`RunFolderError`) a campaign that has not made the records."""
     if content_hash != manifest["campaign_hash"]:
         expected = f"campaign {manifest['campaign_hash']}, which made the records (manifest.json)"
-        mend = "Restore campaign.yaml and files that it names: environment.parameters, testing.challenge, surrogates, an FMU."
+        mend = "Restore campaign.yaml and what it names: environment.parameters, testing.challenge, surrogates, an FMU."
         raise RunFolderError(str(path), f"campaign {content_hash}", expected, mend)
 
 

@@ -184,7 +184,7 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
 def late_words(*, script: bool) -> str:
     """That a vehicle does nothing before BV is in its lane, and what would show it."""
     what = "getLateralLanePosition" if script else "bv_lateral_m"
-    return f"it reacted only once the other car (BV) was in its lane; {what} shows it some 2 s earlier"
+    return f"it did nothing before the other car (BV) was in its lane; {what} shows it some 2 s earlier"
 
 
 def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> Iterator[str]:

@@ -195,11 +195,14 @@ def _likely_cause(source: Source, episode: int) -> tuple[Cause | None, Sequence[
             return "process", ()
         if one.bits != later.bits:  # the clock is the same in the first two, and another in the last
             return "clock", later.clock_read_at
+        elsewhere = one.bits[0]
     alone = bits_after([])
     if any(bits_after([]) != alone for _ in range(2)):
         return "random", ()
     if any(bits_after(before) != alone for before in (range(max(0, episode - OTHER_CELLS), episode), [episode])):
         return "remembers", ()
+    if has_foreign_code(source.campaign.av) and alone != elsewhere:
+        return "process", ()  # as hash() of a text, which is the same in all fresh processes of one server
     return "shares", ()
 
 

@@ -84,9 +84,22 @@ class KeepsItsAnswer(Steady):
         self.at = -1.0
 
     def step(self, seen):
-        if (now := time.monotonic()) > self.at + 0.01:
+        if (now := self.now()) > self.at + 0.01:
             self.at, self.answer = now, -0.01 * seen.bv.speed_mps
         return self.answer
+
+    def now(self):
+        return time.monotonic()
+
+
+class KeepsItForAnHour(KeepsItsAnswer):
+    def now(self):
+        return float(time.strftime("%Y%j%H"))
+
+
+class KeepsItByClockGettime(KeepsItsAnswer):
+    def now(self):
+        return time.clock_gettime_ns(time.CLOCK_MONOTONIC) / 1e9
 
 
 class LooksAtTheClock(Steady):
@@ -103,6 +116,11 @@ class LooksAtTheClock(Steady):
 class OfItsProcess(Steady):
     def step(self, seen):
         return -1e-6 * (os.getpid() % 1000)
+
+
+class HashesAText(Steady):
+    def step(self, seen):
+        return -1e-6 * (hash("BV") % 1000)
 
 
 class WindsUp(Steady):
@@ -155,7 +173,10 @@ def test_the_built_in_idm_is_fine():
         pytest.param("Sharing", "they share something", marks=pytest.mark.slow),
         pytest.param("LooksAtTheClock", "", marks=pytest.mark.slow),
         pytest.param("KeepsItsAnswer", "on the clock (time.monotonic, test_av_check.py:", marks=pytest.mark.slow),
+        pytest.param("KeepsItForAnHour", "on the clock (time.time, test_av_check.py:", marks=pytest.mark.slow),
+        pytest.param("KeepsItByClockGettime", "on the clock (time.clock_gettime, test_a", marks=pytest.mark.slow),
         pytest.param("OfItsProcess", "It differs from process to process: ", marks=pytest.mark.slow),
+        pytest.param("HashesAText", "It differs from process to process: ", marks=pytest.mark.slow),
     ],
 )
 def test_a_controller_that_is_not_reproduced_is_found_out(name, why):
