@@ -104,9 +104,14 @@ def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:
     return f"Correct it; the key means: {about.rstrip('.')}." if about else "Correct the value."
 
 
+_ALSO_CALLED = {"nade": "step_mixture"}
+
+
 def did_you_mean(word: object, words: Sequence[str]) -> str:
     """The closest of some words, as a question; empty if none is close."""
     asked = str(word)[:_LONGEST]
+    if (known := _ALSO_CALLED.get(asked)) in words:
+        return f"{asked.upper()} is '{known}'."
     cutoff = 0.75 if len(asked) > 4 else 0.6  # of three letters a wrong one leaves 0.67
     return next((f"Did you mean '{close}'?" for close in difflib.get_close_matches(asked, words, 1, cutoff)), "")
 

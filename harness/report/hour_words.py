@@ -95,10 +95,9 @@ def exposures(content: Mapping[str, Any]) -> str:
     told: dict[str, list[str]] = {}
     for name, of in content["families"].items():
         found = of["exposure"]
-        sure = found["low"] == found["high"]
-        ends = "" if sure else f" ({_short(found['low'])}–{_short(found['high'])})"
-        kind = "counted" if found["counted"] else "given" if sure and found["source"] != "assumed" else "assumed"
-        told.setdefault(kind, []).append(f"{called(name)} {_short(found['per_hour'])}{ends}")
+        given = found["low"] == found["high"] and found["source"] != "assumed"
+        kind = "counted" if found["counted"] else "given" if given else "assumed"
+        told.setdefault(kind, []).append(f"{called(name)} {plain(float(format(found['per_hour'], '.2g')))}")
     return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
 
 
@@ -107,10 +106,6 @@ def between(low: float, high: float | None, rate: float) -> str:
     if high is None:
         return f"≥ {number(low)}"
     return interval(low, high, beside=rate) if low > 0.0 and high < 100.0 * low else f"{number(low)} to {number(high)}"
-
-
-def _short(value: float) -> str:
-    return plain(float(f"{value:.2g}"))
 
 
 def scope(content: Mapping[str, Any]) -> str:

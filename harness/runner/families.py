@@ -183,7 +183,10 @@ def read_families(folder: Path) -> dict[str, Any]:
     """``families.json`` of a folder; a `RunFolderError` where it is missing, damaged, or another version's."""
     if not (folder / FAMILIES).is_file():
         found, expected = "a run of one scenario", "a folder of several, which has families.json"
-        raise RunFolderError(str(folder), found, expected, "Leave out --exposure: one scenario has no rate per hour.")
+        mend = "Leave out --exposure: one scenario has no rate per hour."
+        if (folder.resolve().parent / FAMILIES).is_file():
+            mend = f"Name {folder.parent}, the folder of all."
+        raise RunFolderError(str(folder), found, expected, mend)
     content = read_as(dict[str, Any], folder / FAMILIES, mend=MEND)
     if missing := [key for key in _SHOWN if key not in content]:
         expected = "an answer as this version of the harness writes it"
