@@ -114,10 +114,10 @@ def test_damaged_text_loads_or_is_a_clear_error(load, text, draw):
 ALSO = [
     *("crash.counts_above_mps=5", "environment.cut_in_lead_s=0.5", "av={controller: 'a:B', warm_up_s: 0}"),
     *("av={controller: 'a:B', parameters: {x: 1}, before_event: controller}", "accept.crash_rate_below=1e-7"),
-    *("run.shard_size=7", "pool.library=ladder-1"),
+    *("run.shard_size=7", "pool.library=ladder-lateral-1"),
 ]
 SHELLS = FOLDER / "overtaking_shells.yaml"
-HASHES = "462b792351098fe0"
+HASHES = "f3f49576061560f2"
 
 
 def test_hashes_stay():

@@ -13,10 +13,10 @@ from harness.resolved import resolve
 from harness.vocabulary import CRASH, CUT_IN, PASSED, STATE_DTYPE
 from harness.worlds.twin import TwinWorld
 from tests.episode.twin_runs import campaign, run
+from tests.golden.campaigns import LATERAL_FILE
 
 N = 3000
-LOG_NORMAL = "ndd-overtaking-1-lateral"
-LATERAL = [{"lead_s": 1.5}, {"parameters": LOG_NORMAL}]
+LATERAL = [{"lead_s": 1.5}, {"parameters": LATERAL_FILE}]
 
 
 def episodes(method: str = "forced", **settings):

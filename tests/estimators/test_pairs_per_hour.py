@@ -70,8 +70,8 @@ RATES = [
 
 
 def test_intervals_hold_as_often_as_they_say():
-    """Of difference and ratio, at 90 %, in 200 draws; those of one scenario alone do not hold the sum's."""
-    rng, n, held, of_one = np.random.default_rng(5), 200, np.zeros(2, int), 0
+    """Of difference and ratio, at 90 %, in 100 draws; those of one scenario alone do not hold the sum's."""
+    rng, n, held, of_one = np.random.default_rng(5), 100, np.zeros(2, int), 0
     for _ in range(n):
         each = []
         for shares in SHARES:

@@ -38,10 +38,10 @@ def one_braking(peak: float = 5.0, at: int = 200, n: int = 600) -> np.ndarray:
 
 @pytest.mark.parametrize("scale", [pytest.param(0.5, marks=pytest.mark.slow), 1.0])
 def test_brakings_of_a_known_law_are_found_again(scale):
-    found = seen(BrakingFitter(), braking(12.0, 30.0, 5, scale=scale))
+    found = seen(BrakingFitter(), braking(8.0, 30.0, 5, scale=scale))
     low, high = (end / found.hours for end in garwood(found.events.size, TAIL))
     assert low < 30.0 < high
-    assert found.hours == pytest.approx(12.0, rel=0.02)
+    assert found.hours == pytest.approx(8.0, rel=0.02)
     number = BrakingFitter().numbers(found.events)["braking"]["peak_scale_mps2"]
     assert off(number, scale) < 3.0
     assert off(number, 1.5 - scale) > 3.0  # the other law is told from it

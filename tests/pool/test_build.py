@@ -51,7 +51,7 @@ def test_kept_cut_ins_stand_for_their_shell(pool):
 
 
 def test_what_changes_a_pool_changes_its_key():
-    changes = ("seed=7", "environment.lane_change_level=2", "pool.library=ladder-1", "pool.seed=2")
+    changes = ("seed=7", "environment.lane_change_level=2", "pool.library=ladder-lateral-1", "pool.seed=2")
     campaigns = (load_campaign(MIXTURE_FILE, [*SMALL_POOL, change]) for change in changes)
     assert len({campaign_pool_key(resolve(each)) for each in campaigns}) == len(changes)
 
@@ -125,7 +125,7 @@ def test_weights_of_a_proposal_make_up_for_its_aim():
 
 
 STRIDE = family_named("cut_in").stride
-LIBRARY = load_library("ladder-1")
+LIBRARY = load_library("ladder-2")
 
 
 def test_a_stride_asks_the_same_cut_ins_and_each_stands_for_as_many(environment):

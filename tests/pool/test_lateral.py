@@ -13,6 +13,7 @@ from harness.resolved import resolve
 from harness.vehicles.library import load_library
 from harness.vocabulary import CRASH, PASSED
 from harness.worlds.twin import TwinWorld
+from tests.golden.campaigns import LATERAL
 from tests.pool.conftest import GOLDEN_POOL, MIXTURE_FILE, enumerated
 
 LIBRARY = load_library("ladder-lateral-1")
@@ -28,7 +29,7 @@ def of(*overrides: str):
 
 @pytest.fixture(scope="module")
 def lateral():
-    return of("environment.parameters=ndd-overtaking-1-lateral")
+    return of(LATERAL)
 
 
 @pytest.fixture(scope="module")

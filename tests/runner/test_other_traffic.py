@@ -15,6 +15,7 @@ from harness.progress import Progress
 from harness.runner import stored_shells
 from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.runner.stored_shells import StoredShells
+from tests.golden.campaigns import LATERAL_FILE
 from tests.stored_runs import answer as words
 from tests.stored_runs import estimates, golden
 
@@ -92,7 +93,7 @@ def test_a_reference_driver_told_too_low_is_as_far_off_as_one_told_too_high(stor
 @pytest.mark.parametrize(
     ("name", "where", "found"),
     [
-        ("shells-twin", "ndd-overtaking-1-lateral", "in which events take time"),
+        ("shells-twin", LATERAL_FILE, "in which events take time"),
         ("forced-twin", "ndd-overtaking-1", "tests by forced"),
         ("shells-acting-twin", "ndd-overtaking-1", "acts before the event"),
         ("shells-twin", "nowhere", "which is not shipped"),

@@ -18,6 +18,7 @@ from harness.vocabulary import ACCELERATIONS_MPS2
 from studies.__main__ import main
 from studies.traffic import beside_published
 from studies.trajectories import ALIKE, CLOSEST_M, Differences, simulate
+from tests.golden.campaigns import LATERAL_FILE
 
 pytestmark = pytest.mark.slow
 
@@ -26,7 +27,7 @@ TRUE = ["v", "r1", "r1dot"]
 
 @pytest.fixture(scope="module")
 def environment() -> Environment:
-    settings = EnvironmentSettings(parameters="ndd-overtaking-1-lateral", lane_change_level=1000.0)
+    settings = EnvironmentSettings(parameters=LATERAL_FILE, lane_change_level=1000.0)
     made = load_environment(settings)
     numbers = made.numbers.copy()
     numbers["cut_in__ignore_share"] = 0.5

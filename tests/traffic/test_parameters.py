@@ -14,10 +14,11 @@ from harness.families.cut_in.lateral import constant_lead, log_normal_speed
 from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.vehicles.sideways import lateral_position, perceived_in
+from tests.golden.campaigns import LATERAL_FILE
 from tests.kernels import alone, cut_in_terms
 from tests.traffic.tables import DATA, SHIPPED, of, tabled
 
-PAPER, LATERAL = "ndd-overtaking-1", "ndd-overtaking-1-lateral"
+PAPER, LATERAL = "ndd-overtaking-1", LATERAL_FILE
 TEXT = SHIPPED.read_text(encoding="utf-8")
 NUMBERS = [(section, name) for section, numbers in DATA.items() if isinstance(numbers, dict) for name in numbers]
 NOT_NUMBERS = [".nan", "'1'", "null", "1" + "0" * 400]

@@ -68,9 +68,6 @@ def bits(shard: Shard, row: int) -> bytes:
 # -- controllers plugged in, in the twin --
 
 
-LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
-
-
 def forced(*overrides: str) -> Campaign:
     """Forced cut-ins."""
     return smoke("testing={method: forced}", "world.engine=twin", *overrides)

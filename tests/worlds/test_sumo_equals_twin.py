@@ -27,6 +27,7 @@ from harness.sampling import prepare
 from harness.vehicles.kinematics import STEP_S, next_position
 from harness.vocabulary import AV, BV, CONTACT, CRASH, LV, PASSED, STATE_DTYPE, VEHICLES
 from harness.worlds.twin import TwinWorld
+from tests.golden.campaigns import LATERAL
 from tests.traffic.tables import tabled
 from tests.worlds.running import smoke
 
@@ -156,7 +157,6 @@ AVS = {
     "fuzzy_safety": "{model: r157-fsm, parameters: {lateral_speed_mps: 1}, reaction: {inattention_probability: 0.5,"
     " inattention_delay_s: 0.9}}",
 }
-LATERAL = "environment.parameters=ndd-overtaking-1-lateral"
 OUTRUNS = (
     "av={model: constant, parameters: {acceleration_mps2: 5}, reaction: {perceives_lateral_m: 0}, takes_over: onset}"
 )

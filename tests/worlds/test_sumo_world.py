@@ -208,7 +208,7 @@ def run(world) -> Shard:
 @pytest.mark.slow
 def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes():
     campaign = smoke("testing.method=shells")
-    environment, library = load_environment(campaign.environment), load_library("ladder-1")
+    environment, library = load_environment(campaign.environment), load_library("ladder-2")
     shard = run(TwinWorld(4))
     assert shard.episode["outcome"].tolist() == OUTCOMES
     assert shard.episode["n_steps"].tolist() == [1, 200, 1, 1]
