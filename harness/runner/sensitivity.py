@@ -68,7 +68,8 @@ def sensitivity(
     asked = list(moves(settings.parameters, parameters, tested.here.family.shipped, ranges or {}))
     if not asked:
         found = f"{settings.parameters}, of which no number has a standard error (se) or a range"
-        mend = "State one, e.g. --range cut_in.ignore_share=0.001:0.08."
+        number = next(reversed(parameters.numbers()), "section__name").replace("__", ".")
+        mend = f"State one, e.g. --range {number}=LOW:HIGH."
         raise CampaignError(_OPTION, found, "numbers that are said to be uncertain", mend)
     results = tested.nearby([each for move in asked for each in move.settings], progress)
     bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
