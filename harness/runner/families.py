@@ -5,6 +5,7 @@ So everything that there is for a run, from replay to export, is there for each 
 
 from __future__ import annotations
 
+import sys
 import time
 import zlib
 from collections.abc import Mapping, Sequence
@@ -43,6 +44,8 @@ MEND = "Run the campaign again into the same folder with --resume."
 _SHOWN = ("families", "per_hour", "beside", "readings", "decision")
 """Keys of ``families.json`` without which nothing can be shown."""
 EARLY = "n_crashes_before_event"
+FAR_ABOVE = 10.0
+"""Of what is assumed at most, from which on an exposure is likely to be of other events [assumed]."""
 
 
 @dataclass(frozen=True)
@@ -237,8 +240,11 @@ def estimate_families(
 
 def exposure_of(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
     """How often events of a scenario are met: the shipped number, or the one that is given for it."""
-    shipped = resolved.family.exposure(resolved.environment, resolved.parameters)
-    return own_exposure(shipped, given.get(resolved.campaign.scenario))
+    shipped, name = resolved.family.exposure(resolved.environment, resolved.parameters), resolved.campaign.scenario
+    if (own := given.get(name)) is not None and own > FAR_ABOVE * shipped.high:
+        told = f"exposure {name}={own:g} is {own / shipped.per_hour:.0f} times the shipped one, which is of events in scope"
+        sys.stderr.write(f"note: {told} (docs/families.md)\n")
+    return own_exposure(shipped, given.get(name))
 
 
 def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> None:

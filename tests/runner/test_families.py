@@ -109,7 +109,11 @@ def test_other_exposures_need_no_new_tests(run, capsys):
         assert found["per_hour"][key] == pytest.approx(2.0 * told["per_hour"][key], rel=1e-9)
     assert found["beside"]["ratio"] == pytest.approx(told["beside"]["ratio"])
     assert main(["estimate", str(run.folder), "--exposure", "lead_brakes=0.3"]) == 0
-    assert "given: lead brakes 0.3" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "given: lead brakes 0.3" in said.out
+    assert not said.err
+    assert main(["estimate", str(run.folder), "--exposure", "cut_out=1"]) == 0  # of all, not of those in scope
+    assert "note: exposure cut_out=1 is 245 times the shipped one" in capsys.readouterr().err
     again = estimate_families(run.folder, {})
     assert {key: of for key, of in again.items() if key != "crc32"} == told
     assert main(["estimate", str(run.folder), "--exposure", "lane_change=0.3"]) == 2
