@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import os
+import re
 import sys
 from collections.abc import Callable
 from copy import deepcopy
@@ -295,8 +296,9 @@ def _file_of_script(name: str) -> str:
 def _note_step_length(file: str) -> None:
     """Say once that a script may be asked more often than by SUMO, for which it may have been written."""
     script = real_path(file)
-    if "step-length" not in script.read_text("utf-8", errors="replace"):
-        told = "names no --step-length: without one in its .sumocfg it is asked every 0.1 s; SUMO's default is 1 s"
+    named = filter(Path.is_file, map(Path, re.findall(r"[\w./-]+cfg\b", script.read_text("utf-8", errors="replace"))))
+    if not any("step-length" in file.read_text("utf-8", errors="replace") for file in (script, *named)):
+        told = "names no --step-length, nor does a .sumocfg of its: it is asked every 0.1 s; SUMO's default is 1 s"
         sys.stderr.write(f"note: {script.name} {told}.\n")
 
 

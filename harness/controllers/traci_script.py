@@ -157,10 +157,11 @@ class ScriptTraci(Traci):
             raise GreenletExit  # the next of a script that runs several: a test is one
         if self.simulation.n_steps:
             raise RefusedError("traci.start is refused after a step: each test is one run of the script.")
-        if isinstance(cmd, list | tuple) and (asked := _step_length([*map(str, cmd)])) is not None:
+        if isinstance(cmd, list | tuple) and (found := _step_length([*map(str, cmd)])) is not None:
+            asked, where = found
             self.every = round(float(asked) / STEP_S)
             if self.every < 1 or abs(self.every * STEP_S - float(asked)) > _ROUNDING:
-                raise RefusedError(f"--step-length {asked} is refused: steps here are 0.1 s; ask for a multiple of it.")
+                raise RefusedError(f"{where} {asked} is refused: steps here are 0.1 s; ask for a multiple of it.")
             self.vehicle.step_s = self.simulation.step_s = self.every * STEP_S
         return _VERSION
 
@@ -236,16 +237,16 @@ class ScriptTraci(Traci):
         return listener is not None
 
 
-def _step_length(options: Sequence[str]) -> str | None:
-    """What SUMO's options say (s), or else the configuration file that they name, if it is there."""
+def _step_length(options: Sequence[str]) -> tuple[str, str] | None:
+    """What SUMO's options say (s), or else the configuration file that they name, if it is there; and where."""
     given = {**dict(pairwise(options)), **dict(each.split("=", 1) for each in options if "=" in each)}
     if "--step-length" in given:
-        return given["--step-length"]
+        return given["--step-length"], "--step-length"
     for name in (each.rpartition("=")[2] for each in options):
         if name.endswith("cfg") and Path(name).is_file():
             with suppress(ElementTree.ParseError):
                 found = ElementTree.parse(name).find(".//step-length")  # noqa: S314 - the user's own
-                return None if found is None else found.get("value")
+                return None if found is None else (found.get("value", ""), f"the step-length of {name},")
     return None
 
 

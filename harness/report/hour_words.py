@@ -6,11 +6,12 @@ from collections.abc import Iterator, Mapping, Sized
 from pathlib import Path
 from typing import Any
 
+from harness.estimators.answer import AssumedOfRate
 from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
 from harness.report.rows import decided
-from harness.report.words import GO_ON, doubt_words, early_words, ended_words, milder_words, scope_words
+from harness.report.words import GO_ON, doubt_words, early_words, ended_words, milder_words, scope_words, unseen_words
 
 
 def called(family: str) -> str:
@@ -86,6 +87,9 @@ def warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
     for name, of in content["families"].items():
         yield from milder_words(name, of["milder"])
+        if of["assumed"] and (found := AssumedOfRate(**of["assumed"])).no_lower_limit:
+            most = found.most * (of["ci_high"] if of["n_crashes"] else of["upper_bound"])
+            yield f"{called(name)}: {unseen_words(found.where)}, here {number(most)} per hour"
         doubts = doubt_words({**of, "rate": of["rate_per_hour"]}, " per hour")
         yield from (f"{called(name)}: {text}" for text in (*early_words(of["n_crashes_before_event"]), *doubts))
 

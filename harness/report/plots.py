@@ -76,16 +76,18 @@ def convergence_plot(run: RunFolder) -> Plot | None:
     left.add("band", "blue", n, low, high, opacity=0.16, label=f"{confidence} interval")
     left.add("line", "blue", n, rate, label="estimate")
     left.add("line", "muted", n[[0, -1]], rate[[-1, -1]], dash=DASHED, width=1.0, label="at the end")
-    caption = WEIGHTED if estimates.headline != "shells" else IN_ROUNDS
-    if target is None:
+    right = _rhw_panel(tests, n, rhw, None if of_library else target)
+    caption, ending = WEIGHTED if estimates.headline != "shells" else IN_ROUNDS, f", ending at {number(rhw[-1])}"
+    if right is None:
+        caption, ending = caption.partition(" RHW")[0], ": not known"
+    elif target is None:
         caption += " No RHW was asked for."
     elif of_library:
         caption += " The RHW that was asked for is that of the statement library, not of the rate drawn here."
     alt = (
         f"Crash rate against number of tests with its {confidence} band, ending at {number(rate[-1])} after "
-        f"{count(n[-1])} tests. Relative half-width against tests, ending at {number(rhw[-1])}."
+        f"{count(n[-1])} tests. Relative half-width against tests{ending}."
     )
-    right = _rhw_panel(tests, n, rhw, None if of_library else target)
     return Plot("convergence", [left, *([] if right is None else [right])], alt, caption)
 
 

@@ -179,6 +179,7 @@ def doubts_of(
         EARLY: n_left_out(campaign, estimates["diagnostics"].get(EARLY, 0)), "milder": estimates["milder"],
         "if_failed_had_crashed": times * best["details"]["crash_rate_if_failed_had_crashed"],
         "cut_off": times * estimates["cut_off"], "cautions": best["cautions"], "repeated": manifest.get("repeated"),
+        "assumed": estimates["assumed"],
     }  # fmt: skip
 
 

@@ -219,7 +219,13 @@ def test_a_step_of_the_script_is_as_long_as_it_asks_for(tmp_path):
 def test_one_that_names_none_is_told_so_once(tmp_path, capsys):
     body, folder = text("traci.vehicle.setSpeed('ego', 20.0)"), tmp_path / "my.pyenv"
     folder.mkdir()
-    for name, script in (("none.py", body), ("some.py", body.replace('"sumo"', '"sumo", "--step-length=0.1"'))):
+    (tmp_path / "my.sumocfg").write_text('<c><time><step-length value="0.2"/></time></c>', "utf-8")
+    scripts = {
+        "none.py": body,
+        "some.py": body.replace('"sumo"', '"sumo", "--step-length=0.1"'),
+        "cfg.py": body.replace('"sumo"', f'"sumo", "-c", "{tmp_path}/my.sumocfg"'),
+    }
+    for name, script in scripts.items():
         (folder / name).write_text(script, "utf-8")
         for _ in range(2):
             assert runs_script(load_campaign(str(folder / name)).av)

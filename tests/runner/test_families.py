@@ -12,7 +12,7 @@ import harness
 from harness.campaign.sections import EXPOSURES
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError
-from harness.numbers import plain
+from harness.numbers import number, plain
 from harness.pool import moved
 from harness.printed import PRINTED
 from harness.records.folder import read_manifest, write_sealed
@@ -186,6 +186,18 @@ def test_what_does_not_go_together_is_refused(overrides, where, tmp_path):
         harness.run(campaign(*overrides), tmp_path / "run")
     assert where in str(refused.value.where)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("times", "warned"), [([0.2, 4.0], True), ([0.99, 1.01], False), (None, False)])
+def test_a_rate_that_traffic_leaves_open_has_only_an_upper_limit_in_the_sum_too(run, times, warned):
+    """Where no lane change was seen that a notable part of it comes from."""
+    open_ = {"where": "TTC < 3 s", "highest": None, "times": times}
+    of = run.content["families"]
+    content = {**run.content, "families": {**of, "cut_in": {**of["cut_in"], "assumed": open_}}}
+    told = " ".join(" ".join(hour_lines(content)).split())
+    said = "! cut-in: no lane change was seen at TTC < 3 s in the data of this traffic: rates have only an upper limit"
+    most = f", here {number(4.0 * of['cut_in']['ci_high'])} per hour"
+    assert [each in told for each in (said, said + most)] == [warned, warned]
 
 
 def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
