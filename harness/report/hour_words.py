@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from harness.estimators.answer import AssumedOfRate
+from harness.estimators.estimate import WIDE_RHW
 from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
-from harness.report.rows import decided
+from harness.report.rows import decided, ratio_texts
 from harness.report.words import GO_ON, doubt_words, early_words, ended_words, milder_words, scope_words, unseen_words
 
 
@@ -40,27 +41,27 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
 
 def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """Crashes per hour, and beside the competent driver: what, value, interval, remark."""
-    hour, beside = content["per_hour"], content["beside"]
-    per_km = f"{number(content['per_1e6_km'])} per million km"
-    if content["n_crashes"]:
+    hour, beside, decision = content["per_hour"], content["beside"], content["decision"]
+    wide = hour["rhw"] is None or hour["rhw"] > WIDE_RHW
+    from_below = wide and decision is not None and decision["verdict"] == "rejected"
+    if from_below:  # the other end says nothing
+        yield "crashes so far", f"> {number(hour['ci_low'])} per hour", f"estimate {number(hour['rate'])}", ""
+    elif content["n_crashes"]:
         ends = between(hour["ci_low"], hour["ci_high"], hour["rate"])
+        per_km = f"{number(content['per_1e6_km'])} per million km"
         yield "crashes", f"{number(hour['rate'])} per hour", ends, per_km
     else:
         yield "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen", ""
-    yield beside_row("× competent driver", beside, seen=content["n_crashes"] > 0)
+    yield beside_row("× competent driver", beside, seen=content["n_crashes"] > 0, from_below=from_below)
 
 
-def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool) -> tuple[str, ...]:
+def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool, from_below: bool = False) -> tuple[str, ...]:
     """The rate beside a reading of that driver, where crashes were ``seen`` or none: name, ratio, interval, remark."""
     if beside["ratio"] is None:
         return name, "no ratio", "", "such a driver never crashes here"
-    low, high = beside["ratio_low"], beside["ratio_high"]
-    apart = "not told apart" if high is None or low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
-    most = "no limit" if high is None else ratio(high)
-    ends = beside["over_assumed"]
+    found, ends = (beside if seen else {**beside, "ratio": 0.0}), beside["over_assumed"]
     over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed ranges"
-    value = f"{ratio(beside['ratio'])} ({apart})" if seen else f"< {most}"
-    return name, value, f"{ratio(low)} to {most}", over
+    return name, *ratio_texts(found, wide=from_below, from_below=from_below), over
 
 
 def reading_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:

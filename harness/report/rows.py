@@ -144,21 +144,24 @@ def decided(decision: Mapping[str, Any]) -> Row:
 
 
 def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: bool) -> Row:
-    low, high, seen = found["ratio_low"], end(found["ratio_high"]), found["ratio"]
     who = {"r157-cc": "r157-cc, UN R157’s driver"}.get(found["reference"], found["reference"])
     if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
         who = f"{found['reference']}, from the same state"
+    return Row("ratio", "× competent driver", *ratio_texts(found, wide=wide, from_below=from_below), who)
+
+
+def ratio_texts(found: Mapping[str, Any], *, wide: bool, from_below: bool) -> tuple[str, str]:
+    """A ratio to a reference, and its interval, of which a ``wide`` one says what it says with one end alone."""
+    low, high, seen = found["ratio_low"], end(found["ratio_high"]), found["ratio"]
+    most = "no limit" if math.isinf(high) else ratio(high)
     if not seen:
-        value, ends = f"< {ratio(high)}", "no crash seen"
-    elif wide and high < 1.0:
-        value, ends = f"< {ratio(high)} (crashes less)", f"estimate {ratio(seen)}, ≥ {ratio(low)}"
-    elif from_below and low > 1.0:
-        value, ends = f"> {ratio(low)} (crashes more)", f"estimate {ratio(seen)}"
-    else:
-        apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
-        value = f"{ratio(seen)} ({apart})"
-        ends = f"≥ {ratio(low)}" if from_below else f"{ratio(low)} to {ratio(high)}"
-    return Row("ratio", "× competent driver", value, ends, who)
+        return f"< {most}", "no crash seen"
+    if wide and high < 1.0:
+        return f"< {most} (crashes less)", f"estimate {ratio(seen)}, ≥ {ratio(low)}"
+    if from_below and low > 1.0:
+        return f"> {ratio(low)} (crashes more)", f"estimate {ratio(seen)}"
+    apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
+    return f"{ratio(seen)} ({apart})", f"≥ {ratio(low)}" if from_below else f"{ratio(low)} to {most}"
 
 
 def within(found: Mapping[str, Any]) -> Row:

@@ -12,6 +12,7 @@ import harness
 from harness.campaign.sections import EXPOSURES
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError
+from harness.estimators.stopping import Decision
 from harness.numbers import number, plain
 from harness.pool import moved
 from harness.printed import PRINTED
@@ -186,6 +187,16 @@ def test_what_does_not_go_together_is_refused(overrides, where, tmp_path):
         harness.run(campaign(*overrides), tmp_path / "run")
     assert where in str(refused.value.where)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("rhw", "low", "shown"), [(3.0, 1.2, True), (0.3, 1.2, False), (3.0, 0.9, False)])
+def test_where_few_tests_reject_only_the_lower_ends_are_told(run, rhw, low, shown):
+    decision = Decision(1.0, "assumption_free", 0.95, low, 40.0, driver="r157-cc").to_json()
+    per_hour, beside = ({**run.content[key]} for key in ("per_hour", "beside"))
+    content = {**run.content, "decision": decision, "per_hour": per_hour | {"rhw": rhw, "ci_low": 1e-3}}
+    told = "\n".join(hour_lines({**content, "beside": beside | {"ratio_low": 2.5, "ratio_high": 900.0}}))
+    ratio = "> 2.50 (crashes more)" in told
+    assert ("crashes so far      > 1.00 × 10⁻³ per hour" in told, ratio, "to 900" in told) == (shown, shown, not shown)
 
 
 @pytest.mark.parametrize(("times", "warned"), [([0.2, 4.0], True), ([0.99, 1.01], False), (None, False)])
