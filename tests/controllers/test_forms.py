@@ -13,8 +13,9 @@ from harness.controllers.hosts import BatchHost, Guard
 from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
 from harness.vocabulary import CRASH
+from tests.golden.campaigns import LATERAL
 from tests.stored_runs import ROOT
-from tests.worlds.running import LATERAL, drive, fmu_av, forced, motion
+from tests.worlds.running import drive, fmu_av, forced, motion
 
 FORMS = {
     "per vehicle": "av={controller: 'examples.idm:IDM'}",

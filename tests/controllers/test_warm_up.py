@@ -13,7 +13,8 @@ import pytest
 from examples.idm import IDM, idm_acceleration
 from harness.controllers.traci_style import TraciStyleController
 from harness.worlds.sumo import SumoWorld
-from tests.worlds.running import LATERAL, drive, motion
+from tests.golden.campaigns import LATERAL
+from tests.worlds.running import drive, motion
 
 pytestmark = pytest.mark.slow  # at night
 
