@@ -41,10 +41,8 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
 
 def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """Crashes per hour, and beside the competent driver: what, value, interval, remark."""
-    hour, beside, decision = content["per_hour"], content["beside"], content["decision"]
-    wide = hour["rhw"] is None or hour["rhw"] > WIDE_RHW
-    from_below = wide and decision is not None and decision["verdict"] == "rejected"
-    if from_below:  # the other end says nothing
+    hour, from_below = content["per_hour"], _from_below(content)
+    if from_below:
         yield "crashes so far", f"> {number(hour['ci_low'])} per hour", f"estimate {number(hour['rate'])}", ""
     elif content["n_crashes"]:
         ends = between(hour["ci_low"], hour["ci_high"], hour["rate"])
@@ -52,7 +50,13 @@ def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         yield "crashes", f"{number(hour['rate'])} per hour", ends, per_km
     else:
         yield "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen", ""
-    yield beside_row("× competent driver", beside, seen=content["n_crashes"] > 0, from_below=from_below)
+    yield beside_row("× competent driver", content["beside"], seen=content["n_crashes"] > 0, from_below=from_below)
+
+
+def _from_below(content: Mapping[str, Any]) -> bool:
+    """Whether few tests have rejected a limit: upper ends say nothing then."""
+    rhw, decision = content["per_hour"]["rhw"], content["decision"]
+    return decision is not None and decision["verdict"] == "rejected" and (rhw is None or rhw > WIDE_RHW)
 
 
 def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool, from_below: bool = False) -> tuple[str, ...]:
@@ -66,7 +70,8 @@ def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool, from_below: 
 
 def reading_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """The same beside other readings of the regulation's driver."""
-    return [beside_row(f"× {each['reference']}", each, seen=content["n_crashes"] > 0) for each in content["readings"]]
+    how = {"seen": content["n_crashes"] > 0, "from_below": _from_below(content)}
+    return [beside_row(f"× {each['reference']}", each, **how) for each in content["readings"]]
 
 
 def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
