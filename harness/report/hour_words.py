@@ -93,7 +93,7 @@ def warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
     for name, of in content["families"].items():
         yield from milder_words(name, of["milder"])
-        if of["assumed"] and (found := AssumedOfRate(**of["assumed"])).no_lower_limit:
+        if (left := of.get("assumed")) and (found := AssumedOfRate(**left)).no_lower_limit:
             most = found.most * (of["ci_high"] if of["n_crashes"] else of["upper_bound"])
             yield f"{called(name)}: {unseen_words(found.where)}, here {number(most)} per hour"
         doubts = doubt_words({**of, "rate": of["rate_per_hour"]}, " per hour")

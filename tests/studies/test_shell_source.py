@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 PATHS = 1024
 ENVIRONMENT = load_environment(EnvironmentSettings(parameters="ndd-overtaking-1"))
-LIBRARY = load_library("ladder-2")
+LIBRARY = load_library("ladder-2").model_copy(update={"references": {}})
 AVS = {
     name: AutomatedVehicle.model_validate(av)
     for name, av in {

@@ -218,7 +218,7 @@ def test_contact_in_the_step_of_the_cut_in_is_retraced_and_no_surrogate_crashes(
     stored, room = stored_paths(episodes, campaign.seed), empty_trajectory(environment)
     followers = Followers(library.followers(environment.lateral.present).drivers)
     assert replay_surrogates(*map(unboxed, (stored, environment, followers, room)), crashes) == -1
-    everybody = 2 ** len(library.surrogates) - 1
+    everybody = 2 ** (len(library.surrogates) + len(library.references)) - 1
     assert crashes.tolist()[::2] == [0, everybody]
     assert crashes[3] == 0
 
