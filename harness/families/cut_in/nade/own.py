@@ -20,9 +20,9 @@ from harness.controllers.hosts import cause_of
 from harness.controllers.protocol import BatchController, BatchObservation
 from harness.errors import CampaignError
 from harness.families.cut_in.laws import Environment
-from harness.families.cut_in.nade.challenge import COLLIDED, LEVELS, build_before_cut_in, induced, level_steps
+from harness.families.cut_in.nade.challenge import COLLIDED, LEVELS, induced, level_steps
 from harness.families.cut_in.nade.grid import AFTER, points_of
-from harness.families.cut_in.nade.tables import Tables
+from harness.families.cut_in.nade.tables import Tables, recursive_tables
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, RecordArray, read_only
 
@@ -37,7 +37,7 @@ def own_challenge(name: str) -> Callable[[Environment, RecordArray, str], Tables
 
     def build(environment: Environment, driver: RecordArray, _: str) -> Tables:
         function = own_code(name, WHERE, "a function of a driver and a state (docs/method.md)")
-        numbers, shape, none = driver.view(np.recarray)[0], AFTER.shape, np.zeros((0, 2, 2, 2), np.float32)
+        numbers, shape = driver.view(np.recarray)[0], AFTER.shape
         per_level_s = STEP_S * level_steps(int(environment.numbers["hold_steps"]))
         value, maneuvers = np.zeros((LEVELS + 1, *shape), np.float32), np.zeros((*shape, N_ACCELERATIONS), np.float32)
         for i, speed in enumerate(points_of(AFTER).speed):
@@ -46,7 +46,7 @@ def own_challenge(name: str) -> Callable[[Environment, RecordArray, str], Tables
                 value[level, i] = _asked(name, function, numbers, speed, gap, rate, 0.0, level * per_level_s)
             states = speed, gap[..., None], rate[..., None], ACCELERATIONS_MPS2
             maneuvers[i] = _asked(name, function, numbers, *states, LEVELS * per_level_s)
-        return Tables(value, maneuvers, build_before_cut_in(environment, value), none)
+        return recursive_tables(environment, value, maneuvers)
 
     return build
 
@@ -82,9 +82,7 @@ def own_surrogate(name: str, where: str) -> Callable[[Environment, RecordArray, 
                 after[i] = states_after(made(), speed, gap, rate, bv, hold).reshape(after.shape[1:])
         except (Exception, SystemExit) as error:
             raise CampaignError(where, f"{name}: {cause_of(error)}", expected, "Fix the class.") from error
-        value, maneuvers = induced(environment, after)
-        none = np.zeros((0, 2, 2, 2), np.float32)
-        return Tables(value, maneuvers, build_before_cut_in(environment, value), none)
+        return recursive_tables(environment, *induced(environment, after))
 
     return build
 

@@ -61,14 +61,20 @@ def _content(tables: Tables) -> memoryview:
     return file.getbuffer()
 
 
+_NONE = np.zeros((0, 2, 2, 2), np.float32)
+
+
 def build_one(environment: Environment, driver: RecordArray, challenge: str) -> Tables:
     """Tables of one surrogate, ``driver`` (1,), without its axis."""
-    none = np.zeros((0, 2, 2, 2), np.float32)
     if challenge == "immediate":
         value, maneuvers, least = build_immediate(environment, driver)
-        return Tables(value, maneuvers, none, least)
-    value, maneuvers = build_after_cut_in(environment, driver)
-    return Tables(value, maneuvers, build_before_cut_in(environment, value), none)
+        return Tables(value, maneuvers, _NONE, least)
+    return recursive_tables(environment, *build_after_cut_in(environment, driver))
+
+
+def recursive_tables(environment: Environment, value: Float32Array, maneuvers: Float32Array) -> Tables:
+    """Tables of one surrogate by a challenge after the cut-in; what precedes it follows."""
+    return Tables(value, maneuvers, build_before_cut_in(environment, value), _NONE)
 
 
 def build_tables(
