@@ -11,7 +11,7 @@ SHELLS = ("testing.method=shells", "environment.lane_change_level=1")
 SPEEDS = "{controller: 'tests.golden.vehicles:Speeds', before_event: controller, limits: {max_acceleration_mps2: 2}}"
 ACTING, FAILING = f"av={SPEEDS}", "av.controller=tests.golden.vehicles:Fails"
 BRAKES_LITTLE = "av.parameters.min_acceleration_mps2=-1.5"
-LATERAL_FILE = str(Path(__file__).parents[2] / "scenarios" / "validate" / "ndd-overtaking-1-lateral.yaml")
+LATERAL_FILE = str(Path(__file__).parents[2] / "scenarios" / "validate" / "traffic" / "ndd-overtaking-1-lateral.yaml")
 LATERAL = f"environment.parameters={LATERAL_FILE}"
 NDE, STEP, MIXTURE, FORCED = (f"testing.method={name}" for name in ("nde", "step_mixture", "episode_mixture", "forced"))
 
