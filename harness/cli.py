@@ -77,7 +77,7 @@ def _told(error: Exception, group: click.Group, name: str) -> int:
     known = error if isinstance(error, HarnessError) else None
     if isinstance(error, click.UsageError):
         known = usage_error(error, error.ctx or click.Context(group, info_name=name))
-    elif isinstance(error, OSError):
+    elif isinstance(error, OSError | MemoryError):
         known = system_error(error)
     if known is None:
         raise error

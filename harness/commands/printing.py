@@ -105,8 +105,11 @@ _OF_THE_SYSTEM = (
 """Errors that a user can mend: which, what was found and expected, and how."""
 
 
-def system_error(error: OSError) -> HarnessError | None:
+def system_error(error: OSError | MemoryError) -> HarnessError | None:
     """Translate an error of the operating system that a user can mend; None for any other."""
+    if isinstance(error, MemoryError):
+        mend = f"Use fewer --workers, or lift the limit (`ulimit -v`, or one that the vehicle has set). {_AGAIN}"
+        return HarnessError("memory", "none left", "room for the tests of each worker", mend)
     name, where = errno.errorcode.get(error.errno or 0), str(error.filename or "disk of the output folder")
     if name == "ENOENT" and error.filename is None:  # so says os.getcwd
         return HarnessError("current folder", "that it has been removed", "a folder", "Go to one that is there (cd).")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -20,6 +21,8 @@ WATCHED = (
     *("builtins", "math", "json", "os", "pickle", "signal", "struct", "time"),
     *("numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
 )
+OURS = "harness", "numba", "llvmlite", "numpy"
+"""Packages of which no module may be replaced."""
 CHANGED_MODES = "changed the processor's rounding mode or floating-point flags (fesetround, -ffast-math); restore them"
 
 _CONTROL, _MXCSR, _MODES = 0, 7, 0xFFC0
@@ -55,20 +58,37 @@ class FloatingPointModes:
 
 
 class OtherModules:
-    """What the modules that the harness itself rests on hold when it is made."""
+    """What the harness itself rests on when it is made: modules and what they hold, and how others are imported."""
 
     def __init__(self) -> None:
-        self._modules = {name: sys.modules[name] for name in WATCHED if name in sys.modules}
-        self._kept = {name: _functions_and_numbers(vars(module)) for name, module in self._modules.items()}
+        self._loaded, self._finders, self._depth = dict(sys.modules), list(sys.meta_path), sys.getrecursionlimit()
+        self._blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+        self._kept = {
+            name: _functions_and_numbers(vars(self._loaded[name])) for name in WATCHED if name in self._loaded
+        }
 
     def restored(self) -> list[str]:
         """Names, as ``math`` or ``math.sqrt``, that had been replaced or deleted; they are as before."""
-        changed = [name for name, module in self._modules.items() if sys.modules.get(name) is not module]
-        sys.modules.update(self._modules)
+        gone = {name: module for name, module in self._loaded.items() if sys.modules.get(name) is not module}
+        changed = [name for name in gone if name in WATCHED or name.partition(".")[0] in OURS]
+        sys.modules.update(
+            {name: module for name, module in gone.items() if name in changed or name not in sys.modules}
+        )
         for name, kept in self._kept.items():
-            there = vars(self._modules[name])
+            there = vars(self._loaded[name])
             changed += [f"{name}.{key}" for key, value in kept.items() if there.get(key, self) is not value]
             there.update(kept)
+        if lost := [finder for finder in self._finders if finder not in (sys.meta_path or ())]:
+            sys.meta_path = [*(sys.meta_path or ()), *lost]
+            changed.append("sys.meta_path")
+        if not callable(sys.excepthook):
+            sys.excepthook = sys.__excepthook__
+            changed.append("sys.excepthook")
+        if sys.getrecursionlimit() < self._depth:
+            sys.setrecursionlimit(self._depth)
+            changed.append("sys.setrecursionlimit")
+        if signal.pthread_sigmask(signal.SIG_SETMASK, self._blocked) != self._blocked:
+            changed.append("signal.pthread_sigmask")
         return changed
 
 

@@ -2,6 +2,8 @@
 
 import json
 import re
+import signal
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from benchmarks.kills import orphans
 from harness.cli import main
 from harness.controllers.find import build_host
 from harness.controllers.hosts import _numbers
+from harness.controllers.process_state import OtherModules
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.printed import PRINTED
 from harness.runner.workers import LocalWorkers
@@ -204,13 +207,24 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
 
 
 @pytest.mark.parametrize("at", quick(1, ["constructor", "step"]))
-@pytest.mark.parametrize("what", ["math.isfinite", "pyarrow.parquet.write_table", "numpy"])
+@pytest.mark.parametrize(
+    "what", ["math.isfinite", "pyarrow.parquet.write_table", "numpy", "harness", "sys.excepthook", "sys.meta_path"]
+)
 def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, capsys):
     assert _run(tmp_path, _of("Replaces", what=what, at=at)) == EXIT_BAD_INPUT
     err = capsys.readouterr().err
     assert err.startswith("error: av.controller\n")
     assert f"a vehicle that has replaced {what}, which the harness calls, too" in err
     assert (tmp_path / "run").exists() == (at == "step")
+
+
+def test_what_the_process_itself_is_told_is_as_it_was():
+    others, depth = OtherModules(), sys.getrecursionlimit()
+    sys.setrecursionlimit(depth - 1)
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])  # in a worker the calls' time would have no limit
+    assert others.restored() == ["sys.setrecursionlimit", "signal.pthread_sigmask"]
+    assert sys.getrecursionlimit() == depth
+    assert not others.restored()
 
 
 def test_one_after_which_no_file_can_be_opened_is_told_so(tmp_path, capsys):
