@@ -6,6 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
@@ -143,7 +144,7 @@ class ParameterFile(Section):
 
     folder: ClassVar[Path]
     replicates: ClassVar[Any]
-    blocks: ClassVar[Mapping[str, tuple[str, ...]]]
+    blocks: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
 
     @model_validator(mode="before")
     @classmethod

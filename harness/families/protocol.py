@@ -11,18 +11,22 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import pyarrow as pa
 
 from harness.campaign.drivers import Surrogate
+from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError
 from harness.families.numbers import ParameterFile
 from harness.families.script import Script
-from harness.families.words import Shown, Words
+from harness.families.words import CLOSING, GAP, Shown, Words, words_of
+from harness.random_stream import INITIAL, uniforms
 from harness.vehicles.drivers import Followers
+from harness.vehicles.sideways import TO_OVERLAP_M
 from harness.vocabulary import BoolArray, FloatArray, IntArray, Method, RecordArray
 
 Environment: TypeAlias = Any
@@ -100,6 +104,15 @@ class Events(NamedTuple):
     after_failure: FloatArray
 
 
+def every_event(probability: FloatArray, crashes: IntArray, stride: int = 1, offset: IntArray | None = None) -> Events:
+    """Every ``stride``-th of events that no AV makes more or less probable, given the ``probability`` of all (n, E)."""
+    n, n_events = probability.shape
+    asked = np.arange(n_events) % stride == (np.zeros(n, np.int64) if offset is None else offset)[:, None]
+    total = probability.sum(axis=1)
+    with np.errstate(divide="ignore"):
+        return Events(np.where(asked, stride * probability, 0.0), np.where(asked, crashes, 0), np.log(total), total)
+
+
 class Chosen(NamedTuple):
     """Events (m,) that were chosen: what has to be known to repeat them.
 
@@ -139,8 +152,15 @@ class Driven(NamedTuple):
     ahead: FloatArray
 
 
+N_MEAN_PATHS = 1024
+"""Paths over which means are taken."""
+
+
 class Family(Protocol):
-    """A kind of events, and what most have alike. ``traffic`` is all that its kernels need of its environment."""
+    """A kind of events, and what most have alike. ``traffic`` is all that its kernels need of its environment.
+
+    A family has to say the names below that have no value, and `start`, `events`, `choose` and `script`.
+    """
 
     name: str
     vehicles: tuple[str, ...]
@@ -153,37 +173,48 @@ class Family(Protocol):
     """The facts that records keep."""
     n_uniforms: int
     """From how many uniforms the beginning of a path is made: what a pool is aimed over."""
-    shipped: Path
-    """Folder of the parameter files that a name alone stands for."""
+    model: type[Parameters]
+    """Its parameter files; ``folder`` has those that a name alone stands for."""
     default_parameters: str
     """The one of them where nothing is said."""
     ladders: Mapping[bool, str]
     """Libraries of surrogates where nothing is said, by whether events show themselves before they happen."""
-    follows: bool
+    follows: bool = False
     """Whether the AV drives from the start, behind a vehicle that does not look at it: events do not depend on it."""
-    stride: int
+    stride: int = 1
     """Events of a path between two that a pool asks."""
-    pool_error: float
+    pool_error: float = 0.01
     """Relative standard error of its surrogates' crash rates where nothing is said."""
-    fitter: str
+    fitter: str = ""
     """Its fit to trajectories (`harness.fitting.protocol.Fitter`), ``module:class``; empty without one."""
     crosses: int
     """Place of the vehicle that changes lanes, -1 for none."""
-    words: Words
-    """What pages say of events."""
-    maps: tuple[tuple[Shown, Shown], ...]
+    maps: tuple[tuple[Shown, Shown], ...] = ((GAP, CLOSING),)
     """Axes (x, y) of their maps."""
-    stand_ins: Mapping[str, tuple[str, Surrogate]]
-    """Who is driven in the AV's place, by name: a phrase and the driver, the reference driver first."""
+    stand_ins: Mapping[str, tuple[str, Surrogate]] = MappingProxyType({})
+    """Who is driven in the AV's place (`drive`), by name: a phrase and the driver, the reference driver first."""
 
-    def parameters(self, settings: EnvironmentSettings) -> Parameters:
+    @property
+    def words(self) -> Words:
+        """What pages say of events."""
+        return words_of(event=f"{self.name} event", of=self.vehicles[self.principal])
+
+    @property
+    def shipped(self) -> Path:
+        """Folder of the parameter files that a name alone stands for."""
+        return self.model.folder
+
+    def parameters(self, settings: EnvironmentSettings) -> Any:
         """The numbers that a campaign's environment names.
 
         Raises `CampaignError`: the file is missing or wrong, every place being named, or its laws are unsound.
         """
+        file = shipped_or_own(settings.named(self.default_parameters), self.shipped, "environment.parameters")
+        return read_model(file, self.model)
 
     def traffic(self, settings: EnvironmentSettings, parameters: Any = None) -> Environment:
-        """All that kernels need; ``parameters`` are read unless they are given."""
+        """All that kernels need; ``parameters`` are read unless they are given. The parameters, where nothing is."""
+        return parameters or self.parameters(settings)
 
     def traffic_with(
         self, settings: EnvironmentSettings, parameters: Any, values: Mapping[str, float]
@@ -196,19 +227,23 @@ class Family(Protocol):
 
     def digest(self, traffic: Environment) -> str:
         """Hash of all numbers of it."""
+        return hashlib.sha256(_numbers_in(traffic)).hexdigest()[:24]
 
     def max_steps(self, traffic: Environment) -> int:
-        """Steps of the longest test."""
+        """Steps of the longest test: of any script."""
+        return int(self.uneventful(traffic, 1).speed.shape[1])
 
     def sideways_m(self, traffic: Environment) -> float:
         """Way (m) from a first lateral motion to overlap."""
+        return TO_OVERLAP_M
 
     def shows(self, traffic: Environment) -> bool:
         """Whether events can be seen before they happen."""
         return False
 
-    def exposure(self, traffic: Environment, parameters: Any) -> Exposure:
-        """How often there are events, as `Events.probability` counts them."""
+    def exposure(self, traffic: Environment, parameters: Any) -> Exposure | None:
+        """How often there are events, as `Events.probability` counts them; None where nobody knows."""
+        return None
 
     def milder(self, traffic: Environment) -> Environment | None:
         """The same with events that are too mild to count, of which some are driven all the same; None without any."""
@@ -217,12 +252,13 @@ class Family(Protocol):
     def mean_distance_m(self, traffic: Environment) -> float | None:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens.
 
-        None where a test is an event that happens for certain: between two of them lies no distance that tests know.
+        None where tests know no such distance, as between two events that happen for certain.
         """
         return None
 
     def mean_speed_mps(self, traffic: Environment) -> float:
-        """Mean speed (m/s) of the AV on the road that its exposure is of."""
+        """Mean speed (m/s) of the AV on the road that its exposure is of; here that with which its tests begin."""
+        return float(self.uneventful(traffic, N_MEAN_PATHS).v[:, -1].mean())
 
     def sources(self) -> Mapping[Method, type[Any]]:
         """Methods of its own, which draw the event in the loop: a class each (`harness.sampling.protocol.Source`)."""
@@ -250,7 +286,8 @@ class Family(Protocol):
         """Events of paths (m,), one of each, -1 for none; those of a pool are drawn each for itself."""
 
     def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:
-        """Steps (m,) at whose end chosen events begin; what happens in them may be later."""
+        """Steps (m,) at whose end chosen events begin, -1 for none; what happens in them may be later."""
+        return np.where(chosen.at < 0, -1, np.maximum(chosen.at - chosen.lead, 0))
 
     def told(self, facts: Mapping[str, Any]) -> str:
         """What an event is like, by the columns of its test, as a phrase behind that of its onset; may be empty."""
@@ -259,14 +296,20 @@ class Family(Protocol):
     def script(self, traffic: Environment, chosen: Chosen) -> Script:
         """The motion that chosen events are, from their facts alone."""
 
+    def uneventful(self, traffic: Environment, n: int) -> Script:
+        """The motion on ``n`` paths on which nothing happens."""
+        paths = Paths(np.arange(n), self.start(traffic, uniforms(0, 0, n, INITIAL, self.n_uniforms)))
+        return self.script(traffic, self.choose(traffic, 0, paths, np.full(n, -1)))
+
     def drive(
         self, traffic: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
     ) -> Driven:
         """Other drivers (D,) in the AV's place, on chosen events (m,), from the end of the step of the onset on.
 
         ``start`` (m, 2) is the AV's position (m) and speed (m/s) then, NaN where it has kept its speed until there.
-        With ``last`` the motion on the last event is told.
+        With ``last`` the motion on the last event is told. Nobody asks a family without `stand_ins`.
         """
+        raise NotImplementedError
 
     def avoidable(
         self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray
@@ -275,3 +318,16 @@ class Family(Protocol):
 
         ``facts`` are of typical tests. None where these two do not decide it.
         """
+        return None
+
+
+def _numbers_in(traffic: Any) -> bytes:
+    """All numbers of a traffic: of parameters, or of a tuple, as kernels take it."""
+    if isinstance(traffic, ParameterFile):
+        return traffic.content_hash().encode()
+    if isinstance(traffic, tuple):
+        return b"".join(map(_numbers_in, traffic))
+    numbers = np.asarray(traffic)
+    if numbers.dtype.hasobject:
+        raise TypeError(f"{type(traffic).__name__} in a traffic is no number: its family needs a digest of its own")
+    return f"{numbers.dtype}{numbers.shape}".encode() + numbers.tobytes()

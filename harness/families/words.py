@@ -40,6 +40,19 @@ class Words(NamedTuple):
     limits: str = ""
 
 
+def words_of(*, event: str, of: str, **own: Any) -> Words:
+    """What can be said of an event ``of`` a vehicle that has a name, and whatever a family has of its ``own``."""
+    said = {
+        "called": event, "events": f"{event}s", "since": f"the {event}", "such": "", "same": f"{event}s",
+        "kicker": f"How often an automated vehicle (AV) crashes when there is a {event}, on a motorway",
+        "none": f"There was no {event}.", "strikes": "", "who": f"{of} the one that the {event} is about",
+        "shows": (of, f"begins the {event}"), "happens": (of, f"does the {event}"), "unlikely": "",
+        "tests": lambda _: f"a {event} on a straight road",
+        "rests": lambda *_: f"the probabilities of {event}s, for which nothing else vouches",
+    }  # fmt: skip
+    return Words(event=event, **{**said, **own})
+
+
 class Shown(NamedTuple):
     """A number of events that maps and tables show.
 
@@ -60,3 +73,10 @@ class Shown(NamedTuple):
     def axis(self) -> str:
         """What stands beside an axis."""
         return f"{self.words}, {self.unit}"
+
+
+GAP = Shown("gap at the event", "m", ("Gap at", "event"), lambda of: of["event_gap_m"], beyond=1.4, cell=1.0)
+CLOSING = Shown(
+    "closing speed", "m/s", ("Closing", "speed"), lambda of: np.asarray(-of["event_rate_mps"]), beyond=1.15, cell=0.5
+)
+"""To the vehicle that events are about, at the event: of any family."""

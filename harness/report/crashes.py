@@ -78,7 +78,7 @@ def crash_gallery(
         crash = {name: float(crashes[name][place]) for name in SHOWN_COLUMNS}
         number, component = int(episode[place]), _component_name(run, int(crashes["component"][place]))
         names = [name for name, avoids in zip(family.stand_ins, avoided[place], strict=True) if avoids]
-        by, scene = ", ".join(names) or ("–" if UNKNOWN in ends[place] else "nobody"), None
+        by, scene = ", ".join(names) or ("nobody" if (ends[place] != UNKNOWN).all() and ends.size else "–"), None
         if traces is not None and number in traced:
             impact, scene = tenths(crash["impact_speed_mps"]), len(shown)
             row, trace = (each.filter(pc.equal(each["episode"], number)) for each in (stored, traces))
@@ -100,7 +100,7 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
         keys["outermost"] = crashes["component"]
     elif not summary.all_weights_one:
         keys["weight"] = weight
-    first = {"avoidable by r157-cc": worst_crashes(impact, episode, avoided[:, 0])}
+    first = {"avoidable by r157-cc": worst_crashes(impact, episode, avoided[:, 0])} if avoided.size else {}
     return first | {name: worst_crashes(key, episode, among) for name, key in keys.items()}
 
 

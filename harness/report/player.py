@@ -84,7 +84,7 @@ class Scenes:
 
         Shape (n, D).
         """
-        if self._environment is None or not rows.num_rows:
+        if self._environment is None or not rows.num_rows or not self.n_stand_ins:
             return np.full((rows.num_rows, self.n_stand_ins), UNKNOWN)
         return self._drive(self._environment, rows, traces).end
 
@@ -152,6 +152,8 @@ class Scenes:
         self, environment: Environment, row: pa.Table, trace: pa.Table, onset: int, bv: Scene, av: Scene
     ) -> list[Scene]:
         """Stand-ins along an episode from its begin; after a crash the one ahead goes on as long as they are shown."""
+        if not self.n_stand_ins:
+            return []
         [end], motion, ahead = self._drive(environment, row, trace, last=True)
         last = shown = av["x"].size - 1
         if av["crash"] is not None:

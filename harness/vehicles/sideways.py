@@ -11,6 +11,8 @@ import math
 
 from harness.compiled import compiled_inline
 
+TO_OVERLAP_M = 1.7
+"""From a first lateral motion: a lane of 3.6 m less a car of 1.9 m [derived]."""
 _ROUNDING = 1e-9
 
 

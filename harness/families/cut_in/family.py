@@ -7,7 +7,6 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
 from harness.campaign.sections import EnvironmentSettings
@@ -16,12 +15,13 @@ from harness.errors import CampaignError
 from harness.families.cut_in.events import FREE_DRAWS_PER_CUT_IN, enumerate_cut_ins, write_maneuvers
 from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import load_environment, load_parameters, require_sound_laws
-from harness.families.cut_in.parameters import DEFAULT, SHIPPED_FOLDER, EnvironmentParameters
+from harness.families.cut_in.parameters import DEFAULT, EnvironmentParameters
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
-from harness.families.cut_in.words import CLOSING, GAP, STAND_INS, WORDS
+from harness.families.cut_in.words import AT_OVERLAP, STAND_INS, WORDS
 from harness.families.protocol import Chosen, Column, Exposure, Family, Paths
+from harness.families.words import CLOSING
 from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
 
 STATE_FACTS = (
@@ -57,14 +57,13 @@ class CutIn(Family):
     columns = (*(each._replace(doc=f"initial {each.doc}") for each in STATE_FACTS), *MANEUVER_FACTS)
     n_uniforms = len(STATE_COLUMNS)
 
-    shipped = SHIPPED_FOLDER
-    default_parameters = DEFAULT
-    follows, stride, pool_error = False, 4, 0.005  # `benchmarks.pool_stride` says what other strides would cost
+    model, default_parameters = EnvironmentParameters, DEFAULT
+    stride, pool_error = 4, 0.005  # `benchmarks.pool_stride` says what other strides would cost
     ladders = {False: "ladder-2", True: "ladder-lateral-1"}
 
     fitter = "harness.families.cut_in.fitting.fitter:CutInFitter"
     crosses, words = BV, WORDS
-    maps = ((GAP, CLOSING),)
+    maps = ((AT_OVERLAP, CLOSING),)
     stand_ins = STAND_INS
 
     parameters = staticmethod(load_parameters)
@@ -121,9 +120,6 @@ class CutIn(Family):
     def choose(self, traffic: Environment, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
         maneuvers = write_maneuvers(seed, paths, event, traffic, FREE_DRAWS_PER_CUT_IN if of_pool else 0)
         return Chosen(facts_of(paths.start, maneuvers), event, maneuvers.lead)
-
-    def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:  # records have its lead
-        return np.asarray(np.maximum(chosen.at - chosen.lead, 0))
 
     def avoidable(
         self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray

@@ -18,10 +18,8 @@ from scipy import special
 from harness.compiled import compiled_inline
 from harness.random_stream import LATERAL, uniform
 from harness.vehicles.kinematics import STEP_S
+from harness.vehicles.sideways import TO_OVERLAP_M
 from harness.vocabulary import FloatArray
-
-DISTANCE_M = 1.7
-"""Lane of 3.6 m less a car of 1.9 m [derived]."""
 
 
 class LateralMotion(NamedTuple):
@@ -36,7 +34,7 @@ class LateralMotion(NamedTuple):
         return self.cumulative.size > 1
 
 
-def constant_lead(lead_s: float = 0.0, distance_m: float = DISTANCE_M) -> LateralMotion:
+def constant_lead(lead_s: float = 0.0, distance_m: float = TO_OVERLAP_M) -> LateralMotion:
     """Every cut-in shows itself this long before overlap; not at all as in the paper."""
     cumulative = np.zeros(round(lead_s / STEP_S) + 1)
     cumulative[-1] = 1.0

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
-import numpy as np
-
 from harness.campaign.drivers import Surrogate
 from harness.families.cut_in.laws import Environment
-from harness.families.words import Shown, Words
+from harness.families.words import GAP, Words
 
 
 def _tests(shows: bool) -> str:
@@ -45,10 +43,7 @@ WORDS = Words(
     limits=" Left of its line the competent driver (r157-cc), or the best of brakes (8 m/s² at once), crashes in the "
     "vehicle’s place, too, if the car that cuts in keeps its speed.",
 )
-GAP = Shown("gap at the overlap", "m", ("Gap at", "overlap"), lambda of: of["event_gap_m"], beyond=1.4, cell=1.0)
-CLOSING = Shown(
-    "closing speed", "m/s", ("Closing", "speed"), lambda of: np.asarray(-of["event_rate_mps"]), beyond=1.15, cell=0.5
-)
+AT_OVERLAP = GAP._replace(words="gap at the overlap", head=("Gap at", "overlap"))
 STAND_INS = MappingProxyType(
     {
         "r157-cc": ("a careful and competent driver", Surrogate(model="r157-cc")),

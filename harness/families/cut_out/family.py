@@ -107,7 +107,6 @@ class CutOut(FollowingFamily):
         Column("lateral_speed_mps", pa.float64(), "m/s", "at which it leaves"),
         Column("visible_s", pa.float64(), "s", "from when the revealed one is seen to the lane being clear"),
     )
-    shipped = Path(__file__).parent
     ladders = {False: "ladder-cut-out-1"}
     default_parameters = "cut-out-1"
     fitter = "harness.families.cut_out.fitting:CutOutFitter"

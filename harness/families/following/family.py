@@ -5,15 +5,11 @@ So the probability of an event depends on no AV, and pools are exact for any. An
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
 
-from harness.campaign.files import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
 from harness.families.following.approach import (
@@ -32,7 +28,7 @@ from harness.families.script import Script, natural_script
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vehicles.following import seen_after
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
+from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 START_FACTS = (
     Column("start_speed_mps", pa.float64(), "m/s", "initial speed of all but a revealed vehicle"),
@@ -50,12 +46,8 @@ MILDEST_MPS2 = 0.5
 class FollowingFamily(Family):
     """A family says which parameters, vehicles and facts it has. When somebody sees an event its drivers know."""
 
-    n_uniforms, follows, pool_error, stand_ins = 2, True, 0.01, STAND_INS
-    model: ClassVar[type[FollowingParameters]]
-
-    def parameters(self, settings: EnvironmentSettings) -> FollowingParameters:
-        file = shipped_or_own(settings.named(self.default_parameters), self.shipped, "environment.parameters")
-        return read_model(file, self.model)
+    n_uniforms, follows, stand_ins = 2, True, STAND_INS
+    model: type[FollowingParameters]
 
     def traffic(self, settings: EnvironmentSettings, parameters: FollowingParameters | None = None) -> Following:
         given = parameters or self.parameters(settings)
@@ -70,12 +62,6 @@ class FollowingFamily(Family):
         dtype = [*((name, "f8") for name in known), *((name, "i8") for name in steps)]
         numbers = np.array([(*known.values(), *steps.values())], dtype)[0]
         return Following(numbers, *given.grid())
-
-    def digest(self, traffic: Following) -> str:
-        numbers = {name: traffic.numbers[name].item() for name in traffic.numbers.dtype.names or ()}
-        digest = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode())
-        digest.update(traffic.grid.tobytes() + traffic.share.tobytes())
-        return digest.hexdigest()[:24]
 
     def max_steps(self, traffic: Following) -> int:
         return int(traffic.numbers["max_steps"])
@@ -183,9 +169,6 @@ class FollowingFamily(Family):
             set_speed_mps=np.full(n, float(traffic.numbers["approach__set_speed_mps"])),
         )
 
-    def onset(self, traffic: Following, chosen: Chosen) -> IntArray:
-        return np.where(chosen.at < 0, -1, int(traffic.numbers["onset"]))
-
     def drive(
         self, traffic: Following, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
     ) -> Driven:
@@ -196,9 +179,6 @@ class FollowingFamily(Family):
         drive_others(_tests(traffic, facts), unboxed(traffic), drivers, unboxed(room), at, tracks, end)
         ahead = np.stack((room.x[:, self.principal], room.v[:, self.principal]), axis=1)
         return Driven(end, tracks if last else np.zeros((0, 0, 0)), ahead if last else np.zeros((0, 0)))
-
-    def avoidable(self, *_: Any) -> BoolArray | None:
-        return None
 
 
 def _tests(traffic: Following, facts: RecordArray) -> Tests:

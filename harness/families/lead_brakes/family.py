@@ -76,7 +76,6 @@ class LeadBrakes(FollowingFamily):
         Column("held_s", pa.float64(), "s", "for how long so hard, infinite: to standstill"),
         Column("jerk_mps3", pa.float64(), "m/s³", "how abruptly"),
     )
-    shipped = Path(__file__).parent
     ladders = {False: "ladder-lead-1"}
     default_parameters = "lead-brakes-1"
     fitter = "harness.families.lead_brakes.fitting:BrakingFitter"
