@@ -16,6 +16,7 @@ from harness.arguments import AtLeastTwo, checked
 from harness.errors import HarnessError, printable
 from harness.families import families
 from harness.files import read_bytes
+from harness.fitting.distinct import fingerprint, require_distinct
 from harness.fitting.protocol import Asked, Fitted, Fitter
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
@@ -96,12 +97,14 @@ def fit_files(
     require_place(out.parent)
 
     progress.stage("reading trajectories", 1000)
-    done = 0
+    done, seen = 0, []
     for recording in recordings(paths, read):
+        seen.append(fingerprint(recording))
         for each in fitters.values():
             each.observe(recording)
         progress.advance(round(1000 * recording.share_read) - done)
         done = round(1000 * recording.share_read)
+    require_distinct(seen)
     asked = Asked(paths, mapping, read, out, n_replicates, seed, progress)
     found: dict[str, Fitted] = {}
     for name, each in reversed(fitters.items()):

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness.families.cut_in.fitting.observations import Observations, Tally, observe, require_distinct, require_enough
+from harness.families.cut_in.fitting.observations import Observations, Tally, observe, require_enough
 from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
 
@@ -23,7 +23,6 @@ def joined(found: list[Observations], name: str) -> np.ndarray:
 def test_states_and_accelerations_of_a_known_motion(tmp_path):
     rows = overtaking(3.0)
     found, total = observed(rows, tmp_path)
-    require_distinct(found)
     assert require_enough(found, "rows.parquet", load_mapping()) == total
     following, leads, at_risk = (joined(found, name) for name in ("following", "leads", "at_risk"))
 

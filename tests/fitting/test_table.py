@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 
 from harness.errors import EXIT_BAD_INPUT, HarnessError, TrajectoryError
-from harness.families.cut_in.fitting.observations import Tally, observe, require_distinct, require_enough
+from harness.families.cut_in.fitting.observations import Tally, observe, require_enough
+from harness.fitting.distinct import fingerprint, require_distinct
 from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
 
@@ -22,9 +23,9 @@ ROWS = overtaking(2.5)
 def judged(file: Path, mapping: str | None = None, *others: Path, leave_out: tuple[str, ...] = ()) -> Tally:
     """What `harness fit` does with files before it fits."""
     read = load_mapping(mapping, leave_out=leave_out)
-    found = list(map(observe, recordings([file, *others], read)))
-    require_distinct(found)
-    return require_enough(found, file.name, read)
+    read_in = list(recordings([file, *others], read))
+    require_distinct(list(map(fingerprint, read_in)))
+    return require_enough(list(map(observe, read_in)), file.name, read)
 
 
 def changed(**columns: object) -> Callable[[], pd.DataFrame]:

@@ -12,7 +12,7 @@ from harness.campaign.files import read_model
 from harness.campaign.yaml_text import yaml_text
 from harness.families.cut_in.fitting.fit import Fit, fit_traffic, replicates
 from harness.families.cut_in.fitting.laws import Traffic
-from harness.families.cut_in.fitting.observations import Observations, Tally, observe, require_distinct, require_enough
+from harness.families.cut_in.fitting.observations import Observations, Tally, observe, require_enough
 from harness.families.cut_in.fitting.page import CONFIDENCE, page
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.files import content_hash
@@ -44,7 +44,6 @@ class CutInFitter:
         self._seen.append(observe(recording))
 
     def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:
-        require_distinct(self._seen)
         where = places(asked.files)
         tally = require_enough(self._seen, where, asked.read)
         fit = fit_traffic(Traffic.of(self._seen), self._base, BASE, where, asked.progress)

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from harness.errors import TrajectoryError
 from harness.fitting.recording import ONE_CLOCK, Recording
@@ -57,9 +56,6 @@ MOST_OVERLAPPING = 0.005
 MOST_OUTSIDE = 0.5
 FEWEST_CHANGES = 20
 LEAST_CLOSING_S = 1.0
-ONE_OF = 8
-MOST_SHARED = 0.1
-"""Share of the rows of a recording that may be in another one by chance [assumed]."""
 OTHER_SIDE = 10.0
 """If vehicles close in this many times as long on the other side, that side must be meant."""
 
@@ -120,8 +116,6 @@ class Observations:
     noise_mps2: float
     """Standard deviation of ``acceleration_mps2`` by white measurement noise."""
     tally: Tally
-    marks: IntArray
-    """Hashes (m,) of a part of the rows, the same ones in a copy of them."""
 
 
 def observe(track: Recording) -> Observations:
@@ -171,31 +165,7 @@ def observe(track: Recording) -> Observations:
         leads,
         noise_of(track),
         tally,
-        _marks(track),
     )
-
-
-def _marks(track: Recording) -> IntArray:
-    """Hashes of one row in `ONE_OF`, by what it says of a vehicle, whatever clock, order and identifiers there are."""
-    state = np.rint(np.column_stack([track.s * 1e3, track.v * 1e3, track.length * 1e2])).astype(np.int64)
-    of_row = pd.util.hash_pandas_object(pd.DataFrame(state), index=False).to_numpy()
-    return np.unique(of_row[of_row % ONE_OF == 0]).astype(np.int64)
-
-
-def require_distinct(found: Sequence[Observations]) -> None:
-    """Refuse a recording that has come before, under whatever name, or a notable part of one (`TrajectoryError`)."""
-    sizes = [each.marks.size for each in found]
-    marks, of = np.concatenate([each.marks for each in found]), np.repeat(np.arange(len(found)), sizes)
-    order = np.lexsort((of, marks))
-    marks, of = marks[order], of[order]
-    again = np.flatnonzero(marks[1:] == marks[:-1])
-    pairs, counts = np.unique(np.column_stack([of[again], of[again + 1]]), axis=0, return_counts=True)
-    for (first, second), n in zip(pairs.tolist(), counts.tolist(), strict=True):
-        if n > MOST_SHARED * min(sizes[first], sizes[second]):
-            share = n / min(sizes[first], sizes[second])
-            words = f"{share:.0%} of its rows also in {found[first].place}: positions, speeds and lengths are the same"
-            mend = "Leave one of them out: what comes twice would count twice."
-            raise TrajectoryError(found[second].place, words, "other vehicles, or other times", mend)
 
 
 def _records(kind: str, columns: dict[str, RecordArray], inside: BoolArray) -> RecordArray:

@@ -1,0 +1,67 @@
+"""Recordings that come twice under another guise, and such as are only alike."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from harness.errors import TrajectoryError
+from harness.fitting.distinct import fingerprint, require_distinct
+from harness.fitting.files import fit_files
+from tests.fitting.following import braking, leaving, recording
+from tests.fitting.trajectories import overtaking
+
+ROWS = overtaking(2.0)
+
+
+def at_25_hz(rows: pd.DataFrame) -> pd.DataFrame:
+    """Between their rows, and by a clock that ticks elsewhere."""
+    found = []
+    for (name, vehicle), of in rows.groupby(["recording_id", "vehicle_id"]):
+        time_s = np.arange(0.013, of.time_s.max(), 0.04)
+        columns = {key: np.interp(time_s, of.time_s, of[key]) for key in ("s_m", "speed_mps", "lateral_m")}
+        lane = of.lane.to_numpy()[np.searchsorted(of.time_s, time_s)]
+        own = {"recording_id": name, "vehicle_id": vehicle, "length_m": of.length_m.iloc[0]}
+        found.append(pd.DataFrame({"time_s": time_s, "lane": lane, **own, **columns}))
+    return pd.concat(found)
+
+
+GUISES: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
+    "elsewhere": lambda rows: rows.assign(s_m=rows.s_m + 17.3, lateral_m=rows.lateral_m + 2.0),
+    "mirrored": lambda rows: rows.assign(lane=1 - rows.lane, lateral_m=-rows.lateral_m, s_m=rows.s_m + 1.0),
+    "rounded": lambda rows: rows.assign(s_m=rows.s_m + 73.1 * rows.recording_id).round(
+        {"s_m": 1, "speed_mps": 1, "length_m": 1, "lateral_m": 1}
+    ),
+    "at another rate": at_25_hz,
+    "half of its time": lambda rows: rows[rows.time_s >= 20.0].assign(s_m=rows.s_m - 0.5),
+    "all of it": lambda rows: at_25_hz(rows).assign(s_m=lambda of: of.s_m + 3.3).round({"s_m": 1, "speed_mps": 1}),
+}
+
+
+@pytest.mark.parametrize("guise", GUISES)
+def test_a_recording_that_comes_again_under_a_guise_is_refused(guise, tmp_path):
+    again = GUISES[guise](ROWS)
+    ROWS.to_parquet(tmp_path / "rows.parquet", index=False)
+    again.assign(recording_id=again.recording_id + 5000).to_parquet(tmp_path / "b.parquet", index=False)
+    found = r"b\.parquet, recording 5\d+: found \d+% of its motion also in .*rows\.parquet, recording \d+: speeds"
+    with pytest.raises(TrajectoryError, match=found):
+        fit_files([tmp_path / "rows.parquet", tmp_path / "b.parquet"], tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_recordings_of_one_law_are_told_apart(noise):
+    """Three of five vehicles of each drive at one speed, the others speed up by one of three values."""
+    whole = [rows for _, rows in overtaking(20.0, 5, noise=noise).groupby("recording_id")]
+    require_distinct([fingerprint(recording(rows)) for rows in whole])
+
+
+def test_drivers_of_one_speed_and_headway_are_no_copies():
+    """At the same places, too, but for when they brake, and how hard."""
+    found = [fingerprint(recording(rows)) for rows in braking(6.0, 60.0, 3) + leaving(20, 0.6, 4)]
+    require_distinct([each._replace(rows=each.rows[:0]) for each in found])
+
+
+def test_a_recording_too_short_to_tell_is_none():
+    rows = ROWS[ROWS.time_s < 3.0].query("recording_id == 0")
+    assert fingerprint(recording(rows)).motions.size == 0
