@@ -35,7 +35,9 @@ CAMPAIGN = [str(BASE), *sets(*RUNS["shells-refuted"])]
 def folder(stored_run, tmp_path):
     """A copy of a finished run, which a test may write into; pages are others' concern."""
     with one_process(), without_page():
-        yield copy_of(stored_run("shells-refuted"), tmp_path / "an out")
+        out = copy_of(stored_run("shells-refuted"), tmp_path / "an out")
+        (out / "report.html").touch()
+        yield out
 
 
 def test_check_prints_a_campaign_file(capsys, tmp_path):
