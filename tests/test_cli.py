@@ -73,6 +73,11 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     assert json.loads(capsys.readouterr().out) == content
 
 
+def test_an_estimator_that_the_records_do_not_allow_is_a_reason_and_no_row(folder, capsys):
+    assert main(["estimate", str(folder), "-e", "dr", "-e", "nade"]) == 2
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == ["dr", "nade"]
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -251,7 +251,7 @@ def report(folder: Path) -> None:
 @click.option("--gui", is_flag=True, help="Show it in sumo-gui, halted at the onset (extra 'sumo').")
 @click.option(
     "--sumo", "sumo_folder", metavar="DIR", type=FOLDER,
-    help="Write what SUMO needs to repeat it: DIR/test.sumocfg, which sumo and sumo-gui run (-c), and its files.",
+    help="Write what SUMO needs to repeat it: DIR/test.sumocfg, which sumo and sumo-gui run (-c; extra 'sumo').",
 )  # fmt: skip
 @click.option(
     "--stored", is_flag=True, help="Use the motion that the run has kept: nothing is simulated, no code of others runs."
