@@ -9,6 +9,7 @@ import inspect
 import json
 import math
 import re
+import shutil
 import subprocess
 import sys
 from importlib.metadata import version
@@ -142,6 +143,36 @@ def test_in_a_notebook_it_is_the_short_answer_and_the_map(name, stored_run, tmp_
     svg = base64.b64decode(re.search('base64,(.*?)"', image)[1])
     assert ElementTree.fromstring(svg).findall(".//{*}path")
     assert b"--ink" in svg
+
+
+@pytest.mark.parametrize(
+    ("call", "first", "map_below"),
+    [
+        (harness.estimate, "idm · ", True),
+        (lambda run: harness.estimate(run, estimators=["shells"]), "golden: 49 crashes in ", True),
+        (harness.read, "idm · ", True),
+        (lambda run: harness.replay(run, 3), "test 3: ", False),
+    ],
+    ids=["estimate", "by estimator", "read", "replay"],
+)
+def test_what_is_stored_is_shown_in_ten_lines_too(call, first, map_below, stored_run, capsys):
+    found = call(stored_run(RUN))
+    assert repr(found).startswith(first)
+    assert len(repr(found).splitlines()) <= 10
+    text, image = found._repr_html_().split("</pre>")
+    assert html.unescape(text) == f"<pre>{found!r}"
+    assert ("<img" in image) is map_below
+    if first == "idm · ":  # as the command line has it
+        assert main(["estimate", str(stored_run(RUN))]) == 0
+        assert capsys.readouterr().out == f"{found!r}\n"
+
+
+def test_a_run_without_an_answer_is_shown_all_the_same(stored_run, tmp_path):
+    folder = shutil.copytree(stored_run(RUN), tmp_path / "run")
+    (folder / "estimates.json").unlink()
+    found = harness.read(folder)
+    assert repr(found).endswith(" tests, without an answer as yet")
+    assert "<img" not in found._repr_html_()
 
 
 # -- the recommended method against a committed reference --

@@ -35,7 +35,9 @@ CAMPAIGN = [str(BASE), *sets(*RUNS["shells-refuted"])]
 def folder(stored_run, tmp_path):
     """A copy of a finished run, which a test may write into; pages are others' concern."""
     with one_process(), without_page():
-        yield copy_of(stored_run("shells-refuted"), tmp_path / "an out")
+        out = copy_of(stored_run("shells-refuted"), tmp_path / "an out")
+        (out / "report.html").touch()
+        yield out
 
 
 def test_check_prints_a_campaign_file(capsys, tmp_path):
@@ -69,6 +71,11 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     assert (out, len(out)) == (short, 7)
     assert main([*command, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == content
+
+
+def test_an_estimator_that_the_records_do_not_allow_is_a_reason_and_no_row(folder, capsys):
+    assert main(["estimate", str(folder), "-e", "dr", "-e", "nade"]) == 2
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == ["dr", "nade"]
 
 
 @pytest.mark.parametrize(

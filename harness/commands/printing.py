@@ -173,8 +173,10 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
             "largest weight share": share(entry.get("largest_weight_share")),
         }
         for name, entry in shown.items()
+        if entry["crash_rate"] is not None  # else there is but a reason
     ]
-    print_table(f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests", rows)
+    if rows:
+        print_table(f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests", rows)
     for name, entry in shown.items():
         for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("why")])]:
             say(f"{name}: {note_words(remark)}")

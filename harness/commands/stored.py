@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,21 +100,9 @@ def estimate(
     elif estimators:
         print_estimates(content, estimators)
     else:
-        _print_answer(folder, content, folder / "report.html" if environment is None else None)
+        say(content)
     if estimators and all(content["estimates"][name]["crash_rate"] is None for name in estimators):
         ctx.exit(EXIT_BAD_INPUT)
-
-
-def _print_answer(folder: Path, content: Mapping[str, Any], page: Path | None) -> None:
-    """Print the short answer, and where its page is, if there is one."""
-    from harness.records.folder import read_manifest
-    from harness.records.reader import read_campaign
-    from harness.report.lines import lines
-    from harness.report.words import answer_of
-
-    manifest = read_manifest(folder)
-    answer = answer_of(read_campaign(folder, manifest), manifest, content)
-    say(*lines(answer, manifest.get("wall_time_s"), page if page is not None and page.is_file() else None))
 
 
 def _estimate_hours(
@@ -263,7 +251,7 @@ def report(folder: Path) -> None:
 @click.option("--gui", is_flag=True, help="Show it in sumo-gui, halted at the onset (extra 'sumo').")
 @click.option(
     "--sumo", "sumo_folder", metavar="DIR", type=FOLDER,
-    help="Write what SUMO needs to repeat it: DIR/test.sumocfg, which sumo and sumo-gui run (-c), and its files.",
+    help="Write what SUMO needs to repeat it: DIR/test.sumocfg, which sumo and sumo-gui run (-c; extra 'sumo').",
 )  # fmt: skip
 @click.option(
     "--stored", is_flag=True, help="Use the motion that the run has kept: nothing is simulated, no code of others runs."

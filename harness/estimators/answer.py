@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import LEAST_POOL_ERROR, MOST_EVENTS
@@ -96,6 +97,9 @@ class Estimates:
         found = self.estimates[self.headline]
         assert isinstance(found, Estimate)
         return found
+
+
+STORED_ESTIMATES = TypeAdapter(Estimates)
 
 
 def estimate_blocks(

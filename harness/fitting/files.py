@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
@@ -21,6 +21,7 @@ from harness.fitting.protocol import Asked, Fitted, Fitter
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
 from harness.records.folder import require_place, write_together
+from harness.shown import Shown
 
 OF_YAML = b"Traffic fitted by harness"
 """What marks environment files that a fit has written."""
@@ -28,13 +29,13 @@ REPLICATES, SEED = 200, 1
 
 
 @dataclass(frozen=True, repr=False)
-class FittedFiles:
+class FittedFiles(Shown):
     """What a fit has found and written, by family."""
 
     families: Mapping[str, Fitted]
 
-    def __repr__(self) -> str:
-        return "\n".join(map(str, self.files))
+    def _lines(self) -> Iterable[str]:
+        return map(str, self.files)
 
     @property
     def files(self) -> list[Path]:

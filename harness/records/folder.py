@@ -31,8 +31,8 @@ Tables = Mapping[str, pa.Table | None]
 MANIFEST = "manifest.json"
 CAMPAIGN = "campaign.yaml"
 SHELLS = "shells.json"
-SENSITIVITY = "sensitivity.json"
 """Strata of a shells campaign, as its estimates need them."""
+ESTIMATES, SENSITIVITY = "estimates.json", "sensitivity.json"
 TABLES = ("episodes", "moments", "traces")
 SHADOW, MILDER = BEFORE = ("shadow", "milder")
 """Tables of what comes before tests that count: baseline runs, which keep their first name, and milder events."""

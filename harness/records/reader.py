@@ -25,6 +25,7 @@ from harness.files import read_bytes
 from harness.processes import made_ahead
 from harness.records.folder import (
     CAMPAIGN,
+    ESTIMATES,
     SHELLS,
     Part,
     concatenated,
@@ -36,10 +37,13 @@ from harness.records.folder import (
 )
 from harness.records.schemas import traces_schema
 from harness.resolved import resolve
+from harness.shown import Shown
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from harness.report.drawing import Plot
 
 TableName = Literal["episodes", "moments", "traces"]
 
@@ -99,9 +103,9 @@ def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) 
     return concatenated(found, folder) if any(table.num_rows for table in found) else None
 
 
-@dataclass(frozen=True)
-class StoredRun:
-    """A run folder, whose tables are read when asked for.
+@dataclass(frozen=True, repr=False)
+class StoredRun(Shown):
+    """A run folder, whose tables are read when asked for; shown, it is the short answer.
 
     ``frame.attrs["unit"]`` and ``frame.attrs["doc"]`` give unit and meaning of each column by its name; the unit
     of a number without one is ``"1"``, that of a text ``""``.
@@ -113,7 +117,21 @@ class StoredRun:
     def estimates(self) -> dict[str, Any]:
         """Content of ``estimates.json``: estimates, and the ``severity`` of crashes."""
         again = f"Make it again with `harness estimate {self.folder} --write`."
-        return read_as(dict[str, Any], self.folder / "estimates.json", mend=again)
+        return read_as(dict[str, Any], self.folder / ESTIMATES, mend=again)
+
+    def _lines(self) -> list[str]:
+        from harness.report.lines import run_lines  # noqa: PLC0415 - draws
+
+        manifest = read_manifest(self.folder)
+        if not (self.folder / ESTIMATES).is_file():
+            return [f"{self.folder}: {manifest['n_episodes']:,} tests, without an answer as yet"]
+        return run_lines(read_campaign(self.folder, manifest), manifest, self.estimates, self.folder / "report.html")
+
+    def _plot(self) -> Plot | None:
+        from harness.report.page import where_plot_of  # noqa: PLC0415 - draws
+        from harness.report.summary import read_run_folder  # noqa: PLC0415
+
+        return where_plot_of(read_run_folder(self.folder)) if (self.folder / ESTIMATES).is_file() else None
 
     @checked("episodes")
     def episodes(self, columns: Sequence[str] | None = None) -> pd.DataFrame:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.report.words import late_words
+from harness.shown import Shown
 
 SLOW_S = 0.1
 """Time of a constructor that is worth a word."""
@@ -93,7 +94,7 @@ class Speed:
 
 
 @dataclass(frozen=True, repr=False)
-class AvCheck:
+class AvCheck(Shown):
     """What a few dozen episodes say about an AV, run on an engine with cut-ins that a method brought about.
 
     ``failures`` are numbers of episodes of the first run by the cause that they failed with, where one stands for all
@@ -131,8 +132,8 @@ class AvCheck:
         """0 when all is well, 3 when episodes failed or were not reproduced."""
         return EXIT_TOO_MANY_FAILED if self.failures or self.differing else EXIT_DONE
 
-    def __repr__(self) -> str:
-        return verdict(self)
+    def _lines(self) -> list[str]:
+        return [verdict(self)]
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON content; undefined numbers become null."""

@@ -7,8 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from harness.campaign.campaign import Campaign
+from harness.estimators.answer import STORED_ESTIMATES, Estimates
 from harness.numbers import count, duration, interval, share
-from harness.report.words import ShortAnswer
+from harness.report.words import ShortAnswer, short_answer
 
 WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
@@ -32,6 +34,15 @@ def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None 
         head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
     table = columns([row.texts for row in rows])
     return [" · ".join(head), *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+
+
+def run_lines(
+    campaign: Campaign, manifest: Mapping[str, Any], content: Estimates | Mapping[str, Any], report: Path
+) -> list[str]:
+    """The answer of a run; the ``report`` is named if it is there, and of the same traffic."""
+    told, took_s = STORED_ESTIMATES.validate_python(content), manifest.get("wall_time_s")
+    page = report if told.elsewhere is None and report.is_file() else None
+    return lines(short_answer(campaign, manifest, told), took_s, page)
 
 
 def estimate_lines(content: Mapping[str, Any]) -> list[str]:

@@ -23,6 +23,7 @@ from harness.pool.kept import onset_steps
 from harness.records.schemas import chosen_from
 from harness.report.summary import floats
 from harness.report.templates import write_page
+from harness.shown import Shown
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import library_records
 from harness.vocabulary import FloatArray, IntArray
@@ -43,7 +44,7 @@ Scene = dict[str, Any]
 
 
 @dataclass(frozen=True, repr=False)
-class ReplayResult:
+class ReplayResult(Shown):
     """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
 
     ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where
@@ -59,9 +60,9 @@ class ReplayResult:
     scene: dict[str, Any]
     suspects: str | None = None
 
-    def __repr__(self) -> str:
+    def _lines(self) -> list[str]:
         facts = [f"  {name:<18} {fact}" for name, fact in self.scene["facts"]]
-        return "\n".join([f"test {self.row['episode']}: {self.outcome}", *facts])
+        return [f"test {self.row['episode']}: {self.outcome}", *facts]
 
 
 class Scenes:

@@ -20,7 +20,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
-from harness.estimators.answer import Estimates
+from harness.estimators.answer import STORED_ESTIMATES, Estimates
 from harness.estimators.block import outcome_places
 from harness.estimators.estimate import Estimate
 from harness.estimators.shells import ShellDetails
@@ -34,8 +34,6 @@ from harness.sampling.shells import Shells
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
-
-_ESTIMATES = TypeAdapter(Estimates)
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ class RunFolder:
         traffic: Environment | None,
     ) -> RunFolder:
         """A run in hand; ``estimates`` as they are written, or read."""
-        told = _ESTIMATES.validate_python(estimates)
+        told = STORED_ESTIMATES.validate_python(estimates)
         shells = None if design is None else _shells(path, told.best, design)
         return cls(path, campaign, manifest, told, tests, traffic, shells, typed_folder(path))
 
@@ -123,10 +121,10 @@ def typed_folder(folder: Path) -> str:
     return shlex.quote(folder.resolve().name)
 
 
-def read_run_folder(path: Path) -> RunFolder:
-    """Read campaign, manifest, estimates and tests of a run."""
+def read_run_folder(path: Path, told: dict[str, Any] | None = None) -> RunFolder:
+    """Read campaign, manifest, tests and, where they are not ``told``, estimates of a run."""
     manifest = read_manifest(path)
-    estimates, campaign = _read_estimates(path, manifest["campaign_hash"]), read_campaign(path, manifest)
+    estimates, campaign = told or _read_estimates(path, manifest["campaign_hash"]), read_campaign(path, manifest)
     tests = ShownTests.stored(path, manifest, family_named(campaign.scenario))
     design = Shells.stored_design(path) if campaign.sampling.strata else None
     return RunFolder.of(path, campaign, manifest, estimates, design, tests, traffic_of(campaign, manifest))

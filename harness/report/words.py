@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.estimators.answer import Elsewhere, Estimates
+from harness.estimators.answer import STORED_ESTIMATES, Elsewhere, Estimates
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.numbers import WIDEST_RHW, count, leaves, number, plain, share, words
@@ -61,12 +61,9 @@ class ShortAnswer:
     scope: str
 
 
-_ESTIMATES = TypeAdapter(Estimates)
-
-
 def answer_of(campaign: Campaign, manifest: Mapping[str, Any], content: Mapping[str, Any]) -> ShortAnswer:
     """The answer of ``estimates.json``."""
-    return short_answer(campaign, manifest, _ESTIMATES.validate_python(content))
+    return short_answer(campaign, manifest, STORED_ESTIMATES.validate_python(content))
 
 
 def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> ShortAnswer:

@@ -38,10 +38,12 @@ from harness.runner.families import MEND, doubts_of, hour_answer, read_families,
 from harness.runner.paired import SIDES, Both, Scenario, copy_stored, drive_pairs, together
 from harness.runner.stored import replay_episode
 from harness.sampling.shells import PairRounds
+from harness.shown import Shown
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import COMPARISON, FAMILIES
 
 if TYPE_CHECKING:
+    from harness.report.drawing import Plot
     from harness.report.summary import RunFolder
 
 MAY_DIFFER = frozenset({"av", "name", "description"})
@@ -49,7 +51,7 @@ EXIT_OF: Mapping[PairVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUT
 
 
 @dataclass(frozen=True, repr=False)
-class Comparison:
+class Comparison(Shown):
     """Two finished campaigns, in run folders ``a`` and ``b``, and the difference; shown, it is the short answer.
 
     ``content`` is that of ``compare.json``, ``report`` the page. The exit code is 4 when budget or pool were spent
@@ -63,22 +65,20 @@ class Comparison:
     shown: list[RunFolder]
     """What the page is made of, of A and of B."""
 
-    def __repr__(self) -> str:
+    def _lines(self) -> list[str]:
         from harness.report.pair_words import pair_lines  # noqa: PLC0415 - draws
 
         last = self.shown[1]
         s_per_pair = last.manifest["wall_time_s"] / self.content["n_pairs"]
-        return "\n".join(pair_lines(self.content, last.campaign, self.report, s_per_pair))
+        return pair_lines(self.content, last.campaign, self.report, s_per_pair)
 
-    def _repr_html_(self) -> str:
-        """The short answer, and the map of events on which one of them crashes, as a notebook shows them."""
+    def _plot(self) -> Plot | None:
+        """Events on which one of them crashes."""
         from harness.report.compare_page import crashing_pairs  # noqa: PLC0415 - draws
-        from harness.report.page import shown_with  # noqa: PLC0415
 
         if "shells" not in self.content:  # of several scenarios, each of which has its own map
-            return shown_with(repr(self), None)
-        plot = crashing_pairs(self.shown, self.content["shells"]).plot(family_named(self.shown[0].campaign.scenario))
-        return shown_with(repr(self), plot)
+            return None
+        return crashing_pairs(self.shown, self.content["shells"]).plot(family_named(self.shown[0].campaign.scenario))
 
 
 @checked("harness.compare")

@@ -30,14 +30,15 @@ from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
 from harness.printed import PRINTED
 from harness.progress import Progress
-from harness.records.folder import CAMPAIGN, read_as, read_manifest, sole_use, write_bytes, write_sealed
+from harness.records.folder import CAMPAIGN, ESTIMATES, read_as, read_manifest, sole_use, write_bytes, write_sealed
 from harness.records.reader import read_campaign
 from harness.resolved import Resolved, require_ready, resolve
 from harness.runner.kept import require_no_fewer, require_own_folder
 from harness.runner.stored import stored_blocks
-from harness.runner.underway import ESTIMATES, EXIT_OF, RunResult, Underway, begun
+from harness.runner.underway import EXIT_OF, RunResult, Underway, begun
 from harness.sampling.hours import HourRounds
 from harness.sampling.milder import beyond_scope, n_left_out
+from harness.shown import Shown
 from harness.vocabulary import FAMILIES
 
 MEND = "Run the campaign again into the same folder with --resume."
@@ -48,8 +49,8 @@ FAR_ABOVE = 10.0
 """Of what is assumed at most, from which on an exposure is likely to be of other events [assumed]."""
 
 
-@dataclass(frozen=True)
-class Hours:
+@dataclass(frozen=True, repr=False)
+class Hours(Shown):
     """What a finished campaign of several scenarios left: a run folder each, and ``families.json``, the ``content``.
 
     ``runs`` are their results. The exit code is 0, or 4 when the budget or a pool was spent before what was asked was
@@ -62,10 +63,19 @@ class Hours:
     runs: dict[str, RunResult]
     exit_code: int
 
-    def __repr__(self) -> str:
+    def _lines(self) -> list[str]:
         from harness.report.hour_words import hour_lines  # noqa: PLC0415 - draws
 
-        return "\n".join(hour_lines(self.content, self.report))
+        return hour_lines(self.content, self.report)
+
+
+class HourEstimates(Shown, dict[str, Any]):
+    """Content of ``families.json``; shown, it is the short answer."""
+
+    def _lines(self) -> list[str]:
+        from harness.report.hour_words import hour_lines  # noqa: PLC0415 - draws
+
+        return hour_lines(self)
 
 
 def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: bool, progress: Progress) -> Hours:
@@ -205,7 +215,7 @@ def estimate_families(
     confidence: Confidence | None = None,
     *,
     counts: bool = False,
-) -> dict[str, Any]:
+) -> HourEstimates:
     """Answer anew from the tests of several scenarios; returns the content of ``families.json``.
 
     Parameters
@@ -236,7 +246,7 @@ def estimate_families(
         told[name] = read_as(dict[str, Any], of / ESTIMATES, mend=MEND), manifest
     answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
     decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
-    return finite_json({**stored, "exposure": given, "decision": decision, **answer})
+    return HourEstimates(finite_json({**stored, "exposure": given, "decision": decision, **answer}))
 
 
 def exposure_of(resolved: Resolved, given: Mapping[str, float]) -> Exposure:

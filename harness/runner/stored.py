@@ -32,22 +32,38 @@ from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
+from harness.shown import Shown
 from harness.vocabulary import ESTIMATORS
 from harness.worlds import build_world
 
 if TYPE_CHECKING:
+    from harness.report.drawing import Plot
     from harness.report.player import ReplayResult
 
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
-class Estimates(dict[str, Any]):
-    """Content of ``estimates.json``; shown, a line an estimator."""
+class Estimates(Shown, dict[str, Any]):
+    """Content of ``estimates.json``, of the run in a folder; shown, it is the short answer, or a line an estimator."""
 
-    def __repr__(self) -> str:
-        from harness.report.lines import estimate_lines  # noqa: PLC0415 - draws
+    def __init__(self, content: Mapping[str, Any], folder: Path, *, by_estimator: bool = False) -> None:
+        super().__init__(content)
+        self._folder, self._by_estimator = folder, by_estimator
 
-        return "\n".join(estimate_lines(self))
+    def _lines(self) -> list[str]:
+        from harness.report.lines import estimate_lines, run_lines  # noqa: PLC0415 - draws
+
+        if self._by_estimator:
+            return estimate_lines(self)
+        manifest = read_manifest(self._folder)
+        return run_lines(read_campaign(self._folder, manifest), manifest, self, self._folder / "report.html")
+
+    def _plot(self) -> Plot | None:
+        """The map of its tests, where what is told is of their own traffic."""
+        from harness.report.page import where_plot_of  # noqa: PLC0415 - draws
+        from harness.report.summary import read_run_folder  # noqa: PLC0415
+
+        return None if self.get("elsewhere") else where_plot_of(read_run_folder(self._folder, self))
 
 
 @checked("harness.estimate")
@@ -88,7 +104,8 @@ def estimate_run(
     require_trust(folder, manifest, campaign.testing.estimator, "Read that code, and run campaign.yaml yourself.")
     asked = asked_for(estimators or ESTIMATORS, "harness.estimate(estimators=…)")
     blocks = stored_blocks(folder, moments=not {*asked} < {*ESTIMATORS} - {"scv"})
-    return Estimates(estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence))
+    content = estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence)
+    return Estimates(content, folder, by_estimator=estimators is not None)
 
 
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:

@@ -23,7 +23,7 @@ from harness.files import remove_unfinished
 from harness.pool.moved import assumed
 from harness.pool.shells import PrescribedEpisodes
 from harness.progress import Progress
-from harness.records.folder import MILDER, SHELLS, parquet, write_sealed
+from harness.records.folder import ESTIMATES, MILDER, SHELLS, parquet, write_sealed
 from harness.records.shown import ShownTests
 from harness.resolved import Resolved
 from harness.runner.kept import Run, cpu_name, require_few_failed, require_same_pool, take_over
@@ -33,19 +33,20 @@ from harness.sampling.baseline import IN_WORDS, begin, requests_before, stored_b
 from harness.sampling.milder import N_TESTS, beyond_scope, milder_of, n_left_out
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import Shells, round_requests
+from harness.shown import Shown
 from harness.signals import uninterrupted
 from harness.strata import STORED_DESIGN
 from harness.vocabulary import IntArray, StoppedBy
 
 if TYPE_CHECKING:
+    from harness.report.drawing import Plot
     from harness.report.summary import RunFolder
 
 EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
-ESTIMATES = "estimates.json"
 
 
 @dataclass(frozen=True, repr=False)
-class RunResult:
+class RunResult(Shown):
     """What a finished campaign left in its folder, ``estimates.json`` and the page ``report.html`` among it.
 
     Shown, it is the short answer.
@@ -63,18 +64,15 @@ class RunResult:
     shown: RunFolder
     """What its page is made of."""
 
-    def __repr__(self) -> str:
-        from harness.report.lines import lines  # noqa: PLC0415 - draws
-        from harness.report.words import short_answer  # noqa: PLC0415
+    def _lines(self) -> list[str]:
+        from harness.report.lines import run_lines  # noqa: PLC0415 - draws
 
-        answer = short_answer(self.shown.campaign, self.shown.manifest, self.shown.estimates)
-        return "\n".join(lines(answer, self.shown.manifest["wall_time_s"], self.report))
+        return run_lines(self.shown.campaign, self.shown.manifest, self.shown.estimates, self.report)
 
-    def _repr_html_(self) -> str:
-        """The short answer, and the map of the share of cut-ins that crash, as a notebook shows them."""
-        from harness.report.page import shown_with, where_plot_of  # noqa: PLC0415 - draws
+    def _plot(self) -> Plot | None:
+        from harness.report.page import where_plot_of  # noqa: PLC0415 - draws
 
-        return shown_with(repr(self), where_plot_of(self.shown))
+        return where_plot_of(self.shown)
 
 
 @dataclass

@@ -153,7 +153,7 @@ def told(folder: Path) -> str:
     page, run = read_run_folder(folder), read(folder)
     summary = {name: repr(value) for name, value in vars(summarise(page)).items()}
     tables = [hashes(run.table(name)) for name in TABLES]
-    return repr((tables, estimate_run(folder), page.estimates, page.campaign, summary))
+    return repr((tables, {**estimate_run(folder)}, page.estimates, page.campaign, summary))
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import shutil
 from pathlib import Path
@@ -78,6 +79,12 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
 
 
 @pytest.mark.slow
+def test_the_sum_is_shown_in_ten_lines_by_python_too(run):
+    for found in (run, estimate_families(run.folder)):
+        assert html.unescape(found._repr_html_()) == f"<pre>{found!r}</pre>"
+        assert len(repr(found).splitlines()) <= 10
+
+
 def test_workers_and_interruptions_change_no_bit(run, tmp_path):
     both, stopped = tmp_path / "two", tmp_path / "stopped"
     harness.run(campaign(), both, workers=2)
