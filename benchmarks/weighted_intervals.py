@@ -16,7 +16,7 @@ import numpy as np
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
-from harness.estimators.block import Block, Drawn
+from harness.estimators.block import Block, SamplingPlan
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
 from harness.estimators.stopping import StopRule
@@ -54,7 +54,7 @@ class Population:
 def _crashes(weights: FloatArray, cap: float) -> Block:
     n = len(weights)
     columns = {"cut_in": np.ones(n, np.bool_)}
-    return Block(0, np.full(n, CRASH, np.int8), np.log(weights), columns, Drawn("forced", weight_cap=cap))
+    return Block(0, np.full(n, CRASH, np.int8), np.log(weights), columns, SamplingPlan("forced", weight_cap=cap))
 
 
 def drive(name: str, av: dict[str, object], method: Method, n: int) -> Population:

@@ -1,12 +1,17 @@
-"""Results as Python shows them: a short answer, in a notebook with what there is to see below it."""
+"""Results as Python shows them: a short answer, in a notebook with what there is to see below it.
+
+What they show is the report's, which is imported when something is shown: `run` and `estimate` draw nothing.
+"""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from harness.campaign.campaign import Campaign
     from harness.report.drawing import Plot
 
 
@@ -25,6 +30,23 @@ class Shown:
         return "\n".join(self._lines())
 
     def _repr_html_(self) -> str:
-        from harness.report.page import shown_with  # noqa: PLC0415 - `run` and `estimate` draw nothing
+        from harness.report.page import shown_with  # noqa: PLC0415 - see above
 
         return shown_with(repr(self), self._plot())
+
+
+def lines_of_run(
+    campaign: Campaign, manifest: Mapping[str, Any], estimates: Mapping[str, Any], folder: Path
+) -> list[str]:
+    """The short answer of a stored run."""
+    from harness.report.lines import run_lines  # noqa: PLC0415 - see above
+
+    return run_lines(campaign, manifest, estimates, folder / "report.html")
+
+
+def plot_of_run(folder: Path) -> Plot | None:
+    """The map of a stored run."""
+    from harness.report.page import where_plot_of  # noqa: PLC0415 - see above
+    from harness.report.summary import read_run_folder  # noqa: PLC0415
+
+    return where_plot_of(read_run_folder(folder))

@@ -30,7 +30,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.estimators.traffic import ONE_LAW
 from harness.families.cut_in.fitting.fit import fit_traffic, replicates
 from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
-from harness.families.cut_in.fitting.laws import Traffic
+from harness.families.cut_in.fitting.laws import ObservedTraffic
 from harness.families.cut_in.fitting.observations import KINDS, observe
 from harness.families.cut_in.loading import evaluate_laws, load_environment, load_parameters
 from harness.families.cut_in.parameters import FIXED, EnvironmentParameters
@@ -74,10 +74,10 @@ def truth() -> EnvironmentParameters:
     return load_parameters(TRAFFIC).with_values({"cut_in__ignore_share": IGNORE_SHARE})
 
 
-def simulated(folder: Path, n_parts: int, progress: Progress) -> Traffic:
+def simulated(folder: Path, n_parts: int, progress: Progress) -> ObservedTraffic:
     """Observations of ``n_parts`` of 10 vehicle-hours, 20 recordings each, as a fit reads them from files; kept."""
     progress.stage("trajectories", n_parts)
-    parts: list[Traffic] = []
+    parts: list[ObservedTraffic] = []
     for part in range(n_parts):
         path = folder / "observations" / f"{part:04d}.npz"
         if not path.exists():
@@ -85,21 +85,21 @@ def simulated(folder: Path, n_parts: int, progress: Progress) -> Traffic:
             write_atomically(path, functools.partial(_observe, part))
         with np.load(path) as kept:
             recording = kept["recording"] + RECORDINGS_OF_PART * part
-            parts.append(Traffic(**{name: kept[name] for name in KINDS}, recording=recording))
+            parts.append(ObservedTraffic(**{name: kept[name] for name in KINDS}, recording=recording))
         progress.advance(1)
-    return Traffic.joined(parts)
+    return ObservedTraffic.joined(parts)
 
 
 def _observe(part: int, path: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         file = Path(name, "trajectories.parquet")
         write(simulate(load_environment(TRAFFIC, truth()), PART_H, SEED + part, Differences()), file)
-        traffic = Traffic.of(map(observe, recordings([file], load_mapping())))
+        traffic = ObservedTraffic.of(map(observe, recordings([file], load_mapping())))
     with path.open("wb") as out:
         np.savez(out, recording=traffic.recording, **{kind: getattr(traffic, kind) for kind in KINDS})
 
 
-def data_set(pool: Traffic, hours: float, index: int) -> Traffic:
+def data_set(pool: ObservedTraffic, hours: float, index: int) -> ObservedTraffic:
     """So many vehicle-hours of recordings: each is in one set of 10 alone, larger sets are drawn from all."""
     n = round(hours / RECORDING_H)
     if hours == PART_H:
@@ -113,7 +113,7 @@ def data_set(pool: Traffic, hours: float, index: int) -> Traffic:
         rows: RecordArray = getattr(pool, kind)
         kept[kind] = rows[inside[rows["vehicle"]]]
         kept[kind]["vehicle"] = number[kept[kind]["vehicle"]]
-    return Traffic(**kept, recording=np.unique(pool.recording[inside], return_inverse=True)[1])
+    return ObservedTraffic(**kept, recording=np.unique(pool.recording[inside], return_inverse=True)[1])
 
 
 # -- crash rates of known drivers --
@@ -253,7 +253,7 @@ def on_common_knots(rows: pd.DataFrame) -> dict[str, float]:
 # -- data sets --
 
 
-def fit_data_set(traffic: Traffic, seed: int, n_replicates: int) -> pd.DataFrame:
+def fit_data_set(traffic: ObservedTraffic, seed: int, n_replicates: int) -> pd.DataFrame:
     """Rows of numbers by kind (index): the estimate, standard errors (NaN where none), replicates."""
     fit = fit_traffic(traffic, load_parameters(FITTED), FITTED.parameters, f"data set {seed}", Progress())
     drawn = replicates(fit, n_replicates, seed, Progress())
@@ -364,7 +364,7 @@ def true_hazard(state: Sequence[float]) -> float:
     return float(-np.log1p(-values.chance[0]))
 
 
-def true_shares(pool: Traffic) -> dict[str, float]:
+def true_shares(pool: ObservedTraffic) -> dict[str, float]:
     """Share that the environment accepts of the lane changes that are wished in each step, in the moments at risk."""
     risk = pool.at_risk
     nobody = ~np.isfinite(risk["r2_m"])

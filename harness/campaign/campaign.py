@@ -26,13 +26,13 @@ from harness.campaign.sections import (
     EventsPerHour,
     PoolSettings,
     Records,
-    Run,
+    RunSettings,
     Section,
     Stop,
     SurrogateName,
     Testing,
     Whole,
-    World,
+    WorldSettings,
 )
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.families import DEFAULT_FAMILY
@@ -83,11 +83,11 @@ class Campaign(Section):
     """stand-ins for the unknown AV, by name: each a driver, the name of a shipped one (r157-cc), or my.py:Model"""
     testing: Testing = Testing()
     pool: PoolSettings = PoolSettings()
-    world: World = World()
+    world: WorldSettings = WorldSettings()
     records: Records = Records()
     stop: Stop = Stop()
     accept: Accept | None = Field(None, description="stop at a decision instead of at a precision")
-    run: Run = Run()
+    run: RunSettings = RunSettings()
 
     @model_validator(mode="after")
     def _parts_go_together(self) -> Self:

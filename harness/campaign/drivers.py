@@ -71,7 +71,7 @@ class ConstantParameters(Section):
         return self.acceleration_mps2
 
 
-class Reference(Following):
+class ReferenceParameters(Following):
     """What the reference drivers of UN Regulation No. 157 share: when they react, and how they follow.
 
     The regulation's cut-in takes time: BV moves sideways, and the driver has seen and evaluated the risk when their
@@ -109,7 +109,7 @@ class Reference(Following):
         return max(0.0, 10.0 * self.reaction_time_s - self.used_up_steps) / 10.0
 
 
-class CarefulCompetentParameters(Reference):
+class CarefulCompetentParameters(ReferenceParameters):
     """The careful and competent human driver of UN Regulation No. 157."""
 
     critical_ttc_s: Strength = 2.0
@@ -117,7 +117,7 @@ class CarefulCompetentParameters(Reference):
     coasting_mps2: float = Field(0.4, ge=0.0, le=5.0, description="deceleration off the accelerator [JRC-FSM]")
 
 
-class FuzzySafetyParameters(Reference):
+class FuzzySafetyParameters(ReferenceParameters):
     """The fuzzy safety model of UN Regulation No. 157."""
 
     comfortable_braking_mps2: Strength = Field(4.0, description="braking in anticipation [JRC-FSM: FSM_br_min]")
@@ -212,7 +212,7 @@ class Surrogate(Driver):
     @property
     def delay_after_event_s(self) -> float | None:
         """How long after a dangerous cut-in a reference driver begins to brake (s); None for any other driver."""
-        if not isinstance(self.parameters, Reference):
+        if not isinstance(self.parameters, ReferenceParameters):
             return None
         return self.parameters.delay_after_event_s + self.reaction.delay_s
 

@@ -205,7 +205,7 @@ class PoolSettings(Section):
     """of the pool and of baseline runs, which another seed alone leaves as they are"""
 
 
-class World(Section):
+class WorldSettings(Section):
     """Where tests are simulated."""
 
     engine: Literal["sumo", "twin"] = Field("sumo", description="sumo, or twin: the same motion without SUMO")
@@ -290,7 +290,7 @@ USUAL_SHARD, LARGEST_SHARD = 5_000, 2_000_000
 SHARD_SHARE, LONG_RUN = 32, 2_500_000
 
 
-class Run(Section):
+class RunSettings(Section):
     """How the work is spread; nothing here changes a result."""
 
     shard_size: Annotated[int, Field(ge=1, le=LARGEST_SHARD), BeforeValidator(whole)] | None = None

@@ -14,8 +14,8 @@ import sumo_data
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_script import Script, ScriptController, ScriptVehicles
-from harness.controllers.traci_vehicle import VEH_ID, Seen
+from harness.controllers.traci_script import ScriptController, ScriptVehicles, TraciScript
+from harness.controllers.traci_vehicle import VEH_ID, SeenVehicle
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
@@ -32,7 +32,7 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
     """
     name, style = str(av.controller), av.traci_style
     try:
-        script = Script(name, dict(av.parameters))
+        script = TraciScript(name, dict(av.parameters))
     except SyntaxError as error:
         found, place = f"{name}, which is no Python", f"{error.msg} in line {error.lineno}"
         raise CampaignError("av.controller", found, "a TraCI script", f"Fix it: {place}.") from error
@@ -77,14 +77,14 @@ class _AnyName(str):
     __hash__ = str.__hash__
 
 
-class _Anybody(dict[str, Seen]):
+class _Anybody(dict[str, SeenVehicle]):
     """Vehicles by name, where every unknown one is the AV."""
 
-    def __init__(self, there: dict[str, Seen], ego: _AnyName) -> None:
+    def __init__(self, there: dict[str, SeenVehicle], ego: _AnyName) -> None:
         super().__init__(there)
         self._ego = ego
 
-    def __missing__(self, name: str) -> Seen:
+    def __missing__(self, name: str) -> SeenVehicle:
         self._ego.asked[name] = None
         return self[self._ego]
 
@@ -104,7 +104,7 @@ class _Tried(ScriptVehicles):
             self.commanded[vehID] = None
 
 
-def _found(script: Script) -> tuple[str | None, str]:
+def _found(script: TraciScript) -> tuple[str | None, str]:
     """Name of the one vehicle that a script commands, or what is wrong with it.
 
     Names are first taken as they come, each for the AV; those that came are then tried, one after the other.
@@ -124,7 +124,7 @@ def _found(script: Script) -> tuple[str | None, str]:
     return None, f"{FAILS}: {wrong}" if wrong else "commands no vehicle before a cut-in"
 
 
-def _commanded(script: Script, ego: str) -> tuple[list[str], str]:
+def _commanded(script: TraciScript, ego: str) -> tuple[list[str], str]:
     """Names of the vehicles that a script commands when a car cuts in before it; and what it raises."""
     tried = _Tried(ego)
     try:

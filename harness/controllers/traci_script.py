@@ -318,7 +318,7 @@ class _Imports:
         return spec
 
 
-class Script:
+class TraciScript:
     """A script: its file, ``file.py``, or a function of it, ``file.py:main``; compiled once.
 
     Parameters become keyword arguments of the function; without one, options of the command line.
@@ -351,7 +351,7 @@ class ScriptController:
 
     _traci: ScriptTraci
 
-    def __init__(self, script: Script, vehicle: Callable[[float, str, str], ScriptVehicles]) -> None:
+    def __init__(self, script: TraciScript, vehicle: Callable[[float, str, str], ScriptVehicles]) -> None:
         self._script, self._vehicle = script, vehicle
         self._run: greenlet | None = None
         self._held, self._left = 0.0, 0

@@ -25,7 +25,7 @@ _CHANGES_LANE = 0b1100_1111_1111
 _DEFAULT_VARIABLES, _VEHICLES, _LEADER = (0x50, 0x56), 0xA4, 0x68
 
 
-class Seen:
+class SeenVehicle:
     """What a script may ask of one vehicle: m, m/s, m/s²; lane 0 right, 1 left; sideways positive to the left."""
 
     __slots__ = "acceleration", "lane", "max_speed", "position", "sideways", "sideways_speed", "speed"
@@ -41,7 +41,7 @@ class Seen:
         raise TraCIException(f"The {name} of a vehicle is not known before the first step.")
 
 
-_QUESTIONS: dict[str, tuple[int, Callable[[Seen], Any]]] = {
+_QUESTIONS: dict[str, tuple[int, Callable[[SeenVehicle], Any]]] = {
     "getLateralSpeed": (0x32, lambda of: of.sideways_speed),
     "getSpeed": (0x40, lambda of: of.speed),
     "getMaxSpeed": (0x41, lambda of: of.max_speed),  # of the AV that at which it cruises
@@ -99,7 +99,11 @@ class VehicleDomain(Domain):
         self._subscribed: dict[str, tuple[int, ...]] = {}
         self._around: dict[str, tuple[float, tuple[int, ...]]] = {}
         """Range (m) and variables of what has been subscribed to around a vehicle."""
-        self._lv, self._bv, self._own = Seen(1, MAX_SPEED_MPS), Seen(1, MAX_SPEED_MPS), Seen(0, set_speed_mps)
+        self._lv, self._bv, self._own = (
+            SeenVehicle(1, MAX_SPEED_MPS),
+            SeenVehicle(1, MAX_SPEED_MPS),
+            SeenVehicle(0, set_speed_mps),
+        )
         self._others = {name: other for name, other in ((lv_name, self._lv), (bv_name, self._bv)) if name}
         self._seen = {**self._others, ego: self._own}
         self._begun = False
@@ -145,7 +149,7 @@ class VehicleDomain(Domain):
         self._told = max(0.0, self._own.speed + acceleration * self.step_s)
         return acceleration
 
-    def _of(self, vehID: str) -> Seen:
+    def _of(self, vehID: str) -> SeenVehicle:
         try:
             return self._seen[vehID]
         except KeyError:
@@ -316,7 +320,7 @@ def _variables(asked: Sequence[int] | None) -> tuple[int, ...]:
     return wanted
 
 
-def _question(answer: Callable[[Seen], Any]) -> Callable[[VehicleDomain, str], Any]:
+def _question(answer: Callable[[SeenVehicle], Any]) -> Callable[[VehicleDomain, str], Any]:
     return lambda self, vehID: answer(self._of(vehID))
 
 

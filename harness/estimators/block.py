@@ -51,7 +51,7 @@ Column = NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class SamplingPlan:
     """How all tests of a campaign are drawn.
 
     ``alpha`` (M,) are mixture weights of the importance functions; ``weight_cap`` is the bound on Y = 1{crash}·weight
@@ -103,7 +103,7 @@ class Block:
     outcome: Int8Array
     log_weight: FloatArray
     columns: Mapping[str, Column]
-    drawn: Drawn
+    drawn: SamplingPlan
 
     def __len__(self) -> int:
         return len(self.outcome)
@@ -244,7 +244,7 @@ def block_from_tables(
             columns["step"] = np.where(columns["happened"], step, -1 - index).astype(np.int64)
     cap, above_mps = None if sampling.controlled else 1.0, campaign.crash.counts_above_mps
     method, names = campaign.testing.method, campaign.importance_names
-    drawn = Drawn(method, alpha, cap, shells, above_mps, campaign.testing.epsilon, names)
+    drawn = SamplingPlan(method, alpha, cap, shells, above_mps, campaign.testing.epsilon, names)
     block = Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
     return block.harder_than(above_mps) if above_mps > 0.0 else block
 

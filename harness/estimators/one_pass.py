@@ -14,7 +14,7 @@ import numpy as np
 
 from harness.campaign.sections import LEAST_TESTS
 from harness.errors import CampaignError
-from harness.estimators.block import Block, Drawn, joined
+from harness.estimators.block import Block, SamplingPlan, joined
 from harness.estimators.doubly_robust import DoublyRobust
 from harness.estimators.estimate import Accumulator, Estimate, FailureBounds, Note, Point, Unavailable, note
 from harness.estimators.own import Asked, OwnEstimator, OwnState
@@ -44,7 +44,7 @@ BEFORE_OVERLAP = ("took_over_early", "asked_to_speed_up")
 class Diagnostics:
     """Running moments of weights and ratios; add blocks, ask for the result."""
 
-    _drawn: Drawn  # of the last block
+    _drawn: SamplingPlan  # of the last block
 
     def __init__(self) -> None:
         self.n, self.counts = 0, Counter[str]()

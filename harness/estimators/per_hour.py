@@ -213,8 +213,9 @@ class PerHour:
 
     def with_exposures(self, exposures: Mapping[str, float]) -> PerHour:
         """The same tests with other exposures (events per hour), by family."""
-        own = {name: known_exposure(per_hour) for name, per_hour in exposures.items()}
-        return PerHour([of._replace(exposure=own.get(of.family, of.exposure)) for of in self.families])
+        return PerHour(
+            [of._replace(exposure=own_exposure(of.exposure, exposures.get(of.family))) for of in self.families]
+        )
 
     def to_json(self, confidence: float, speed_mps: float, *, counts: bool = False) -> dict[str, Any]:
         """All of it, as plain content; with ``counts`` those of exposures are in the interval of the sum."""
@@ -260,6 +261,8 @@ class PerHour:
             }  # fmt: skip
 
 
-def known_exposure(per_hour: float) -> Exposure:
-    """The user's own, which is taken to be known."""
+def own_exposure(shipped: Exposure, per_hour: float | None) -> Exposure:
+    """The shipped exposure, or the user's own, which is taken to be known."""
+    if per_hour is None:
+        return shipped
     return Exposure(per_hour, per_hour, per_hour, None, "given")

@@ -159,7 +159,7 @@ N_MEAN_PATHS = 1024
 class Family(Protocol):
     """A kind of events, and what most have alike. ``traffic`` is all that its kernels need of its environment.
 
-    A family has to say the names below that have no value, and `start`, `events`, `choose` and `script`.
+    A family has to say the names below that have no value, and `exposure`, `start`, `events`, `choose` and `script`.
     """
 
     name: str
@@ -241,9 +241,8 @@ class Family(Protocol):
         """Whether events can be seen before they happen."""
         return False
 
-    def exposure(self, traffic: Environment, parameters: Any) -> Exposure | None:
-        """How often there are events, as `Events.probability` counts them; None where nobody knows."""
-        return None
+    def exposure(self, traffic: Environment, parameters: Any) -> Exposure:
+        """How often there are events, as `Events.probability` counts them."""
 
     def milder(self, traffic: Environment) -> Environment | None:
         """The same with events that are too mild to count, of which some are driven all the same; None without any."""

@@ -42,7 +42,7 @@ JUMP_MPS, HARDEST_MPS2 = 5.0, 10.0
 """A speed may change from row to row by measurement error and at this acceleration [assumed]."""
 
 
-class Rule(NamedTuple):
+class ColumnRule(NamedTuple):
     """What must hold of a column in every row; ``found`` is formatted with the value of a row for which it does not."""
 
     column: str
@@ -52,23 +52,23 @@ class Rule(NamedTuple):
     mend: str = CORRECT
 
 
-def _near(column: str, most: float) -> Rule:
+def _near(column: str, most: float) -> ColumnRule:
     """Values further from the median are wrong [assumed]."""
     expected = f"at most {most:g} from the median of the recording"
-    return Rule(column, lambda x: np.abs(x - np.median(x)) <= most, f"{column} {{:g}}", expected)
+    return ColumnRule(column, lambda x: np.abs(x - np.median(x)) <= most, f"{column} {{:g}}", expected)
 
 
 _NUMBERS = "time_s", "s_m", "speed_mps", "lane", "length_m"
 NUMBERS = (
-    *(Rule(name, np.isfinite, "no finite number", "a number in every row") for name in _NUMBERS),
-    Rule("lane", lambda x: x % 1 == 0, "{:g}", "a whole number", "Number the lanes by whole numbers."),
+    *(ColumnRule(name, np.isfinite, "no finite number", "a number in every row") for name in _NUMBERS),
+    ColumnRule("lane", lambda x: x % 1 == 0, "{:g}", "a whole number", "Number the lanes by whole numbers."),
 )
-SOME_LENGTH = Rule("length_m", lambda x: x >= 0.5, "length_m {:g}", "a length of 0.5 m or more", NO_LENGTH)
+SOME_LENGTH = ColumnRule("length_m", lambda x: x >= 0.5, "length_m {:g}", "a length of 0.5 m or more", NO_LENGTH)
 NEAR_TIME = _near("time_s", 1e7)
 NEAR = _near("s_m", 1e5), _near("lane", 20), _near("length_m", 50.0), _near("speed_mps", 60.0)
 
 
-def require(rule: Rule, rows: pd.DataFrame, where: Callable[[int], str]) -> None:
+def require(rule: ColumnRule, rows: pd.DataFrame, where: Callable[[int], str]) -> None:
     """Refuse the first of some rows that breaks a rule; ``where`` names the i-th (`TrajectoryError`)."""
     values = rows[rule.column].to_numpy()
     if not (holds := rule.holds(values)).all():

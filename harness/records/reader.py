@@ -37,7 +37,7 @@ from harness.records.folder import (
 )
 from harness.records.schemas import traces_schema
 from harness.resolved import resolve
-from harness.shown import Shown
+from harness.shown import Shown, lines_of_run, plot_of_run
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
@@ -120,18 +120,13 @@ class StoredRun(Shown):
         return read_as(dict[str, Any], self.folder / ESTIMATES, mend=again)
 
     def _lines(self) -> list[str]:
-        from harness.report.lines import run_lines  # noqa: PLC0415 - draws
-
         manifest = read_manifest(self.folder)
         if not (self.folder / ESTIMATES).is_file():
             return [f"{self.folder}: {manifest['n_episodes']:,} tests, without an answer as yet"]
-        return run_lines(read_campaign(self.folder, manifest), manifest, self.estimates, self.folder / "report.html")
+        return lines_of_run(read_campaign(self.folder, manifest), manifest, self.estimates, self.folder)
 
     def _plot(self) -> Plot | None:
-        from harness.report.page import where_plot_of  # noqa: PLC0415 - draws
-        from harness.report.summary import read_run_folder  # noqa: PLC0415
-
-        return where_plot_of(read_run_folder(self.folder)) if (self.folder / ESTIMATES).is_file() else None
+        return plot_of_run(self.folder) if (self.folder / ESTIMATES).is_file() else None
 
     @checked("episodes")
     def episodes(self, columns: Sequence[str] | None = None) -> pd.DataFrame:

@@ -68,7 +68,7 @@ def _told(stored: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-class Pairs(NamedTuple):
+class CrashPairs(NamedTuple):
     """Pairs with a crash: who of `WHO`, what it adds to the rate, and of the event what a map's axes show, (2, n).
 
     The event is that of the vehicle that crashes, A's where both do. ``episode`` and ``impact_mps`` are of A and B,
@@ -91,7 +91,7 @@ class Pairs(NamedTuple):
         return pairs_plot(self.who, self.weight, self.values, family)
 
 
-def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> Pairs:
+def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> CrashPairs:
     """Pairs on which A or B crashes, by the records: the i-th test of a shell of A and of B."""
     axes = family_named(runs[0].campaign.scenario).maps[0]
     n_pairs, found = [shell["n_pairs"] for shell in shells], []
@@ -108,10 +108,10 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
     impact = np.stack([each["impact_speed_mps"][kept] for each in found])
     weight = np.repeat(weight_of_a_test(np.array([shell["p"] for shell in shells]), np.array(n_pairs)), n_pairs)
     who = np.where(a & b, 0, np.where(a, 1, 2))[kept]
-    return Pairs(who, weight[kept], of_map, episode.astype(np.int64), impact)
+    return CrashPairs(who, weight[kept], of_map, episode.astype(np.int64), impact)
 
 
-def scenes_of(runs: Sequence[RunFolder], pairs: Pairs, replay: Replay) -> Iterator[Scene]:
+def scenes_of(runs: Sequence[RunFolder], pairs: CrashPairs, replay: Replay) -> Iterator[Scene]:
     """The hardest crashes of B alone, then of A alone, beside the other vehicle on the same event."""
     family = family_named(runs[0].campaign.scenario)
     for side, other in ((1, 0), (0, 1)):

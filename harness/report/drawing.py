@@ -25,7 +25,7 @@ RIGHT, BOTTOM, AXIS = 12.0, 36.0, 54.0
 FEW_DECADES, MOST_TICKS = 1.7, 6
 
 
-class Axis(NamedTuple):
+class PlotAxis(NamedTuple):
     """From ``low`` to ``high``; logarithmic, or of rows with ``names`` at 0, 1 and so on."""
 
     label: str
@@ -98,12 +98,12 @@ class Mark(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Panel:
+class PlotPanel:
     """Axes with marks in them, in the order in which they are drawn; labels of marks make the legend."""
 
     title: str
-    x: Axis
-    y: Axis
+    x: PlotAxis
+    y: PlotAxis
     marks: list[Mark] = field(default_factory=list)
     height: float = 250.0
 
@@ -171,7 +171,7 @@ class Plot:
     """
 
     name: str
-    panels: Sequence[Panel]
+    panels: Sequence[PlotPanel]
     alt: str
     caption: str
 
@@ -190,7 +190,7 @@ class Plot:
         return f"{head}<style>{style}</style>{panels}</svg>\n".encode()
 
 
-def _drawn(mark: Mark, panel: Panel, width: float, height: float) -> str:
+def _drawn(mark: Mark, panel: PlotPanel, width: float, height: float) -> str:
     """A mark in its panel's inner part, which cuts off what is beyond its edges."""
     first, *rest = (np.atleast_1d(np.asarray(column, np.float64)) for column in mark.columns)
     xs = [first, rest[0]] if mark.kind == "boxes" else [first]

@@ -12,7 +12,7 @@ from harness.estimators.traffic import Sensitivity
 from harness.families.protocol import Environment, Family
 from harness.families.words import Shown
 from harness.numbers import count, number, plain, share
-from harness.report.drawing import Axis, Panel, Plot
+from harness.report.drawing import Plot, PlotAxis, PlotPanel
 from harness.report.summary import RunFolder, RunSummary, ShownShells
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.library import library_records
@@ -47,8 +47,8 @@ def severity_plot(estimates: Estimates) -> Plot | None:
     seen = rate > 0.0
     shown = slice(0, min(int(seen.sum()) + 1, rate.size))
     bottom, top = 0.3 * float(rate[seen].min()), 2.0 * float(high[shown].max())
-    x = Axis("impact speed (closing speed at contact), m/s", 0.0, float(above[shown][-1]))
-    panel = Panel("Rate of crashes above an impact speed", x, Axis("crashes per test", bottom, top, log=True))
+    x = PlotAxis("impact speed (closing speed at contact), m/s", 0.0, float(above[shown][-1]))
+    panel = PlotPanel("Rate of crashes above an impact speed", x, PlotAxis("crashes per test", bottom, top, log=True))
     band = f"{share(estimates.confidence)} band, at each speed"
     panel.add("band", "blue", above[shown], np.maximum(low[shown], bottom), high[shown], opacity=0.16, label=band)
     panel.add("line", "blue", above[seen], rate[seen], label="rate of harder crashes")
@@ -71,8 +71,8 @@ def convergence_plot(run: RunFolder) -> Plot | None:
     columns = [(each.n, each.crash_rate, each.ci_low, each.ci_high, each.rhw) for each in points]
     n, rate, low, high, rhw = np.array(columns, np.float64).T
     confidence, level = share(estimates.confidence), plain(estimates.lane_change_level)
-    tests = Axis("tests", float(n[0]), float(n[-1]), log=True)
-    left = Panel("Crash rate", tests, Axis(f"per test (level {level})", 0.0, _rate_limit(rate, high)))
+    tests = PlotAxis("tests", float(n[0]), float(n[-1]), log=True)
+    left = PlotPanel("Crash rate", tests, PlotAxis(f"per test (level {level})", 0.0, _rate_limit(rate, high)))
     left.add("band", "blue", n, low, high, opacity=0.16, label=f"{confidence} interval")
     left.add("line", "blue", n, rate, label="estimate")
     left.add("line", "muted", n[[0, -1]], rate[[-1, -1]], dash=DASHED, width=1.0, label="at the end")
@@ -100,14 +100,14 @@ def _rate_limit(rate: FloatArray, high: FloatArray) -> float:
     return 1.15 * max(min(settled, 3.0 * float(high[-1])), float(np.nanmax(rate[-2:])), 1e-300)
 
 
-def _rhw_panel(tests: Axis, n: FloatArray, rhw: FloatArray, target: float | None) -> Panel | None:
+def _rhw_panel(tests: PlotAxis, n: FloatArray, rhw: FloatArray, target: float | None) -> PlotPanel | None:
     known = np.isfinite(rhw) & (rhw > 0.0)
     if not known.any():
         return None
     n, rhw = n[known], rhw[known]
     shown = rhw if target is None else np.append(rhw, target)
-    y = Axis("RHW", float(shown.min()) / 1.5, float(shown.max()) * 1.6, log=True)
-    panel = Panel("Relative half-width (RHW)", tests, y)
+    y = PlotAxis("RHW", float(shown.min()) / 1.5, float(shown.max()) * 1.6, log=True)
+    panel = PlotPanel("Relative half-width (RHW)", tests, y)
     panel.add("line", "blue", n, rhw, label=f"RHW, {rhw[-1]:.3g} at the end")
     if target is not None:
         panel.add("line", "vermillion", [tests.low, tests.high], [target] * 2, dash="6 3", label=f"target {target:g}")
@@ -124,10 +124,10 @@ def shells_plot(found: ShownShells) -> Plot:
     tested = [shell for shell in shells if shell.n_episodes] or list(shells)
     limit = 1.12 * max(shell.high for shell in tested)
     widest = 1.3 * max(*(shell.half_width for shell in tested), pool)
-    rows, y, height = np.arange(len(names)), Axis("", len(names) - 0.4, -0.6, names=names), 62.0 + 26.0 * len(names)
-    adds = Axis("contribution to the crash rate, per test", 0.0, limit)
-    left = Panel("Where the rate comes from", adds, y, height=height)
-    right = Panel("Where the uncertainty lies", Axis("half-width, per test", 0.0, widest), y, height=height)
+    rows, y, height = np.arange(len(names)), PlotAxis("", len(names) - 0.4, -0.6, names=names), 62.0 + 26.0 * len(names)
+    adds = PlotAxis("contribution to the crash rate, per test", 0.0, limit)
+    left = PlotPanel("Where the rate comes from", adds, y, height=height)
+    right = PlotPanel("Where the uncertainty lies", PlotAxis("half-width, per test", 0.0, widest), y, height=height)
     at, inside = rows[:-1], np.array([shell.inside for shell in shells])
     low, rate, high = np.array([(shell.low, shell.contribution, shell.high) for shell in shells]).T
     for kind, colour in ((inside, "blue"), (~inside, "vermillion")):
@@ -171,8 +171,10 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
     rate, ratio = ends[0::2].T, ends[1::2].T
     low, high = 0.9 * float(max(rate[0].min(), 1e-3)), 1.1 * float(rate[1].max())
     rows, fitted = np.arange(len(names)), np.array([bar.known == "fitted" for bar in shown])
-    y = Axis("", len(names) - 0.4, -0.6, names=names)
-    panel = Panel("What moves the answer", Axis("times", low, high, log=True), y, height=76.0 + 22.0 * len(names))
+    y = PlotAxis("", len(names) - 0.4, -0.6, names=names)
+    panel = PlotPanel(
+        "What moves the answer", PlotAxis("times", low, high, log=True), y, height=76.0 + 22.0 * len(names)
+    )
     for kind, colour, label in ((fitted, "blue", "rate, fitted"), (~fitted, "vermillion", "rate, assumed")):
         if kind.any():
             left, at = np.maximum(rate[0][kind], low), rows[kind]
@@ -233,7 +235,7 @@ def _bare(words: str) -> str:
     return words.partition(" at ")[0].partition(" of ")[0].partition(" when ")[0]
 
 
-def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArray, events: str) -> Panel:
+def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArray, events: str) -> PlotPanel:
     """Share of events that crash in cells, of the rows that ``met`` one."""
     weight, crash = rows["weight"][met], rows["outcome"][met] == CRASH
     of, n = crash if crash.any() else np.ones_like(crash), crash.size
@@ -251,8 +253,8 @@ def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArr
     (gap, closing), (x, y) = values, edges
     every, crashed = (np.histogram2d(gap, closing, (x, y), weights=w)[0].T for w in (weight, weight * crash))
     shares = np.divide(crashed, every, out=np.full_like(every, -1.0), where=every > 0.0)
-    across, up = (Axis(each.axis, float(of[0]), float(of[-1])) for each, of in zip(axes, edges, strict=True))
-    panel = Panel(f"Share of {events} that crash", across, up, height=300.0)
+    across, up = (PlotAxis(each.axis, float(of[0]), float(of[-1])) for each, of in zip(axes, edges, strict=True))
+    panel = PlotPanel(f"Share of {events} that crash", across, up, height=300.0)
     for low, (high, colour) in zip((-0.5, *SHARES), SHARES.items(), strict=False):
         if ((shares > low) & (shares <= high)).any():
             row, column = np.nonzero((shares > low) & (shares <= high))
@@ -289,8 +291,8 @@ def pairs_plot(who: IntArray, weight: FloatArray, values: FloatArray, family: Fa
     place = place.ravel()  # numpy 2.0 gives it another axis
     adds = np.bincount(place, weight)
     gap, closing = (np.bincount(place, weight * x) / adds for x in values)
-    axes = Axis(first.axis, 0.0, 1.1 * gap.max()), Axis(second.axis, 0.0, 1.1 * closing.max())
-    panel = Panel(f"{words.events.capitalize()} that crash, by who crashes", *axes, height=300.0)
+    axes = PlotAxis(first.axis, 0.0, 1.1 * gap.max()), PlotAxis(second.axis, 0.0, 1.1 * closing.max())
+    panel = PlotPanel(f"{words.events.capitalize()} that crash, by who crashes", *axes, height=300.0)
     told = []
     for code, (name, colour) in enumerate(WHO.items()):
         of, n = kind == code, count(int(np.count_nonzero(who == code)))

@@ -36,7 +36,7 @@ Of a vehicle that is random in one of four tests, ten miss all with a probabilit
 Bits = tuple[bytes, bytes, str | None]
 
 
-class Tests(NamedTuple):
+class DrawnTests(NamedTuple):
     """Consecutive tests from the ``first`` on, and what the others do in them."""
 
     first: int
@@ -57,7 +57,7 @@ def bits_of(shard: Shard, row: int) -> Bits:
     return record, b"" if trace is None else trace.tobytes(), shard.failures.get(row)
 
 
-def run_elsewhere(source: Source, tests: Sequence[Tests], n_cells: int = 1, *, held: bool = False) -> Again:
+def run_elsewhere(source: Source, tests: Sequence[DrawnTests], n_cells: int = 1, *, held: bool = False) -> Again:
     """Run tests one after the other in a fresh process, by a clock of its own (`harness.controllers.clock`).
 
     Raises `AvEndedProcessError`: the controller ended the process.
@@ -67,7 +67,7 @@ def run_elsewhere(source: Source, tests: Sequence[Tests], n_cells: int = 1, *, h
 
 
 def _run_here(
-    av: AutomatedVehicle, scenario: Scenario, keep: RecordPolicy, tests: Sequence[Tests], n_cells: int, held: bool
+    av: AutomatedVehicle, scenario: Scenario, keep: RecordPolicy, tests: Sequence[DrawnTests], n_cells: int, held: bool
 ) -> Again:
     clock, found = Clock(held=held), list[Bits]()
     with clock.shown():
@@ -82,7 +82,7 @@ def _run_here(
 def repeat(loop: EpisodeLoop, source: Source, shard: Shard) -> Repeated:
     """Run some tests of a loop's shard again, each alone: a user's code elsewhere, what SUMO drives after the shard."""
     rows = _rows_to_repeat(shard, source.campaign)
-    tests = [Tests(shard.first_episode + row, shard.traffic.rows(slice(row, row + 1))) for row in rows]
+    tests = [DrawnTests(shard.first_episode + row, shard.traffic.rows(slice(row, row + 1))) for row in rows]
     if has_foreign_code(source.campaign.av):
         again = _each_elsewhere(source, tests)
     else:
@@ -91,7 +91,7 @@ def repeat(loop: EpisodeLoop, source: Source, shard: Shard) -> Repeated:
     return Repeated(len(rows), sorted(shard.first_episode + row for row, bits in pairs if bits != bits_of(shard, row)))
 
 
-def _each_elsewhere(source: Source, tests: list[Tests]) -> list[Bits | None]:
+def _each_elsewhere(source: Source, tests: list[DrawnTests]) -> list[Bits | None]:
     """What each leaves; None of one that ends its process, or whose controller cannot be made once more."""
     try:
         return [*run_elsewhere(source, tests).bits]

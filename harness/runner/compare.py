@@ -35,7 +35,7 @@ from harness.records.folder import CAMPAIGN, read_manifest, require_sum, write_s
 from harness.records.origin import code_of, require_trust
 from harness.resolved import require_ready
 from harness.runner.families import MEND, doubts_of, hour_answer, read_families, require_no_other
-from harness.runner.paired import SIDES, Both, Scenario, copy_stored, drive_pairs, together
+from harness.runner.paired import SIDES, Both, PairedScenario, copy_stored, drive_pairs, together
 from harness.runner.stored import replay_episode
 from harness.sampling.shells import PairRounds
 from harness.shown import Shown
@@ -188,7 +188,9 @@ def _require_stored(stored: Path, folders: Sequence[str], campaign: Campaign) ->
         require_sum(stored / CAMPAIGN, known, read_bytes(stored / CAMPAIGN), MEND)
 
 
-def _written(of: Scenario, ended: Mapping[str, Any], labels: tuple[str, str], asked: str, code: int) -> Comparison:
+def _written(
+    of: PairedScenario, ended: Mapping[str, Any], labels: tuple[str, str], asked: str, code: int
+) -> Comparison:
     """Write what is known of one scenario, and its page."""
     resolved = [each.run.resolved for each in of.runs]
     campaign, told = resolved[0].campaign, zip(SIDES, labels, resolved, strict=True)
@@ -211,7 +213,7 @@ def _sum_written(
     out: Path,
     campaign: Campaign,
     pairs: PairsPerHour,
-    scenarios: Sequence[Scenario],
+    scenarios: Sequence[PairedScenario],
     ended: Mapping[str, Any],
     decisions: Mapping[str, Any],
     labels: tuple[str, str],
@@ -242,7 +244,7 @@ def _sum_written(
     return Comparison(out, content, code, write_sum(out, content), shown)
 
 
-def _decided(rule: PairRule, scenarios: Sequence[Scenario]) -> PairDecision:
+def _decided(rule: PairRule, scenarios: Sequence[PairedScenario]) -> PairDecision:
     """What a rule has found, after what was seen besides in these scenarios."""
     of_a, of_b = ([of.runs[side].doubted() for of in scenarios] for side in (0, 1))
     return rule.decision.doubted(sum(n for n, _ in of_b), sum(n for _, n in (*of_a, *of_b)))

@@ -23,7 +23,7 @@ from harness.campaign.sections import Confidence, EventsPerHour
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
-from harness.estimators.per_hour import OfFamily, PerHour, known_exposure
+from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import HourRule
 from harness.estimators.tally import empty_tally
@@ -252,16 +252,10 @@ def estimate_families(
 def exposure_of(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
     """How often events of a scenario are met: the shipped number, or the one that is given for it."""
     shipped, name = resolved.family.exposure(resolved.environment, resolved.parameters), resolved.campaign.scenario
-    own = given.get(name)
-    if shipped is None:
-        if own is None:
-            found, expected = f"none of {name}", "its events per hour of driving, which its family does not know"
-            raise CampaignError("exposure", found, expected, f"Write exposure: {{{name}: …}}, or sum up others.")
-        return known_exposure(own)
-    if own is not None and own > FAR_ABOVE * shipped.high:
+    if (own := given.get(name)) is not None and own > FAR_ABOVE * shipped.high:
         told = f"exposure {name}={own:g} is {own / shipped.per_hour:.0f} times the shipped one, of events in scope"
         sys.stderr.write(f"note: {told} (docs/families.md)\n")
-    return shipped if own is None else known_exposure(own)
+    return own_exposure(shipped, given.get(name))
 
 
 def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> None:

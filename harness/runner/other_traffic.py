@@ -26,7 +26,7 @@ from harness.pool.moved import assumed
 from harness.progress import Progress
 from harness.records.replicates import read_replicates
 from harness.resolved import resolve
-from harness.runner.stored import Estimates
+from harness.runner.stored import StoredEstimates
 from harness.runner.stored_shells import ELSEWHERE, OPTION, Nearby, StoredShells, moved_to, require_shares
 from harness.vocabulary import EstimatorName, FloatArray
 
@@ -39,7 +39,7 @@ def estimate_in_other_traffic(
     confidence: Confidence | None = None,
     own: bool = False,
     progress: Progress | None = None,
-) -> Estimates:
+) -> StoredEstimates:
     """Content of ``estimates.json`` as the stored tests of shells have it for another environment.
 
     Parameters
@@ -83,7 +83,7 @@ def estimate_in_other_traffic(
         was, now = (Path(each).stem for each in (campaign.environment.parameters, environment))
         content |= finite_json({"elsewhere": Elsewhere(was, now, drivers, moved.reference_error())})
     told = content | finite_json({"traffic": traffic_error(moved, content, progress)})
-    return Estimates(told, Path(folder))
+    return StoredEstimates(told, Path(folder))
 
 
 def traffic_error(moved: StoredShells, content: Mapping[str, Any], progress: Progress) -> TrafficError | None:

@@ -39,7 +39,7 @@ SIDES = ("a", "b")
 Both = tuple[Resolved, Resolved]
 
 
-class Scenario:
+class PairedScenario:
     """Both vehicles in one scenario: ``folder``, runs of A and B, what these have left, and pairs so far."""
 
     results: tuple[RunResult, RunResult]  # once all is driven
@@ -89,7 +89,7 @@ class Scenario:
 
 def drive_pairs(
     campaign: Campaign, ready: Mapping[Path, Both], rule: PairRule, workers: int | None, progress: Progress
-) -> tuple[PairRounds, list[Scenario]]:
+) -> tuple[PairRounds, list[PairedScenario]]:
     """Rounds of pairs until the rule is content; returns them, and what there is of each scenario.
 
     ``ready`` are A and B, ready to be run in ``a`` and ``b`` of the folder of each.
@@ -106,7 +106,9 @@ def drive_pairs(
             runs.append(working.enter_context(begun(*each, found, workers, progress, len(places))))
             runs[-1].drive_before_tests()
         progress.remark = ""
-        scenarios = [Scenario(*each, campaign.exposure) for each in zip(ready, runs[::2], runs[1::2], strict=True)]
+        scenarios = [
+            PairedScenario(*each, campaign.exposure) for each in zip(ready, runs[::2], runs[1::2], strict=True)
+        ]
         available = [of.runs[0].prescribed.available for of in scenarios]
         rounds = PairRounds(campaign, together(scenarios, campaign), available, rule)
         progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
@@ -127,7 +129,7 @@ def drive_pairs(
         return rounds, scenarios
 
 
-def together(scenarios: list[Scenario], campaign: Campaign) -> Pairs:
+def together(scenarios: list[PairedScenario], campaign: Campaign) -> Pairs:
     """The pairs of one scenario, per test; of several, those of all, per hour."""
     if campaign.scenarios is None:
         return scenarios[0].pairs

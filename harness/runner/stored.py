@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
-class Estimates(Shown, dict[str, Any]):
+class StoredEstimates(Shown, dict[str, Any]):
     """Content of ``estimates.json``, of the run in a folder; shown, it is the short answer, or a line an estimator."""
 
     def __init__(self, content: Mapping[str, Any], folder: Path, *, by_estimator: bool = False) -> None:
@@ -72,7 +72,7 @@ def estimate_run(
     *,
     estimators: Annotated[Sequence[str | Any], Field(min_length=1)] | None = None,
     confidence: Confidence | None = None,
-) -> Estimates:
+) -> StoredEstimates:
     """Estimate a stored run from its records; returns the content of ``estimates.json``, a dict.
 
     Parameters
@@ -105,7 +105,7 @@ def estimate_run(
     asked = asked_for(estimators or ESTIMATORS, "harness.estimate(estimators=…)")
     blocks = stored_blocks(folder, moments=not {*asked} < {*ESTIMATORS} - {"scv"})
     content = estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence)
-    return Estimates(content, folder, by_estimator=estimators is not None)
+    return StoredEstimates(content, folder, by_estimator=estimators is not None)
 
 
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:

@@ -42,11 +42,7 @@ def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, Any]:
         crashes = pc.and_(crashes, pc.fill_null(pc.greater(table.column("impact_speed_mps"), above), fill_value=False))
     exposure = family.exposure(family.milder(resolved.environment), resolved.parameters)
     counts = {"n_tests": len(table), "n_crashes": pc.sum(crashes).as_py()}
-    return {
-        **counts,
-        "n_failed": len(table) - table.column("failure").null_count,
-        "per_hour": exposure and exposure.per_hour,
-    }
+    return {**counts, "n_failed": len(table) - table.column("failure").null_count, "per_hour": exposure.per_hour}
 
 
 def n_left_out(campaign: Campaign, n_before_event: int) -> int:

@@ -18,7 +18,7 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from harness.campaign.drivers import NATURAL, BuiltInParameters, Reaction, Reference, Reflexes
+from harness.campaign.drivers import NATURAL, BuiltInParameters, Reaction, ReferenceParameters, Reflexes
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.compiled import compiled_inline
 from harness.vocabulary import Record, RecordArray
@@ -74,7 +74,7 @@ def driver_records(
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3
         record["perceives_lateral_m"] = reaction.perceives_lateral_m
         record["delay_steps"] = round(reaction.delay_s * 10.0)
-        if see_onset and isinstance(driver, Reference):
+        if see_onset and isinstance(driver, ReferenceParameters):
             record["used_up_steps"] = 0.0
             record["delay_steps"] += round(10.0 * driver.risk_evaluation_s)
         if isinstance(reaction, Reaction):

@@ -23,7 +23,7 @@ import numpy as np
 from harness.campaign.drivers import default_surrogates
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.estimators.block import MAX_CONTROL_STEPS, Block, Drawn
+from harness.estimators.block import MAX_CONTROL_STEPS, Block, SamplingPlan
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.nade.challenge import roll_out
@@ -130,7 +130,7 @@ class SmallWorld:
             crash[running], cut_in[running] = cut & (self.crash[here] > 0.0), cut
             running = running[~cut]
         columns = {"happened": cut_in, "log_q": log_q, "n_control_steps": steps, "first_ratios": ratios}
-        drawn = Drawn("step_mixture", np.full(j, 1.0 / j))
+        drawn = SamplingPlan("step_mixture", np.full(j, 1.0 / j))
         return Block(0, np.where(crash, CRASH, TIMEOUT).astype(np.int8), log_weight, columns, drawn)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from harness.estimators.block import MAX_CONTROL_STEPS, Block, Drawn
+from harness.estimators.block import MAX_CONTROL_STEPS, Block, SamplingPlan
 from harness.vocabulary import CRASH, TIMEOUT, BoolArray, FloatArray, IntArray, Method
 from studies.chains.chain import Chain
 
@@ -91,7 +91,7 @@ class Sampler:
             log_weight[np.isinf(log_weight)] = 0.0  # a forced cut-in that could not be
         outcome = np.where(self.after == self.chain.crashed, CRASH, TIMEOUT).astype(np.int8)
         weight_cap = {"nde": 1.0, "forced": cap, "episode_mixture": cap / DEFENSIVE_SHARE}.get(self.method)
-        return Block(first_episode, outcome, log_weight, columns, Drawn(self.method, self.alpha, weight_cap))
+        return Block(first_episode, outcome, log_weight, columns, SamplingPlan(self.method, self.alpha, weight_cap))
 
     def _step_before(self, t: int, rows: IntArray) -> None:
         chain, state = self.chain, self.path[rows, t]
@@ -195,7 +195,7 @@ class SingleChoice:
         ratios[:, 0] = np.exp(log_q + log_weight[:, None])
         columns = {"happened": np.ones(n, np.bool_), "log_q": log_q, "n_control_steps": np.ones(n, np.int64)}
         outcome = np.where(self.crash[maneuver], CRASH, TIMEOUT).astype(np.int8)
-        return Block(0, outcome, log_weight, {**columns, "first_ratios": ratios}, Drawn(method, self.alpha))
+        return Block(0, outcome, log_weight, {**columns, "first_ratios": ratios}, SamplingPlan(method, self.alpha))
 
 
 def with_optimal_function(tilt: float = 1.0) -> SingleChoice:

@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from harness.estimators.block import Block, Drawn
+from harness.estimators.block import Block, SamplingPlan
 from harness.estimators.tally import Tally
 from harness.strata import ShellDesign
 from harness.vocabulary import CRASH, FAILED, TIMEOUT, Method
@@ -45,7 +45,7 @@ def block(
     ).astype(np.int8)
     columns = {"happened": crashed, "log_q": np.zeros((n, 2)), "n_control_steps": np.ones(n, dtype=np.int64)}
     columns |= {"martingale": np.zeros((n, 2)), **more}
-    drawn = Drawn(method, np.full(2, 0.5) if alpha is None else alpha, weight_cap, epsilon=epsilon)
+    drawn = SamplingPlan(method, np.full(2, 0.5) if alpha is None else alpha, weight_cap, epsilon=epsilon)
     return Block(
         first_episode, outcome, np.array([0.0] * n if log_weight is None else log_weight, np.float64), columns, drawn
     )
@@ -57,7 +57,7 @@ def in_shells(strata: list[int], crash: list[bool], failed: list[bool] | None = 
     some = block(crash, failed=failed)
     columns = {"happened": np.ones(n, np.bool_), "stratum": stratum, "cell": stratum}
     columns["cell_mass"] = np.tile(SHELLS.p, (n, 1))
-    return Block(first, some.outcome, np.log(SHELLS.p)[strata], columns, Drawn("shells", shells=SHELLS))
+    return Block(first, some.outcome, np.log(SHELLS.p)[strata], columns, SamplingPlan("shells", shells=SHELLS))
 
 
 def tally(mass: np.ndarray, crashes: Sequence[int], tests: Sequence[int], failed: Sequence[int] | int = 0) -> Tally:

@@ -10,7 +10,7 @@ import pytest
 
 import harness
 from harness.compiled import unboxed
-from harness.estimators.block import Block, Drawn, joined
+from harness.estimators.block import Block, SamplingPlan, joined
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import SPEEDS_MPS, Impacts
 from harness.estimators.shells import SeenShells
@@ -120,7 +120,9 @@ def campaign_of(source, crashed, impact, rows, rng):
             "cell_mass": np.zeros((n, design.p.size)),
         }  # fmt: skip
         outcome = np.where(crash, CRASH, TIMEOUT).astype(np.int8)
-        block = Block(int(rounds.tally.tests.sum()), outcome, np.zeros(n), columns, Drawn("shells", shells=design))
+        block = Block(
+            int(rounds.tally.tests.sum()), outcome, np.zeros(n), columns, SamplingPlan("shells", shells=design)
+        )
         sums.add(block)
         if rounds.enough(block):
             break

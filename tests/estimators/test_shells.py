@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from harness.estimators.beside import share_of_crashes
-from harness.estimators.block import Drawn
+from harness.estimators.block import SamplingPlan
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
@@ -37,7 +37,7 @@ def shells_estimate(*rows: tuple[int, int, int, int], shells=SHELLS, **columns) 
     strata = np.repeat([stratum for stratum, *_ in rows], [sum(counts) for _, *counts in rows])
     end = np.concatenate([np.repeat(["crash", "failed", "passed"], counts) for _, *counts in rows])
     block = in_shells(strata, end == "crash", end == "failed")
-    block = replace(block, columns={**block.columns, **columns}, drawn=Drawn("shells", shells=shells))
+    block = replace(block, columns={**block.columns, **columns}, drawn=SamplingPlan("shells", shells=shells))
     return one_pass([block], ("shells",)).headline_estimate
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import Run, Stop
+from harness.campaign.sections import RunSettings, Stop
 from harness.estimators.answer import ended_by, expected_for
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import accumulator
@@ -34,7 +34,7 @@ def passing(n: int, *, rhw: float = 0.01, n_crashes: int = 1_000):
 
 @given(st.integers(1, 10**9), st.integers(1, 10**6))
 def test_looks_are_shard_boundaries_on_a_geometric_grid(n_episodes, shard_size):
-    looks = look_grid(n_episodes, Run(shard_size=shard_size).shard_ends(n_episodes))
+    looks = look_grid(n_episodes, RunSettings(shard_size=shard_size).shard_ends(n_episodes))
     assert looks[-1] == n_episodes
     assert all(a < b for a, b in itertools.pairwise(looks))
     assert all(look % shard_size == 0 for look in looks[:-1])

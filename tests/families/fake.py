@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.families.numbers import ParameterFile
-from harness.families.protocol import HOLDING, Chosen, Column, Family, every_event
+from harness.families.protocol import HOLDING, Chosen, Column, Exposure, Family, every_event
 from harness.families.script import natural_script
 
 P = {8.0: (0.02, 0.01), 100.0: (0.04, 0.03)}
@@ -28,6 +28,9 @@ class Fake(Family):
     model, default_parameters, ladders, n_uniforms = Numbers, "two-events", {False: "ladder-2"}, 1
     columns = Column("gap_m", pa.float64(), "m", "initial gap"), Column("event", pa.int64(), "1", "of two; -1: none")
 
+    def exposure(self, traffic, parameters):
+        return Exposure(2.0, 1.0, 4.0, None, "assumed")
+
     def start(self, traffic, u):
         return np.where(u < 0.5, *P).astype([("gap_m", float)])[:, 0]
 
@@ -43,12 +46,9 @@ class Fake(Family):
     def script(self, traffic, chosen):
         n, gap, at = len(chosen.at), chosen.facts["gap_m"], chosen.at[:, None]
         lanes = np.where((at >= 0) & (at <= STEPS), 0, 1).astype(np.int8)[:, :, None]
-        x, v, lane = (
-            np.stack((105.0 + gap, 0.0 * gap + 100.0), 1),
-            np.tile([20.0, 30.0], (n, 1)),
-            np.tile([1, 0], (n, 1)),
-        )
-        return natural_script(x, v, lane.astype(np.int8), np.full(lanes.shape, 20.0), lanes, chosen.at, chosen.lead)
+        x, v = np.stack((105.0 + gap, np.full(n, 100.0)), axis=1), np.tile([20.0, 30.0], (n, 1))
+        lane = np.tile(np.array([1, 0], np.int8), (n, 1))
+        return natural_script(x, v, lane, np.full(lanes.shape, 20.0), lanes, chosen.at, chosen.lead)
 
 
 FAKE = Fake()

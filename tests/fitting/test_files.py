@@ -12,7 +12,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.errors import HarnessError, TrajectoryError
 from harness.families.cut_in.fitting.hazard import FREE_TTC_S, fit_hazard
-from harness.families.cut_in.fitting.laws import LAWS, FittedLaw, Traffic
+from harness.families.cut_in.fitting.laws import LAWS, FittedLaw, ObservedTraffic
 from harness.families.cut_in.fitting.maximum import Maximum
 from harness.families.cut_in.fitting.observations import observe
 from harness.families.cut_in.loading import load_parameters
@@ -53,7 +53,7 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
 def test_a_hazard_above_what_a_second_allows_is_fitted(tmp_path):
     """Where BV nearly always cuts in within a second, the likelihood once had a bend, at which no maximum was found."""
     overtaking(2.0).assign(length_m=4.5).to_parquet(tmp_path / "rows.parquet", index=False)
-    traffic = Traffic.of(map(observe, recordings([tmp_path / "rows.parquet"], load_mapping())))
+    traffic = ObservedTraffic.of(map(observe, recordings([tmp_path / "rows.parquet"], load_mapping())))
     risk = traffic.at_risk[traffic.at_risk["ttc_s"] > FREE_TTC_S]
     wished = float(fit_hazard(traffic).rate(risk) @ risk["duration_s"])
     assert wished == pytest.approx(risk["changes"].sum(), rel=0.1)

@@ -4,16 +4,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness.families.cut_in.fitting.observations import Observations, Tally, observe, require_enough
+from harness.families.cut_in.fitting.observations import BesideCounts, Observations, observe, require_enough
 from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
 
 
-def observed(rows: pd.DataFrame, tmp_path, **mapping) -> tuple[list[Observations], Tally]:
+def observed(rows: pd.DataFrame, tmp_path, **mapping) -> tuple[list[Observations], BesideCounts]:
     file = tmp_path / "rows.parquet"
     rows.to_parquet(file, index=False)
     found = list(map(observe, recordings([file], load_mapping().model_copy(update=mapping))))
-    return found, Tally.of(found)
+    return found, BesideCounts.of(found)
 
 
 def joined(found: list[Observations], name: str) -> np.ndarray:

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from harness.errors import EXIT_BAD_INPUT, HarnessError, TrajectoryError
-from harness.families.cut_in.fitting.observations import Tally, observe, require_enough
+from harness.families.cut_in.fitting.observations import BesideCounts, observe, require_enough
 from harness.fitting.distinct import fingerprint, require_distinct
 from harness.fitting.table import load_mapping, recordings
 from tests.fitting.trajectories import overtaking
@@ -20,7 +20,7 @@ FEET = 1 / 0.3048
 ROWS = overtaking(2.5)
 
 
-def judged(file: Path, mapping: str | None = None, *others: Path, leave_out: tuple[str, ...] = ()) -> Tally:
+def judged(file: Path, mapping: str | None = None, *others: Path, leave_out: tuple[str, ...] = ()) -> BesideCounts:
     """What `harness fit` does with files before it fits."""
     read = load_mapping(mapping, leave_out=leave_out)
     read_in = list(recordings([file, *others], read))

@@ -10,7 +10,7 @@ import pytest
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.families import family_named
 from harness.records.reader import traffic_of
-from harness.report.drawing import Axis, Panel
+from harness.report.drawing import PlotAxis, PlotPanel
 from harness.report.plots import POOL, limits_of_others, sensitivity_plot, severity_plot, shells_plot
 from harness.report.summary import summarise
 from harness.vocabulary import CRASH, OUTCOMES
@@ -22,7 +22,7 @@ def marks(panel, kind):
 
 
 def test_texts_are_escaped_and_marks_stand_where_their_axis_says():
-    panel = Panel("<b>a & b</b>", Axis("gap", 0.0, 2e-7), Axis("rate", 1e-3, 10.0, log=True))
+    panel = PlotPanel("<b>a & b</b>", PlotAxis("gap", 0.0, 2e-7), PlotAxis("rate", 1e-3, 10.0, log=True))
     panel.add("line", "blue", [0.0, 1e-7, np.nan], [1e-3, 0.1, 1.0], label="a < b")
     panel.add("dots", "grey", [2e-7], [10.0], 3.0)
     svg = str(panel.svg)

@@ -9,7 +9,7 @@ from scipy.stats import gamma
 
 from harness.families.cut_in.fitting.fit import HEAVIEST_TAILS, fit_traffic
 from harness.families.cut_in.fitting.hazard import Acceptance
-from harness.families.cut_in.fitting.laws import Traffic
+from harness.families.cut_in.fitting.laws import ObservedTraffic
 from harness.families.cut_in.fitting.observations import observe
 from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.fitting.table import load_mapping, recordings
@@ -33,7 +33,7 @@ def test_traffic_is_fitted_whose_speed_differences_are_as_wide_as_on_motorways_a
     numbers["initial_state__r1dot_log_scale"] = 1.2
     numbers["free_driving__brake_logit"] = -12.0
     write(simulate(environment._replace(numbers=numbers), 5.0, 1), tmp_path / "wide.parquet")
-    traffic = Traffic.of(map(observe, recordings([tmp_path / "wide.parquet"], load_mapping())))
+    traffic = ObservedTraffic.of(map(observe, recordings([tmp_path / "wide.parquet"], load_mapping())))
     fit = fit_traffic(traffic, load_parameters(roundtrip.FITTED), roundtrip.FITTED.parameters, "wide", Progress())
     found = fit.environment.values()
     assert (

@@ -8,7 +8,7 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.estimators.block import Block, Drawn
+from harness.estimators.block import Block, SamplingPlan
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
 from harness.estimators.tally import combined
@@ -149,7 +149,7 @@ def as_block(drawn, tests, crashed, failed, first) -> Block:
     columns = {"stratum": np.array(drawn.design.cell_stratum)[cell], "cell": cell, "cell_mass": mass}
     if known is not None:
         columns |= {"shadow": path, "step": known.number[place], "event_mass": known.mass[place]}
-    return Block(first, outcome, np.zeros(cell.size), columns, Drawn("shells", shells=drawn.design))
+    return Block(first, outcome, np.zeros(cell.size), columns, SamplingPlan("shells", shells=drawn.design))
 
 
 @pytest.mark.parametrize("shadow_runs", [False, True])

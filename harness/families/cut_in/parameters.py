@@ -30,13 +30,13 @@ class EnvironmentParameters(ParameterFile):
 
     format: Literal["ndd-overtaking"]
     version: Literal[1]
-    scenario: sections.Scenario
+    scenario: sections.Horizon
     fit_range: FitRange
     initial_state: sections.InitialState
     free_driving: sections.FreeDriving
     car_following: sections.CarFollowing
-    guard: sections.Guard
-    cut_in: sections.CutIn
+    guard: sections.FollowingGuard
+    cut_in: sections.CutInLaw
     hazard_table: sections.HazardTable | None = None
     acceptance_steps: sections.AcceptanceSteps | None = None
     lateral: sections.Lateral | None = None

@@ -48,7 +48,7 @@ HAZARD_OF = {"v_mps": "v_log", "r1_m": "r1_log", "r1dot_mps": "r1dot_log"}
 """What the hazard of cut-ins depends on, and the names of its effects."""
 
 
-class Scenario(Section):
+class Horizon(Section):
     """Horizon of a test."""
 
     duration_s: Annotated[Number, within(1.0, 25.0), AfterValidator(in_whole_steps)]
@@ -111,7 +111,7 @@ class CarFollowing(Section):
     rate_cap_mps: Speed
 
 
-class Guard(Section):
+class FollowingGuard(Section):
     """What keeps BV off LV; part of p."""
 
     lead_braking_mps2: Braking
@@ -120,7 +120,7 @@ class Guard(Section):
     margin_m: Gap
 
 
-class CutIn(Section):
+class CutInLaw(Section):
     """Hazard of the cut-in; coefficients in whose place there is a table are left out (`REPLACED`)."""
 
     intercept: Coefficient | None = None
@@ -139,7 +139,7 @@ class CutIn(Section):
 
 _ACCEPTANCE = ("ignore_share", "accept_ttc_s", "accept_scale_s")
 REPLACED = {
-    "hazard_table": tuple(name for name in CutIn.model_fields if name not in (*_ACCEPTANCE, "max_probability_1s")),
+    "hazard_table": tuple(name for name in CutInLaw.model_fields if name not in (*_ACCEPTANCE, "max_probability_1s")),
     "acceptance_steps": _ACCEPTANCE,
 }
 """Coefficients of ``cut_in`` in whose place a table may stand."""

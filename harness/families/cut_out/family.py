@@ -13,7 +13,7 @@ from scipy.special import ndtr, ndtri
 
 from harness.campaign.sections import Section
 from harness.families.cut_out.words import CLOSING, TTC, WORDS
-from harness.families.following.approach import Following
+from harness.families.following.approach import FollowingTraffic
 from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import FollowingParameters, grid_of
 from harness.families.numbers import Number, Share, ordered, within
@@ -120,7 +120,7 @@ class CutOut(FollowingFamily):
         what = f"one at {speed:.1f} m/s, {facts['closing_mps']:.1f} m/s slower" if speed > 0.0 else "one that stands"
         return f"at {facts['lateral_speed_mps']:.1f} m/s sideways, and reveals {what}"
 
-    def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
+    def facts_of(self, traffic: FollowingTraffic, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
         clear_m, visible_m = (float(traffic.numbers[name]) for name in ("clear_m", "visible_from_m"))
         clear = [0 if np.isnan(w) else seen_after(clear_m, w, NEVER) for w in events["lateral_mps"]]
         seen = [c - seen_after(visible_m, w, c) if c else 0 for c, w in zip(clear, events["lateral_mps"], strict=True)]

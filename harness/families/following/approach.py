@@ -26,7 +26,7 @@ _GRID_MPS2 = 0.2
 START_DTYPE = np.dtype([("speed_mps", np.float64), ("natural_headway_s", np.float64)])
 
 
-class Following(NamedTuple):
+class FollowingTraffic(NamedTuple):
     """What kernels need of such a traffic.
 
     ``numbers`` is a record: steps, and parameters by their flat names. ``grid``, ``share`` (E,) are the events and
@@ -45,7 +45,7 @@ class Motion(NamedTuple):
     v: FloatArray
 
 
-def empty_motion(traffic: Following) -> Motion:
+def empty_motion(traffic: FollowingTraffic) -> Motion:
     """Room for one test."""
     return Motion(*np.zeros((2, int(traffic.numbers["max_steps"]) + 1, 2)))
 

@@ -15,7 +15,7 @@ from harness.compiled import unboxed
 from harness.families.following.approach import (
     AV_START_M,
     START_DTYPE,
-    Following,
+    FollowingTraffic,
     drawn_accelerations,
     empty_motion,
     starts_from,
@@ -49,7 +49,7 @@ class FollowingFamily(Family):
     n_uniforms, follows, stand_ins = 2, True, STAND_INS
     model: type[FollowingParameters]
 
-    def traffic(self, settings: EnvironmentSettings, parameters: FollowingParameters | None = None) -> Following:
+    def traffic(self, settings: EnvironmentSettings, parameters: FollowingParameters | None = None) -> FollowingTraffic:
         given = parameters or self.parameters(settings)
         values = given.values()
         onset = round(values["approach__duration_s"] / STEP_S)
@@ -61,43 +61,43 @@ class FollowingFamily(Family):
         known = {name: value for name, value in values.items() if name.startswith(kernel)} | clear | scope
         dtype = [*((name, "f8") for name in known), *((name, "i8") for name in steps)]
         numbers = np.array([(*known.values(), *steps.values())], dtype)[0]
-        return Following(numbers, *given.grid())
+        return FollowingTraffic(numbers, *given.grid())
 
-    def max_steps(self, traffic: Following) -> int:
+    def max_steps(self, traffic: FollowingTraffic) -> int:
         return int(traffic.numbers["max_steps"])
 
-    def sideways_m(self, traffic: Following) -> float:
+    def sideways_m(self, traffic: FollowingTraffic) -> float:
         return float(np.nan_to_num(traffic.numbers["clear_m"]))
 
-    def mean_speed_mps(self, traffic: Following) -> float:
+    def mean_speed_mps(self, traffic: FollowingTraffic) -> float:
         """Of the vehicle ahead, as it approaches."""
         nothing = self.choose(traffic, 0, _usual_paths(traffic), np.full(N_SPEEDS, -1))
         speed = self._moved(traffic, nothing.facts)[1]
         return float(speed[:, : int(traffic.numbers["onset"]), 0].mean())
 
-    def share_in_scope(self, traffic: Following) -> float:
+    def share_in_scope(self, traffic: FollowingTraffic) -> float:
         """Share of events that are in scope."""
         found = self.events(traffic, 0, _usual_paths(traffic), Followers(driver_records([])))
         return float(np.exp(found.log_any).mean())
 
-    def exposure(self, traffic: Following, parameters: FollowingParameters) -> Exposure:
+    def exposure(self, traffic: FollowingTraffic, parameters: FollowingParameters) -> Exposure:
         given, share = parameters.counted(), self.share_in_scope(traffic)
         counted = given.counted and (given.counted[0], given.counted[1] / share)
         return Exposure(given.per_hour * share, given.low * share, given.high * share, counted, given.source)
 
-    def milder(self, traffic: Following) -> Following | None:
+    def milder(self, traffic: FollowingTraffic) -> FollowingTraffic | None:
         if (scope := float(traffic.numbers["scope_mps2"])) <= MILDEST_MPS2:
             return None
         numbers = traffic.numbers.copy()
         numbers["scope_mps2"], numbers["below_mps2"] = MILDEST_MPS2, scope
         return traffic._replace(numbers=numbers)
 
-    def start(self, traffic: Following, u: FloatArray) -> RecordArray:
+    def start(self, traffic: FollowingTraffic, u: FloatArray) -> RecordArray:
         return starts_from(traffic.numbers, u)
 
     def events(
         self,
-        traffic: Following,
+        traffic: FollowingTraffic,
         seed: int,
         paths: Paths,
         drivers: Followers,
@@ -115,7 +115,9 @@ class FollowingFamily(Family):
         enumerate_events(paths.start, accelerations, stride, first, *known, at, at_onset, unboxed(found))
         return found
 
-    def choose(self, traffic: Following, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
+    def choose(
+        self, traffic: FollowingTraffic, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True
+    ) -> Chosen:
         n, seconds = event.size, -(-int(traffic.numbers["onset"]) // 10)
         lists = [("lead_accelerations", np.int8, (seconds,)), ("n_seconds", np.int64)]
         real = [(each.name, np.float64) for each in self.columns if each.kind == pa.float64()]
@@ -134,18 +136,18 @@ class FollowingFamily(Family):
         lead = np.where(clear - onset < traffic.numbers["max_steps"], clear - onset - 1, 0)
         return Chosen(facts, np.where(event < 0, -1, onset + lead), np.where(event < 0, 0, lead))
 
-    def facts_of(self, traffic: Following, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
+    def facts_of(self, traffic: FollowingTraffic, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
         """Facts of the family's own, of events (n,) with a vehicle ahead at a speed: here those of its grid."""
         return {each.name: events[each.name] for each in self.columns if each.name in (EVENT_DTYPE.names or ())}
 
-    def _moved(self, traffic: Following, facts: RecordArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    def _moved(self, traffic: FollowingTraffic, facts: RecordArray) -> tuple[FloatArray, FloatArray, IntArray]:
         n, others = len(facts), len(self.vehicles) - 1
         x, speed = np.zeros((n, others)), np.zeros((n, self.max_steps(traffic), others))
         clear = np.zeros(n, np.int64)
         move_others(_tests(traffic, facts), unboxed(traffic), unboxed(empty_motion(traffic)), x, speed, clear)
         return x, speed, clear
 
-    def script(self, traffic: Following, chosen: Chosen) -> Script:
+    def script(self, traffic: FollowingTraffic, chosen: Chosen) -> Script:
         facts, onset = chosen.facts, int(traffic.numbers["onset"])
         ahead, speed, clear = self._moved(traffic, facts)
         n, steps, others = speed.shape
@@ -170,7 +172,7 @@ class FollowingFamily(Family):
         )
 
     def drive(
-        self, traffic: Following, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
+        self, traffic: FollowingTraffic, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
     ) -> Driven:
         steps, facts = self.max_steps(traffic), chosen.facts  # whoever follows has done so from the start
         end, tracks = np.zeros((len(facts), len(drivers)), np.int64), np.zeros((len(drivers), steps + 1, 2))
@@ -181,7 +183,7 @@ class FollowingFamily(Family):
         return Driven(end, tracks if last else np.zeros((0, 0, 0)), ahead if last else np.zeros((0, 0)))
 
 
-def _tests(traffic: Following, facts: RecordArray) -> Tests:
+def _tests(traffic: FollowingTraffic, facts: RecordArray) -> Tests:
     """Tests (n,) by their facts, for kernels."""
     start: RecordArray = np.zeros(len(facts), START_DTYPE)
     start["speed_mps"], start["natural_headway_s"] = facts["start_speed_mps"], facts["natural_headway_s"]
@@ -189,11 +191,11 @@ def _tests(traffic: Following, facts: RecordArray) -> Tests:
     return unboxed(Tests(start, drawn, events_of(traffic, facts["event"])))
 
 
-def events_of(traffic: Following, number: IntArray) -> RecordArray:
+def events_of(traffic: FollowingTraffic, number: IntArray) -> RecordArray:
     """Events (n,) by their numbers in the grid; for -1 one in which nothing happens."""
     return np.append(traffic.grid, NO_EVENT)[number]
 
 
-def _usual_paths(traffic: Following) -> Paths:
+def _usual_paths(traffic: FollowingTraffic) -> Paths:
     u = (np.arange(N_SPEEDS) + 0.5) / N_SPEEDS
     return Paths(np.arange(N_SPEEDS), starts_from(traffic.numbers, np.column_stack((u, u))))

@@ -8,7 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.compiled import compiled_inline, compiled_threads
-from harness.families.following.approach import AV_START_M, LEAD, REVEALED, Following, Motion, happen, in_scope, walk
+from harness.families.following.approach import (
+    AV_START_M,
+    LEAD,
+    REVEALED,
+    FollowingTraffic,
+    Motion,
+    happen,
+    in_scope,
+    walk,
+)
 from harness.families.protocol import Events
 from harness.families.script import NEVER
 from harness.vehicles.drivers import Followers
@@ -56,7 +65,7 @@ def set_out(
     x: float,
     v: float,
     a: float,
-    traffic: Following,
+    traffic: FollowingTraffic,
     motion: Motion,
     at: Record,
 ) -> None:
@@ -123,7 +132,7 @@ def enumerate_events(
     accelerations: Int8Array,
     stride: int,
     offset: IntArray,
-    traffic: Following,
+    traffic: FollowingTraffic,
     followers: Followers,
     motion: Motion,
     at: RecordArray,
@@ -172,7 +181,7 @@ def enumerate_events(
 
 @compiled_threads
 def move_others(
-    tests: Tests, traffic: Following, motion: Motion, x: FloatArray, speed: FloatArray, clear: IntArray
+    tests: Tests, traffic: FollowingTraffic, motion: Motion, x: FloatArray, speed: FloatArray, clear: IntArray
 ) -> None:
     """The others' motion in tests (n,): first positions (n, O), speeds (n, steps, O), steps from which they are clear.
 
@@ -191,7 +200,7 @@ def move_others(
 @compiled_threads
 def drive_others(
     tests: Tests,
-    traffic: Following,
+    traffic: FollowingTraffic,
     drivers: RecordArray,
     motion: Motion,
     at: RecordArray,

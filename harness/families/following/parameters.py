@@ -53,7 +53,7 @@ def grid_of(**laws: tuple[FloatArray, FloatArray]) -> tuple[RecordArray, FloatAr
     return grid.ravel(), share.ravel()
 
 
-class FreeDriving(Section):
+class LeaderDriving(Section):
     """How the vehicle ahead drives before the event, each second anew."""
 
     df: DegreesOfFreedom
@@ -89,7 +89,7 @@ class FollowingParameters(ParameterFile):
 
     fit_range: FitRange
     initial_state: SpeedsAndGaps
-    free_driving: FreeDriving
+    free_driving: LeaderDriving
     approach: Approach
     exposure: Counted
 

@@ -19,7 +19,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
 from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.fitting.hazard import FREE_TTC_S, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
-from harness.families.cut_in.fitting.laws import LAWS, FittedLaw, Traffic, fit_rate
+from harness.families.cut_in.fitting.laws import LAWS, FittedLaw, ObservedTraffic, fit_rate
 from harness.families.cut_in.loading import load_environment, require_sound_laws
 from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.families.cut_in.sections import HAZARD_OF, REPLACED
@@ -41,7 +41,7 @@ class Fit:
     kept from it, by its subject.
     """
 
-    traffic: Traffic
+    traffic: ObservedTraffic
     base: EnvironmentParameters
     base_name: str
     laws: dict[str, FittedLaw]
@@ -51,7 +51,9 @@ class Fit:
     environment: EnvironmentParameters
 
 
-def fit_traffic(traffic: Traffic, base: EnvironmentParameters, base_name: str, where: str, progress: Progress) -> Fit:
+def fit_traffic(
+    traffic: ObservedTraffic, base: EnvironmentParameters, base_name: str, where: str, progress: Progress
+) -> Fit:
     """Fit all laws.
 
     Raises `TrajectoryError`: no hazard can be fitted, or tests cannot be drawn from the laws; ``where`` names the

@@ -11,8 +11,8 @@ import pyarrow as pa
 from harness.campaign.files import read_model
 from harness.campaign.yaml_text import yaml_text
 from harness.families.cut_in.fitting.fit import Fit, fit_traffic, replicates
-from harness.families.cut_in.fitting.laws import Traffic
-from harness.families.cut_in.fitting.observations import Observations, Tally, observe, require_enough
+from harness.families.cut_in.fitting.laws import ObservedTraffic
+from harness.families.cut_in.fitting.observations import BesideCounts, Observations, observe, require_enough
 from harness.families.cut_in.fitting.page import CONFIDENCE, page
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.files import content_hash
@@ -46,7 +46,7 @@ class CutInFitter:
     def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:
         where = places(asked.files)
         tally = require_enough(self._seen, where, asked.read)
-        fit = fit_traffic(Traffic.of(self._seen), self._base, BASE, where, asked.progress)
+        fit = fit_traffic(ObservedTraffic.of(self._seen), self._base, BASE, where, asked.progress)
         rows = replicates(fit, asked.n_replicates, asked.seed, asked.progress)
         noise_mps2 = math.sqrt(math.fsum(each.noise_mps2**2 for each in self._seen) / len(self._seen))
         out, shown, beside = self.marks(asked.out)
@@ -59,7 +59,7 @@ class CutInFitter:
         return Fitted(files, _told(fit, tally, asked.n_replicates), _facts(fit, tally))
 
 
-def _text(fit: Fit, tally: Tally, asked: Asked) -> str:
+def _text(fit: Fit, tally: BesideCounts, asked: Asked) -> str:
     clusters = "recording" if fit.traffic.by_recording else "vehicle, as recordings are few"
     head = [
         f"{fit.traffic.n_recordings} recordings: "
@@ -71,7 +71,7 @@ def _text(fit: Fit, tally: Tally, asked: Asked) -> str:
     return environment_text(head, fit.environment.model_dump(exclude_defaults=True))
 
 
-def _told(fit: Fit, tally: Tally, n_replicates: int) -> tuple[str, ...]:
+def _told(fit: Fit, tally: BesideCounts, n_replicates: int) -> tuple[str, ...]:
     traffic, steps, unseen = fit.traffic, fit.acceptance, fit.environment.unseen
     limited = f"! no lane change seen at {unseen}: rates of crashes that begin there have only an upper limit"
     return (
@@ -85,7 +85,7 @@ def _told(fit: Fit, tally: Tally, n_replicates: int) -> tuple[str, ...]:
     )
 
 
-def _facts(fit: Fit, tally: Tally) -> dict[str, object]:
+def _facts(fit: Fit, tally: BesideCounts) -> dict[str, object]:
     steps, traffic = fit.acceptance, fit.traffic
     counted = {"events": steps.events.tolist(), "exposure": steps.exposure.tolist()}
     return {

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from harness.families.cut_in.fitting.laws import FittedLaw, Traffic
+from harness.families.cut_in.fitting.laws import FittedLaw, ObservedTraffic
 from harness.families.cut_in.fitting.maximum import Prior, maximise
 from harness.families.cut_in.sections import HAZARD_OF, SMALLEST_SHARE
 from harness.vocabulary import FloatArray, IntArray, RecordArray
@@ -41,7 +41,7 @@ class Hazard:
         return np.exp(_design(self.knots, rows) @ self.law.maximum.theta)
 
 
-def fit_hazard(traffic: Traffic) -> Hazard | None:
+def fit_hazard(traffic: ObservedTraffic) -> Hazard | None:
     """Fit it; None if there is no lane change, or no maximum is found."""
     rows = traffic.at_risk[traffic.at_risk["ttc_s"] > FREE_TTC_S]
     n_changes = int(rows["changes"].sum())
@@ -120,7 +120,7 @@ class Acceptance:
     duration_s: FloatArray
 
     @classmethod
-    def of(cls, traffic: Traffic, hazard: Hazard) -> Acceptance:
+    def of(cls, traffic: ObservedTraffic, hazard: Hazard) -> Acceptance:
         """Count lane changes and what is expected."""
         rows = traffic.at_risk
         at = np.searchsorted(TTC_EDGES_S, rows["ttc_s"], side="right")

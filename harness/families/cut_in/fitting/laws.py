@@ -33,7 +33,7 @@ _TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
-class Traffic:
+class ObservedTraffic:
     """Observations of all recordings; ``vehicle`` numbers all vehicles, ``recording`` (vehicles,) is that of each."""
 
     free: RecordArray
@@ -44,7 +44,7 @@ class Traffic:
     recording: IntArray
 
     @classmethod
-    def of(cls, observations: Iterable[Observations]) -> Traffic:
+    def of(cls, observations: Iterable[Observations]) -> ObservedTraffic:
         """Join recordings."""
         alone = []
         for i, seen in enumerate(observations):
@@ -54,7 +54,7 @@ class Traffic:
         return cls.joined(alone)
 
     @classmethod
-    def joined(cls, parts: Iterable[Traffic]) -> Traffic:
+    def joined(cls, parts: Iterable[ObservedTraffic]) -> ObservedTraffic:
         """Join parts, whose recordings have different numbers."""
         parts = list(parts)
         before = np.cumsum([0, *(part.recording.size for part in parts)])
@@ -148,7 +148,7 @@ def _fitted(
     spread: Mapping[str, float],
     log_likelihood: LogLikelihood,
     designs: Sequence[FloatArray],
-    traffic: Traffic,
+    traffic: ObservedTraffic,
     rows: RecordArray,
     base: Base,
     starts: Sequence[FloatArray] = (),
@@ -180,7 +180,7 @@ def _fitted(
 # -- initial states --
 
 
-def fit_speed(traffic: Traffic, base: Base) -> FittedLaw | None:
+def fit_speed(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
     """v_BV: skew-normal, truncated to the fit range."""
     rows, spread = traffic.initial, {"v_location_mps": 10.0, "v_scale_mps": 1.0, "v_shape": 4.0}
     if rows.size < FEWEST["initial"]:
@@ -200,7 +200,7 @@ def fit_speed(traffic: Traffic, base: Base) -> FittedLaw | None:
     return _fitted("initial_state", spread, log_likelihood, designs, traffic, rows, base, starts)
 
 
-def fit_gap(traffic: Traffic, base: Base) -> FittedLaw | None:
+def fit_gap(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
     """R1 given v_BV: shifted log-normal, truncated to the fit range."""
     rows = traffic.initial
     spread = {"r1_shift_m": 5.0, "r1_shift_u_m": 5.0, "r1_log_mean": 1.5, "r1_log_mean_u": 1.0}
@@ -224,7 +224,7 @@ def fit_gap(traffic: Traffic, base: Base) -> FittedLaw | None:
     return _fitted("initial_state", spread, log_likelihood, [design] * 3, traffic, rows, base, [plain])
 
 
-def fit_rate(traffic: Traffic, base: Base, kept: str = "") -> FittedLaw | None:
+def fit_rate(traffic: ObservedTraffic, base: Base, kept: str = "") -> FittedLaw | None:
     """R1dot given v_BV and R1: Student's t, truncated at the smallest time to collision; one number may be ``kept``."""
     least_s = base["initial_state__r1dot_min_ttc_s"]
     rows = traffic.initial[traffic.initial["r1dot_mps"] > -traffic.initial["r1_m"] / least_s]
@@ -274,7 +274,7 @@ def _binned(k: IntArray, cap: IntArray | int) -> RecordArray:
     return out
 
 
-def fit_free_driving(traffic: Traffic, base: Base) -> FittedLaw | None:
+def fit_free_driving(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
     """Accelerations in free driving: Student's t, mixed with a share that brakes."""
     rows = traffic.free
     spread = {"location_mps2": 0.5, "log_scale": 1.5, "log_scale_u": 1.0, "log_scale_uu": 1.0, "df": 1.5}
@@ -310,7 +310,7 @@ def guard_caps(r1: FloatArray, r1dot: FloatArray, base: Base) -> IntArray:
     return np.asarray(np.maximum(cap, 0), np.int64)
 
 
-def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
+def fit_car_following(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
     """Accelerations behind a leader; guard and behaviour near standstill are kept.
 
     The mean's coefficients are those of R1dot and R1, three of the gap's polynomial in u, and the closing gain.
@@ -357,7 +357,7 @@ def fit_car_following(traffic: Traffic, base: Base) -> FittedLaw | None:
     return None if found is None else FittedLaw(named, values, found)
 
 
-def fit_leads(traffic: Traffic, base: Base) -> FittedLaw | None:
+def fit_leads(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
     """Time from onset of lateral motion to overlap: log-normal, at most the longest, in steps."""
     rows, longest_s = traffic.leads, base["lateral__longest_lead_s"]
     if rows.size < FEWEST["leads"]:
@@ -381,7 +381,7 @@ def fit_leads(traffic: Traffic, base: Base) -> FittedLaw | None:
     return None if found is None else FittedLaw(names, values, found)
 
 
-LAWS: dict[str, tuple[Callable[[Traffic, Base], FittedLaw | None], str]] = {
+LAWS: dict[str, tuple[Callable[[ObservedTraffic, Base], FittedLaw | None], str]] = {
     "speed": (fit_speed, "speeds of BV"),
     "gap": (fit_gap, "gaps to LV"),
     "rate": (fit_rate, "speed differences to LV"),

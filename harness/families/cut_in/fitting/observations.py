@@ -60,7 +60,7 @@ OTHER_SIDE = 10.0
 """If vehicles close in this many times as long on the other side, that side must be meant."""
 
 
-class Tally(NamedTuple):
+class BesideCounts(NamedTuple):
     """Counts of vehicles beside the target lane, by which all recordings are judged together."""
 
     vehicles: int = 0
@@ -84,7 +84,7 @@ class Tally(NamedTuple):
     """The same on the other side."""
 
     @classmethod
-    def of(cls, found: Iterable[Observations]) -> Tally:
+    def of(cls, found: Iterable[Observations]) -> BesideCounts:
         """Sum over recordings."""
         summed: list[Any] = [sum(counts) for counts in zip(*(each.tally for each in found), strict=True)]
         return cls(*summed)
@@ -115,7 +115,7 @@ class Observations:
     above 4 s may be lower limits."""
     noise_mps2: float
     """Standard deviation of ``acceleration_mps2`` by white measurement noise."""
-    tally: Tally
+    tally: BesideCounts
 
 
 def observe(track: Recording) -> Observations:
@@ -142,7 +142,7 @@ def observe(track: Recording) -> Observations:
     columns |= {"ttc_s": state.ttc_s, "acceleration_mps2": acceleration, "changes": crosses}
     leads, odd = _leads(track, rows[crosses & state.fits])
     overlaps = state.follows & (state.r1 < OVERLAP_M)
-    tally = Tally(
+    tally = BesideCounts(
         vehicles=np.unique(track.vehicle[rows]).size,
         driven_s=float(duration_s.sum()),
         outside_s=float(duration_s[~state.fits].sum()),
@@ -180,7 +180,7 @@ def _records(kind: str, columns: dict[str, RecordArray], inside: BoolArray) -> R
 
 
 def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int]:
-    """Leads of some crossings (rows before them), and how many are `Tally.odd`.
+    """Leads of some crossings (rows before them), and how many are `BesideCounts.odd`.
 
     The onset is the bend of a line, level before and straight from there to the crossing, fitted to the lateral
     positions: the law's motion at constant lateral speed. Where none is seen, the lead is the time that was searched,
@@ -219,12 +219,12 @@ def _onset(time_s: FloatArray, lateral: FloatArray) -> float:
 # -- is it enough? --
 
 
-def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) -> Tally:
+def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) -> BesideCounts:
     """Refuse recordings that are too few, or that were read wrongly by the ``mapping``; the sum of their counts.
 
     Raises `TrajectoryError`: a rule is broken; it says which, and by which recording most; ``where`` names the files.
     """
-    total = Tally.of(found)
+    total = BesideCounts.of(found)
 
     def refuse(words: str, expected: str, mend: str, column: str = "", most: str = "") -> TrajectoryError:
         largest = max(found, key=lambda each: float(getattr(each.tally, most or "used")))

@@ -16,14 +16,14 @@ from harness.estimators.limits import garwood
 from harness.families.cut_in.fitting.fit import Fit
 from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
 from harness.families.cut_in.fitting.laws import bins
-from harness.families.cut_in.fitting.observations import Tally
+from harness.families.cut_in.fitting.observations import BesideCounts
 from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.sections import HAZARD_OF
 from harness.fitting.protocol import Asked
 from harness.numbers import number
-from harness.report.drawing import Axis, Panel, Plot
+from harness.report.drawing import Plot, PlotAxis, PlotPanel
 from harness.report.templates import templates
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, IntArray, RecordArray
 
@@ -35,7 +35,7 @@ MOST_ROWS = 20_000
 _SEED = 1
 
 
-def page(fit: Fit, tally: Tally, noise_mps2: float, asked: Asked, others: Sequence[str]) -> str:
+def page(fit: Fit, tally: BesideCounts, noise_mps2: float, asked: Asked, others: Sequence[str]) -> str:
     """The page, self-contained.
 
     ``noise_mps2`` is the standard deviation of accelerations by measurement noise; ``others`` say what was found for
@@ -105,34 +105,34 @@ def _histogram(values: FloatArray, edges: FloatArray) -> FloatArray:
 def _beside(
     title: str,
     label: str,
-    y: Axis,
+    y: PlotAxis,
     edges: FloatArray,
     seen: FloatArray,
     law: tuple[FloatArray, FloatArray],
     words: tuple[str, str] = ("seen", "law"),
-) -> Panel:
+) -> PlotPanel:
     """A histogram (n,) between edges (n + 1,), and points of the law's line."""
-    panel, (at, line) = Panel(title, Axis(label, float(edges[0]), float(edges[-1])), y), law
+    panel, (at, line) = PlotPanel(title, PlotAxis(label, float(edges[0]), float(edges[-1])), y), law
     low = np.full(seen.size, y.low)
     panel.add("boxes", "blue", edges[:-1], edges[1:], low, np.maximum(seen, low), opacity=0.3, label=words[0])
     panel.add("line", "vermillion", at, np.maximum(line, y.low), label=words[1])
     return panel
 
 
-def _add_limits(panel: Panel, edges: FloatArray, low: FloatArray, high: FloatArray, label: str) -> None:
+def _add_limits(panel: PlotPanel, edges: FloatArray, low: FloatArray, high: FloatArray, label: str) -> None:
     """Limits (n,) between edges (n + 1,), as far as they are within the panel."""
     low, high = (np.clip(each, panel.y.low, panel.y.high) for each in (low, high))
     panel.add("boxes", "blue", edges[:-1], edges[1:], low, high, opacity=0.18, label=label)
 
 
-def _density(*curves: FloatArray) -> Axis:
-    return Axis("density", 0.0, 1.15 * max(float(each.max()) for each in curves))
+def _density(*curves: FloatArray) -> PlotAxis:
+    return PlotAxis("density", 0.0, 1.15 * max(float(each.max()) for each in curves))
 
 
 def _acceptance_plot(fit: Fit) -> Plot:
     found, edges = fit.acceptance, np.array([0.0, *TTC_EDGES_S, 12.0])
-    y = Axis("share carried out", 1e-3, 3.0, log=True)
-    panel = Panel("", Axis("time to collision, s", 0.0, 12.0), y, height=280.0)
+    y = PlotAxis("share carried out", 1e-3, 3.0, log=True)
+    panel = PlotPanel("", PlotAxis("time to collision, s", 0.0, 12.0), y, height=280.0)
     limits = _limits(found.events, found.exposure)
     _add_limits(panel, edges, *limits, f"{numbers.share(CONFIDENCE)} limits by bin")
     steps = np.repeat(edges, 2)[1:-1]
@@ -167,7 +167,9 @@ def _hazard_plot(fit: Fit) -> Plot:
         per_1000_s = np.maximum(time_s, 1e-9) / 1000.0
         low, high = _limits(seen, per_1000_s)
         top = 1.1 * float(max(high.max(), (wished / per_1000_s).max()))
-        panel = Panel("", Axis(label, float(edges[0]), float(edges[-1])), Axis("lane changes per 1,000 s", 0.0, top))
+        panel = PlotPanel(
+            "", PlotAxis(label, float(edges[0]), float(edges[-1])), PlotAxis("lane changes per 1,000 s", 0.0, top)
+        )
         _add_limits(panel, edges, low, high, "seen, 90 % limits")
         panel.add("line", "blue", middle, wished / per_1000_s, label="fitted")
         panels.append(panel)
@@ -193,14 +195,14 @@ def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
     return Plot("initial", panels, alt, "States behind a leader, one per vehicle and 20 s.")
 
 
-def _acceleration_panel(rows: RecordArray, title: str, traffic: Environment) -> Panel:
+def _acceleration_panel(rows: RecordArray, title: str, traffic: Environment) -> PlotPanel:
     step = -(-rows.size // MOST_ROWS)
     some = rows[::step]
     names = rows.dtype.names or ()
     states = np.column_stack([some[name] if name in names else np.zeros(some.size) for name in HAZARD_OF])
     pmf = evaluate_laws(traffic, states).pmf[CAR_FOLLOWING if "r1_m" in names else FREE_DRIVING]
     law, seen = pmf.mean(axis=0), np.bincount(bins(rows["acceleration_mps2"]), minlength=N_ACCELERATIONS) / rows.size
-    y = Axis("share", 10.0 ** math.floor(math.log10(min(1.0 / rows.size, 0.1))), 1.0, log=True)
+    y = PlotAxis("share", 10.0 ** math.floor(math.log10(min(1.0 / rows.size, 0.1))), 1.0, log=True)
     edges = np.append(ACCELERATIONS_MPS2 - 0.1, ACCELERATIONS_MPS2[-1] + 0.1)
     return _beside(title, "acceleration of one second, m/s²", y, edges, seen, (ACCELERATIONS_MPS2, law))
 

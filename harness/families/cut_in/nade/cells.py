@@ -73,7 +73,7 @@ class Scratch(NamedTuple):
     path: Trajectory
 
 
-class Nade(NamedTuple):
+class NadeKernel(NamedTuple):
     """All that NADE's kernels need beside the loop's.
 
     ``states`` (n,) are the initial states of a shard's tests, ``cell`` (K,) `CELL_DTYPE` records of those that run, for
@@ -92,7 +92,7 @@ class Nade(NamedTuple):
 
 def empty_nade(
     states: RecordArray, n_cells: int, environment: Environment, importance: Importance, moment_limit: int
-) -> Nade:
+) -> NadeKernel:
     """Room for the tests (n,) that begin in ``states``, of which K run side by side."""
     n, n_surrogates, capacity = len(states), importance.n_surrogates, CONTROL_STEPS * len(states) + n_cells
     _, hold_steps, n_draws = lengths(environment)
@@ -107,7 +107,7 @@ def empty_nade(
     scratch = np.zeros(N_ACCELERATIONS), q, q_acceleration, challenge, ratio, empty_trajectory(environment)
     running = np.zeros(n_cells, CELL_DTYPE), cutting, staying
     drawn = Drawn(n_lv, n_bv, log_q, martingale, lv_path, bv_path, *moments)
-    return Nade(states, *running, drawn, Scratch(*scratch), environment, importance)
+    return NadeKernel(states, *running, drawn, Scratch(*scratch), environment, importance)
 
 
 def with_more_room(drawn: Drawn) -> Drawn:

@@ -11,7 +11,7 @@ import math
 from harness.compiled import compiled, compiled_inline
 from harness.families.cut_in import laws
 from harness.families.cut_in.laws import acceleration, draw_acceleration
-from harness.families.cut_in.nade.cells import Nade
+from harness.families.cut_in.nade.cells import NadeKernel
 from harness.families.cut_in.nade.challenge import remaining_level
 from harness.families.cut_in.nade.functions import challenges_nobody, look_ahead, propose_acceleration, propose_cut_in
 from harness.families.cut_in.nade.likelihood_ratio import log_mixture, record_acceleration, record_lane
@@ -29,7 +29,7 @@ RIGHT = 0
 
 
 @compiled
-def decide(kernel: KernelState, nade: Nade, placed: int) -> None:
+def decide(kernel: KernelState, nade: NadeKernel, placed: int) -> None:
     """Draw what LV and BV do in the coming step, in every cell; in the first ``placed`` cells tests begin."""
     cells = kernel.cells
     for i in range(placed):
@@ -44,7 +44,7 @@ def decide(kernel: KernelState, nade: Nade, placed: int) -> None:
 
 
 @compiled
-def finish(kernel: KernelState, nade: Nade, n: int) -> None:
+def finish(kernel: KernelState, nade: NadeKernel, n: int) -> None:
     """Write what the ``n`` tests weigh that have just ended to their rows."""
     for i in range(n):
         k, row = kernel.cells.ended[i], kernel.cells.ended_row[i]
@@ -55,7 +55,7 @@ def finish(kernel: KernelState, nade: Nade, n: int) -> None:
 
 
 @compiled_inline
-def draw_maneuvers(k: int, state: State, kernel: KernelState, nade: Nade) -> None:
+def draw_maneuvers(k: int, state: State, kernel: KernelState, nade: NadeKernel) -> None:
     """Redraw where a hold period begins; before the cut-in, stay or cut in."""
     hold_steps = nade.environment.numbers.hold_steps
     cell = kernel.cells.cell[k]
@@ -76,7 +76,7 @@ def draw_maneuvers(k: int, state: State, kernel: KernelState, nade: Nade) -> Non
 
 
 @compiled_inline
-def redraw_following(k: int, period: int, state: State, kernel: KernelState, nade: Nade) -> None:
+def redraw_following(k: int, period: int, state: State, kernel: KernelState, nade: NadeKernel) -> None:
     """BV's acceleration behind LV, and what cutting in or staying would be worth during the coming hold period."""
     cell, draws = kernel.cells.cell[k], nade.cell[k]
     u = uniform(kernel.seed, cell.episode, BV_DRAWS, period)
@@ -88,7 +88,7 @@ def redraw_following(k: int, period: int, state: State, kernel: KernelState, nad
 
 
 @compiled_inline
-def redraw_free(k: int, period: int, state: State, kernel: KernelState, nade: Nade) -> None:
+def redraw_free(k: int, period: int, state: State, kernel: KernelState, nade: NadeKernel) -> None:
     """BV's acceleration for a hold period after its cut-in."""
     cell, draws = kernel.cells.cell[k], nade.cell[k]
     u = uniform(kernel.seed, cell.episode, BV_FREE_DRAWS, period)
@@ -100,14 +100,14 @@ def redraw_free(k: int, period: int, state: State, kernel: KernelState, nade: Na
 
 
 @compiled_inline
-def add_to_path(row: int, maneuver: int, nade: Nade) -> None:
+def add_to_path(row: int, maneuver: int, nade: NadeKernel) -> None:
     """What BV does from now on in the test of a row."""
     nade.drawn.bv_path[row, nade.drawn.n_bv[row]] = maneuver
     nade.drawn.n_bv[row] += 1
 
 
 @compiled_inline
-def begin(k: int, kernel: KernelState, nade: Nade) -> None:
+def begin(k: int, kernel: KernelState, nade: NadeKernel) -> None:
     """Draw when BV will cut in, on the clock of hazards; a forced cut-in on its path."""
     cell, draws, environment, importance = kernel.cells.cell[k], nade.cell[k], nade.environment, nade.importance
     test = kernel.episode[cell.row]
@@ -139,7 +139,7 @@ def draw_component(u: float, alpha: FloatArray) -> int:
 
 
 @compiled_inline
-def choose_lane(k: int, state: State, kernel: KernelState, nade: Nade) -> None:
+def choose_lane(k: int, state: State, kernel: KernelState, nade: NadeKernel) -> None:
     """Stay or cut in."""
     scratch, environment, importance = nade.scratch, nade.environment, nade.importance
     cell, draws = kernel.cells.cell[k], nade.cell[k]
@@ -180,7 +180,7 @@ def sampled_probability(component: int, alpha: FloatArray, q: FloatArray) -> flo
 
 
 @compiled_inline
-def controlled_draw(k: int, u: float, state: State, kernel: KernelState, nade: Nade) -> int:
+def controlled_draw(k: int, u: float, state: State, kernel: KernelState, nade: NadeKernel) -> int:
     """Acceleration index at a redraw time after the cut-in, which may be critical."""
     scratch, environment, importance = nade.scratch, nade.environment, nade.importance
     cell, p, q = kernel.cells.cell[k], scratch.p, scratch.q_acceleration

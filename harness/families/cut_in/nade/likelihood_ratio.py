@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 
 from harness.compiled import compiled_inline
-from harness.families.cut_in.nade.cells import Nade
+from harness.families.cut_in.nade.cells import NadeKernel
 from harness.families.cut_in.nade.functions import Importance
 from harness.loop.cells import KernelState
 from harness.vocabulary import CUT_IN, STAY, FloatArray, State
@@ -86,7 +86,7 @@ def forced_ratio(before: float, after: float, total: float, cut: bool) -> float:
 
 @compiled_inline
 def record_lane(
-    k: int, state: State, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState, nade: Nade
+    k: int, state: State, cut: bool, p: float, hazard: float, critical: bool, kernel: KernelState, nade: NadeKernel
 ) -> None:
     """Likelihood ratios of having stayed or cut in, and the moment if it was one of control.
 
@@ -111,7 +111,7 @@ def record_lane(
 
 
 @compiled_inline
-def record_acceleration(k: int, state: State, maneuver: int, kernel: KernelState, nade: Nade) -> None:
+def record_acceleration(k: int, state: State, maneuver: int, kernel: KernelState, nade: NadeKernel) -> None:
     """Likelihood ratios of an acceleration at a critical moment after the cut-in, and the moment.
 
     ``scratch.p`` (31,), ``scratch.q_acceleration`` (J, 31) and ``scratch.challenge`` (J,) are what it was drawn by.
@@ -127,7 +127,7 @@ def record_acceleration(k: int, state: State, maneuver: int, kernel: KernelState
 
 
 @compiled_inline
-def accumulate_step(k: int, kernel: KernelState, nade: Nade) -> float:
+def accumulate_step(k: int, kernel: KernelState, nade: NadeKernel) -> float:
     """Take ``scratch.ratio`` and ``scratch.challenge`` of a step into the likelihood ratios; returns its q_α/p."""
     scratch, importance, draws = nade.scratch, nade.importance, nade.cell[k]
     row = kernel.cells.cell[k].row
@@ -139,7 +139,7 @@ def accumulate_step(k: int, kernel: KernelState, nade: Nade) -> float:
 
 @compiled_inline
 def record_moment(
-    k: int, state: State, maneuver: int, p: float, q_sampled: float, kernel: KernelState, nade: Nade
+    k: int, state: State, maneuver: int, p: float, q_sampled: float, kernel: KernelState, nade: NadeKernel
 ) -> None:
     """Count a control step, and keep it if the campaign keeps that many of an episode."""
     results, scratch, cell = nade.drawn, nade.scratch, kernel.cells.cell[k]
