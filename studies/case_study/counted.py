@@ -35,7 +35,6 @@ from studies.case_study.tested import settled, tests_of
 from studies.rnot import (
     Procedure,
     RequiredTests,
-    acceleration,
     cut_at,
     first_block,
     over_shuffles,
@@ -241,11 +240,10 @@ class Counted(NamedTuple):
         """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
         value, low, high = ratio_of_means(self.rnot.n, other.rnot.n, confidence).values()
         found = {
-            "equal": figure(value, low, high),
-            "at least": figure(value, low or value),
-            "at most": figure(value, None, high or value),
-            "unknown": figure(None),
-        }[acceleration(self.rnot, other.rnot)[1]]
+            (False, False): figure(value, low, high),
+            (True, False): figure(value, low or value),
+            (False, True): figure(value, None, high or value),
+        }.get((self.rnot.is_lower_limit, other.rnot.is_lower_limit), figure(None))
         return marked(found, settled=self.settled and other.settled)
 
 
@@ -269,7 +267,7 @@ def _required(
 ) -> Counted:
     """Of the mean of Y, or of what SCV claims, on all tests of a step or its first ones."""
     tests = tests_of(made).first(first)
-    context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", procedure.n_shuffles)
+    context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", None)
     block = first_block(made.folder / "run", tests.n) if scv else None
-    found = over_shuffles(tests, procedure, lambda: context.progress.advance(1), scv_of=block)
+    found = over_shuffles(tests, procedure, scv_of=block)
     return Counted(found, settled(made))

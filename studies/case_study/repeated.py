@@ -112,7 +112,7 @@ def claims_in_twin(
                 known.add(block)
             if campaign.sampling.mixes:
                 dr.add(block)
-            parts.append(Tests.of(block.first_episode, block.outcome, block.log_weight))
+            parts.append(Tests.of_block(block))
             counts = np.bincount(block.n_control_steps, minlength=len(steps))
             steps = counts + np.pad(steps, (0, len(counts) - len(steps)))
         rows.append(claims.row(rhw, confidence))

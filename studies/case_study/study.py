@@ -237,10 +237,7 @@ class Context:
     workers: int | None
     progress: Progress
 
-    def by_workers(
-        self, jobs: Sequence[Any], make: Callable[[Any], _Result], size: Callable[[Any], int] = lambda _job: 1
-    ) -> list[_Result]:
+    def by_workers(self, jobs: Sequence[Any], make: Callable[[Any], _Result]) -> list[_Result]:
         """Results of all jobs, made by worker processes; see `results_of`."""
-        name = self.folder.name.rpartition("-")[0]
         with worker_processes(self.workers) as executor:
-            return results_of(name, jobs, make, self.progress, run=executor.map, size=size)
+            return results_of(self.folder.name.rpartition("-")[0], jobs, make, self.progress, executor)

@@ -290,7 +290,7 @@ def walk_paths(
         part = {name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in ("index", "start", "weight")}
         jobs.append((first, replace(paths, **part)))
     walk = partial(_walk, campaign.model_dump_json(), stride)
-    return joined(results_of("walked paths", jobs, walk, progress, run=executor.map, size=lambda job: len(job[1])))
+    return joined(results_of("walked paths", jobs, walk, progress, executor))
 
 
 def _walk(campaign_json: str, stride: int, job: tuple[int, BaselinePaths]) -> SuperPopulation:
