@@ -83,7 +83,6 @@ def simulated(folder: Path, n_parts: int, progress: Progress) -> Traffic:
     for part in range(n_parts):
         path = folder / "observations" / f"{part:04d}.npz"
         if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, functools.partial(_observe, part))
         with np.load(path) as kept:
             recording = kept["recording"] + RECORDINGS_OF_PART * part
@@ -139,9 +138,8 @@ class Drivers:
 
     def _of(self, environment: Any) -> FloatArray:
         paths = replace(self._paths, environment=environment).run(PILOT_PATHS, N_PATHS, Progress())
-        return (
-            np.array([np.where((paths.crashes >> bit) & 1 == 1, paths.mass, 0.0).sum() for bit in self._bits]) / N_PATHS
-        )
+        crashing = [np.where((paths.crashes >> bit) & 1 == 1, paths.mass, 0.0).sum() for bit in self._bits]
+        return np.array(crashing) / N_PATHS
 
 
 # -- numbers of data sets, made comparable --
@@ -188,9 +186,8 @@ class Surrogate:
     def log_rates(self, rows: pd.DataFrame) -> FloatArray:
         """Of rows of numbers: (n, d)."""
         numbers = np.hstack([rows[list(self.names)].to_numpy(), effects(rows)])
-        return (
-            np.log(_listed(rows, "acceptance_steps__share") @ self.masses.T) + (numbers - self.middle) @ self.gradient.T
-        )
+        shares = _listed(rows, "acceptance_steps__share")
+        return np.log(shares @ self.masses.T) + (numbers - self.middle) @ self.gradient.T
 
 
 def surrogate(drivers: Drivers, sets: pd.DataFrame, progress: Progress) -> Surrogate:
@@ -267,28 +264,17 @@ def fit_data_set(traffic: Traffic, seed: int, n_replicates: int) -> pd.DataFrame
     return rows
 
 
-def fit_data_sets(folder: Path, hours: float, n: int, n_replicates: int, progress: Progress) -> None:
-    """Fit ``n`` data sets of so many vehicle-hours, those that the folder does not have yet."""
-    missing = [index for index in range(n) if not _kept(folder, hours, index).exists()]
-    if not missing:
-        return
-    pool = simulated(folder, n, progress)
-    progress.stage(f"fits of {hours:g} vehicle-hours", n, done=n - len(missing))
-    for index in missing:
-        path = _kept(folder, hours, index)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        rows = fit_data_set(data_set(pool, hours, index), index, n_replicates)
-        write_atomically(path, rows.reset_index().to_parquet)
-        progress.advance(1)
-
-
-def _kept(folder: Path, hours: float, index: int) -> Path:
-    return folder / f"{hours:g}h" / f"{index:04d}.parquet"
-
-
-def kept_data_sets(folder: Path, hours: float) -> list[pd.DataFrame]:
-    """What the folder has."""
-    return [pd.read_parquet(path).set_index("kind") for path in sorted((folder / f"{hours:g}h").glob("*.parquet"))]
+def data_sets(folder: Path, hours: float, n: int, n_replicates: int, progress: Progress) -> list[pd.DataFrame]:
+    """Rows of ``n`` data sets of so many vehicle-hours; those that the folder does not have yet are fitted."""
+    paths = [folder / f"{hours:g}h" / f"{index:04d}.parquet" for index in range(n)]
+    if missing := [(index, path) for index, path in enumerate(paths) if not path.exists()]:
+        pool = simulated(folder, n, progress)
+        progress.stage(f"fits of {hours:g} vehicle-hours", n, done=n - len(missing))
+        for index, path in missing:
+            rows = fit_data_set(data_set(pool, hours, index), index, n_replicates)
+            write_atomically(path, rows.reset_index().to_parquet)
+            progress.advance(1)
+    return [pd.read_parquet(path).set_index("kind") for path in paths]
 
 
 # -- judgement --
@@ -406,9 +392,7 @@ def check(sets: Sequence[pd.DataFrame], near: Surrogate, drivers: Drivers) -> di
 
 def judged_data_sets(folder: Path, hours: Sequence[float], n: int, n_replicates: int, progress: Progress) -> Path:
     """Fit what is missing, and judge all of it, into roundtrip.json: the mean law is that of the largest sets."""
-    for each in hours:
-        fit_data_sets(folder, each, n, n_replicates, progress)
-    sets = {each: kept_data_sets(folder, each) for each in sorted(hours)}
+    sets = {each: data_sets(folder, each, n, n_replicates, progress) for each in sorted(hours)}
     largest = pd.DataFrame([each.loc[ESTIMATE] for each in sets[max(sets)]])
     drivers, mean = Drivers(), on_common_knots(largest)
     near = surrogate(drivers, largest, progress)

@@ -73,17 +73,13 @@ def keep_run(step: Run, context: Context) -> dict[str, Any]:
     assert isinstance(done, RunResult)  # of one scenario
     method, engine = campaign.testing.method, {"engine": campaign.world.engine}
     if method != "shells":
-        return {
-            **engine,
-            **_kept(context, method, Tests.joined(map(Tests.of_block, stored_blocks(run, moments=False)))),
-        }
+        tests = Tests.joined(map(Tests.of_block, stored_blocks(run, moments=False)))
+        return engine | _kept(context, method, tests)
     found = done.estimates["estimates"]["shells"]
     needed = None if found["rhw"] is None else found["n_episodes"] * (found["rhw"] / context.rhw) ** 2
     rate = figure(found["crash_rate"], found["ci_low"], found["ci_high"])
-    return {
-        **engine,
-        "figures": {"tests": exactly(found["n_episodes"]), "crash_rate": rate, "tests_for_rhw": figure(needed)},
-    }
+    figures = {"tests": exactly(found["n_episodes"]), "crash_rate": rate, "tests_for_rhw": figure(needed)}
+    return {**engine, "figures": figures}
 
 
 def _kept(context: Context, method: Method, tests: Tests) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from studies.chains.shells import ChainShells
 from studies.replication import populations, shells
 from studies.replication.experiment import Experiment
 from studies.replication.judgement import Subject
-from studies.replication.populations import RATE, Drivers, Known, SuperPopulation, Truths
+from studies.replication.populations import CONDITIONAL_DIFFERENCE, RATE, Drivers, Known, SuperPopulation, Truths
 from studies.replication.shells import Division
 from studies.replication.weighted import WeightedCampaign, chain_episodes, twin_episodes
 
@@ -37,9 +37,7 @@ def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> 
     if experiment.acting and not experiment.pairs:
         size, seeds = experiment.super_population, (experiment.seed + 1, experiment.seed)
         sizes = zip(seeds, (size.reference_paths, size.paths), strict=True)
-        walked = [
-            populations.choose_paths(experiment.campaign, seed, n_paths, progress) for seed, n_paths in sizes if n_paths
-        ]
+        walked = [populations.choose_paths(experiment.campaign, seed, n, progress) for seed, n in sizes if n]
         for name in experiment.acting:
             campaign = experiment.subject(name)
             pools = populations.walk_paths(campaign, walked[-1], executor, progress, 1)
@@ -63,13 +61,14 @@ def _holding(experiment: Experiment, progress: Progress) -> Iterator[Tested]:
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     drivers = Drivers.of(library, experiment.holding, see_onset=environment.lateral.present)
     together = [{pair.a, pair.b} & {*drivers.vehicles} for pair in pairs.values()]
-    enumerated = partial(populations.enumerate_paths, environment, drivers, experiment.seed, size.paths, progress)
+    enumerated = partial(populations.enumerate_paths, environment, progress)
     if campaign.testing.method == "shells" and not (pairs or size.reference_paths):
-        yield from _single(experiment, library, drivers, None, enumerated())
+        yield from _single(experiment, library, drivers, None, enumerated(drivers, experiment.seed, size.paths))
         return
-    truths = Truths(environment, drivers, experiment.seed + 1, size.reference_paths, progress, together)
+    truths = Truths(enumerated, drivers, experiment.seed + 1, size.reference_paths, together)
     if campaign.testing.method == "shells":
-        yield from (_pairs if pairs else _single)(experiment, library, drivers, truths, enumerated())
+        pools = enumerated(drivers, experiment.seed, size.paths)
+        yield from (_pairs if pairs else _single)(experiment, library, drivers, truths, pools)
         return
     for name in experiment.holding:
         tested = experiment.subject(name)
@@ -82,16 +81,12 @@ def _acting(experiment: Experiment, name: str, truth: SuperPopulation | None, po
     campaign = experiment.subject(name)
     library, limit = load_library(campaign.pool.library), acceleration_limit(campaign.av)
     vehicle = {library.n_drivers: 1.0}
-    crashing, paths, references = (
-        pools.crash_mass(vehicle),
-        campaign.pool.shadow_paths,
-        populations.reference_drivers(library),
-    )
+    crashing, references = pools.crash_mass(vehicle), populations.reference_drivers(library)
     if truth is None:
         known = _exactly(populations.of_vehicle(pools, crashing, references))
     else:
         known = populations.of_vehicle(truth, truth.crash_mass(vehicle), references)
-    division = Division(library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
+    division = Division(library, pools, [crashing], campaign.pool.shadow_paths, limit_mps2=limit, shadow_runs=True)
     return _vehicle(experiment, name, division.of_vehicle(crashing), known)
 
 
@@ -175,13 +170,11 @@ def _pairs(
             for one, crashing in zip(both, of_base, strict=True)
         )
         known = truths.pair(*both) if both == base else _exactly(populations.of_pair(pools, a, b))
-        source, scale = division.of_pair(a, b), known[populations.CONDITIONAL_DIFFERENCE].scale
+        source, scale = division.of_pair(a, b), known[CONDITIONAL_DIFFERENCE].scale
         # Shares of the larger rate, as widths are; what only one of them does counts, whichever it is.
         differing = source.crashing[1] + source.crashing[2]
         rate = float(differing.sum()) / len(differing)
-        outside = {
-            populations.CONDITIONAL_DIFFERENCE: source.crashes_outside(differing)[LIBRARY_STATEMENT] * rate / scale
-        }
+        outside = {CONDITIONAL_DIFFERENCE: source.crashes_outside(differing)[LIBRARY_STATEMENT] * rate / scale}
         facts = dict(known), outside, source.left_out, source.template.library.boundary
         campaign, seed = experiment.subject(base[0]), experiment.seed_of(place)
         yield Subject(name, Known.exactly(scale), *facts), shells.PairedCampaign(campaign, source.draw, seed)
