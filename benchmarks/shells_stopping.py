@@ -15,6 +15,7 @@ from pathlib import Path
 from benchmarks.contenders import SCENARIOS
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Stop
+from harness.progress import Progress
 from studies.replication.experiment import Experiment, load_experiment
 from studies.replication.run import validate
 from studies.replication.shells import FREE
@@ -36,7 +37,7 @@ def main(replications: int) -> None:
     print("| --- | --- | --- | --- | --- |")
     for rhw in (0.1, 0.3, 0.5, 1.0, 2.0):
         with tempfile.TemporaryDirectory() as folder:
-            judgements = validate(stopped_at(experiment, rhw), Path(folder))
+            judgements = validate(stopped_at(experiment, rhw), Path(folder), None, Progress())
         for found in judgements:
             if found["result"] == FREE:
                 row = "{subject} | {tests_median:,.0f} | {bias:+.1%} ± {bias_std_error:.1%} | {coverage:.3f}"

@@ -15,6 +15,7 @@ seen in sets that are enumerated.
 from __future__ import annotations
 
 import functools
+import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -40,6 +41,7 @@ from harness.fitting.table import load_mapping, recordings
 from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import take_aim
 from harness.progress import Progress
+from harness.records.folder import write_json
 from harness.resolved import resolve
 from harness.vocabulary import BoolArray, FloatArray, RecordArray
 from studies.trajectories import RECORDING_H, Differences, simulate, write
@@ -66,7 +68,7 @@ STATES = ((30.0, 40.0, 0.0), (25.0, 20.0, -2.0), (35.0, 60.0, 2.0), (30.0, 15.0,
 SEED, PART_H = 10_000, 10.0
 RECORDINGS_OF_PART = round(PART_H / RECORDING_H)
 N_PATHS = 4096
-N_STEPS = 6
+N_STEPS, N_CHECKED = 6, 20
 
 
 def truth() -> EnvironmentParameters:
@@ -81,7 +83,6 @@ def simulated(folder: Path, n_parts: int, progress: Progress) -> ObservedTraffic
     for part in range(n_parts):
         path = folder / "observations" / f"{part:04d}.npz"
         if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(path, functools.partial(_observe, part))
         with np.load(path) as kept:
             recording = kept["recording"] + RECORDINGS_OF_PART * part
@@ -137,30 +138,30 @@ class Drivers:
 
     def _of(self, environment: Any) -> FloatArray:
         paths = replace(self._paths, environment=environment).run(PILOT_PATHS, N_PATHS, Progress())
-        return (
-            np.array([np.where((paths.crashes >> bit) & 1 == 1, paths.mass, 0.0).sum() for bit in self._bits]) / N_PATHS
-        )
+        crashing = [np.where((paths.crashes >> bit) & 1 == 1, paths.mass, 0.0).sum() for bit in self._bits]
+        return np.array(crashing) / N_PATHS
 
 
 # -- numbers of data sets, made comparable --
 
 
+def _of_axes(rows: pd.DataFrame, at: Sequence[Any]) -> list[FloatArray]:
+    """Log-hazards of rows by axis, each at some values of it: (n,) of one value, else (n, values)."""
+    found = []
+    for axis, values in zip(KNOTS, at, strict=True):
+        knots, log = (_listed(rows, f"hazard_table__{name}") for name in (HAZARD[axis], f"{axis}_log"))
+        found.append(np.array([np.interp(values, *pair) for pair in zip(knots, log, strict=True)]))
+    return found
+
+
 def effects(rows: pd.DataFrame) -> FloatArray:
     """Log-hazards (n, knots) of rows at `KNOTS`, those of v, R1 and R1dot side by side; their sums count."""
-    parts = []
-    for axis, knots in KNOTS.items():
-        at, log = (_listed(rows, f"hazard_table__{name}") for name in (HAZARD[axis], f"{axis}_log"))
-        parts.append(np.array([np.interp(knots, *pair) for pair in zip(at, log, strict=True)]))
-    return np.hstack(parts)
+    return np.hstack(_of_axes(rows, [*KNOTS.values()]))
 
 
 def log_hazard(rows: pd.DataFrame, state: Sequence[float]) -> FloatArray:
     """Log-hazard (n,) of rows in a state."""
-    total = np.zeros(len(rows))
-    for axis, value in zip(KNOTS, state, strict=True):
-        at, log = (_listed(rows, f"hazard_table__{name}") for name in (HAZARD[axis], f"{axis}_log"))
-        total += [float(np.interp(value, *pair)) for pair in zip(at, log, strict=True)]
-    return total
+    return np.asarray(sum(_of_axes(rows, state), start=np.zeros(len(rows))))
 
 
 def _listed(rows: pd.DataFrame, name: str) -> FloatArray:
@@ -172,8 +173,9 @@ def _listed(rows: pd.DataFrame, name: str) -> FloatArray:
 class Surrogate:
     """Log crash rates of the drivers (d) near some numbers: Σ shares · ``masses`` · exp(gradient · (θ - middle)).
 
-    ``names`` (p,) are numbers that enter as they are; the hazard enters by its `effects`. ``gradient`` is
-    (d, p + effects), ``middle`` as long, ``masses`` (d, steps) the rates that a share of 1 would give each step.
+    Shares are those of lane changes that are carried out. ``names`` (p,) are numbers that enter as they are; the hazard
+    enters by its `effects`. ``gradient`` is (d, p + effects), ``middle`` as long, ``masses`` (d, steps) the rates of a
+    share of 1 in each step.
     """
 
     names: tuple[str, ...]
@@ -184,12 +186,8 @@ class Surrogate:
     def log_rates(self, rows: pd.DataFrame) -> FloatArray:
         """Of rows of numbers: (n, d)."""
         numbers = np.hstack([rows[list(self.names)].to_numpy(), effects(rows)])
-        return np.log(shares(rows) @ self.masses.T) + (numbers - self.middle) @ self.gradient.T
-
-
-def shares(rows: pd.DataFrame) -> FloatArray:
-    """Shares (n, steps) of lane changes that are carried out."""
-    return _listed(rows, "acceptance_steps__share")
+        shares = _listed(rows, "acceptance_steps__share")
+        return np.log(shares @ self.masses.T) + (numbers - self.middle) @ self.gradient.T
 
 
 def surrogate(drivers: Drivers, sets: pd.DataFrame, progress: Progress) -> Surrogate:
@@ -220,7 +218,7 @@ def surrogate(drivers: Drivers, sets: pd.DataFrame, progress: Progress) -> Surro
     return Surrogate(names, place, np.array(gradient).T, np.array(masses).T)
 
 
-def parameters_of(row: Mapping[str, Any]) -> EnvironmentParameters:
+def parameters_of(row: Mapping[Any, Any]) -> EnvironmentParameters:
     """Environment of a row of numbers."""
     base = truth()
     content = base.model_dump(exclude_none=True)
@@ -266,28 +264,17 @@ def fit_data_set(traffic: ObservedTraffic, seed: int, n_replicates: int) -> pd.D
     return rows
 
 
-def fit_data_sets(folder: Path, hours: float, n: int, n_replicates: int, progress: Progress) -> None:
-    """Fit ``n`` data sets of so many vehicle-hours, those that the folder does not have yet."""
-    missing = [index for index in range(n) if not _kept(folder, hours, index).exists()]
-    if not missing:
-        return
-    pool = simulated(folder, n, progress)
-    progress.stage(f"fits of {hours:g} vehicle-hours", n, done=n - len(missing))
-    for index in missing:
-        path = _kept(folder, hours, index)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        rows = fit_data_set(data_set(pool, hours, index), index, n_replicates)
-        write_atomically(path, rows.reset_index().to_parquet)
-        progress.advance(1)
-
-
-def _kept(folder: Path, hours: float, index: int) -> Path:
-    return folder / f"{hours:g}h" / f"{index:04d}.parquet"
-
-
-def kept_data_sets(folder: Path, hours: float) -> list[pd.DataFrame]:
-    """What the folder has."""
-    return [pd.read_parquet(path).set_index("kind") for path in sorted((folder / f"{hours:g}h").glob("*.parquet"))]
+def data_sets(folder: Path, hours: float, n: int, n_replicates: int, progress: Progress) -> list[pd.DataFrame]:
+    """Rows of ``n`` data sets of so many vehicle-hours; those that the folder does not have yet are fitted."""
+    paths = [folder / f"{hours:g}h" / f"{index:04d}.parquet" for index in range(n)]
+    if missing := [(index, path) for index, path in enumerate(paths) if not path.exists()]:
+        pool = simulated(folder, n, progress)
+        progress.stage(f"fits of {hours:g} vehicle-hours", n, done=n - len(missing))
+        for index, path in missing:
+            rows = fit_data_set(data_set(pool, hours, index), index, n_replicates)
+            write_atomically(path, rows.reset_index().to_parquet)
+            progress.advance(1)
+    return [pd.read_parquet(path).set_index("kind") for path in paths]
 
 
 # -- judgement --
@@ -317,39 +304,30 @@ def judge_numbers(
     sets: Sequence[pd.DataFrame], true: Mapping[str, float], mean: Mapping[str, float]
 ) -> list[dict[str, Any]]:
     """Of each number: how often intervals hold the environment's (None for tables), and that of the mean law."""
-    z = float(stats.norm.ppf(ENDS[1]))
-    estimates = pd.DataFrame([each.loc[ESTIMATE] for each in sets])
-    errors = pd.DataFrame([each.loc[ERROR] for each in sets])
-    judged = []
+    z, judged = float(stats.norm.ppf(ENDS[1])), list[dict[str, Any]]()
+    estimates, errors = (pd.DataFrame([each.loc[kind] for each in sets]) for kind in (ESTIMATE, ERROR))
     for name in fitted_numbers(estimates):
         if name.startswith("hazard_table"):
             continue
-        told = errors[name].notna().to_numpy()
+        told, of = errors[name].notna().to_numpy(), estimates[name]
         aims = {"environment": true.get(name), "mean_law": mean[name]}
-        row: dict[str, Any] = {
-            "number": name,
-            **aims,
-            "mean": float(estimates[name].mean()),
-            "spread": float(estimates[name].std()),
-            "kept": int((~told).sum()),
-        }
+        row: dict[str, Any] = {"number": name, **aims, "mean": float(of.mean()), "spread": float(of.std())}
+        row["kept"] = int((~told).sum())
         if told.any():
             row["std_error"] = float(errors[name].median())
         for aim, value in aims.items():
             if value is None:
                 continue
             if told.any():
-                off = (estimates[name] - value).abs().to_numpy()[told] / errors[name].to_numpy()[told]
+                off = (of - value).abs().to_numpy()[told] / errors[name].to_numpy()[told]
                 row[f"{aim}_by_se"] = coverage(off <= z)
             of_replicates = [_within(each.loc[[REPLICATE], name].to_numpy(), value) for each in sets]
             row[f"{aim}_by_replicates"] = coverage(np.array(of_replicates)[told | ~told.any()])
         judged.append(row)
     for state in STATES:
         values = [log_hazard(each.loc[[ESTIMATE, REPLICATE]], state) for each in sets]
-        aims = {
-            "mean_law": float(log_hazard(pd.DataFrame([mean]), state)[0]),
-            "environment": float(np.log(true_hazard(state))),
-        }
+        of_law, of_environment = log_hazard(pd.DataFrame([mean]), state)[0], np.log(true_hazard(state))
+        aims = {"mean_law": float(of_law), "environment": float(of_environment)}
         first = np.array([each[0] for each in values])
         row = {"number": f"log-hazard at {state}", **aims, "mean": float(first.mean()), "spread": float(first.std())}
         for aim, value in aims.items():
@@ -405,84 +383,34 @@ def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray,
     return judged
 
 
-def check(sets: Sequence[pd.DataFrame], near: Surrogate, drivers: Drivers, n: int) -> dict[str, float]:
-    """How far log rates of a few replicates of different sets come out wrong: root mean square, and most, by driver."""
-    off = []
-    for each in sets[:: max(len(sets) // n, 1)][:n]:
-        row = each.loc[[REPLICATE]].iloc[[0]]
-        off.append(
-            near.log_rates(row)[0]
-            - np.log(drivers.rates(parameters_of({str(name): value for name, value in row.iloc[0].items()})))
-        )
+def check(sets: Sequence[pd.DataFrame], near: Surrogate, drivers: Drivers) -> dict[str, float]:
+    """How far log rates of a replicate of some sets come out wrong: root mean square, and most, over drivers."""
+    rows = [each.loc[[REPLICATE]].iloc[[0]] for each in sets[:: max(len(sets) // N_CHECKED, 1)][:N_CHECKED]]
+    off = [near.log_rates(row)[0] - np.log(drivers.rates(parameters_of(row.iloc[0].to_dict()))) for row in rows]
     return {"n": len(off), "root_mean_square": float(np.sqrt(np.square(off).mean())), "most": float(np.abs(off).max())}
 
 
-def judge(folder: Path, hours: Sequence[float], progress: Progress, n_checked: int = 20) -> dict[str, Any]:
-    """All of it: the mean law is that of the largest sets."""
-    sets = {each: kept_data_sets(folder, each) for each in sorted(hours)}
+def judged_data_sets(folder: Path, hours: Sequence[float], n: int, n_replicates: int, progress: Progress) -> Path:
+    """Fit what is missing, and judge all of it, into roundtrip.json: the mean law is that of the largest sets."""
+    sets = {each: data_sets(folder, each, n, n_replicates, progress) for each in sorted(hours)}
     largest = pd.DataFrame([each.loc[ESTIMATE] for each in sets[max(sets)]])
     drivers, mean = Drivers(), on_common_knots(largest)
     near = surrogate(drivers, largest, progress)
     true = truth().values() | true_shares(simulated(folder, 1, progress))
+    of_mean = drivers.rates(parameters_of(mean))
     found: dict[str, Any] = {
         "command": "python -m studies roundtrip --out DIR",
         "traffic": f"{TRAFFIC.parameters}, ignore_share {IGNORE_SHARE:g}, level {TRAFFIC.lane_change_level:g}",
+        "mean_law_over_environment": dict(zip(DRIVERS, (of_mean / drivers.true).tolist(), strict=True)),
     }
-    of_mean = drivers.rates(parameters_of(mean))
-    found["mean_law_over_environment"] = dict(zip(DRIVERS, (of_mean / drivers.true).tolist(), strict=True))
     for each, of in sets.items():
         found[f"{each:g} vehicle-hours"] = {
             "data_sets": len(of),
             "without_an_event": [int(sum(one[f"{SEEN}__{i}"].iloc[0] == 0 for one in of)) for i in range(N_STEPS)],
             "rates": judge_rates(of, near, drivers.true, of_mean),
-            "gradient": check(of, near, drivers, n_checked),
+            "gradient": check(of, near, drivers),
             "numbers": judge_numbers(of, true, mean),
         }
-    return found
-
-
-def rounded(content: Any) -> Any:
-    """The same with four digits of each number."""
-    if isinstance(content, dict):
-        return {key: rounded(value) for key, value in content.items()}
-    if isinstance(content, list):
-        return [rounded(value) for value in content]
-    return float(f"{content:.4g}") if isinstance(content, float) else content
-
-
-def table(found: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """What was judged, as tables by their titles."""
-    tables: dict[str, list[dict[str, Any]]] = {}
-    for size, of in found.items():
-        if not size.endswith(" vehicle-hours"):
-            continue
-        tables[f"Crash rates, {of['data_sets']} sets of {size}"] = [
-            {
-                "of": name,
-                "estimate / true": f"{rate['median_estimate_over_true']:.3g}",
-                "interval × ÷": f"{rate['median_factor']:.3g}",
-                "coverage": _shown(rate["interval"]),
-                "of upper limit": _shown(rate["upper_limit"]),
-                "of the mean law": _shown(rate["interval_of_mean_law"]),
-            }
-            for name, rate in of["rates"].items()
-        ]
-        tables[f"Numbers, {size}"] = [
-            {
-                "number": row["number"],
-                "environment": f"{row['environment']:.4g}" if row.get("environment") is not None else "",
-                "mean": f"{row['mean']:.4g}",
-                "spread": f"{row['spread']:.2g}",
-                "std error": f"{row['std_error']:.2g}" if "std_error" in row else "",
-                **{aim: _shown(row[key]) if (key := f"{aim}_by_replicates") in row else "" for aim in AIMS},
-            }
-            for row in of["numbers"]
-        ]
-    return tables
-
-
-AIMS = "environment", "mean_law"
-
-
-def _shown(of: Mapping[str, float]) -> str:
-    return f"{of['coverage']:.3f} ({of['low']:.3f} … {of['high']:.3f})"
+    four_digits = json.loads(json.dumps(found), parse_float=lambda text: float(f"{float(text):.4g}"))
+    write_json(folder / "roundtrip.json", four_digits)
+    return folder / "roundtrip.json"

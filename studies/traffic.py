@@ -8,20 +8,20 @@ likely up to the sensor's view. What depends on the scenario is asked of natural
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Self
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
+import yaml
 from scipy import stats
 from scipy.optimize import brentq
 
-from harness.campaign.files import read_model
-from harness.campaign.sections import EnvironmentSettings, Section
+from harness.campaign.sections import EnvironmentSettings
+from harness.estimators.estimate import finite_json
 from harness.families.cut_in.events import write_maneuvers
 from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.protocol import Paths
-from harness.problems import broken_rule
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, BV, LV, FloatArray
 
@@ -30,83 +30,19 @@ N_PATHS, SEED = 4096, 1
 BOUND = "not_looking_bound_percent"
 
 
-class Quantiles(Section):
-    """Of a distribution that is taken as normal."""
-
-    p5: float
-    p95: float
-
-
-class Approach(Section):
-    """What traffic the published cut-ins were seen in."""
-
-    speed_mps: float
-    headway_s: float
-    closing_mps: Quantiles
-    n_closing: int
-    ttc_s: float
-
-
-class Figure(Section):
-    """A published number, the model's name of it, and what the model's has to lie in, or why that is not asked."""
-
-    what: str
-    unit: str
-    source: str
-    model: str
-    published: float | str
-    within: Annotated[list[float | str], Field(min_length=2, max_length=2)] | None = None
-    why: str = ""
-    not_held: str = ""
-
-    @model_validator(mode="after")
-    def _says_why(self) -> Self:
-        if (self.within is None) == (not self.not_held) or (self.within is not None) == (not self.why):
-            mend = "Say why nothing is asked of the model, or what its number has to lie in, and why."
-            raise broken_rule("within", "not the keys of one of both", "within and why, or not_held", mend)
-        return self
-
-
-class Published(Section):
-    """The table of what is published."""
-
-    sources: dict[str, str]
-    approach: Approach
-    figures: list[Figure]
-
-
-def beside_published(environment: str, published: Path = PUBLISHED) -> list[dict[str, Any]]:
-    """Rows of an environment (shipped name or file): each figure, the model's number, and ``pass``, ``fail`` or ``-``.
-
-    Raises `CampaignError`: a file is missing or wrong.
-    """
-    table = read_model(published, Published)
-    found = model_figures(load_environment(EnvironmentSettings(parameters=environment)), table.approach)
-    rows = []
-    for figure in table.figures:
-        value, verdict, within = found[figure.model], "-", None
-        if figure.within is not None:
-            low, high = (found[end] if isinstance(end, str) else end for end in figure.within)
-            verdict, within = "pass" if low <= value <= high else "fail", [low, high]
-        rows.append(
-            {
-                "figure": figure.what,
-                "unit": figure.unit,
-                "published": figure.published,
-                "model": value,
-                "within": within,
-                "verdict": verdict,
-                "remark": figure.why or figure.not_held,
-                "source": figure.source,
-                "reference": table.sources[figure.source],
-            }
-        )
+def beside_published(environment: str) -> list[dict[str, Any]]:
+    """Rows of an environment (shipped name or file): each figure, the model's number, and whether it passes."""
+    loaded = load_environment(EnvironmentSettings(parameters=environment))
+    table, rows = yaml.safe_load(PUBLISHED.read_text(encoding="utf-8")), list[dict[str, Any]]()
+    approach = SimpleNamespace(**table["approach"])
+    found = {**_leads(loaded), **_kept(loaded, approach), **_scenario(loaded, approach)}
+    for figure in table["figures"]:
+        value, verdict, within = found[figure.pop("model")], "-", None
+        if "within" in figure:
+            within = [found.get(end, end) for end in figure["within"]]
+            verdict = "pass" if within[0] <= value <= within[1] else "fail"
+        rows.append(finite_json(figure | {"model": value, "within": within, "verdict": verdict}))
     return rows
-
-
-def model_figures(environment: Environment, approach: Approach) -> dict[str, float]:
-    """What an environment says of the figures, by name."""
-    return {**_leads(environment), **_kept(environment, approach), **_scenario(environment, approach)}
 
 
 def _leads(environment: Environment) -> dict[str, float]:
@@ -127,9 +63,9 @@ def _leads(environment: Environment) -> dict[str, float]:
     }
 
 
-def _kept(environment: Environment, approach: Approach) -> dict[str, float]:
+def _kept(environment: Environment, approach: SimpleNamespace) -> dict[str, float]:
     """The law of acceptance at published closing speeds, with equally likely gaps up to the sensor's view."""
-    low, high = approach.closing_mps.p5, approach.closing_mps.p95
+    low, high = approach.closing_mps
     sd = (high - low) / (2.0 * stats.norm.isf(0.05))
     closing = stats.norm.ppf((np.arange(200) + 0.5) / 200, 0.5 * (low + high), sd)
     longest = approach.headway_s * approach.speed_mps
@@ -157,7 +93,7 @@ def _kept(environment: Environment, approach: Approach) -> dict[str, float]:
     }
 
 
-def _scenario(environment: Environment, approach: Approach) -> dict[str, float]:
+def _scenario(environment: Environment, approach: SimpleNamespace) -> dict[str, float]:
     """Cut-ins of naturalistic paths whose AV keeps its speed, and lane changes per km where nobody is behind."""
     index = np.arange(N_PATHS)
     start = InitialStates(environment.numbers).draw(SEED, 0, N_PATHS)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -42,6 +43,9 @@ LEAVES_AFTER = 9
 """Steps that the third vehicle is seen after BV's lane change."""
 CLOSEST_M = 0.5
 LV, BV, AV = range(3)
+
+
+Arrays = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -84,8 +88,9 @@ def simulate(environment: Environment, hours: float, seed: int, differences: Dif
     x, v = np.zeros((2, n, 3, n_steps + 1))
     cut, lead = np.full((2, n), -1)
     upto = np.zeros((n, 3), np.int64)
-    drive(start, length, hazard, bias, spread, seed, unboxed(environment), x, v, cut, lead, upto)
-    return _table(recording, length, x, v, _lateral(cut, lead, environment, n_steps), cut, upto, random, differences)
+    drive(start, (length, bias, spread), hazard, seed, unboxed(environment), (x, v), (cut, lead, upto))
+    seen, lateral = (recording, length, x, v, cut, upto), _lateral(cut, lead, environment, n_steps)
+    return _table(seen, lateral, random, differences)
 
 
 def _mean_one(random: np.random.Generator, log_sd: float, shape: int | tuple[int, ...]) -> FloatArray:
@@ -94,24 +99,15 @@ def _mean_one(random: np.random.Generator, log_sd: float, shape: int | tuple[int
 
 @compiled_threads
 def drive(
-    start: RecordArray,
-    length: FloatArray,
-    hazard: FloatArray,
-    bias: FloatArray,
-    spread: FloatArray,
-    seed: int,
-    environment: Environment,
-    x: FloatArray,
-    v: FloatArray,
-    cut: IntArray,
-    lead: IntArray,
-    upto: IntArray,
-) -> None:
+    start: RecordArray, vehicles: Arrays, hazard: FloatArray, seed: int, environment: Environment,
+    motion: Arrays, changes: Arrays,
+) -> None:  # fmt: skip
     """Drive triples from initial states (n,): centres and speeds (n, 3, steps + 1).
 
-    ``cut`` and ``lead`` (n,) receive the state in which BV is on the right first, -1 for never, and the steps from
-    onset to it; ``upto`` (n, 3) the number of states of each vehicle.
+    Lengths, biases and spreads of ``vehicles`` are (n, 3). ``changes`` receive the state in which BV is on the right
+    first (n,), -1 for never, the steps from onset to it (n,), and the number of states of each vehicle (n, 3).
     """
+    (length, bias, spread), (x, v), (cut, lead, upto) = vehicles, motion, changes
     n_steps, held = x.shape[2] - 1, round(1.0 / STEP_S)
     a = np.zeros(3)
     for i in range(start.size):
@@ -139,13 +135,8 @@ def drive(
                     law = laws.free_driving(v[i, vehicle, t], environment)
                     if vehicle == BV and cut[i] < 0:
                         law = laws.car_following(state, environment)
-                    own = AccelerationLaw(
-                        law.noise,
-                        law.cap,
-                        law.mean + bias[i, vehicle],
-                        law.inverse_scale / spread[i, vehicle],
-                        law.brake_share,
-                    )
+                    mean, inverse_scale = law.mean + bias[i, vehicle], law.inverse_scale / spread[i, vehicle]
+                    own = AccelerationLaw(law.noise, law.cap, mean, inverse_scale, law.brake_share)
                     u = uniform(seed, i, LV_DRAWS if vehicle == LV else BV_DRAWS, 4 * t + vehicle)
                     a[vehicle] = laws.acceleration(laws.draw_acceleration(u, own, environment))
             beside = -(length[i, AV] + length[i, BV]) < r2 <= 0.0
@@ -178,16 +169,9 @@ def _lateral(cut: IntArray, lead: IntArray, environment: Environment, n_steps: i
 
 
 def _table(
-    recording: IntArray,
-    length: FloatArray,
-    x: FloatArray,
-    v: FloatArray,
-    lateral: FloatArray | None,
-    cut: IntArray,
-    upto: IntArray,
-    random: np.random.Generator,
-    differences: Differences,
+    of: Arrays, lateral: FloatArray | None, random: np.random.Generator, differences: Differences
 ) -> pd.DataFrame:
+    recording, length, x, v, cut, upto = of
     n, n_states = len(x), x.shape[2]
     smoothed = differences.smoothed_s / STEP_S
 

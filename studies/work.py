@@ -6,7 +6,7 @@ import hashlib
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
@@ -55,22 +55,12 @@ def _end_with_parent() -> None:
 
 
 def results_of(
-    name: str,
-    jobs: Sequence[_Job],
-    make: Callable[[_Job], _Result],
-    progress: Progress,
-    *,
-    run: Callable[..., Any] = map,
-    size: Callable[[_Job], int] = lambda _job: 1,
+    name: str, jobs: Sequence[_Job], make: Callable[[_Job], _Result], progress: Progress, executor: Executor
 ) -> list[_Result]:
-    """Results of all jobs, in their order.
-
-    ``run`` is `map`, or that of an executor, and ``make`` a function of a module then; ``name`` is that of the stage
-    that is shown, of which a job takes ``size`` units.
-    """
-    progress.stage(name, sum(map(size, jobs)))
+    """Results of all jobs in their order, by a function of a module; ``name`` is that of the stage that is shown."""
+    progress.stage(name, len(jobs))
     results = []
-    for job, result in zip(jobs, run(make, jobs), strict=True):
+    for result in executor.map(make, jobs):
         results.append(result)
-        progress.advance(size(job))
+        progress.advance(1)
     return results

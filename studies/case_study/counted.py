@@ -19,29 +19,11 @@ from harness.estimators.scv import Scv, StratumFit, fill_product_columns
 from harness.estimators.weighted import Nade
 from harness.runner.stored import stored_blocks
 from harness.vocabulary import FloatArray, Method
-from studies.case_study.figures import (
-    exactly,
-    figure,
-    marked,
-    mean_of,
-    ratio,
-    ratio_of_means,
-    ratio_of_variances,
-    tests_for,
-    weights_are_in,
-)
+from studies import rnot
+from studies.case_study import figures
+from studies.case_study.figures import exactly, figure, marked
 from studies.case_study.study import Context, ControlVariates, Convergence, Made, RequiredNumbers
 from studies.case_study.tested import settled, tests_of
-from studies.rnot import (
-    Procedure,
-    RequiredTests,
-    acceleration,
-    cut_at,
-    first_block,
-    over_shuffles,
-    required_tests,
-    total_and_half_width,
-)
 from studies.work import write_table
 
 
@@ -74,19 +56,16 @@ class Claims:
         nade, z = self.nade.result(confidence), Level.two_sided(confidence).z
         scv = self._scv.result(confidence) if self._with_scv else None
         mean_weight = self._weight / self._n
-        settled = weights_are_in(self._method, mean_weight)
-        row: dict[str, Any] = {
-            "n": self._n,
-            "mean_weight": mean_weight,
-            "settled": settled,
-            "largest_weight_share": nade.largest_weight_share,
-        }
+        settled = figures.weights_are_in(self._method, mean_weight)
+        row: dict[str, Any] = {"n": self._n, "mean_weight": mean_weight, "settled": settled}
+        row["largest_weight_share"] = nade.largest_weight_share
         for name, found in (("nade", nade), ("scv", scv)):
             rate, half = (0.0, 0.0) if found is None else (found.crash_rate, z * found.std_error)
             interval = figure(rate, max(rate - half, 0.0), rate + half) if rate > 0.0 else figure(None)
             row[f"{name}_rate"] = marked(interval, settled=settled)
             row[f"{name}_rhw"] = half / rate if rate > 0.0 else None
-            row[f"{name}_tests"] = tests_for(self._n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
+            needed = figures.tests_for(self._n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
+            row[f"{name}_tests"] = needed
         row |= dict.fromkeys(("gain_claimed", "gain_degrees_of_freedom", "gain_leave_one_out", "difference"))
         row["n_saturated"] = 0 if scv is None else len(scv.details["gain"]["saturated"])
         if scv is not None and scv.std_error > 0.0 < nade.crash_rate:
@@ -104,26 +83,26 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
     sizes = sorted({*shown, *between.astype(int).tolist()})
     claims, rows = Claims(leave_one_out=True), list[dict[str, Any]]()
     context.progress.stage("both estimates", max(sizes, default=0))
-    for block in cut_at(stored_blocks(run, moments=True), sizes):
+    for block in rnot.cut_at(stored_blocks(run, moments=True), sizes):
         claims.add(block)
         context.progress.advance(len(block))
         if (size := block.first_episode + len(block)) in sizes:
             again = gain_of_parts(run, size, n, step.parts, context.confidence)
             rows.append({**claims.row(context.rhw, context.confidence), "gain_replicated": again})
-    fits, figures = claims.scv.fits(), {}
+    fits, answers = claims.scv.fits(), {}
     strata = [
         {"control_steps": level, "columns": fit.n_columns, "rank": fit.rank, **_spread_of([fit])}
         for level, fit in (fits if step.spread_tests else ())
     ]
     if step.spread_tests:
-        write_table(context.folder / SPREAD, spread(first_block(run, min(step.spread_tests, n))))
+        write_table(context.folder / SPREAD, spread(rnot.first_block(run, min(step.spread_tests, n))))
     if rows:
         late = _spread_of([fit for level, fit in fits if level >= 4])
         left = late["sd_after"] / late["sd_before"] if late["sd_before"] else None
-        figures["rate_over_nade"] = exactly(1.0 + max(row["difference"] or 0.0 for row in rows))
-        figures["sd_left_from_4"] = marked(figure(left, left, left), settled=rows[-1]["settled"])
+        answers["rate_over_nade"] = exactly(1.0 + max(row["difference"] or 0.0 for row in rows))
+        answers["sd_left_from_4"] = marked(figure(left, left, left), settled=rows[-1]["settled"])
     sizes_shown = [row for row in rows if row["n"] in shown]
-    return {"looks": rows, "sizes": sizes_shown, "strata": strata, "figures": figures}
+    return {"looks": rows, "sizes": sizes_shown, "strata": strata, "figures": answers}
 
 
 def gain_of_parts(run: Path, size: int, n: int, parts: int, confidence: float) -> dict[str, Any]:
@@ -131,12 +110,12 @@ def gain_of_parts(run: Path, size: int, n: int, parts: int, confidence: float) -
     if n < parts * size:
         return figure(None)
     claims, rates = Claims(), list[tuple[float, float]]()
-    for block in cut_at(stored_blocks(run, moments=True), [k * size for k in range(1, 1 + parts)]):
+    for block in rnot.cut_at(stored_blocks(run, moments=True), [k * size for k in range(1, 1 + parts)]):
         claims.add(block)
         if (block.first_episode + len(block)) % size == 0:
             rates.append(claims.rates())
             claims = Claims()
-    return ratio_of_variances([nade for nade, _ in rates], [scv for _, scv in rates], confidence)
+    return figures.ratio_of_variances([nade for nade, _ in rates], [scv for _, scv in rates], confidence)
 
 
 SPREAD = "results.parquet"
@@ -187,7 +166,7 @@ class KnownMeans:
         """NADE's variance over what is left."""
         plain, *columns = np.transpose(self._of_campaigns)
         best = int(np.argmin([np.mean(one) for one in columns]))
-        return {"gain_known": ratio_of_means(plain, columns[best], confidence)}
+        return {"gain_known": figures.ratio_of_means(plain, columns[best], confidence)}
 
 
 def _spread_of(fits: Sequence[StratumFit]) -> dict[str, Any]:
@@ -204,72 +183,71 @@ CURVES = "curves.parquet"
 
 def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
     """Curves as Parquet; how many tests each needed in the order in which it was tested; rates over the reference's."""
-    procedure = Procedure(context.rhw, context.confidence)
-    curves, figures = list[pd.DataFrame](), dict[str, Any]()
+    procedure = rnot.Procedure(context.rhw, context.confidence)
+    curves, answers = list[pd.DataFrame](), dict[str, Any]()
     reference = context.made[step.reference].result["figures"]["crash_rate"]
     for name in step.of:
         tests = tests_of(context.made[name])
         n = procedure.grid(tests.n)
-        total, half = total_and_half_width(tests.y, np.searchsorted(tests.episode, n), n, procedure.z)
+        total, half = rnot.total_and_half_width(tests.y, np.searchsorted(tests.episode, n), n, procedure.z)
         curves.append(pd.DataFrame({"step": name, "n": n, "crash_rate": total / n, "half_width": half / n}))
         rhw = np.divide(half / n, total / n, out=np.full(len(n), np.inf), where=total > 0.0)
-        required = required_tests(rhw[None, :], n, procedure.rhw)
+        required = rnot.required_tests(rhw[None, :], n, procedure.rhw)
         found = {
             "settled": figure(None, tests.n) if required.is_lower_limit else exactly(required.n[0]),
-            "over_reference": ratio(context.made[name].result["figures"]["crash_rate"], reference),
+            "over_reference": figures.ratio(context.made[name].result["figures"]["crash_rate"], reference),
         }
         is_in = settled(context.made[name])
-        figures |= {f"{name}.{key}": marked(each, settled=is_in) for key, each in found.items()}
+        answers |= {f"{name}.{key}": marked(each, settled=is_in) for key, each in found.items()}
     write_table(context.folder / CURVES, pa.Table.from_pandas(pd.concat(curves), preserve_index=False))
-    return {"figures": figures}
+    return {"figures": answers}
 
 
 class Counted(NamedTuple):
     """RNoT of every shuffle of some tests, and whether their weights have come in."""
 
-    rnot: RequiredTests
+    shuffles: rnot.RequiredTests
     settled: bool
 
     def figure(self, confidence: float) -> dict[str, Any]:
         """Mean over shuffles with its interval; a lower limit where some needed more tests than there were."""
-        mean = mean_of(self.rnot.n.tolist(), confidence)
-        if self.rnot.is_lower_limit:
-            mean = figure(None if self.rnot.never_reached.all() else mean["value"], mean["low"] or mean["value"])
+        mean = figures.mean_of(self.shuffles.n.tolist(), confidence)
+        if self.shuffles.is_lower_limit:
+            mean = figure(None if self.shuffles.never_reached.all() else mean["value"], mean["low"] or mean["value"])
         return marked(mean, settled=self.settled)
 
     def over(self, other: Counted, confidence: float) -> dict[str, Any]:
         """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
-        value, low, high = ratio_of_means(self.rnot.n, other.rnot.n, confidence).values()
+        value, low, high = figures.ratio_of_means(self.shuffles.n, other.shuffles.n, confidence).values()
         found = {
-            "equal": figure(value, low, high),
-            "at least": figure(value, low or value),
-            "at most": figure(value, None, high or value),
-            "unknown": figure(None),
-        }[acceleration(self.rnot, other.rnot)[1]]
+            (False, False): figure(value, low, high),
+            (True, False): figure(value, low or value),
+            (False, True): figure(value, None, high or value),
+        }.get((self.shuffles.is_lower_limit, other.shuffles.is_lower_limit), figure(None))
         return marked(found, settled=self.settled and other.settled)
 
 
 def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, Any]:
     """RNoT of every step that is named, and of SCV beside NADE on the same shuffles of the same tests."""
     asked = context.rhw, context.confidence
-    found = {name: _required(context.made[name], Procedure(*asked, step.shuffles), context) for name in step.of}
+    found = {name: _required(context.made[name], rnot.Procedure(*asked, step.shuffles), context) for name in step.of}
     pairs = {f"{step.of[0]}_over_{name}": (step.of[0], name) for name in step.of[1:]}
     if step.scv is not None:
-        made, fewer = context.made[step.scv], Procedure(*asked, step.scv_shuffles, ratio=step.scv_ratio)
+        made, fewer = context.made[step.scv], rnot.Procedure(*asked, step.scv_shuffles, ratio=step.scv_ratio)
         found["nade_beside_scv"] = _required(made, fewer, context, step.scv_tests)
         found["scv"] = _required(made, fewer, context, step.scv_tests, scv=True)
         pairs["nade_over_scv"] = "nade_beside_scv", "scv"
-    figures = {name: each.figure(context.confidence) for name, each in found.items()}
+    answers = {name: each.figure(context.confidence) for name, each in found.items()}
     ratios = {name: found[a].over(found[b], context.confidence) for name, (a, b) in pairs.items()}
-    return {"figures": figures | ratios}
+    return {"figures": answers | ratios}
 
 
 def _required(
-    made: Made, procedure: Procedure, context: Context, first: int | None = None, *, scv: bool = False
+    made: Made, procedure: rnot.Procedure, context: Context, first: int | None = None, *, scv: bool = False
 ) -> Counted:
     """Of the mean of Y, or of what SCV claims, on all tests of a step or its first ones."""
     tests = tests_of(made).first(first)
-    context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", procedure.n_shuffles)
-    block = first_block(made.folder / "run", tests.n) if scv else None
-    found = over_shuffles(tests, procedure, lambda: context.progress.advance(1), scv_of=block)
+    context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", None)
+    block = rnot.first_block(made.folder / "run", tests.n) if scv else None
+    found = rnot.over_shuffles(tests, procedure, scv_of=block)
     return Counted(found, settled(made))

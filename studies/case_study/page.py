@@ -63,11 +63,8 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
 
 def _remarks(claims: list[dict[str, Any]]) -> dict[str, list[int]]:
     """Every remark once, with the numbers of its claims."""
-    found: dict[str, list[int]] = {}
-    for number, claim in enumerate(claims, start=1):
-        if claim["why"]:
-            found.setdefault(claim["why"], []).append(number)
-    return found
+    said = [claim["why"] for claim in claims]
+    return {why: [n for n, one in enumerate(said, start=1) if one == why] for why in dict.fromkeys(said) if why}
 
 
 def asked(path: str, made: Mapping[str, Made]) -> dict[str, Any]:

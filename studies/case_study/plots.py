@@ -99,14 +99,8 @@ def tests_plot(picture: Mapping[str, Line], ours: Mapping[str, dict[str, Any]], 
         is_limit = found["high"] is None and found["low"] is not None
         axes.errorbar(place, value, yerr=ends, fmt="^" if is_limit else "o", color=colour, capsize=4.0, markersize=7)
         words = ("> " if is_limit else "") + tick_label(float(f"{value:.2g}")) + (" †" if colour == GREY else "")
-        at_offset: dict[str, Any] = {
-            "xytext": (0, -18 if is_limit else 7),
-            "textcoords": "offset points",
-            "ha": "center",
-        }
-        axes.annotate(
-            words, (place, found["high"] or value), **at_offset, fontsize=8, bbox={"color": "white", "pad": 0.5}
-        )
+        put: dict[str, Any] = {"xytext": (0, -18 if is_limit else 7), "textcoords": "offset points", "ha": "center"}
+        axes.annotate(words, (place, found["high"] or value), **put, fontsize=8, bbox={"color": "white", "pad": 0.5})
     axes.margins(y=0.15)
     axes.set_xticks(range(len(ours)), list(ours), fontsize=8)
     axes.set_xlabel("method")

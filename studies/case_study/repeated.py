@@ -17,19 +17,9 @@ from harness.estimators.scv import Scv
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.vocabulary import EstimatorName, FloatArray
+from studies.case_study import figures
 from studies.case_study.counted import Claims, Counted, KnownMeans
-from studies.case_study.figures import (
-    covered,
-    exactly,
-    figure,
-    is_settled,
-    marked,
-    mean_of,
-    range_of,
-    ratio_of_means,
-    ratio_of_variances,
-    tests_for,
-)
+from studies.case_study.figures import figure, marked, range_of
 from studies.case_study.study import Context, Variants
 from studies.case_study.tested import AT_ONCE, IN_THE_TWIN
 from studies.replication.weighted import prepared_twin, twin_episodes
@@ -60,20 +50,22 @@ def test_variants(step: Variants, context: Context) -> dict[str, Any]:
     jobs = [campaign.model_dump_json() for campaign in campaigns.values()]
     claims = context.by_workers(jobs, make)
     rows = [{"variant": name, **row} for name, row in zip(campaigns, claims, strict=True)]
-    figures = {row["variant"]: row["gain_claimed"] for row in rows}
-    mean = mean_of((gain["value"] for gain in figures.values()), context.confidence)
-    figures |= {f"{key}, {row['variant']}": row[key] for row in rows for key in SHOWN}
-    figures["mean"] = marked(mean, settled=all(row["settled"] for row in rows))
-    figures["minimum_at"] = _minimum_at({name: figures[name] for name in step.avs})
+    answers = {row["variant"]: row["gain_claimed"] for row in rows}
+    mean = figures.mean_of((gain["value"] for gain in answers.values()), context.confidence)
+    answers |= {f"{key}, {row['variant']}": row[key] for row in rows for key in SHOWN}
+    answers["mean"] = marked(mean, settled=all(row["settled"] for row in rows))
+    answers["minimum_at"] = _minimum_at({name: answers[name] for name in step.avs})
     if step.means:
-        figures["gain_known"] = range_of(
+        answers["gain_known"] = range_of(
             sorted((row["gain_known"] for row in rows), key=lambda each: -(each["value"] or 0.0))
         )
     if step.reference:
         best = min(rows, key=lambda row: float(row["rnot"]["value"] or math.inf))
-        figures["most_frequent_steps"] = range_of([exactly(row["most_frequent_steps"]) for row in (best, *rows)])
-        figures["rnot_range"] = range_of([row["rnot"] for row in (best, *rows)])
-    return {"variants": rows, "figures": figures}
+        answers["most_frequent_steps"] = range_of(
+            [figures.exactly(row["most_frequent_steps"]) for row in (best, *rows)]
+        )
+        answers["rnot_range"] = range_of([row["rnot"] for row in (best, *rows)])
+    return {"variants": rows, "figures": answers}
 
 
 def _minimum_at(gains: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -85,7 +77,9 @@ def _minimum_at(gains: dict[str, dict[str, Any]]) -> dict[str, Any]:
     at = {float(name.rpartition("-")[2]): gain for name, gain in known.items() if name.startswith("alpha-")}
     may = [number for number, gain in at.items() if gain["low"] <= lowest["high"]]
     value = next((number for number, gain in at.items() if gain is lowest), None)
-    return marked(figure(value, min(may, default=None), max(may, default=None)), settled=is_settled(*known.values()))
+    return marked(
+        figure(value, min(may, default=None), max(may, default=None)), settled=figures.is_settled(*known.values())
+    )
 
 
 def claims_in_twin(
@@ -112,7 +106,7 @@ def claims_in_twin(
                 known.add(block)
             if campaign.sampling.mixes:
                 dr.add(block)
-            parts.append(Tests.of(block.first_episode, block.outcome, block.log_weight))
+            parts.append(Tests.of_block(block))
             counts = np.bincount(block.n_control_steps, minlength=len(steps))
             steps = counts + np.pad(steps, (0, len(counts) - len(steps)))
         rows.append(claims.row(rhw, confidence))
@@ -129,16 +123,16 @@ def claims_in_twin(
         rnot = Counted(found, row["settled"]).figure(confidence)
     return {
         **row,
-        "claimed": marked(mean_of(tests["nade"], confidence), settled=row["settled"]),
-        "true": true_tests(rates["nade"], reference, tests_for(n, rhw, confidence)),
+        "claimed": marked(figures.mean_of(tests["nade"], confidence), settled=row["settled"]),
+        "true": true_tests(rates["nade"], reference, figures.tests_for(n, rhw, confidence)),
         "rnot": rnot,
         "most_frequent_steps": int(np.argmax(steps[1:]) + 1) if len(steps) > 1 else 0,
-        "covers": covered([each["nade_rate"] for each in rows], reference),
-        "scv_claimed": marked(mean_of(tests["scv"], confidence), settled=row["settled"]),
-        "gain_claimed": marked(ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
-        "gain_true": ratio_of_variances(rates["nade"], rates["scv"], confidence),
+        "covers": figures.covered([each["nade_rate"] for each in rows], reference),
+        "scv_claimed": marked(figures.mean_of(tests["scv"], confidence), settled=row["settled"]),
+        "gain_claimed": marked(figures.ratio_of_means(tests["nade"], tests["scv"], confidence), settled=row["settled"]),
+        "gain_true": figures.ratio_of_variances(rates["nade"], rates["scv"], confidence),
         **(known.row(confidence) if known else {}),
-        "gain_dr": marked(ratio_of_means(*left, confidence), settled=row["settled"]),
+        "gain_dr": marked(figures.ratio_of_means(*left, confidence), settled=row["settled"]),
         "difference": max((each["difference"] for each in rows if each["difference"] is not None), default=None),
     }
 

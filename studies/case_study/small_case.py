@@ -185,10 +185,8 @@ def _crashes(drivers: Sequence[RecordArray], speed: FloatArray, r2: FloatArray, 
     for row, (v, gap) in enumerate(states):
         points = GridPoints(np.array([v]), np.array([gap]), np.array([v - AV_MPS]))
         for k, driver in enumerate(drivers):
-            smallest, of_maneuvers = (
-                np.empty((2, 1, 1, 1), np.float32),
-                np.empty((1, 1, 1, N_ACCELERATIONS), np.float32),
-            )
+            smallest = np.empty((2, 1, 1, 1), np.float32)
+            of_maneuvers = np.empty((1, 1, 1, N_ACCELERATIONS), np.float32)
             roll_out(driver, 0, max(steps, 1), points, smallest, of_maneuvers, np.empty_like(smallest))
             found[row, k] = gap < CONTACT_M or (steps > 0 and smallest[1, 0, 0, 0] < CONTACT_M)
     return found[back.ravel()]

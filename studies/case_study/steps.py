@@ -42,19 +42,11 @@ _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
 }
 
 
-def run_study(
-    study: Study,
-    folder: Path,
-    *,
-    workers: int | None = None,
-    progress: Progress | None = None,
-    told: Callable[[str, float | None], None] = lambda _name, _seconds: None,
-) -> dict[str, Any]:
+def run_study(study: Study, folder: Path, workers: int | None, progress: Progress) -> dict[str, Any]:
     """Make what is missing, and the page, in a folder that is new, empty, or that of an earlier study.
 
-    Worker processes, one per core by default, change no result. ``told`` receives each step's name and seconds when it
-    is finished, None for one that was there before. Returned are the place of the page, all claims with verdicts, and
-    the seconds.
+    Worker processes, one per core by default, change no result. Returned are the place of the page, all claims with
+    verdicts, and the seconds that each step took, None for one that was there before.
 
     Raises `HarnessError`: a file that a step names is wrong, which shows before any step is made; or the folder cannot
     be used.
@@ -68,12 +60,11 @@ def run_study(
             seconds[name] = None
             if not (place / RESULT).is_file():
                 began = time.monotonic()
-                context = Context(place, study.rhw, study.confidence, made, workers, progress or Progress())
+                context = Context(place, study.rhw, study.confidence, made, workers, progress)
                 write_sealed(place / RESULT, finite_json({"kind": step.kind, **_MAKERS[step.kind](step, context)}))
                 seconds[name] = time.monotonic() - began
             result = read_as(dict[str, Any], place / RESULT, mend="Delete the folder of this step; it is made again.")
             made[name] = Made(place, result)
-            told(name, seconds[name])
         page, claims = write_page(study, folder, made)
         return {"page": str(page), "claims": claims, "seconds": seconds}
 

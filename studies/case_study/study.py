@@ -17,6 +17,7 @@ from studies.work import results_of, worker_processes
 
 _Result = TypeVar("_Result")
 StepName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+SettingName = Annotated[str, Field(pattern=r"^[^.|]+$")]
 Overrides = list[str]
 _OVERRIDES: Any = Field([], description="values laid over the file's, such as testing.epsilon=0.2")
 
@@ -54,12 +55,8 @@ class ControlVariates(Section):
     of: StepName = Field(description="step of kind run: a step mixture with records.moments first_9 or all")
     sizes: list[Whole] = Field(min_length=1, description="numbers of tests, rising, for the table")
     looks: Whole = Field(12, ge=2, le=100, description="numbers of tests between 300 and the last one, for the plot")
-    spread_tests: Whole | None = Field(
-        200_000, ge=10, description="first tests whose results are shown one by one; null to leave strata out"
-    )
-    parts: Whole = Field(
-        10, ge=3, le=1_000, description="of each size that the run has so many of, for the gain by replication"
-    )
+    spread_tests: Whole | None = Field(200_000, ge=10, description="first ones, shown one by one; null: no strata")
+    parts: Whole = Field(10, ge=3, le=1_000, description="of each size, for the gain by replication")
 
 
 class RequiredNumbers(Section):
@@ -84,12 +81,8 @@ class Variants(Section):
     tests: Whole = Field(ge=2, le=100_000_000, description="of each campaign")
     replications: Whole = Field(1, ge=1, le=10_000, description="campaigns with each of them")
     avs: list[str] = Field([], description="vehicles of the shipped panel")
-    settings: dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides] = Field(
-        {}, description="values laid over the campaign's, by a name for the table"
-    )
-    each_of: list[dict[Annotated[str, Field(pattern=r"^[^.|]+$")], Overrides]] = Field(
-        [], description="lists of such settings, of which every combination is another variant"
-    )
+    settings: dict[SettingName, Overrides] = Field({}, description="values laid over the campaign's")
+    each_of: list[dict[SettingName, Overrides]] = Field([], description="settings; every combination is a variant")
     shown: dict[str, str] = Field({}, description="those that the page has, if not all, and their names there")
     epsilons: list[Probability] = Field([], description="values of testing.epsilon, a variant each")
     reference: StepName | None = Field(None, description="step with the crash rate of all, for tests by replication")
@@ -116,9 +109,7 @@ class SmallCase(Section):
     thresholds: list[Probability] = Field(default=[0.0], min_length=1, description="of criticality")
     draws: Whole = Field(200, ge=2, le=100_000, description="campaigns that are repeated to see the true spread")
     tests_of_draw: Whole = Field(1_000, ge=10)
-    reported: dict[Literal["nade", "scv"], Positive] = Field(
-        {}, description="numbers of tests that are looked for among the settings"
-    )
+    reported: dict[Literal["nade", "scv"], Positive] = Field({}, description="tests looked for among the settings")
 
 
 Step = Annotated[
@@ -237,10 +228,7 @@ class Context:
     workers: int | None
     progress: Progress
 
-    def by_workers(
-        self, jobs: Sequence[Any], make: Callable[[Any], _Result], size: Callable[[Any], int] = lambda _job: 1
-    ) -> list[_Result]:
+    def by_workers(self, jobs: Sequence[Any], make: Callable[[Any], _Result]) -> list[_Result]:
         """Results of all jobs, made by worker processes; see `results_of`."""
-        name = self.folder.name.rpartition("-")[0]
         with worker_processes(self.workers) as executor:
-            return results_of(name, jobs, make, self.progress, run=executor.map, size=size)
+            return results_of(self.folder.name.rpartition("-")[0], jobs, make, self.progress, executor)

@@ -16,13 +16,14 @@ from harness.estimators.limits import clopper_pearson
 from harness.records.folder import read_table
 from harness.resolved import resolve
 from harness.runner.run import run_campaign
+from harness.runner.stored import stored_blocks
 from harness.runner.underway import RunResult
 from harness.sampling import prepare
 from harness.vocabulary import FloatArray, Method
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in
 from studies.case_study.study import Context, Made, Run, TwinTests
 from studies.replication.weighted import prepared_twin
-from studies.rnot import Tests, read_run
+from studies.rnot import Tests
 from studies.work import write_table
 
 PART, AT_ONCE = 500_000, 50_000
@@ -51,7 +52,7 @@ def test_in_twin(step: TwinTests, context: Context) -> dict[str, Any]:
     prepare(resolve(campaign), context.progress)  # tables and kernels are built once, before the workers start
     make = partial(crashes_in_twin, campaign.model_dump_json())
     jobs = [(first, min(PART, step.tests - first)) for first in range(0, step.tests, PART)]
-    found = context.by_workers(jobs, make, size=lambda job: job[1])
+    found = context.by_workers(jobs, make)
     return _kept(context, campaign.testing.method, Tests.joined(found))
 
 
@@ -72,14 +73,13 @@ def keep_run(step: Run, context: Context) -> dict[str, Any]:
     assert isinstance(done, RunResult)  # of one scenario
     method, engine = campaign.testing.method, {"engine": campaign.world.engine}
     if method != "shells":
-        return {**engine, **_kept(context, method, read_run(run)[0])}
+        tests = Tests.joined(map(Tests.of_block, stored_blocks(run, moments=False)))
+        return engine | _kept(context, method, tests)
     found = done.estimates["estimates"]["shells"]
     needed = None if found["rhw"] is None else found["n_episodes"] * (found["rhw"] / context.rhw) ** 2
     rate = figure(found["crash_rate"], found["ci_low"], found["ci_high"])
-    return {
-        **engine,
-        "figures": {"tests": exactly(found["n_episodes"]), "crash_rate": rate, "tests_for_rhw": figure(needed)},
-    }
+    figures = {"tests": exactly(found["n_episodes"]), "crash_rate": rate, "tests_for_rhw": figure(needed)}
+    return {**engine, "figures": figures}
 
 
 def _kept(context: Context, method: Method, tests: Tests) -> dict[str, Any]:

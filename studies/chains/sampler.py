@@ -13,6 +13,8 @@ from harness.vocabulary import CRASH, TIMEOUT, BoolArray, FloatArray, IntArray, 
 from studies.chains.chain import Chain
 
 DEFENSIVE_SHARE = 0.1
+Seen = tuple[BoolArray, FloatArray]
+"""Whether a step is critical (m,), and C_j of its maneuvers (J, m, A)."""
 
 
 def blocks(chain: Chain, method: Method, sizes: list[int], seed: int) -> Iterator[Block]:
@@ -101,16 +103,16 @@ class Sampler:
         later = self.p_cut_later[rows, t]
         forced_cut = np.divide(p[:, 1], later, out=np.zeros(len(rows)), where=later > 0.0)
         forced = np.stack([1.0 - forced_cut, forced_cut], axis=1)
-        critical, challenge = chain.proposals.critical_before[t, state], self.challenge(t)[0][:, state]
-        cut = self._maneuver(rows, p, q, forced, critical, challenge) == 1
+        seen = chain.proposals.critical_before[t, state], self.challenge(t)[0][:, state]
+        cut = self._maneuver(rows, p, q, forced, seen) == 1
         self.after[rows[cut]] = _choose(chain.entry[state[cut]], self.rng)
 
     def _step_after(self, t: int, rows: IntArray) -> None:
         chain, state = self.chain, self.after[rows]
         p = chain.exposure[state]
         q = np.moveaxis(chain.proposals.maneuver[:, t, state], 0, 1)
-        critical, challenge = chain.proposals.critical_after[t, state], self.challenge(t)[1][:, state]
-        maneuver = self._maneuver(rows, p, q, p, critical, challenge)
+        seen = chain.proposals.critical_after[t, state], self.challenge(t)[1][:, state]
+        maneuver = self._maneuver(rows, p, q, p, seen)
         self.after[rows] = _choose(chain.response[state, maneuver], self.rng)
 
     def challenge(self, t: int) -> tuple[FloatArray, FloatArray]:
@@ -128,17 +130,9 @@ class Sampler:
         log_q = np.column_stack([self.log_forced[rows], self.log_ratio[rows]])
         return np.asarray(np.exp(-logsumexp(log_q + np.log(self.alpha), axis=1)))
 
-    def _maneuver(
-        self,
-        rows: IntArray,
-        p: FloatArray,
-        q: FloatArray,
-        forced: FloatArray,
-        critical: BoolArray,
-        challenge: FloatArray,
-    ) -> IntArray:
-        """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A), challenge (J, m, A)."""
-        sampled = p
+    def _maneuver(self, rows: IntArray, p: FloatArray, q: FloatArray, forced: FloatArray, seen: Seen) -> IntArray:
+        """Draw from what the method says and keep the likelihood ratios; p (m, A), q (m, J, A)."""
+        (critical, challenge), sampled = seen, p
         if self.method == "step_mixture":
             sampled = np.where(critical[:, None], np.einsum("mja,j->ma", q, self.alpha), p)
         elif self.method != "nde":

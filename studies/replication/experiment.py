@@ -30,12 +30,7 @@ class SuperPopulation(Section):
     """
 
     paths: Whole = Field(65_536, ge=1024, le=1 << 22, description="paths that pools are drawn from, with replacement")
-    reference_paths: Whole = Field(
-        65_536,
-        ge=0,
-        le=1 << 22,
-        description="independent paths that the truth is from; 0, of single vehicles under shells: those of the pools",
-    )
+    reference_paths: Whole = Field(65_536, ge=0, le=1 << 22, description="independent ones for the truth; 0: the same")
     pool_paths: Whole = Field(16_384, ge=256, le=1 << 20, description="paths of each pool; smoke.yaml has 32,768")
 
 
@@ -46,9 +41,8 @@ class Adversary(Section):
     """
 
     of: AvName = Field(description="vehicle of avs whose crashes it has")
-    crashes: Literal["everywhere", "on_heaviest_paths", "on_lightest_paths"] = Field(
-        "everywhere", description="those inside the boundary that it has: on paths that weigh most, or least"
-    )
+    crashes: Literal["everywhere", "on_heaviest_paths", "on_lightest_paths"] = "everywhere"
+    """those inside the boundary that it has: on paths that weigh most, or least"""
     share: float = Field(0.1, gt=0.0, le=1.0, description="share of its crash rate that these paths hold")
     hole: float = Field(0.0, ge=0.0, le=1.0, description="share of cut-ins outside on which it crashes besides")
     failing: float = Field(0.0, ge=0.0, lt=1.0, description="share of its crashes that end as failed tests instead")
@@ -72,23 +66,16 @@ class Experiment(Section):
     seed: Whole = Field(1, ge=0, lt=2**31)
     replications: Whole = Field(2000, ge=2, le=1_000_000, description="independent repetitions for each vehicle")
     campaign: Campaign = Field(description="what is repeated; its own av is replaced, stop.rhw null means a fixed n")
-    avs: dict[AvName, AutomatedVehicle] = Field(
-        {}, description="built-in models; under shells controllers that act, too"
-    )
+    avs: dict[AvName, AutomatedVehicle] = Field({}, description="built-in models; under shells controllers that act")
     adversaries: dict[AvName, Adversary] = Field({}, description="made of some of avs; under shells alone")
     pairs: dict[AvName, Pair] = Field({}, description="comparisons, instead of single vehicles; under shells alone")
     chains: list[str] = Field([], description="exact Markov chains, instead of avs")
     estimators: list[EstimatorName] = Field([], description="whose results are judged; the method's own when left out")
-    limits: list[Positive] = Field(
-        [],
-        description="judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate "
-        "in the super-population; at 1 both verdicts are wrong, and each is judged",
-    )
-    verdicts: list[Positive] = Field(
-        [],
-        description="judge decisions, too: limits as multiples of the rate of `beside`, the same for each vehicle; "
-        "which verdict is wrong follows from its own ratio",
-    )
+    limits: list[Positive] = []
+    """judge decisions instead of intervals: limits of `accept`, as multiples of each one's crash rate in the
+    super-population; at 1 both verdicts are wrong, and each is judged"""
+    verdicts: list[Positive] = []
+    """judge decisions, too: limits as multiples of the rate of `beside`; which is wrong follows from one's own ratio"""
     beside: str | None = Field(None, description="decide limits beside this reference driver: accept.times_reference")
     budgets: list[Whole] = Field([], description="numbers of tests within which limits are judged, and stop.episodes")
     levels: list[Positive] = Field([], description="further levels at which the same tests of shells are judged")
@@ -158,9 +145,8 @@ class Experiment(Section):
         names += [("campaign.world.engine", self.campaign.world.engine, ["twin"])]
         for key in ("adversaries", "pairs", "limits", "verdicts"):
             names += [("campaign.testing.method", method, ["shells"])] * bool(getattr(self, key))
-        names += [
-            (f"adversaries.{name}", name, ["a name that avs has not"]) for name in {*self.adversaries} & {*self.avs}
-        ]
+        twice = {*self.adversaries} & {*self.avs}
+        names += [(f"adversaries.{name}", name, ["a name that avs has not"]) for name in twice]
         names += [("limits", "limits for pairs", ["limits for single vehicles"])] * bool(self.limits and self.pairs)
         names += [("beside", "none", ["a reference driver, for verdicts"])] * bool(self.verdicts and not self.beside)
         for name, av in self.avs.items():

@@ -14,7 +14,7 @@ would: told the index of its shadow run, and held to the hash of what it did the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -139,7 +139,7 @@ def _reactions(av: AutomatedVehicle, see_onset: bool) -> tuple[RecordArray, list
 
 
 def enumerate_paths(
-    environment: Environment, drivers: Drivers, seed: int, n_paths: int, progress: Progress
+    environment: Environment, progress: Progress, drivers: Drivers, seed: int, n_paths: int
 ) -> SuperPopulation:
     """Enumerate paths that are aimed at the drivers' crashes, and keep the cut-ins with crashes."""
     pilot = Enumerator(family_named("cut_in"), environment, Followers(drivers.records, drivers.envelope), seed)
@@ -216,6 +216,10 @@ def of_pair(population: SuperPopulation, a: FloatArray, b: FloatArray) -> dict[s
     return {DIFFERENCE: difference, CONDITIONAL_DIFFERENCE: difference}
 
 
+Enumerate = Callable[[Drivers, int, int], SuperPopulation]
+"""`enumerate_paths` by drivers, seed and number of paths."""
+
+
 class Truths:
     """Paths that vehicles' truths are from: aimed at all drivers, and again at some that these leave imprecise.
 
@@ -224,20 +228,13 @@ class Truths:
     """
 
     def __init__(
-        self,
-        environment: Environment,
-        drivers: Drivers,
-        seed: int,
-        n_paths: int,
-        progress: Progress,
-        together: Iterable[set[str]] = (),
+        self, enumerated: Enumerate, drivers: Drivers, seed: int, n_paths: int, together: Iterable[set[str]] = ()
     ) -> None:
-        self._enumerated = [(drivers, enumerate_paths(environment, drivers, seed, n_paths, progress))]
+        self._enumerated = [(drivers, enumerated(drivers, seed, n_paths))]
         imprecise = {name for name in drivers.vehicles if self.vehicle(name)[RATE].relative_error > LARGEST_ERROR}
         if imprecise:
             again = drivers.only(imprecise.union(*(pair for pair in together if pair & imprecise)))
-            population = enumerate_paths(environment, again, seed + 1, MORE_PATHS * n_paths, progress)
-            self._enumerated.insert(0, (again, population))
+            self._enumerated.insert(0, (again, enumerated(again, seed + 1, MORE_PATHS * n_paths)))
 
     def vehicle(self, name: str) -> dict[str, Known]:
         """Everything about one vehicle."""
@@ -290,7 +287,7 @@ def walk_paths(
         part = {name: getattr(paths, name)[first : first + WALKED_CHUNK] for name in ("index", "start", "weight")}
         jobs.append((first, replace(paths, **part)))
     walk = partial(_walk, campaign.model_dump_json(), stride)
-    return joined(results_of("walked paths", jobs, walk, progress, run=executor.map, size=lambda job: len(job[1])))
+    return joined(results_of("walked paths", jobs, walk, progress, executor))
 
 
 def _walk(campaign_json: str, stride: int, job: tuple[int, BaselinePaths]) -> SuperPopulation:

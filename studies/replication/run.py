@@ -6,7 +6,6 @@ The folder receives results.json, and all replications as Parquet.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -24,22 +23,18 @@ TASKS_PER_SUBJECT = 8
 RESULTS, REPLICATIONS = "results.json", "replications.parquet"
 
 
-def validate(
-    experiment: Experiment, folder: Path, *, workers: int | None = None, progress: Progress | None = None
-) -> list[Judgement]:
+def validate(experiment: Experiment, folder: Path, workers: int | None, progress: Progress) -> list[Judgement]:
     """Repeat, judge, and write the results into a folder, whose earlier ones are replaced.
 
     Worker processes, one per core by default, change no bit.
     """
-    progress = progress or Progress()
     require_place(folder)
     n, found = experiment.replications, dict[Subject, list[Row]]()
     size = -(-n // TASKS_PER_SUBJECT)
     jobs = [range(first, min(first + size, n)) for first in range(0, n, size)]
     with worker_processes(workers) as executor:
         for subject, repeated in list(subjects(experiment, executor, progress)):
-            stage = f"replications of {subject.name}"
-            parts = results_of(stage, jobs, repeated.run, progress, run=executor.map, size=len)
+            parts = results_of(f"replications of {subject.name}", jobs, repeated.run, progress, executor)
             found[subject] = [row for part in parts for row in part]
     judgements = corrected(
         [
@@ -48,16 +43,8 @@ def validate(
             for result in dict.fromkeys(row.result for row in rows)
         ]
     )
-    write_results(folder, experiment, judgements, found)
-    return judgements
-
-
-def write_results(
-    folder: Path, experiment: Experiment, judgements: Sequence[Judgement], found: Mapping[Subject, Sequence[Row]]
-) -> None:
-    """Write all files."""
-    rows = [{"subject": subject.name, **asdict(row)} for subject, rows in found.items() for row in rows]
-    write_table(folder / REPLICATIONS, pa.Table.from_pylist(rows))
+    table = [{"subject": subject.name, **asdict(row)} for subject, rows in found.items() for row in rows]
+    write_table(folder / REPLICATIONS, pa.Table.from_pylist(table))
     content = {
         "experiment": experiment.model_dump(mode="json"),
         "confidence": experiment.nominal,
@@ -67,6 +54,7 @@ def write_results(
         "judgements": judgements,
     }
     write_json(folder / RESULTS, finite_json(content))  # of what never crashes nothing relative is known
+    return judgements
 
 
 COLUMNS = {

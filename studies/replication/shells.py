@@ -535,11 +535,8 @@ def equals(library: Library, population: SuperPopulation, crashing: FloatArray) 
     """Surrogates that crash on the same cut-ins as a vehicle (its mass of them, shape (m,)), or nearly as often."""
     rate = crashing.sum()
     masses = {name: population.mass * population.crashes(d) for d, name in enumerate(library.surrogates)}
-    return {
-        name
-        for name, mass in masses.items()
-        if abs(mass.sum() - rate) <= EQUAL_RATE * rate or np.array_equal(mass, crashing)
-    }
+    near = {name for name, mass in masses.items() if abs(mass.sum() - rate) <= EQUAL_RATE * rate}
+    return near | {name for name, mass in masses.items() if np.array_equal(mass, crashing)}
 
 
 def leave_out(library: Library, names: set[str], conservative_first: tuple[str, ...]) -> Library:

@@ -17,36 +17,14 @@ from harness.strata import LIBRARY_STATEMENT
 from harness.vehicles.library import Library, load_library
 from studies.chains.chain import CHAINS, Chain
 from studies.chains.shells import ChainShells
+from studies.replication import populations, shells
 from studies.replication.experiment import Experiment
 from studies.replication.judgement import Subject
-from studies.replication.populations import (
-    CONDITIONAL_DIFFERENCE,
-    RATE,
-    Drivers,
-    Known,
-    SuperPopulation,
-    Truths,
-    choose_paths,
-    enumerate_paths,
-    of_pair,
-    of_vehicle,
-    reference_drivers,
-    walk_paths,
-)
-from studies.replication.shells import (
-    BOUND,
-    Division,
-    Draw,
-    OvertakingShells,
-    PairedCampaign,
-    ShellCampaign,
-    bound_outside,
-    limit_at,
-    result_of,
-)
+from studies.replication.populations import CONDITIONAL_DIFFERENCE, RATE, Drivers, Known, SuperPopulation, Truths
+from studies.replication.shells import Division
 from studies.replication.weighted import WeightedCampaign, chain_episodes, twin_episodes
 
-Repeated = ShellCampaign | PairedCampaign | WeightedCampaign
+Repeated = shells.ShellCampaign | shells.PairedCampaign | WeightedCampaign
 """A campaign that can be repeated, in any process."""
 Tested = tuple[Subject, Repeated]
 
@@ -59,11 +37,11 @@ def subjects(experiment: Experiment, executor: Executor, progress: Progress) -> 
     if experiment.acting and not experiment.pairs:
         size, seeds = experiment.super_population, (experiment.seed + 1, experiment.seed)
         sizes = zip(seeds, (size.reference_paths, size.paths), strict=True)
-        walked = [choose_paths(experiment.campaign, seed, n_paths, progress) for seed, n_paths in sizes if n_paths]
+        walked = [populations.choose_paths(experiment.campaign, seed, n, progress) for seed, n in sizes if n]
         for name in experiment.acting:
             campaign = experiment.subject(name)
-            pools = walk_paths(campaign, walked[-1], executor, progress, 1)
-            truth = walk_paths(campaign, walked[0], executor, progress) if size.reference_paths else None
+            pools = populations.walk_paths(campaign, walked[-1], executor, progress, 1)
+            truth = populations.walk_paths(campaign, walked[0], executor, progress) if size.reference_paths else None
             yield _acting(experiment, name, truth, pools)
 
 
@@ -83,13 +61,14 @@ def _holding(experiment: Experiment, progress: Progress) -> Iterator[Tested]:
     environment, library = load_environment(campaign.environment), load_library(campaign.pool.library)
     drivers = Drivers.of(library, experiment.holding, see_onset=environment.lateral.present)
     together = [{pair.a, pair.b} & {*drivers.vehicles} for pair in pairs.values()]
-    enumerated = partial(enumerate_paths, environment, drivers, experiment.seed, size.paths, progress)
+    enumerated = partial(populations.enumerate_paths, environment, progress)
     if campaign.testing.method == "shells" and not (pairs or size.reference_paths):
-        yield from _single(experiment, library, drivers, None, enumerated())
+        yield from _single(experiment, library, drivers, None, enumerated(drivers, experiment.seed, size.paths))
         return
-    truths = Truths(environment, drivers, experiment.seed + 1, size.reference_paths, progress, together)
+    truths = Truths(enumerated, drivers, experiment.seed + 1, size.reference_paths, together)
     if campaign.testing.method == "shells":
-        yield from (_pairs if pairs else _single)(experiment, library, drivers, truths, enumerated())
+        pools = enumerated(drivers, experiment.seed, size.paths)
+        yield from (_pairs if pairs else _single)(experiment, library, drivers, truths, pools)
         return
     for name in experiment.holding:
         tested = experiment.subject(name)
@@ -102,12 +81,12 @@ def _acting(experiment: Experiment, name: str, truth: SuperPopulation | None, po
     campaign = experiment.subject(name)
     library, limit = load_library(campaign.pool.library), acceleration_limit(campaign.av)
     vehicle = {library.n_drivers: 1.0}
-    crashing, paths, references = pools.crash_mass(vehicle), campaign.pool.shadow_paths, reference_drivers(library)
+    crashing, references = pools.crash_mass(vehicle), populations.reference_drivers(library)
     if truth is None:
-        known = _exactly(of_vehicle(pools, crashing, references))
+        known = _exactly(populations.of_vehicle(pools, crashing, references))
     else:
-        known = of_vehicle(truth, truth.crash_mass(vehicle), references)
-    division = Division(library, pools, [crashing], paths, limit_mps2=limit, shadow_runs=True)
+        known = populations.of_vehicle(truth, truth.crash_mass(vehicle), references)
+    division = Division(library, pools, [crashing], campaign.pool.shadow_paths, limit_mps2=limit, shadow_runs=True)
     return _vehicle(experiment, name, division.of_vehicle(crashing), known)
 
 
@@ -115,7 +94,7 @@ def _seed(experiment: Experiment, name: str) -> int:
     return experiment.seed_of(list(experiment.avs).index(name))
 
 
-def _vehicle(experiment: Experiment, name: str, source: OvertakingShells, known: Mapping[str, Known]) -> Tested:
+def _vehicle(experiment: Experiment, name: str, source: shells.OvertakingShells, known: Mapping[str, Known]) -> Tested:
     """A vehicle by what is known about it, its crash rate among it; adversaries have the seed of what they are of."""
     of = experiment.adversaries[name].of if name in experiment.adversaries else name
     outside, boundary = source.crashes_outside(source.crashing[0]), source.template.library.boundary
@@ -128,7 +107,7 @@ def _of_shells(
     experiment: Experiment,
     campaign: Campaign,
     name: str,
-    draw: Draw,
+    draw: shells.Draw,
     seed: int,
     known: Mapping[str, Known],
     own_rate: float,
@@ -142,15 +121,15 @@ def _of_shells(
     """
     limits, budgets = {factor: factor * own_rate / unit for factor in experiment.limits}, experiment.all_budgets
     limits |= {limit * unit / own_rate: limit for limit in experiment.verdicts}
-    decisions = [result for pair in product(limits, budgets) for result in limit_at(*pair)]
-    outside = {result_of(each): share for each, share in beyond.items()}
-    outside |= dict.fromkeys(decisions, outside.get(result_of(campaign.testing.shells.statement), 0.0))
+    decisions = [result for pair in product(limits, budgets) for result in shells.limit_at(*pair)]
+    outside = {shells.result_of(each): share for each, share in beyond.items()}
+    outside |= dict.fromkeys(decisions, outside.get(shells.result_of(campaign.testing.shells.statement), 0.0))
     others = {result: value for result, value in known.items() if result != RATE}
-    others |= dict.fromkeys([BOUND, *decisions], Known.exactly(own_rate))
-    others |= {bound_outside(each): Known(share * own_rate, 0.0, own_rate) for each, share in beyond.items()}
+    others |= dict.fromkeys([shells.BOUND, *decisions], Known.exactly(own_rate))
+    others |= {shells.bound_outside(each): Known(share * own_rate, 0.0, own_rate) for each, share in beyond.items()}
     subject = Subject(name, known[RATE], others, outside, **more)
     more_of = experiment.siblings, experiment.beside, experiment.levels, bool(experiment.verdicts)
-    return subject, ShellCampaign(campaign, draw, seed, limits, budgets, *more_of)
+    return subject, shells.ShellCampaign(campaign, draw, seed, limits, budgets, *more_of)
 
 
 def _exactly(known: Mapping[str, Known]) -> dict[str, Known]:
@@ -166,12 +145,12 @@ def _single(
     for name, av in experiment.holding.items():
         crashing = pools.crash_mass(drivers.vehicles[name])
         division = Division(library, pools, [crashing], paths, limit_mps2=acceleration_limit(av))
-        own = truths.vehicle(name) if truths else _exactly(of_vehicle(pools, crashing, drivers.references))
+        own = truths.vehicle(name) if truths else _exactly(populations.of_vehicle(pools, crashing, drivers.references))
         yield _vehicle(experiment, name, division.of_vehicle(crashing), own)
         for made_name, made in experiment.adversaries.items():
             if made.of == name:
                 of_adversary = division.as_adversary(made, crashing)
-                known = _exactly(of_vehicle(pools, of_adversary, drivers.references))
+                known = _exactly(populations.of_vehicle(pools, of_adversary, drivers.references))
                 yield _vehicle(experiment, made_name, division.of_vehicle(of_adversary, made), known)
 
 
@@ -190,7 +169,7 @@ def _pairs(
             division.as_adversary(made[one], crashing) if one in made else crashing
             for one, crashing in zip(both, of_base, strict=True)
         )
-        known = truths.pair(*both) if both == base else _exactly(of_pair(pools, a, b))
+        known = truths.pair(*both) if both == base else _exactly(populations.of_pair(pools, a, b))
         source, scale = division.of_pair(a, b), known[CONDITIONAL_DIFFERENCE].scale
         # Shares of the larger rate, as widths are; what only one of them does counts, whichever it is.
         differing = source.crashing[1] + source.crashing[2]
@@ -198,4 +177,4 @@ def _pairs(
         outside = {CONDITIONAL_DIFFERENCE: source.crashes_outside(differing)[LIBRARY_STATEMENT] * rate / scale}
         facts = dict(known), outside, source.left_out, source.template.library.boundary
         campaign, seed = experiment.subject(base[0]), experiment.seed_of(place)
-        yield Subject(name, Known.exactly(scale), *facts), PairedCampaign(campaign, source.draw, seed)
+        yield Subject(name, Known.exactly(scale), *facts), shells.PairedCampaign(campaign, source.draw, seed)

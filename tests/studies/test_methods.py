@@ -11,6 +11,7 @@ import pytest
 
 from harness.campaign.campaign import Campaign
 from harness.families import family_named
+from harness.progress import Progress
 from harness.strata import LIBRARY_STATEMENT
 from studies.chains.chain import CHAINS, DECISIVE, REPLAYED
 from studies.chains.shells import ChainShells
@@ -145,7 +146,7 @@ def test_committed_numbers_of_tests_and_errors_are_those_that_docs_promise():
 @pytest.mark.parametrize("name", ["chains_shells", "chains_forced"])
 def test_committed_experiments_are_what_the_command_gives(name, tmp_path):
     stored, shipped = committed(name)
-    validate(shipped, tmp_path)
+    validate(shipped, tmp_path, None, Progress())
     found = json.loads((tmp_path / "results.json").read_text())["judgements"]
     as_trees = (dict(enumerate(judgements)) for judgements in (found, stored.values()))
     assert unlike(*as_trees, digits=1e-9) == []  # in all digits on one CPU family

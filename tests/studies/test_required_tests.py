@@ -1,16 +1,14 @@
-"""RNoT as published: known answers, rules at the edges, that nothing but seed and records decides; the command."""
+"""RNoT as published: known answers, rules at the edges, that nothing but seed and records decides."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from harness.estimators.block import joined
 from harness.estimators.scv import Scv
-from harness.runner.stored import stored_blocks
 from studies import rnot
-from studies.__main__ import main
+from studies.case_study.counted import Counted
+from studies.case_study.figures import figure
 from studies.chains.chain import overtaking
 from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
@@ -21,40 +19,38 @@ GRID = np.array([10, 20, 30, 40, 50])
 QUICK = rnot.Procedure(rhw=0.6, n_shuffles=5, ratio=1.3, seed=3)
 
 
-def read(*rhw: float) -> rnot.RequiredTests:
-    return rnot.required_tests(np.array([rhw]), GRID, 0.3)
-
-
 @pytest.mark.parametrize(
-    ("rhw", "n", "never_reached", "never_above"),
+    ("rhw", "n", "never_reached"),
     [
-        ((0.9, 0.2, 0.5, 0.3, 0.1), 40, False, False),  # a dip below the threshold does not count
-        ((0.1, 0.15, 0.25, 0.2, 0.1), 30, False, True),  # nothing above it: the n of the largest
-        ((0.2, 0.2, 0.1, 0.2, 0.1), 10, False, True),
-        ((0.9, 0.9, 0.9, 0.9, 0.3), 50, False, False),
-        ((0.1, 0.1, 0.1, 0.1, 0.31), 50, True, False),
-        ((0.1, 0.1, 0.1, 0.1, np.inf), 50, True, False),
-        ((0.1, 0.1, 0.1, 0.1, np.nan), 50, True, False),
+        ((0.9, 0.2, 0.5, 0.3, 0.1), 40, False),  # a dip below the threshold does not count
+        ((0.1, 0.15, 0.25, 0.2, 0.1), 30, False),  # nothing above it: the n of the largest
+        ((0.2, 0.2, 0.1, 0.2, 0.1), 10, False),
+        ((0.9, 0.9, 0.9, 0.9, 0.3), 50, False),
+        ((0.1, 0.1, 0.1, 0.1, 0.31), 50, True),
+        ((0.1, 0.1, 0.1, 0.1, np.inf), 50, True),
+        ((0.1, 0.1, 0.1, 0.1, np.nan), 50, True),
     ],
 )
-def test_the_required_number_is_the_first_look_from_which_on_the_width_stays_below(rhw, n, never_reached, never_above):
-    found = read(*rhw)
-    assert (found.n, found.never_reached, found.never_above) == (n, never_reached, never_above)
+def test_the_required_number_is_the_first_look_from_which_on_the_width_stays_below(rhw, n, never_reached):
+    found = rnot.required_tests(np.array([rhw]), GRID, 0.3)
+    assert (found.n, found.never_reached) == (n, never_reached)
     assert found.is_lower_limit == never_reached
 
 
-def test_the_acceleration_says_on_which_side_of_the_truth_it_is():
-    slow, fast = read(0.9, 0.9, 0.9, 0.1, 0.1), read(0.9, 0.1, 0.1, 0.1, 0.1)
-    never = read(0.9, 0.9, 0.9, 0.9, 0.9)
-    assert rnot.acceleration(slow, fast) == (2.0, "equal")
-    assert rnot.acceleration(never, fast) == (2.5, "at least")
-    assert rnot.acceleration(fast, never) == (0.4, "at most")
-    assert rnot.acceleration(never, never)[1] == "unknown"
+def test_the_acceleration_is_open_on_the_side_where_nothing_is_known():
+    slow, fast, never = (
+        Counted(rnot.required_tests(np.array([[0.9, *rhw]] * 2), GRID, 0.3), settled=True)
+        for rhw in ((0.9, 0.9, 0.1, 0.1), (0.1, 0.1, 0.1, 0.1), (0.9, 0.9, 0.9, 0.9))
+    )
+    assert slow.over(fast, 0.9) == figure(2.0, 2.0, 2.0)
+    assert never.over(fast, 0.9) == figure(2.5, 2.5)
+    assert fast.over(never, 0.9) == figure(0.4, None, 0.4)
+    assert never.over(never, 0.9) == figure(None)
 
 
 def test_the_grid_rises_to_the_total():
     assert rnot.Procedure(first=10, ratio=2.0).grid(100).tolist() == [10, 20, 40, 80, 100]
-    assert rnot.Procedure(first=10, ratio=1.01, total=13).grid(100).tolist() == [10, 11, 12, 13]
+    assert rnot.Procedure(first=10, ratio=1.01).grid(13).tolist() == [10, 11, 12, 13]
     assert rnot.Procedure(first=10).grid(4).tolist() == [4]
 
 
@@ -81,22 +77,3 @@ def test_algorithm_1_grown_look_by_look_is_algorithm_1_on_each_prefix():
         for at, n in enumerate(procedure.grid(3_000)):
             anew = fed(Scv(), [tests.chosen(order[:n])])
             assert grown[shuffle, at] == anew.result(procedure.confidence).rhw
-
-
-def test_a_stored_run_gives_what_its_blocks_give(stored_run, capsys):
-    folder = stored_run("step-recursive-twin")
-    options = ["--rhw", "0.6", "--shuffles", "5", "--seed", "3", "--ratio", "1.3", "-e", "nade", "-e", "scv", "--json"]
-    assert main(["rnot", str(folder), *options]) == 0
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    tests = joined(list(stored_blocks(folder, moments=True)))
-    grid = QUICK.grid(240)
-    nade = rnot.required_tests(rnot.plain_rhw(tests.weighted_crashes()[tests.crash], 240, QUICK), grid, QUICK.rhw)
-    scv = rnot.required_tests(rnot.scv_rhw(tests, QUICK), grid, QUICK.rhw)
-    assert [row["mean"] for row in rows] == [nade.mean, scv.mean]
-    assert (rnot.SCV_REMARK in rows[1]["remarks"], rnot.SCV_REMARK in rows[0]["remarks"]) == (True, False)
-    assert rows[0]["grid"] == f"10 to 240 by 0.3 n ({len(grid)} looks)"
-
-
-def test_the_command_refuses_shells_in_plain_words(stored_run, capsys):
-    assert main(["rnot", str(stored_run("shells-twin"))]) == 2
-    assert "drawn from shells" in capsys.readouterr().err

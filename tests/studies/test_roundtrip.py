@@ -65,13 +65,14 @@ def test_shares_of_one_step_do_not_lean_on_those_of_others() -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One data set of 10 vehicle-hours."""
     made = tmp_path_factory.mktemp("roundtrip")
-    roundtrip.fit_data_sets(made, 10.0, 1, 40, Progress())
+    roundtrip.data_sets(made, 10.0, 1, 40, Progress())
     return made
 
 
 def test_a_data_set_is_fitted_once_and_near_what_was_put_in(folder: Path) -> None:
-    roundtrip.fit_data_sets(folder, 10.0, 1, 40, Progress())
-    (rows,) = roundtrip.kept_data_sets(folder, 10.0)
+    before = [path.stat().st_mtime_ns for path in folder.rglob("*.*")]
+    (rows,) = roundtrip.data_sets(folder, 10.0, 1, 40, Progress())
+    assert [path.stat().st_mtime_ns for path in folder.rglob("*.*")] == before
     assert rows.index.value_counts()[roundtrip.REPLICATE] == 40
     estimate = rows.loc[[roundtrip.ESTIMATE]]
     for state in roundtrip.STATES:  # within four standard errors, which are 0.2 to 0.5

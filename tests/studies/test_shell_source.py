@@ -57,7 +57,7 @@ def drivers():
 
 
 def enumerated(drivers, paths=PATHS):
-    return enumerate_paths(ENVIRONMENT, drivers, 3, paths, Progress())
+    return enumerate_paths(ENVIRONMENT, Progress(), drivers, 3, paths)
 
 
 @pytest.fixture(scope="module")
