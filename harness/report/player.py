@@ -23,7 +23,7 @@ from harness.pool.kept import onset_steps
 from harness.records.schemas import chosen_from
 from harness.report.summary import floats
 from harness.report.templates import write_page
-from harness.shown import Shown
+from harness.shown import ShortAnswer
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import library_records
 from harness.vocabulary import FloatArray, IntArray
@@ -44,7 +44,7 @@ Scene = dict[str, Any]
 
 
 @dataclass(frozen=True, repr=False)
-class ReplayResult(Shown):
+class ReplayResult(ShortAnswer):
     """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
 
     ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where
