@@ -44,9 +44,9 @@ def lines_of_run(
     return run_lines(campaign, manifest, estimates, folder / "report.html")
 
 
-def plot_of_run(folder: Path) -> Plot | None:
-    """The map of a stored run."""
+def plot_of_run(folder: Path, told: dict[str, Any] | None = None) -> Plot | None:
+    """The map of a stored run, by its own estimates or those that are ``told``."""
     from harness.report.page import where_plot_of  # noqa: PLC0415 - see above
     from harness.report.summary import read_run_folder  # noqa: PLC0415
 
-    return where_plot_of(read_run_folder(folder))
+    return where_plot_of(read_run_folder(folder, told))

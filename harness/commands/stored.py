@@ -284,7 +284,7 @@ def replay(
     from harness.records.reader import read_campaign
     from harness.report.motion import writer_of
     from harness.report.sumo_files import gui_program, watch
-    from harness.runner.stored import changed_code
+    from harness.runner.stored import changed_since
 
     files = [*files, *([] if sumo_folder is None else [sumo_folder / "test.sumocfg"])]
     for file in files:  # can be written, before anything is simulated for them
@@ -304,11 +304,10 @@ def replay(
     words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
-    if not stored and result.bit_equal is not False:
-        for changed in changed_code(manifest, campaign):
-            say(f"note: {changed}", err=True)
+    if not stored and result.bit_equal is not False and (note := changed_since(manifest, campaign).code_words()):
+        say(f"note: {note}", err=True)
     if program is not None:
         watch(result, program)
-    if result.bit_equal is False:
+    if result.changed is not None:
         found = "a replay that differs from the stored motion"
-        raise WorldDisagreementError(f"test {episode} of {folder}", found, "the same bits", str(result.suspects))
+        raise WorldDisagreementError(f"test {episode} of {folder}", found, "the same bits", result.changed.words())

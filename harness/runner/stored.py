@@ -32,13 +32,13 @@ from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
-from harness.shown import ShortAnswer
+from harness.shown import ShortAnswer, plot_of_run
 from harness.vocabulary import ESTIMATORS
 from harness.worlds import build_world
 
 if TYPE_CHECKING:
     from harness.report.drawing import Plot
-    from harness.report.player import ReplayResult
+    from harness.report.player import Changed, ReplayResult
 
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
@@ -60,10 +60,7 @@ class StoredEstimates(ShortAnswer, dict[str, Any]):
 
     def _plot(self) -> Plot | None:
         """The map of its tests, where what is told is of their own traffic."""
-        from harness.report.page import where_plot_of  # noqa: PLC0415 - draws
-        from harness.report.summary import read_run_folder  # noqa: PLC0415
-
-        return None if self.get("elsewhere") else where_plot_of(read_run_folder(self._folder, self))
+        return None if self.get("elsewhere") else plot_of_run(self._folder, self)
 
 
 @checked("harness.estimate")
@@ -202,14 +199,14 @@ def _result(
     tables: Mapping[str, pa.Table],
     bit_equal: bool | None,
     compared: tuple[str, ...],
-    suspected: str | None = None,
+    changed: Changed | None = None,
 ) -> ReplayResult:
     from harness.report.player import ReplayResult, Scenes, with_lateral  # noqa: PLC0415 - `run` and `estimate` draw nothing
 
     (row,), traces = tables["episodes"].to_pylist(), tables["traces"]
     scene = Scenes(campaign, traffic).scene(tables["episodes"], traces)
     traces = with_lateral(tables["episodes"], traces, family_named(campaign.scenario), traffic)
-    return ReplayResult(str(row["outcome"]), row, traces, bit_equal, compared, scene, suspected)
+    return ReplayResult(str(row["outcome"]), row, traces, bit_equal, compared, scene, changed)
 
 
 def _simulated(
@@ -222,7 +219,7 @@ def _simulated(
     again = run_apart(campaign.av, _replay, resolved, folder, episode, stored["episodes"])
     compared = tuple(name for name in again if name in stored and stored[name].num_rows)
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
-    why = None if bit_equal is not False else suspects(manifest, campaign)
+    why = None if bit_equal is not False else changed_since(manifest, campaign)
     return _result(campaign, resolved.environment, again, bit_equal, compared, why)
 
 
@@ -238,27 +235,15 @@ def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) ->
     return {"episodes": tables.episodes, "traces": tables.traces}
 
 
-def changed_code(manifest: dict[str, Any], campaign: Campaign) -> list[str]:
-    """Whether the vehicle's code has been changed since the run, in a sentence if so."""
-    if manifest.get("controller_sha256") == require_controller(campaign.av):
-        return []
-    return [f"{campaign.av.controller}, or a file that it is made of, has been changed since the run."]
+def changed_since(manifest: dict[str, Any], campaign: Campaign) -> Changed:
+    """What has changed since a run, by what its manifest knows."""
+    from harness.report.player import Changed  # noqa: PLC0415 - see above
 
-
-def suspects(manifest: dict[str, Any], campaign: Campaign) -> str:
-    """What may have made a replay differ, by what the manifest knows."""
-    changed = changed_code(manifest, campaign)
     here = {**versions(), "CPU": cpu_name()}
     there = {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
-    other = [f"{name} {there[name]} (here {here.get(name)})" for name in there if there[name] != here.get(name)]
-    found = [f"The run was made with {', '.join(other)}; bits are promised for equal ones."] * bool(other) + changed
-    if not changed and campaign.av.model is None:
-        same = "Versions, CPU and the controller's files are the run's. " if not other else ""
-        found.append(
-            f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier tests, "
-            "or a file that it reads. `harness av-check` looks for that."
-        )
-    return " ".join(found) or "Versions and CPU are the run's: the records have been changed, or it is a defect."
+    other = {name: (was, here.get(name)) for name, was in there.items() if was != here.get(name)}
+    same_code = manifest.get("controller_sha256") == require_controller(campaign.av)
+    return Changed(other, "" if same_code else str(campaign.av.controller), campaign.av.model is None)
 
 
 def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:

@@ -16,7 +16,7 @@ from harness.errors import CampaignError
 from harness.records.folder import read_manifest
 from harness.report.av_check import cause, rows, verdict
 from harness.runner.look import check_av
-from harness.runner.stored import replay_episode, suspects
+from harness.runner.stored import changed_since, replay_episode
 from tests.stored_runs import answer_in, copy_of, edit
 from tests.worlds.running import ROOT
 
@@ -301,11 +301,11 @@ def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
     manifest = read_manifest(folder)
     (folder / "estimates.json").unlink()
     edit(folder, repeated=None)
-    assert replay_episode(folder, 3).suspects is None
+    assert replay_episode(folder, 3).changed is None
     campaign = load_campaign(folder / "campaign.yaml")
-    assert "the vehicle does not do the same again" in suspects(manifest, campaign)
-    assert "made of, has been changed" in suspects({**manifest, "controller_sha256": "0"}, campaign)
-    assert "CPU Z80 (here" in suspects({**manifest, "cpu": "Z80"}, campaign)
+    assert "the vehicle does not do the same again" in changed_since(manifest, campaign).words()
+    assert "made of, has been changed" in changed_since({**manifest, "controller_sha256": "0"}, campaign).words()
+    assert "CPU Z80 (here" in changed_since({**manifest, "cpu": "Z80"}, campaign).words()
 
 
 # -- where cut-ins take time --
