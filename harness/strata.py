@@ -134,6 +134,12 @@ class ShellDesign:
         return next(((each.name, rate) for each, rate in rates if rate > 0.0), None)
 
     @property
+    def readings(self) -> list[str]:
+        """The first reference driver, and other readings of it: references that are named after that one."""
+        names = [each.name for each in self.references]
+        return [name for name in names if name == names[0] or name.startswith(f"{names[0]}-")]
+
+    @property
     def n_independent(self) -> float:
         """Paths that would err as the pool's do; fewer where they were chosen from a finite number, which errs too."""
         return self.n_paths / (1.0 + self.n_paths / self.candidates) if self.candidates else self.n_paths

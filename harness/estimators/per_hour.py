@@ -58,12 +58,6 @@ class OfFamily(NamedTuple):
         return float(self.p @ self.tally.share)
 
     @property
-    def readings(self) -> list[str]:
-        """The competent driver, and other readings of it: references that are named after the first one."""
-        names = [each.name for each in self.seen.design.references]
-        return [name for name in names if name == names[0] or name.startswith(f"{names[0]}-")]
-
-    @property
     def reference(self) -> int:
         """Place of its reading among the library's references."""
         names = [each.name for each in self.seen.design.references]
@@ -226,7 +220,7 @@ class PerHour:
         of_bound = Level.of_bound(confidence, n)
         bound = self.limits_with_counts(of_bound)[1] if counts else self.limits(of_bound).high
         per_km = 1e6 / (3.6 * speed_mps)  # of a million km, per hour
-        names = dict.fromkeys(name for of in self.families for name in of.readings) or [""]
+        names = dict.fromkeys(name for of in self.families for name in of.seen.design.readings) or [""]
         beside, *readings = (
             PerHour([of._replace(reading=name) for of in self.families])._beside(name, level) for name in names
         )

@@ -169,7 +169,7 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
     names = tuple(bar.what for bar in shown)
     ends = np.array([[np.nanmin([*of, 1.0]), np.nanmax([*of, 1.0])] for bar in shown for of in (bar.rate, bar.ratio)])
     rate, ratio = ends[0::2].T, ends[1::2].T
-    low, high = 0.9 * float(max(rate[0].min(), 1e-3)), 1.1 * float(rate[1].max())
+    low, high = 0.9 * float(max(ends[:, 0].min(), 1e-3)), 1.1 * float(ends[:, 1].max())
     rows, fitted = np.arange(len(names)), np.array([bar.known == "fitted" for bar in shown])
     y = PlotAxis("", len(names) - 0.4, -0.6, names=names)
     panel = PlotPanel(

@@ -26,6 +26,7 @@ from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, require_place, write_sealed
 from harness.records.replicates import read_replicates
 from harness.runner.stored_shells import Nearby, StoredShells, require_shares
+from harness.strata import ShellDesign
 
 N_REPLICATES = 50
 CONFIDENCE, QUANTILE = 0.9, 1.645
@@ -74,6 +75,7 @@ def sensitivity(
     results = tested.nearby([each for move in asked for each in move.settings], progress)
     bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
     driver = next((each.name for each in tested.design.references), "")
+    bars += bar_of_readings(tested.design)
     ordered, traffic = tuple(sorted(bars, key=lambda bar: -bar.span)), Path(settings.parameters).stem
     content = finite_json(Sensitivity(tested.manifest["campaign_hash"], traffic, driver, ordered))
     write_sealed(folder / SENSITIVITY, content)
@@ -101,12 +103,24 @@ def moves(
             if columns:
                 yield Move(block, "fitted", None, [{key: row[key] for key in columns} for row in rows])
     for key, number in known.items():
+        if key.startswith("exposure__"):  # moves no rate per test
+            continue
         what, value, se, ends = key.replace("__", "."), number.value, number.se, stated.get(key, number.range)
         if ends is not None:
             yield Move(what, "assumed", (ends[0], ends[1]), [{key: end} for end in ends])
         elif se is not None and parameters.replicates is None:
             ends = value - QUANTILE * se, value + QUANTILE * se
             yield Move(what, "fitted", ends, [{key: end} for end in ends])
+
+
+def bar_of_readings(design: ShellDesign) -> list[Bar]:
+    """By how much the ratio moves where the regulation's driver is read otherwise; none where only one reading is."""
+    rates = dict(zip((each.name for each in design.references), design.reference_rate.tolist(), strict=True))
+    first, *others = [rates[name] for name in design.readings] or [0.0]
+    ends = [first / rate for rate in others if min(first, rate) > 0.0]
+    known: Literal["assumed"] = "assumed"
+    whole = (1.0, 1.0), (min([*ends, 1.0]), max([*ends, 1.0])), (0.0, 0.0)
+    return [Bar(f"readings of {next(iter(rates))}", known, None, *whole, n=len(ends))] if ends else []
 
 
 def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:

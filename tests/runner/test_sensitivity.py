@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -13,9 +13,11 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
+from harness.progress import Progress
 from harness.report.rows import bar_note
-from harness.runner.sensitivity import Move, bar_of, moves, sensitivity
-from harness.runner.stored_shells import Nearby
+from harness.runner.sensitivity import Move, bar_of, bar_of_readings, moves, sensitivity
+from harness.runner.stored_shells import Nearby, StoredShells
+from harness.strata import Reference
 from tests.stored_runs import copy_of, manifest
 from tests.traffic.tables import TEXT, fitted
 
@@ -45,6 +47,15 @@ def test_of_traffic_in_which_nobody_crashes_nothing_is_said(folder, capsys):
     assert main(["sensitivity", str(folder), "--range", "scenario.duration_s=1:2", "--json"]) == 0
     (bar,) = (each for each in json.loads(capsys.readouterr().out)["bars"] if each["what"] == "scenario.duration_s")
     assert (bar["rate"], bar["ratio"], bar_note(bar)) == ([None, None], [None, None], "unlike what was tested")
+
+
+def test_other_readings_of_the_regulations_driver_move_the_ratio_alone(stored_run):
+    design = StoredShells.of(stored_run("shells-twin"), Progress(), "").design
+    named = [Reference("cc", ""), Reference("cc-letter", ""), Reference("cc-early", ""), Reference("fsm", "")]
+    rates = np.array([2.0e-4, 2.0e-3, 0.5e-4, 1e-9])
+    (bar,) = bar_of_readings(replace(design, references=tuple(named), reference_rate=rates, reference_square=rates))
+    assert (bar.rate, bar.ratio) == ((1.0, 1.0), pytest.approx((0.1, 4.0)))
+    assert not bar_of_readings(design)
 
 
 def test_what_was_fitted_together_moves_together(tmp_path):
