@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from harness.report.drawing import Plot
 
 
-class ShortAnswer:
+class ShownInPython:
     """Something that is shown as lines of text, of which there are some ten, and maybe a plot."""
 
     @abstractmethod

@@ -21,7 +21,7 @@ from harness.fitting.protocol import Asked, Fitted, Fitter
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
 from harness.records.folder import require_place, write_together
-from harness.shown import ShortAnswer
+from harness.shown import ShownInPython
 
 OF_YAML = b"Traffic fitted by harness"
 """What marks environment files that a fit has written."""
@@ -29,7 +29,7 @@ REPLICATES, SEED = 200, 1
 
 
 @dataclass(frozen=True, repr=False)
-class FittedFiles(ShortAnswer):
+class FittedFiles(ShownInPython):
     """What a fit has found and written, by family."""
 
     families: Mapping[str, Fitted]

@@ -37,7 +37,7 @@ from harness.records.folder import (
 )
 from harness.records.schemas import traces_schema
 from harness.resolved import resolve
-from harness.shown import ShortAnswer, lines_of_run, plot_of_run
+from harness.shown import ShownInPython, lines_of_run, plot_of_run
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) 
 
 
 @dataclass(frozen=True, repr=False)
-class StoredRun(ShortAnswer):
+class StoredRun(ShownInPython):
     """A run folder, whose tables are read when asked for; shown, it is the short answer.
 
     ``frame.attrs["unit"]`` and ``frame.attrs["doc"]`` give unit and meaning of each column by its name; the unit

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
 from harness.report.words import late_words
-from harness.shown import ShortAnswer
+from harness.shown import ShownInPython
 
 SLOW_S = 0.1
 """Time of a constructor that is worth a word."""
@@ -94,7 +94,7 @@ class Speed:
 
 
 @dataclass(frozen=True, repr=False)
-class AvCheck(ShortAnswer):
+class AvCheck(ShownInPython):
     """What a few dozen episodes say about an AV, run on an engine with cut-ins that a method brought about.
 
     ``failures`` are numbers of episodes of the first run by the cause that they failed with, where one stands for all

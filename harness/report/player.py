@@ -24,7 +24,7 @@ from harness.pool.kept import onset_steps
 from harness.records.schemas import chosen_from
 from harness.report.summary import floats
 from harness.report.templates import write_page
-from harness.shown import ShortAnswer
+from harness.shown import ShownInPython
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import library_records
 from harness.vocabulary import FloatArray, IntArray
@@ -73,7 +73,7 @@ class Changed(NamedTuple):
 
 
 @dataclass(frozen=True, repr=False)
-class ReplayResult(ShortAnswer):
+class ReplayResult(ShownInPython):
     """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
 
     ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where

@@ -38,7 +38,7 @@ from harness.runner.families import MEND, doubts_of, hour_answer, read_families,
 from harness.runner.paired import SIDES, Both, PairedScenario, copy_stored, drive_pairs, together
 from harness.runner.stored import replay_episode
 from harness.sampling.shells import PairRounds
-from harness.shown import ShortAnswer
+from harness.shown import ShownInPython
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import COMPARISON, FAMILIES
 
@@ -51,7 +51,7 @@ EXIT_OF: Mapping[PairVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUT
 
 
 @dataclass(frozen=True, repr=False)
-class Comparison(ShortAnswer):
+class Comparison(ShownInPython):
     """Two finished campaigns, in run folders ``a`` and ``b``, and the difference; shown, it is the short answer.
 
     ``content`` is that of ``compare.json``, ``report`` the page. The exit code is 4 when budget or pool were spent

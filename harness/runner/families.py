@@ -38,7 +38,7 @@ from harness.runner.stored import stored_blocks
 from harness.runner.underway import EXIT_OF, RunResult, Underway, begun
 from harness.sampling.hours import HourRounds
 from harness.sampling.milder import beyond_scope, n_left_out
-from harness.shown import ShortAnswer
+from harness.shown import ShownInPython
 from harness.vocabulary import FAMILIES
 
 MEND = "Run the campaign again into the same folder with --resume."
@@ -50,7 +50,7 @@ FAR_ABOVE = 10.0
 
 
 @dataclass(frozen=True, repr=False)
-class Hours(ShortAnswer):
+class Hours(ShownInPython):
     """What a finished campaign of several scenarios left: a run folder each, and ``families.json``, the ``content``.
 
     ``runs`` are their results. The exit code is 0, or 4 when the budget or a pool was spent before what was asked was
@@ -69,7 +69,7 @@ class Hours(ShortAnswer):
         return hour_lines(self.content, self.report)
 
 
-class HourEstimates(ShortAnswer, dict[str, Any]):
+class HourEstimates(ShownInPython, dict[str, Any]):
     """Content of ``families.json``; shown, it is the short answer."""
 
     def _lines(self) -> list[str]:

@@ -32,7 +32,7 @@ from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
-from harness.shown import ShortAnswer, plot_of_run
+from harness.shown import ShownInPython, plot_of_run
 from harness.vocabulary import ESTIMATORS
 from harness.worlds import build_world
 
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
-class StoredEstimates(ShortAnswer, dict[str, Any]):
+class StoredEstimates(ShownInPython, dict[str, Any]):
     """Content of ``estimates.json``, of the run in a folder; shown, it is the short answer, or a line an estimator."""
 
     def __init__(self, content: Mapping[str, Any], folder: Path, *, by_estimator: bool = False) -> None:

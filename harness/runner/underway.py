@@ -33,7 +33,7 @@ from harness.sampling.baseline import IN_WORDS, begin, requests_before, stored_b
 from harness.sampling.milder import N_TESTS, beyond_scope, milder_of, n_left_out
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import Shells, round_requests
-from harness.shown import ShortAnswer
+from harness.shown import ShownInPython
 from harness.signals import uninterrupted
 from harness.strata import STORED_DESIGN
 from harness.vocabulary import IntArray, StoppedBy
@@ -46,7 +46,7 @@ EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTE
 
 
 @dataclass(frozen=True, repr=False)
-class RunResult(ShortAnswer):
+class RunResult(ShownInPython):
     """What a finished campaign left in its folder, ``estimates.json`` and the page ``report.html`` among it.
 
     Shown, it is the short answer.
