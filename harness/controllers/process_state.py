@@ -63,9 +63,8 @@ class OtherModules:
     def __init__(self) -> None:
         self._loaded, self._finders, self._depth = dict(sys.modules), list(sys.meta_path), sys.getrecursionlimit()
         self._blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
-        self._kept = {
-            name: _functions_and_numbers(vars(self._loaded[name])) for name in WATCHED if name in self._loaded
-        }
+        watched = [name for name in self._loaded if name in WATCHED or name.partition(".")[0] == OURS[0]]
+        self._kept = {name: _functions_and_numbers(vars(self._loaded[name])) for name in watched}
 
     def restored(self) -> list[str]:
         """Names, as ``math`` or ``math.sqrt``, that had been replaced or deleted; they are as before."""

@@ -208,7 +208,16 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
 
 @pytest.mark.parametrize("at", quick(1, ["constructor", "step"]))
 @pytest.mark.parametrize(
-    "what", ["math.isfinite", "pyarrow.parquet.write_table", "numpy", "harness", "sys.excepthook", "sys.meta_path"]
+    "what",
+    [
+        "math.isfinite",
+        "pyarrow.parquet.write_table",
+        "numpy",
+        "harness",
+        "harness.controllers.hosts.Guard",
+        "sys.excepthook",
+        "sys.meta_path",
+    ],
 )
 def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, capsys):
     assert _run(tmp_path, _of("Replaces", what=what, at=at)) == EXIT_BAD_INPUT
