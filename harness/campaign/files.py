@@ -20,7 +20,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import ModelName, default_surrogates
 from harness.campaign.python_files import in_python_file, is_script
 from harness.campaign.sections import DEFAULT, Section
-from harness.campaign.vehicle import AV_SOURCES, Panel, with_another_driver
+from harness.campaign.vehicle import AV_SOURCES, READ_BY, Panel, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml, yaml_text
 from harness.errors import CampaignError
 from harness.families import DEFAULT_FAMILY, family_named
@@ -376,10 +376,10 @@ def dump_campaign(campaign: Campaign) -> str:
 
 def written_out(campaign: Campaign) -> dict[str, Any]:
     """Plain data of a campaign with every default, but of the sources of an AV only the one that drives it."""
-    data = campaign.model_dump()
-    data["av"] = {key: value for key, value in data["av"].items() if key not in AV_SOURCES or value is not None}
-    if campaign.scenarios is not None and campaign.scenario == DEFAULT_FAMILY:  # which is not asked then
-        del data["scenario"]
+    several = campaign.scenarios is not None and campaign.scenario == DEFAULT_FAMILY  # which is not asked then
+    data = campaign.model_dump(exclude={"scenario"} if several else None)
+    none = {key for key in AV_SOURCES if data["av"][key] is None}
+    data["av"] = {key: value for key, value in data["av"].items() if READ_BY.get(key, key) not in none}
     return data
 
 

@@ -16,6 +16,8 @@ from harness.campaign.sections import Positive, Section, StepTime, Whole
 from harness.problems import NAME_PATTERN, broken_rule, listed
 
 AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
+READ_BY = {"traci_style": "controller"}
+"""Keys that one source alone reads."""
 READS_NO_PARAMETERS = {
     "sumo": "Write vType attributes under av.sumo itself.",
     "traci": "Give them to your program in av.traci.command.",
