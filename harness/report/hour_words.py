@@ -124,7 +124,7 @@ def scope(content: Mapping[str, Any]) -> str:
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else f', at ± {share(rhw)}'} (asked: ± {share(target)})"
-    elif content["stopped_by"] == "episodes" and content["decision"] is not None:
+    if content["stopped_by"] == "episodes" and (target is not None or content["decision"] is not None):
         ended += GO_ON
     counted = ", that of the sum also of counted events," if content["counts_in_interval"] else ""
     return scope_words(content["confidence"], ended, counted)

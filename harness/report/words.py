@@ -37,7 +37,7 @@ ENDED = {
 }
 """Why a campaign ended (`harness.vocabulary.StoppedBy`), in words."""
 GO_ON = "; raise it and go on with --resume"
-"""What to do where a verdict is open."""
+"""What to do where a verdict is open, or the asked precision not reached."""
 
 
 def ended_words(stopped_by: str | None, decision: Mapping[str, Any] | None) -> str:
@@ -207,7 +207,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         reached = f", at ± {share(asked)}" if asked <= WIDEST_RHW else f", at over ± {share(WIDEST_RHW)}"
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
-        ended += f"{reached} (asked: ± {share(target)}){remedy_words(manifest.get('remedy'))}"
+        more = GO_ON if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
+        ended += f"{reached} (asked: ± {share(target)}){more}"
     elif stopped_by == "episodes":
         ended = "all tests done" if campaign.accept is None else ended + GO_ON
     return scope_words(best.confidence, ended)
