@@ -39,7 +39,12 @@ GUISES: dict[str, Callable[[pd.DataFrame], pd.DataFrame]] = {
 }
 
 
-@pytest.mark.parametrize("guise", GUISES)
+FAST = "half of its time", "all of it"
+
+
+@pytest.mark.parametrize(
+    "guise", [pytest.param(each, marks=() if each in FAST else pytest.mark.slow) for each in GUISES]
+)
 def test_a_recording_that_comes_again_under_a_guise_is_refused(guise, tmp_path):
     again = GUISES[guise](ROWS)
     ROWS.to_parquet(tmp_path / "rows.parquet", index=False)
@@ -49,7 +54,7 @@ def test_a_recording_that_comes_again_under_a_guise_is_refused(guise, tmp_path):
         fit_files([tmp_path / "rows.parquet", tmp_path / "b.parquet"], tmp_path / "mine.yaml")
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.1])
+@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_recordings_of_one_law_are_told_apart(noise):
     """Three of five vehicles of each drive at one speed, the others speed up by one of three values."""
     whole = [rows for _, rows in overtaking(20.0, 5, noise=noise).groupby("recording_id")]
