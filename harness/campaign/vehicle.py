@@ -16,14 +16,14 @@ from harness.campaign.sections import Positive, Section, StepTime, Whole
 from harness.problems import NAME_PATTERN, broken_rule, listed
 
 AV_SOURCES = ("model", "controller", "sumo", "traci", "fmu")
-READ_BY = {"traci_style": "controller"}
-"""Keys that one source alone reads."""
 READS_NO_PARAMETERS = {
     "sumo": "Write vType attributes under av.sumo itself.",
     "traci": "Give them to your program in av.traci.command.",
     "fmu": "Write them under av.fmu.start_values.",
 }
 """Sources of an AV beside which parameters would be lost, and where to write them."""
+READ_BY = {"traci_style": "controller"}
+"""Keys that one source alone reads."""
 CONTROLLER_PATTERN = r"^(.+\.py|([A-Za-z_][A-Za-z0-9_.]*|.+\.py):[A-Za-z_][A-Za-z0-9_]*)$"
 
 
