@@ -213,7 +213,7 @@ class Family(Protocol):
         return read_model(file, self.model)
 
     def traffic(self, settings: EnvironmentSettings, parameters: Any = None) -> Environment:
-        """All that kernels need; ``parameters`` are read unless they are given. The parameters, where nothing is."""
+        """All that kernels need; ``parameters`` are read unless they are given. Here the parameters themselves."""
         return parameters or self.parameters(settings)
 
     def traffic_with(
