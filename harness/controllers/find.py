@@ -7,7 +7,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from functools import cache, partial
 from importlib.util import module_from_spec, spec_from_file_location
@@ -66,14 +66,15 @@ def own_code(name: str, where: str = "av.controller", what: str = _A_CONTROLLER)
 
 
 def source_of_own(name: str, where: str) -> str:
-    """What ``my.py:function`` is, wherever it lies: its name and the hash of its file, which is not run.
+    """What ``my.py:function`` is, wherever it lies: its name and a hash of its file and what this imports beside it.
 
-    Raises `CampaignError`, of the key ``where``: there is no such file.
+    None of it is run. Raises `CampaignError`, of the key ``where``: there is no such file.
     """
     file, _, function = name.rpartition(":")
     if not Path(file).is_file():
         raise CampaignError(where, f"no file {file}", "a Python file", "Correct the path, or put the file there again.")
-    return f"{function} {hashlib.sha256(Path(file).read_bytes()).hexdigest()}"
+    path = real_path(Path(file))
+    return f"{function} {_hash_of_all(map(str, files_imported(path, path.parent)))}"
 
 
 def _of_file(file: Path) -> ModuleType:
@@ -318,6 +319,10 @@ def _sources_of_made(av: AutomatedVehicle) -> str | None:
     files = {str(real_path(file)), *(name for name, was in named.items() if was == _hash_of(name))}
     if is_users(root := str(real_path(file).parents[above])):
         files |= {str(each) for each in files_imported(real_path(file), Path(root))}
+    return _hash_of_all(files)
+
+
+def _hash_of_all(files: Iterable[str]) -> str | None:
     contents = sorted(filter(None, map(_hash_of, files)))
     return hashlib.sha256("".join(contents).encode()).hexdigest() if contents else None
 

@@ -109,11 +109,16 @@ def test_what_is_no_surrogate_is_refused(body, said, tmp_path):
     assert caught.value.where == "surrogates.A"
 
 
-def test_a_surrogate_s_file_is_part_of_the_hash_and_its_place_is_not(tmp_path):
+@pytest.mark.parametrize("in_file", ["model.py", "numbers_of.py"])
+def test_a_surrogate_s_files_are_part_of_the_hash_and_their_place_is_not(in_file, tmp_path):
     resolved = []
     for i, braking in enumerate((-1.0, -1.0, -2.0)):
         (tmp_path / f"{i}").mkdir()
-        (tmp_path / f"{i}/model.py").write_text(f"class Mine:\n    def step_batch(self, seen): return {braking}\n")
+        body = "from numbers_of import BRAKING\nclass Mine:\n    def step_batch(self, seen): return BRAKING\n"
+        (tmp_path / f"{i}/numbers_of.py").write_text("BRAKING = -1.0\n")
+        (tmp_path / f"{i}/model.py").write_text(body)
+        with (tmp_path / f"{i}" / in_file).open("a") as file:
+            file.write(f"BRAKING = {braking}\n")
         one = harness.load_campaign("idm", [*FEW, f"surrogates={{A: '{tmp_path}/{i}/model.py:Mine'}}"])
         resolved.append(resolve(one))
     first, same, other = ((each.content_hash, each.challenge) for each in resolved)
