@@ -179,7 +179,7 @@ class Family(Protocol):
     """The one of them where nothing is said."""
     ladders: Mapping[bool, str]
     """Libraries of surrogates where nothing is said, by whether events show themselves before they happen."""
-    follows: bool = False
+    follows: bool
     """Whether the AV drives from the start, behind a vehicle that does not look at it: events do not depend on it."""
     stride: int = 1
     """Events of a path between two that a pool asks."""
@@ -234,8 +234,10 @@ class Family(Protocol):
         return int(self.uneventful(traffic, 1).speed.shape[1])
 
     def sideways_m(self, traffic: Environment) -> float:
-        """Way (m) from a first lateral motion to overlap."""
-        return TO_OVERLAP_M
+        """Way (m) from a first lateral motion to overlap; 0 where nobody changes lanes."""
+        if self.crosses not in (-1, self.principal):
+            raise NotImplementedError(f"{self.name} says how far its vehicle {self.crosses} moves sideways")
+        return 0.0 if self.crosses < 0 else TO_OVERLAP_M
 
     def shows(self, traffic: Environment) -> bool:
         """Whether events can be seen before they happen."""

@@ -253,8 +253,9 @@ def exposure_of(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
     """How often events of a scenario are met: the shipped number, or the one that is given for it."""
     shipped, name = resolved.family.exposure(resolved.environment, resolved.parameters), resolved.campaign.scenario
     if (own := given.get(name)) is not None and own > FAR_ABOVE * shipped.high:
-        told = f"exposure {name}={own:g} is {own / shipped.per_hour:.0f} times the shipped one, of events in scope"
-        sys.stderr.write(f"note: {told} (docs/families.md)\n")
+        from harness.report.hour_words import far_above  # noqa: PLC0415 - draws
+
+        sys.stderr.write(f"note: {far_above(name, own, shipped.per_hour)}\n")
     return own_exposure(shipped, given.get(name))
 
 

@@ -62,7 +62,7 @@ class CutIn(Family):
     ladders = {False: "ladder-2", True: "ladder-lateral-1"}
 
     fitter = "harness.families.cut_in.fitting.fitter:CutInFitter"
-    crosses, words = BV, WORDS
+    follows, crosses, words = False, BV, WORDS
     maps = ((AT_OVERLAP, CLOSING),)
     stand_ins = STAND_INS
 
