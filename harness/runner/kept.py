@@ -42,8 +42,8 @@ from harness.records.folder import (
     write_sealed,
 )
 from harness.records.origin import signature
+from harness.records.reader import ShownTests, by_kind
 from harness.records.schemas import ShardTables
-from harness.records.shown import ShownTests, by_kind
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult
 from harness.sampling.baseline import BaselineResult

@@ -24,7 +24,7 @@ from harness.pool.moved import assumed
 from harness.pool.shells import PrescribedEpisodes
 from harness.progress import Progress
 from harness.records.folder import ESTIMATES, MILDER, SHELLS, parquet, write_sealed
-from harness.records.shown import ShownTests
+from harness.records.reader import ShownTests
 from harness.resolved import Resolved
 from harness.runner.kept import Run, cpu_name, require_few_failed, require_same_pool, take_over
 from harness.runner.workers import LocalWorkers, ShardResult, Workers

@@ -20,7 +20,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.families import family_named
 from harness.families.protocol import Paths
 from harness.random_stream import INITIAL, uniforms
-from harness.runner.families import Hours
+from harness.runner.run import Hours
 from harness.vehicles.drivers import Followers, driver_records
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")

@@ -20,7 +20,7 @@ from harness.printed import PRINTED
 from harness.records.folder import read_manifest, write_sealed
 from harness.report.hour_words import hour_lines
 from harness.resolved import resolve
-from harness.runner.families import estimate_families
+from harness.runner.stored import estimate_families
 from tests.in_process import one_process
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
