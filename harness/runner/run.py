@@ -11,7 +11,7 @@ import time
 import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
 from harness.estimators.shells import SeenShells
-from harness.estimators.stopping import HourRule
+from harness.estimators.stopping import Decision, HourRule
 from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
 from harness.printed import PRINTED
@@ -33,8 +33,8 @@ from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, sole_use, write_bytes, write_sealed
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import require_no_fewer, require_own_folder
-from harness.runner.underway import EXIT_OF, RunResult, Underway, begun
-from harness.sampling.milder import beyond_scope, n_left_out
+from harness.runner.underway import EXIT_OF, RunResult, Underway, begun, doubted
+from harness.sampling.milder import n_left_out
 from harness.sampling.shells import HourRounds
 from harness.shown import ShownInPython
 from harness.vocabulary import FAMILIES
@@ -137,16 +137,12 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
         }
         yaml = dump_campaign(campaign).encode()
         write_bytes(out / CAMPAIGN, yaml)
-        hour, results = _run(campaign, begins, rule, progress)
+        hour, results, decision = _run(campaign, begins, rule, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     told = {name: (each.estimates, each.shown.manifest) for name, each in results.items()}
     answer = hour_answer(hour, ready, told, campaign.stop.confidence)
-    if (decision := rule.look.decision) is not None:
-        of_each = answer["families"].values()
-        n_milder = sum(beyond_scope(of["milder"]) + of[EARLY] for of in of_each)
-        n_differing = sum(len(of["repeated"]["differing"]) for of in of_each if of["repeated"])
-        decision = replace(decision, n_milder=n_milder, n_differing=n_differing)
+    if decision is not None:
         code = EXIT_OF[decision.verdict]
     from harness.report.page import write_hours  # noqa: PLC0415 - draws
     from harness.report.words import vehicle_words  # noqa: PLC0415
@@ -165,7 +161,7 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
 
 def _run(
     campaign: Campaign, begins: Mapping[str, AbstractContextManager[Underway]], rule: HourRule, progress: Progress
-) -> tuple[PerHour, dict[str, RunResult]]:
+) -> tuple[PerHour, dict[str, RunResult], Decision | None]:
     runs: dict[str, Underway] = {}
     with ExitStack() as working:
         for name, each in begins.items():
@@ -190,7 +186,8 @@ def _run(
     if campaign.accept is not None:  # tests that were cut off count as crashes in its decision alone
         seen = {name: SeenShells.of_blocks(underway.run.blocks) for name, underway in runs.items()}
         hour = PerHour([of._replace(seen=seen[of.family]) for of in hour.families])
-    return hour, results
+    decision = rule.look.decision and doubted(rule.look.decision, runs.values())
+    return hour, results, decision
 
 
 def _no_test_yet(underway: Underway, exposures: Mapping[str, float]) -> OfFamily:
