@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from harness.campaign.files import load_campaign
     from harness.errors import HarnessError
     from harness.fitting.files import fit_files as fit
-    from harness.records.reader import read
     from harness.report.motion import write_motion
     from harness.runner.compare import compare_campaigns as compare
     from harness.runner.look import check_av as av_check
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from harness.runner.stored import estimate_families, write_report
     from harness.runner.stored import estimate_run as estimate
     from harness.runner.stored import replay_episode as replay
+    from harness.runner.tables import read
 
 __all__ = [
     "HarnessError", "av_check", "compare", "estimate", "estimate_families", "estimate_in_other_traffic", "fit",
@@ -44,7 +44,7 @@ _PLACES = {
     "estimate_in_other_traffic": ("harness.runner.other_traffic", "estimate_in_other_traffic"),
     "fit": ("harness.fitting.files", "fit_files"),
     "load_campaign": ("harness.campaign.files", "load_campaign"),
-    "read": ("harness.records.reader", "read"),
+    "read": ("harness.runner.tables", "read"),
     "replay": ("harness.runner.stored", "replay_episode"),
     "run": ("harness.runner.run", "run_campaign"),
     "sensitivity": ("harness.runner.sensitivity", "sensitivity"),

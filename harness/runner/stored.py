@@ -36,7 +36,7 @@ from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.runner.run import exposure_of, hour_answer
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
-from harness.shown import ShownInPython, plot_of_run
+from harness.shown import ShownInPython
 from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 from harness.worlds import build_world
 
@@ -68,7 +68,11 @@ class StoredEstimates(ShownInPython, dict[str, Any]):
 
     def _plot(self) -> Plot | None:
         """The map of its tests, where what is told is of their own traffic."""
-        return None if self.get("elsewhere") or "families" in self else plot_of_run(self._folder, self)
+        from harness.report.page import where_plot_of  # noqa: PLC0415 - draws
+        from harness.report.summary import read_run_folder  # noqa: PLC0415
+
+        none = self.get("elsewhere") or "families" in self
+        return None if none else where_plot_of(read_run_folder(self._folder, self))
 
 
 @checked("harness.estimate")
@@ -348,9 +352,6 @@ def estimate_families(
     decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
     content = finite_json({**stored, "exposure": given, "decision": decision, **answer})
     return StoredEstimates(content, folder)
-
-
-# -- pages --
 
 
 @checked("harness.write_report")
