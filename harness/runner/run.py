@@ -46,7 +46,7 @@ FAR_ABOVE = 10.0
 
 @checked("harness.run")
 def run_campaign(
-    campaign: Campaign | Resolved | str | Path,
+    campaign: Campaign | str | Path,
     out: str | Path,
     *,
     workers: AtLeastOne | None = None,
@@ -84,12 +84,10 @@ def run_campaign(
     ('episodes', 0)
     """
     out, progress = Path(out), progress or Progress()
-    if not isinstance(campaign, Resolved):
-        campaign = campaign_of(campaign)
-        if campaign.scenarios is not None:
-            return run_families(campaign, out, workers=workers, resume=resume, progress=progress)
-        campaign = require_ready(campaign)
-    resolved = campaign
+    campaign = campaign_of(campaign)
+    if campaign.scenarios is not None:
+        return run_families(campaign, out, workers=workers, resume=resume, progress=progress)
+    resolved = require_ready(campaign)
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)
         require_no_fewer(out, earlier["n_episodes"], resolved.campaign.stop.episodes)
