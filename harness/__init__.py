@@ -19,17 +19,16 @@ if TYPE_CHECKING:
     from harness.campaign.files import load_campaign
     from harness.errors import HarnessError
     from harness.fitting.files import fit_files as fit
-    from harness.records.reader import read
     from harness.report.motion import write_motion
     from harness.runner.compare import compare_campaigns as compare
-    from harness.runner.families import estimate_families
     from harness.runner.look import check_av as av_check
     from harness.runner.other_traffic import estimate_in_other_traffic
-    from harness.runner.pages import write_report
     from harness.runner.run import run_campaign as run
     from harness.runner.sensitivity import sensitivity
+    from harness.runner.stored import estimate_families, write_report
     from harness.runner.stored import estimate_run as estimate
     from harness.runner.stored import replay_episode as replay
+    from harness.runner.tables import read
 
 __all__ = [
     "HarnessError", "av_check", "compare", "estimate", "estimate_families", "estimate_in_other_traffic", "fit",
@@ -41,16 +40,16 @@ _PLACES = {
     "av_check": ("harness.runner.look", "check_av"),
     "compare": ("harness.runner.compare", "compare_campaigns"),
     "estimate": ("harness.runner.stored", "estimate_run"),
-    "estimate_families": ("harness.runner.families", "estimate_families"),
+    "estimate_families": ("harness.runner.stored", "estimate_families"),
     "estimate_in_other_traffic": ("harness.runner.other_traffic", "estimate_in_other_traffic"),
     "fit": ("harness.fitting.files", "fit_files"),
     "load_campaign": ("harness.campaign.files", "load_campaign"),
-    "read": ("harness.records.reader", "read"),
+    "read": ("harness.runner.tables", "read"),
     "replay": ("harness.runner.stored", "replay_episode"),
     "run": ("harness.runner.run", "run_campaign"),
     "sensitivity": ("harness.runner.sensitivity", "sensitivity"),
     "write_motion": ("harness.report.motion", "write_motion"),
-    "write_report": ("harness.runner.pages", "write_report"),  # not "report": the package of that name takes that place
+    "write_report": ("harness.runner.stored", "write_report"),  # not "report", as that package is called
 }
 """Where each name is; imported when it is asked for, so that ``import harness`` and ``harness --help`` are quick."""
 

@@ -83,9 +83,7 @@ def _checked(where: str, value: Any, adapter: TypeAdapter[Any], is_path: bool) -
         found = adapter.validate_python(plain)
     except ValidationError as error:
         first, *others = error.errors(include_url=False)
-        expected = " or ".join(
-            dict.fromkeys(filter(None, (_words(each, is_path=is_path) for each in (first, *others))))
-        )
+        expected = " or ".join(dict.fromkeys(_words(each, is_path=is_path) for each in (first, *others)))
         mend = did_you_mean(first["input"], re.findall("'(.*?)'", expected)) or "Correct the argument."
         mend = f"Write [{plain!r}]." if first["type"] == "sequence_str" else mend
         raise HarnessError(where, describe_found(first["input"]), expected, mend) from None
@@ -108,9 +106,10 @@ def _no_name(text: str) -> str:
     return ""
 
 
-def _words(problem: ErrorDetails, *, is_path: bool) -> str | None:
+def _words(problem: ErrorDetails, *, is_path: bool) -> str:
     kind = problem.get("ctx", {}).get("class", "")
     if is_path and (problem["type"] == "string_type" or kind == "Path"):
         return "a path"
-    named = {"Campaign": "a campaign (harness.load_campaign)", "Resolved": ""}
-    return named.get(kind, KINDS.get(problem["type"], problem["msg"].removeprefix("Input should be ")))
+    if kind == "Campaign":
+        return "a campaign (harness.load_campaign)"
+    return KINDS.get(problem["type"], problem["msg"].removeprefix("Input should be "))

@@ -6,12 +6,10 @@ What they show is the report's, which is imported when something is shown: `run`
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from harness.campaign.campaign import Campaign
     from harness.report.drawing import Plot
 
 
@@ -33,20 +31,3 @@ class ShownInPython:
         from harness.report.page import shown_with  # noqa: PLC0415 - see above
 
         return shown_with(repr(self), self._plot())
-
-
-def lines_of_run(
-    campaign: Campaign, manifest: Mapping[str, Any], estimates: Mapping[str, Any], folder: Path
-) -> list[str]:
-    """The short answer of a stored run."""
-    from harness.report.lines import run_lines  # noqa: PLC0415 - see above
-
-    return run_lines(campaign, manifest, estimates, folder / "report.html")
-
-
-def plot_of_run(folder: Path, told: dict[str, Any] | None = None) -> Plot | None:
-    """The map of a stored run, by its own estimates or those that are ``told``."""
-    from harness.report.page import where_plot_of  # noqa: PLC0415 - see above
-    from harness.report.summary import read_run_folder  # noqa: PLC0415
-
-    return where_plot_of(read_run_folder(folder, told))

@@ -19,6 +19,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 from harness.campaign.drivers import NATURAL, OwnSurrogate, Surrogate, default_surrogates
 from harness.campaign.sections import (
     DEFAULT,
+    DEFAULT_FAMILY,
     LEAST_TESTS,
     Accept,
     CrashSettings,
@@ -35,7 +36,6 @@ from harness.campaign.sections import (
     WorldSettings,
 )
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.families import DEFAULT_FAMILY
 from harness.problems import NAME_PATTERN, broken_rule, did_you_mean, listed
 from harness.vocabulary import SAMPLING, Sampling
 

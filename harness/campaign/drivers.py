@@ -183,16 +183,6 @@ def _with_parameters_by_model(schema: dict[str, Any]) -> None:
 Parameters = WrapValidator(_of_the_model, json_schema_input_type=BuiltInParameters | dict[str, Any])
 
 
-class Driver(Section):
-    """A vehicle that follows a built-in driver model."""
-
-    model_config = ConfigDict(json_schema_extra=_with_parameters_by_model)
-
-    model: ModelName = Field(description="driver model")
-    parameters: Annotated[BuiltInParameters, Parameters] = Field(default_factory=dict, validate_default=True)
-    """of the model, as under av"""
-
-
 class Reflexes(Section):
     """How a driver lags behind its model: surrogates may be late and smooth, but not random."""
 
@@ -204,9 +194,14 @@ class Reflexes(Section):
     """how far BV has come over when it is seen, where cut-ins take time [JRC-FSM: 0.375 of wandering]"""
 
 
-class Surrogate(Driver):
+class Surrogate(Section):
     """A stand-in for the unknown AV, with its reflexes; the shipped libraries have some."""
 
+    model_config = ConfigDict(json_schema_extra=_with_parameters_by_model)
+
+    model: ModelName = Field(description="driver model")
+    parameters: Annotated[BuiltInParameters, Parameters] = Field(default_factory=dict, validate_default=True)
+    """of the model, as under av"""
     reaction: Reflexes = Reflexes()
 
     @property

@@ -97,6 +97,8 @@ LeadTime = Annotated[float, Field(ge=0.0, le=10.0), AfterValidator(_whole_steps)
 
 
 DEFAULT = "default"
+DEFAULT_FAMILY = "cut_in"
+"""Kind of events where a campaign names none."""
 
 
 class EnvironmentSettings(Section):

@@ -73,7 +73,8 @@ def compare(
     """
     if file_b is None and not against and against_av is None:
         raise click.UsageError("Name a second campaign, or say with --against or --against-av how B differs.")
-    from harness.campaign.files import names_a_campaign, parse_override
+    from harness.campaign.files import names_a_campaign
+    from harness.campaign.models import parse_override
 
     stored = source_a if source_a.is_dir() else None
     file_a = source_a if stored is None else stored / "campaign.yaml"

@@ -107,9 +107,9 @@ junit_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on stdout instead of text.")
 
 
-def examples(*lines: str, heading: str = "Examples:") -> str:
+def examples(*lines: str) -> str:
     """Lay out lines below a help text, kept as they are (the backspace is click's mark for that)."""
-    return f"\b\n{heading}\n" + "\n".join(f"  {line}" for line in lines)
+    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
 
 
 def accepting(limit: str) -> list[str]:

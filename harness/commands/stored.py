@@ -111,7 +111,7 @@ def _estimate_hours(
     """What stored tests of several scenarios say, with other exposures."""
     from harness.campaign.sections import EXPOSURES
     from harness.report.hour_words import hour_lines
-    from harness.runner.families import estimate_families
+    from harness.runner.stored import estimate_families
 
     given = {}
     for each in exposures:

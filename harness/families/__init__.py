@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 R157 = ("cut_in", "lead_brakes", "cut_out")
 """Those of UN Regulation No. 157."""
-DEFAULT_FAMILY = R157[0]
-"""Where a campaign names none."""
 GROUP = "harness.families"
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness.campaign.drivers import Surrogate
-from harness.campaign.files import read_model, shipped_or_own
+from harness.campaign.models import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError
 from harness.families.numbers import ParameterFile
@@ -179,7 +179,7 @@ class Family(Protocol):
     """The one of them where nothing is said."""
     ladders: Mapping[bool, str]
     """Libraries of surrogates where nothing is said, by whether events show themselves before they happen."""
-    follows: bool = False
+    follows: bool
     """Whether the AV drives from the start, behind a vehicle that does not look at it: events do not depend on it."""
     stride: int = 1
     """Events of a path between two that a pool asks."""
@@ -187,6 +187,8 @@ class Family(Protocol):
     """Relative standard error of its surrogates' crash rates where nothing is said."""
     fitter: str = ""
     """Its fit to trajectories (`harness.fitting.protocol.Fitter`), ``module:class``; empty without one."""
+    sources: Mapping[Method, str] = MappingProxyType({})
+    """Methods of its own, which draw the event in the loop: a `harness.sampling.protocol.Source` each, as above."""
     crosses: int
     """Place of the vehicle that changes lanes, -1 for none."""
     maps: tuple[tuple[Shown, Shown], ...] = ((GAP, CLOSING),)
@@ -234,8 +236,10 @@ class Family(Protocol):
         return int(self.uneventful(traffic, 1).speed.shape[1])
 
     def sideways_m(self, traffic: Environment) -> float:
-        """Way (m) from a first lateral motion to overlap."""
-        return TO_OVERLAP_M
+        """Way (m) from a first lateral motion to overlap; 0 where nobody changes lanes."""
+        if self.crosses not in (-1, self.principal):
+            raise NotImplementedError(f"{self.name} says how far its vehicle {self.crosses} moves sideways")
+        return 0.0 if self.crosses < 0 else TO_OVERLAP_M
 
     def shows(self, traffic: Environment) -> bool:
         """Whether events can be seen before they happen."""
@@ -258,10 +262,6 @@ class Family(Protocol):
     def mean_speed_mps(self, traffic: Environment) -> float:
         """Mean speed (m/s) of the AV on the road that its exposure is of; here that with which its tests begin."""
         return float(self.uneventful(traffic, N_MEAN_PATHS).v[:, -1].mean())
-
-    def sources(self) -> Mapping[Method, type[Any]]:
-        """Methods of its own, which draw the event in the loop: a class each (`harness.sampling.protocol.Source`)."""
-        return {}
 
     def start(self, traffic: Environment, u: FloatArray) -> RecordArray:
         """How paths begin, (n,), from uniforms (n, `n_uniforms`)."""

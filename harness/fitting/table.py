@@ -21,7 +21,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from pydantic import Field
 
-from harness.campaign.files import read_model, shipped_or_own
+from harness.campaign.models import read_model, shipped_or_own
 from harness.campaign.sections import Section
 from harness.errors import TrajectoryError, printable
 from harness.files import opened

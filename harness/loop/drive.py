@@ -168,9 +168,13 @@ def seen_of(k: int, other: int, kernel: KernelState) -> tuple[float, float]:
     return kernel.x[k, other], kernel.v[k, other]
 
 
+_WHOLE = "cell", "episode", "bv_lane", "lv_lane", "bv_overlaps"
+_REAL = [name for name in BatchObservation._fields if name not in _WHOLE]
+
+
 def empty_observation(n_cells: int) -> BatchObservation:
     """Room for the observations of K cells: rows of one array of whole numbers and of one of floats."""
-    return _rows(np.zeros((5, n_cells), np.int64), np.zeros((15, n_cells)))
+    return _rows(np.zeros((len(_WHOLE), n_cells), np.int64), np.zeros((len(_REAL), n_cells)))
 
 
 def first(observation: BatchObservation, n: int) -> BatchObservation:
@@ -207,20 +211,22 @@ class Past:
         known = np.minimum(ago, step)
         x, v = np.moveaxis(self._states[(self._n_noted - known) % n_steps, :, seen.cell], (2, 3), (0, 1))
         x = x - v * ((ago - known) * STEP_S)
-        zero, absent = np.zeros(known.shape), np.full(known.shape, math.nan)
-        nobody, bv = (np.full(known.shape, math.inf), absent), (x[self._principal], v[self._principal])
-        lv = (x[self._ahead], v[self._ahead]) if self._ahead >= 0 else (absent, absent)
-        set_speed = np.broadcast_to(seen.set_speed_mps, known.shape)
-        real = (step - ago) * STEP_S, x[-1], v[-1], zero, *nobody, *bv, *lv, zero, zero, set_speed, zero, zero
+        lv_x, lv_v = (x[self._ahead], v[self._ahead]) if self._ahead >= 0 else (np.full(known.shape, math.nan),) * 2
+        told = {
+            "time_s": (step - ago) * STEP_S, "position_m": x[-1], "speed_mps": v[-1],
+            "gap_m": np.full(known.shape, math.inf), "lead_speed_mps": np.full(known.shape, math.nan),
+            "bv_position_m": x[self._principal], "bv_speed_mps": v[self._principal],
+            "lv_position_m": lv_x, "lv_speed_mps": lv_v,
+            "set_speed_mps": np.broadcast_to(seen.set_speed_mps, known.shape),
+        }  # fmt: skip
+        real = [told.get(name, np.zeros(known.shape)) for name in _REAL]
         left = np.ones_like(seen.cell)
         whole = read_only(np.stack((seen.cell, seen.episode, left, left, np.zeros_like(left))))
         return [_rows(whole, rows) for rows in read_only(np.stack(real, axis=1))]
 
 
 def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
-    cell, episode, bv_lane, lv_lane, bv_overlaps = whole
-    others = *real[6:8], bv_lane, *real[8:10], lv_lane
-    return BatchObservation._make([cell, episode, *real[:6], *others, *real[10:12], bv_overlaps, *real[12:]])
+    return BatchObservation(**dict(zip(_WHOLE, whole, strict=True)), **dict(zip(_REAL, real, strict=True)))
 
 
 @compiled

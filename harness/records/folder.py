@@ -221,12 +221,6 @@ Count = Annotated[int, Field(ge=0, lt=2**63)]
 TablePath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
 
 
-class Stored(BaseModel):
-    """Strict in the types of the keys that it names."""
-
-    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
-
-
 @dataclass(frozen=True)
 class File:
     """A file of a run folder, which counts as long as it has its checksum, where that is known."""
@@ -259,11 +253,13 @@ class Repeated:
     differing: list[Count]
 
 
-class StoredManifest(Stored):
+class StoredManifest(BaseModel):
     """What ``manifest.json`` of a run must hold, and of what it may hold that which answers rest on.
 
     Any other key is let through: the file's checksum says that it is as a run has written it.
     """
+
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
 
     campaign_hash: str
     n_episodes: Count

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pyarrow as pa
 
-from harness.campaign.files import shipped_or_own
+from harness.campaign.models import shipped_or_own
 from harness.errors import RunFolderError
 from harness.files import content_hash
 from harness.records.folder import read_table

@@ -111,6 +111,12 @@ def exposures(content: Mapping[str, Any]) -> str:
     return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
 
 
+def far_above(name: str, given: float, shipped: float) -> str:
+    """That events of a scenario per hour, as they are given, are likely to be of other events than the shipped ones."""
+    times = f"{given / shipped:.0f} times the shipped one, of events in scope"
+    return f"exposure {name}={given:g} is {times} (docs/families.md)"
+
+
 def between(low: float, high: float | None, rate: float) -> str:
     """The interval of a rate; its ends apart where they are far apart, "no limit" where it is open."""
     if high is None:

@@ -27,9 +27,8 @@ from harness.estimators.shells import ShellDetails
 from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.records.folder import read_as, read_manifest
-from harness.records.reader import read_campaign, read_traces, traffic_of
+from harness.records.reader import ShownTests, by_kind, read_campaign, read_traces, traffic_of
 from harness.records.schemas import LEAD
-from harness.records.shown import ShownTests, by_kind
 from harness.sampling.shells import Shells
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S

@@ -34,9 +34,9 @@ from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, require_sum, write_sealed
 from harness.records.origin import code_of, require_trust
 from harness.resolved import require_ready
-from harness.runner.families import MEND, doubts_of, hour_answer, read_families, require_no_other
 from harness.runner.paired import SIDES, Both, PairedScenario, copy_stored, drive_pairs, together
-from harness.runner.stored import replay_episode
+from harness.runner.run import doubts_of, hour_answer, require_no_other
+from harness.runner.stored import MEND, read_families, replay_episode
 from harness.sampling.shells import PairRounds
 from harness.shown import ShownInPython
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT

@@ -42,8 +42,8 @@ from harness.records.folder import (
     write_sealed,
 )
 from harness.records.origin import signature
+from harness.records.reader import ShownTests, by_kind
 from harness.records.schemas import ShardTables
-from harness.records.shown import ShownTests, by_kind
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult
 from harness.sampling.baseline import BaselineResult
@@ -94,7 +94,7 @@ class Run:
     """A campaign on its way into a folder, in which nobody but this process writes.
 
     ``parts`` are written; ``open`` are shards that will make up the next one, of which the last may hold some.
-    ``blocks`` are of all tests, in order, ``failures`` counts causes, and ``facts`` are more keys of the manifest.
+    ``blocks`` are of all tests, in order, and ``facts`` are more keys of the manifest.
     """
 
     folder: Path
@@ -107,10 +107,7 @@ class Run:
     open: tuple[ShardResult, ...] = ()
     blocks: tuple[Block, ...] = ()
     shown: tuple[ShownTests, ...] = ()
-    """What the page shows of them."""
-    n_rows: int = 0
-    """Of all tables of those that are open."""
-    failures: Counter[str] = field(default_factory=Counter)
+    """What the page shows of them, causes of failures among it."""
     repeated: Repeated | None = None
     before: Mapping[str, tuple[pa.Table, ...]] = field(default_factory=dict)
     """What comes before tests that count, by table; ``parts_before`` are written, by an earlier run if need be."""
@@ -152,15 +149,14 @@ class Run:
             open=(*self.open, shard),
             blocks=(*self.blocks, replace(shard.block, drawn=drawn)),
             shown=(*self.shown, ShownTests.of(shard.tables.episodes, self.resolved.family)),
-            n_rows=self.n_rows + sum(table.num_rows for table in shard.tables if table is not None),
-            failures=self.failures + shard.failures,
             repeated=shard.repeated or self.repeated,
         )
         run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
-        if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or run.n_rows >= PART_ROWS:
+        n_rows = sum(table.num_rows for each in run.open for table in each.tables if table is not None)
+        if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or n_rows >= PART_ROWS:
             n = len(run.open)  # small tables cost more than their rows
             shown = (*run.shown[:-n], ShownTests.joined(run.shown[-n:], run.folder))
-            return replace(run.written(), open=(), n_rows=0, shown=shown)
+            return replace(run.written(), open=(), shown=shown)
         return run if run.is_behind else run.written_if_due()
 
     def with_baseline(self, name: str, result: BaselineResult) -> Run:
@@ -211,7 +207,8 @@ class Run:
     def require_few_failed(self, *, at_least: int = 0) -> None:
         """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many."""
         if self.n_episodes >= at_least:
-            require_few_failed(self.failures, self.n_episodes, self.resolved.campaign)
+            failures = sum((each.causes for each in self.shown), Counter[str]())
+            require_few_failed(failures, self.n_episodes, self.resolved.campaign)
 
     @property
     def took_s(self) -> float:

@@ -22,7 +22,7 @@ from harness.controllers.find import build_host, has_foreign_code
 from harness.controllers.hosts import ControllerHost, Failures
 from harness.controllers.protocol import BatchObservation
 from harness.loop.loop import EpisodeLoop, Shard
-from harness.records.shown import by_kind
+from harness.records.reader import by_kind
 from harness.report.av_check import AvCheck, Behaviour, Cause, Follows, Speed
 from harness.resolved import require_world, resolve
 from harness.runner.again import Bits, DrawnTests, bits_of, run_elsewhere

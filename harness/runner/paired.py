@@ -27,8 +27,8 @@ from harness.pool.shells import Draw
 from harness.progress import Progress
 from harness.records.folder import read_manifest, sole_use, write_bytes
 from harness.resolved import Resolved
-from harness.runner.families import exposure_of
 from harness.runner.kept import Earlier, require_own_folder
+from harness.runner.run import exposure_of
 from harness.runner.underway import RunResult, Underway, begun
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import PairRounds

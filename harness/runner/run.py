@@ -1,23 +1,52 @@
-"""Run a campaign into a folder: what was asked for, whether it can be had, and then until it is enough."""
+"""Run a campaign into a folder: what was asked for, whether it can be had, and then until it is enough.
+
+Several families of events are run for one answer: rounds over the strata of all, each family in a run folder of its
+own, so that everything that there is for a run, from replay to export, is there for each; the sum is `FAMILIES`.
+"""
 
 from __future__ import annotations
 
+import sys
+import time
+import zlib
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
-from harness.campaign.files import campaign_of
+from harness.campaign.files import campaign_of, dump_campaign
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
+from harness.estimators.answer import ended_by
+from harness.estimators.estimate import finite_json
+from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
+from harness.estimators.shells import SeenShells
+from harness.estimators.stopping import Decision, HourRule
+from harness.estimators.tally import empty_tally
+from harness.families.protocol import Exposure
+from harness.printed import PRINTED
 from harness.progress import Progress
-from harness.records.folder import sole_use
+from harness.records.folder import CAMPAIGN, sole_use, write_bytes, write_sealed
 from harness.resolved import Resolved, require_ready
-from harness.runner.families import Hours, run_families
 from harness.runner.kept import require_no_fewer, require_own_folder
-from harness.runner.underway import RunResult, begun
+from harness.runner.underway import EXIT_OF, RunResult, Underway, begun, doubted
+from harness.sampling.milder import n_left_out
+from harness.sampling.shells import HourRounds
+from harness.shown import ShownInPython
+from harness.vocabulary import FAMILIES
+
+EARLY = "n_crashes_before_event"
+FAR_ABOVE = 10.0
+"""Of what is assumed at most, from which on an exposure is likely to be of other events [assumed]."""
 
 
 @checked("harness.run")
 def run_campaign(
-    campaign: Campaign | Resolved | str | Path,
+    campaign: Campaign | str | Path,
     out: str | Path,
     *,
     workers: AtLeastOne | None = None,
@@ -55,12 +84,10 @@ def run_campaign(
     ('episodes', 0)
     """
     out, progress = Path(out), progress or Progress()
-    if not isinstance(campaign, Resolved):
-        campaign = campaign_of(campaign)
-        if campaign.scenarios is not None:
-            return run_families(campaign, out, workers=workers, resume=resume, progress=progress)
-        campaign = require_ready(campaign)
-    resolved = campaign
+    campaign = campaign_of(campaign)
+    if campaign.scenarios is not None:
+        return run_families(campaign, out, workers=workers, resume=resume, progress=progress)
+    resolved = require_ready(campaign)
     with sole_use(out):
         earlier = require_own_folder(out, resolved, resume=resume)
         require_no_fewer(out, earlier["n_episodes"], resolved.campaign.stop.episodes)
@@ -69,3 +96,165 @@ def run_campaign(
             rule = underway.drive_tests()
         require_no_fewer(out, earlier["n_episodes"], underway.run.n_episodes)
         return underway.finish(rule)
+
+
+@dataclass(frozen=True, repr=False)
+class Hours(ShownInPython):
+    """What a finished campaign of several scenarios left: a run folder each, and ``families.json``, the ``content``.
+
+    ``runs`` are their results. The exit code is 0, or 4 when the budget or a pool was spent before what was asked was
+    known, or 5 where the rate is above the limit that was to be kept.
+    """
+
+    folder: Path
+    content: dict[str, Any]
+    report: Path
+    runs: dict[str, RunResult]
+    exit_code: int
+
+    def _lines(self) -> list[str]:
+        from harness.report.hour_words import hour_lines  # noqa: PLC0415 - draws
+
+        return hour_lines(self.content, self.report)
+
+
+def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: bool, progress: Progress) -> Hours:
+    """Run the scenarios of a campaign until their sum is known; see `harness.run`."""
+    names, began = campaign.scenarios or [], time.monotonic()
+    ready = {name: require_ready(campaign.of_family(name)) for name in names}
+    require_same_driver(campaign, ready)
+    rule = HourRule(campaign)
+    with ExitStack() as held:
+        held.enter_context(sole_use(out))
+        require_no_other(out, [*names, FAMILIES, CAMPAIGN])
+        for name in names:
+            held.enter_context(sole_use(out / name))
+        earlier = {name: require_own_folder(out / name, ready[name], resume=resume) for name in names}
+        begins = {
+            name: begun(out / name, each, earlier[name], workers, progress, len(names)) for name, each in ready.items()
+        }
+        yaml = dump_campaign(campaign).encode()
+        write_bytes(out / CAMPAIGN, yaml)
+        hour, results, decision = _run(campaign, begins, rule, progress)
+    missed = campaign.stop.rhw is not None and not rule.look.stopped
+    code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
+    told = {name: (each.estimates, each.shown.manifest) for name, each in results.items()}
+    answer = hour_answer(hour, ready, told, campaign.stop.confidence)
+    if decision is not None:
+        code = EXIT_OF[decision.verdict]
+    from harness.report.page import write_hours  # noqa: PLC0415 - draws
+    from harness.report.words import vehicle_words  # noqa: PLC0415
+
+    asked = {
+        "format": 1, "name": campaign.name, "campaign_crc32": zlib.crc32(yaml),
+        "seed": campaign.seed, "engine": campaign.world.engine,
+        "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
+        "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
+        "vehicle": vehicle_words(campaign.av)[0], "wall_time_s": round(time.monotonic() - began, 3),
+    }  # fmt: skip
+    content = finite_json({**asked, **answer})
+    write_sealed(out / FAMILIES, content)
+    return Hours(out, content, write_hours(out, content), results, code)
+
+
+def _run(
+    campaign: Campaign, begins: Mapping[str, AbstractContextManager[Underway]], rule: HourRule, progress: Progress
+) -> tuple[PerHour, dict[str, RunResult], Decision | None]:
+    runs: dict[str, Underway] = {}
+    with ExitStack() as working:
+        for name, each in begins.items():
+            progress.remark = f" ({name.replace('_', ' ')})"
+            runs[name] = working.enter_context(each)
+            runs[name].drive_before_tests()
+        progress.remark = ""
+        hour = PerHour([_no_test_yet(underway, campaign.exposure) for underway in runs.values()])
+        rounds = HourRounds(campaign, hour, [underway.prescribed.available for underway in runs.values()], rule)
+        n_held = sum(underway.run.earlier.n_episodes for underway in runs.values())
+        progress.stage("tests of all scenarios", None, done=n_held)
+        while np.concatenate(added_to := rounds.next_round(hour)).any():
+            for of, added in zip(hour.families, added_to, strict=True):
+                for shard in runs[of.family].drive_added(of.tally.tests, added, rule):
+                    of.seen.add(shard.block if campaign.accept is None else shard.block.cut_off_as_failed())
+            if rule.observe(hour) and not any(underway.run.is_behind for underway in runs.values()):
+                break
+        for underway in runs.values():
+            underway.require_tests()
+            require_no_fewer(underway.run.folder, underway.run.earlier.n_episodes, underway.run.n_episodes)
+    results = {name: underway.finish(rule, of_sum=True) for name, underway in runs.items()}
+    if campaign.accept is not None:  # tests that were cut off count as crashes in its decision alone
+        seen = {name: SeenShells.of_blocks(underway.run.blocks) for name, underway in runs.items()}
+        hour = PerHour([of._replace(seen=seen[of.family]) for of in hour.families])
+    decision = rule.look.decision and doubted(rule.look.decision, runs.values())
+    return hour, results, decision
+
+
+def _no_test_yet(underway: Underway, exposures: Mapping[str, float]) -> OfFamily:
+    resolved, design, seen = underway.run.resolved, underway.prescribed.design, SeenShells()
+    seen.count(design, empty_tally(design.cell_p.size))
+    return OfFamily(resolved.campaign.scenario, exposure_of(resolved, exposures), seen)
+
+
+def hour_answer(
+    hour: PerHour,
+    ready: Mapping[str, Resolved],
+    told: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]],
+    confidence: float,
+    *,
+    counts: bool = False,
+) -> dict[str, Any]:
+    """The sum, with what estimates and manifest of each have ``told``.
+
+    Hours are kilometres by the mean speed of a vehicle that follows, where it does.
+    """
+    follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
+    speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
+    found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
+    for name, (estimates, manifest) in told.items():
+        of = found["families"][name]
+        per_test = of["exposure"]["per_hour"] / of["p_event"]
+        of["median_impact_mps"] = (estimates["severity"] or {}).get("median_mps")
+        of |= doubts_of(ready[name].campaign, estimates, manifest, per_test)
+    return found
+
+
+def doubts_of(
+    campaign: Campaign, estimates: Mapping[str, Any], manifest: Mapping[str, Any], times: float = 1.0
+) -> dict[str, Any]:
+    """What may make the rate of a run doubtful, for its reader to be told: rates per test, or ``times`` as large."""
+    best = estimates["estimates"][estimates["headline"]]
+    return {
+        EARLY: n_left_out(campaign, estimates["diagnostics"].get(EARLY, 0)), "milder": estimates["milder"],
+        "if_failed_had_crashed": times * best["details"]["crash_rate_if_failed_had_crashed"],
+        "cut_off": times * estimates["cut_off"], "cautions": best["cautions"], "repeated": manifest.get("repeated"),
+        "assumed": estimates["assumed"],
+    }  # fmt: skip
+
+
+def exposure_of(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
+    """How often events of a scenario are met: the shipped number, or the one that is given for it."""
+    shipped, name = resolved.family.exposure(resolved.environment, resolved.parameters), resolved.campaign.scenario
+    if (own := given.get(name)) is not None and own > FAR_ABOVE * shipped.high:
+        from harness.report.hour_words import far_above  # noqa: PLC0415 - draws
+
+        sys.stderr.write(f"note: {far_above(name, own, shipped.per_hour)}\n")
+    return own_exposure(shipped, given.get(name))
+
+
+def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> None:
+    """Refuse (`CampaignError`) a limit beside another driver than the one that the sum is held against."""
+    if campaign.accept is None or campaign.accept.times_reference is None:
+        return
+    asked = campaign.accept.times_reference.driver
+    for name, each in ready.items():
+        if (first := next(iter(each.library.references), "")) != asked:
+            expected = f"{first}, the first reference driver of {name}: the sum is held against that of each scenario"
+            mend = f"Write {first}, or one scenario."
+            raise CampaignError("accept.times_reference.driver", f"'{asked}'", expected, mend)
+
+
+def require_no_other(out: Path, names: Sequence[str]) -> None:
+    """Refuse (`RunFolderError`) a folder that holds something else than what is so called, or written beside it."""
+    known = {*names, PRINTED, "report.html"}
+    if other := sorted(each.name for each in out.iterdir() if each.name[0] != "." and each.name not in known):
+        expected = "a new or empty folder, or one of the same scenarios"
+        raise RunFolderError(str(out), f"a folder with {other[0]}", expected, "Choose another folder with --out.")

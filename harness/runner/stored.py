@@ -1,4 +1,4 @@
-"""Stored runs: estimate again from the records; run one of the episodes again, bit for bit, to look at it."""
+"""Stored runs: estimate again from the records; run an episode again, bit for bit, to look at it; write pages anew."""
 
 from __future__ import annotations
 
@@ -14,26 +14,30 @@ from pydantic import Field
 
 from harness.arguments import Episode, checked
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import Confidence
+from harness.campaign.sections import Confidence, EventsPerHour
 from harness.controllers.find import require_controller, run_apart
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables
+from harness.estimators.estimate import finite_json
 from harness.estimators.one_pass import even
 from harness.estimators.own import asked_for
+from harness.estimators.per_hour import OfFamily, PerHour
+from harness.estimators.shells import SeenShells
 from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.processes import made_ahead
-from harness.records.folder import CAMPAIGN, Part, no_episodes, read_kept, read_manifest
+from harness.records.folder import CAMPAIGN, ESTIMATES, Part, no_episodes, read_as, read_kept, read_manifest
 from harness.records.origin import code_of, require_trust
 from harness.records.reader import N_READERS, read_campaign, require_campaign, traffic_of
 from harness.records.schemas import moments_schema, shard_tables
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
+from harness.runner.run import exposure_of, hour_answer
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
-from harness.shown import ShownInPython, plot_of_run
-from harness.vocabulary import ESTIMATORS
+from harness.shown import ShownInPython
+from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 from harness.worlds import build_world
 
 if TYPE_CHECKING:
@@ -44,23 +48,31 @@ _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
 class StoredEstimates(ShownInPython, dict[str, Any]):
-    """Content of ``estimates.json``, of the run in a folder; shown, it is the short answer, or a line an estimator."""
+    """Content of ``estimates.json``, of the run in a folder, or of ``families.json``; shown, it is the short answer.
+
+    One that was asked for ``by_estimator`` has a line each.
+    """
 
     def __init__(self, content: Mapping[str, Any], folder: Path, *, by_estimator: bool = False) -> None:
         super().__init__(content)
         self._folder, self._by_estimator = folder, by_estimator
 
     def _lines(self) -> list[str]:
-        from harness.report.lines import estimate_lines, run_lines  # noqa: PLC0415 - draws
+        from harness.report.hour_words import hour_lines  # noqa: PLC0415 - draws
+        from harness.report.lines import estimate_lines, run_lines  # noqa: PLC0415
 
-        if self._by_estimator:
-            return estimate_lines(self)
+        if self._by_estimator or "families" in self:
+            return estimate_lines(self) if self._by_estimator else hour_lines(self)
         manifest = read_manifest(self._folder)
         return run_lines(read_campaign(self._folder, manifest), manifest, self, self._folder / "report.html")
 
     def _plot(self) -> Plot | None:
         """The map of its tests, where what is told is of their own traffic."""
-        return None if self.get("elsewhere") else plot_of_run(self._folder, self)
+        from harness.report.page import where_plot_of  # noqa: PLC0415 - draws
+        from harness.report.summary import read_run_folder  # noqa: PLC0415
+
+        none = self.get("elsewhere") or "families" in self
+        return None if none else where_plot_of(read_run_folder(self._folder, self))
 
 
 @checked("harness.estimate")
@@ -276,3 +288,111 @@ def _equal(again: pa.Table, stored: pa.Table) -> bool:
     """By bits: what is written of a float is that float alone, 0.0 and -0.0 differ, and NaN equals itself."""
     columns = [name for name in again.column_names if name not in _UNLIKE_BITS]
     return repr(again.select(columns).to_pylist()) == repr(stored.select(columns).to_pylist())
+
+
+# -- of several scenarios --
+
+MEND = "Run the campaign again into the same folder with --resume."
+_SHOWN = ("families", "per_hour", "beside", "readings", "decision")
+"""Keys of ``families.json`` without which nothing can be shown."""
+
+
+def read_families(folder: Path) -> dict[str, Any]:
+    """``families.json`` of a folder; a `RunFolderError` where it is missing, damaged, or another version's."""
+    if not (folder / FAMILIES).is_file():
+        found, expected = "a run of one scenario", "a folder of several, which has families.json"
+        mend = "Leave out --exposure: one scenario has no rate per hour."
+        if (folder.resolve().parent / FAMILIES).is_file():
+            mend = f"Name {folder.parent}, the folder of all."
+        raise RunFolderError(str(folder), found, expected, mend)
+    content = read_as(dict[str, Any], folder / FAMILIES, mend=MEND)
+    if missing := [key for key in _SHOWN if key not in content]:
+        expected = "an answer as this version of the harness writes it"
+        raise RunFolderError(str(folder / FAMILIES), f"no key {missing[0]}", expected, MEND)
+    return content
+
+
+@checked("harness.estimate_families")
+def estimate_families(
+    folder: str | Path,
+    exposures: Mapping[str, EventsPerHour] | None = None,
+    confidence: Confidence | None = None,
+    *,
+    counts: bool = False,
+) -> StoredEstimates:
+    """Answer anew from the tests of several scenarios; returns the content of ``families.json``.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder of several scenarios; nothing is run or written.
+    exposures : mapping of str to float, optional
+        Events per hour of driving, by scenario, in place of the campaign's.
+    confidence : float, optional
+        Level of the intervals, by default the campaign's.
+    counts : bool
+        Whether the interval of the sum holds what few counted events leave open of their exposures.
+
+    Raises `HarnessError`: a run is missing or damaged, or an exposure is of no scenario in it.
+    """
+    folder, exposures = Path(folder), exposures or {}
+    stored, families, ready, told = read_families(folder), [], {}, {}
+    names = list(stored["families"])
+    if unknown := sorted(set(exposures) - set(names)):
+        found = f"an exposure of {', '.join(unknown)}"
+        raise HarnessError("--exposure", found, f"one of {', '.join(names)}", "Name a scenario of this folder.")
+    given = {**stored["exposure"], **exposures}
+    for name in names:
+        of = folder / name
+        manifest, seen = read_manifest(of), SeenShells.of_blocks(stored_blocks(of, moments=False))
+        resolved = ready[name] = resolve(read_campaign(of, manifest))
+        families.append(OfFamily(name, exposure_of(resolved, given), seen))
+        told[name] = read_as(dict[str, Any], of / ESTIMATES, mend=MEND), manifest
+    answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
+    decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
+    content = finite_json({**stored, "exposure": given, "decision": decision, **answer})
+    return StoredEstimates(content, folder)
+
+
+@checked("harness.write_report")
+def write_report(folder: str | Path) -> Path:
+    """Write ``report.html`` and ``plots/`` (SVG) into a run folder anew, or the page of a comparison, or of scenarios.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Run folder, or the folder of a comparison, or of several scenarios.
+
+    The page is self-contained: it can be mailed, archived and opened offline. The same folder gives the same bytes if
+    it is reached from the working directory by the same relative path, by which the commands on the page name it;
+    outside the working directory they use its name alone. Plots of an earlier report that this one does not have are
+    removed.
+
+    Raises `RunFolderError`: if the folder misses a file, or a file is damaged or belongs to another run.
+    """
+    from harness.report.page import write_hours, write_page_of  # noqa: PLC0415 - draws
+    from harness.report.summary import read_run_folder  # noqa: PLC0415
+
+    if (Path(folder) / COMPARISON).is_file():
+        return _write_comparison(Path(folder))
+    if (Path(folder) / FAMILIES).is_file():
+        return write_hours(Path(folder), read_families(Path(folder)))
+    return write_page_of(read_run_folder(Path(folder)))
+
+
+def _write_comparison(folder: Path) -> Path:
+    """Of the comparison, and of each scenario's where it is a sum."""
+    from harness.report import compare_page  # noqa: PLC0415 - draws
+    from harness.report.summary import read_run_folder  # noqa: PLC0415
+
+    stored = read_as(dict[str, Any], folder / COMPARISON, mend=compare_page.MEND)
+    if "families" in stored:
+        for name in stored["families"]:
+            _write_comparison(folder / name)
+        return compare_page.write_sum(folder, stored)
+    runs = [read_run_folder(folder / side) for side in ("a", "b")]
+    for run, of in zip(runs, stored["campaigns"].values(), strict=True):
+        if (found := run.manifest["campaign_hash"]) != of["campaign_hash"]:
+            expected = f"campaign {of['campaign_hash']} ({COMPARISON})"
+            raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, compare_page.MEND)
+    return compare_page.write_page_of(folder, stored, runs, replay_episode)

@@ -18,13 +18,13 @@ import pyarrow as pa
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import ended_by, estimate_blocks, expected_for, pool_remedy
 from harness.estimators.one_pass import even
-from harness.estimators.stopping import Rule, Verdict
+from harness.estimators.stopping import Decision, Rule, Verdict
 from harness.files import remove_unfinished
 from harness.pool.moved import assumed
 from harness.pool.shells import PrescribedEpisodes
 from harness.progress import Progress
 from harness.records.folder import ESTIMATES, MILDER, SHELLS, parquet, write_sealed
-from harness.records.shown import ShownTests
+from harness.records.reader import ShownTests
 from harness.resolved import Resolved
 from harness.runner.kept import Run, cpu_name, require_few_failed, require_same_pool, take_over
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
@@ -181,8 +181,7 @@ class Underway:
         missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
         code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
         if (decision := rule.look.decision) is not None and not of_sum:
-            n_milder, n_differing = self.doubted()
-            decision = replace(decision, n_milder=n_milder, n_differing=n_differing)
+            decision = doubted(decision, [self])
             code = EXIT_OF[decision.verdict]
             decided["decision"] = decision.to_json()
         decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
@@ -202,6 +201,12 @@ class Underway:
         tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
         shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
         return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
+
+
+def doubted(decision: Decision, runs: Iterable[Underway]) -> Decision:
+    """What was decided of these runs together, after what was seen besides."""
+    n_milder, n_differing = map(sum, zip(*(each.doubted() for each in runs), strict=True))
+    return replace(decision, n_milder=n_milder, n_differing=n_differing)
 
 
 @contextmanager

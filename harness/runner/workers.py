@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -56,11 +56,6 @@ class ShardResult:
     is_new: bool = True
     repeated: Repeated | None = None
     """What tests have shown that were run twice: some of the first shard, or none."""
-
-    @property
-    def failures(self) -> Counter[str]:
-        """Causes of failures."""
-        return Counter(self.tables.episodes.column("failure").drop_null().to_pylist())
 
 
 Result = ShardResult | BaselineResult

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pkgutil import resolve_name
 
 from harness.campaign.campaign import Campaign
 from harness.compiled import is_cached
@@ -35,10 +36,10 @@ _SOURCES: Mapping[Method, type[Source]] = {"nde": Naturalistic, "forced": Forced
 def source_of(campaign: Campaign) -> type[Source]:
     """How the tests of a campaign are drawn."""
     method = campaign.testing.method
-    own = family_named(campaign.scenario).sources()
-    if method == "nde" and campaign.av.acts_before_event:  # where its events are depends on what it does
-        return own[method]
-    return _SOURCES.get(method) or own[method]
+    if method in _SOURCES and not (method == "nde" and campaign.av.acts_before_event):
+        return _SOURCES[method]
+    found: type[Source] = resolve_name(family_named(campaign.scenario).sources[method])
+    return found  # also where its events are depends on what the vehicle does
 
 
 def prepare(resolved: Resolved, progress: Progress | None = None) -> Source:

@@ -11,7 +11,7 @@ from typing import Literal, Self
 from pydantic import Field, PrivateAttr, model_validator
 
 from harness.campaign.drivers import NATURAL, Surrogate
-from harness.campaign.files import read_model, shipped_or_own
+from harness.campaign.models import read_model, shipped_or_own
 from harness.campaign.sections import Section, SurrogateName
 from harness.errors import CampaignError
 from harness.problems import broken_rule, did_you_mean, listed

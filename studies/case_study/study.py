@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from harness.campaign.files import Override, read_model
+from harness.campaign.models import Override, read_model
 from harness.campaign.sections import Positive, Probability, Section, Whole
 from harness.problems import NAME_PATTERN, broken_rule
 from harness.progress import Progress

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
-from harness.campaign.files import parse_override, read_model
+from harness.campaign.models import parse_override, read_model
 from harness.campaign.sections import Positive, Section, Whole
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError

@@ -22,7 +22,7 @@ from harness.campaign.drivers import IDMParameters, Reaction
 from harness.families.protocol import Paths
 from harness.random_stream import INITIAL, uniforms
 from harness.resolved import resolve
-from harness.runner.families import Hours
+from harness.runner.run import Hours
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vehicles.library import library_records
 

@@ -13,7 +13,8 @@ import yaml
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import IDMParameters, Surrogate
-from harness.campaign.files import QUICK, load_campaign, load_panel, read_model, schema_text
+from harness.campaign.files import QUICK, load_campaign, load_panel, schema_text
+from harness.campaign.models import read_model
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT, CampaignError

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.campaign.files import Places
+from harness.campaign.models import Places
 from harness.campaign.yaml_text import parse_value, read_yaml
 from harness.errors import CampaignError
 

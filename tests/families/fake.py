@@ -24,7 +24,7 @@ class Numbers(ParameterFile):
 
 
 class Fake(Family):
-    name, vehicles, principal, ahead, crosses = "fake", ("POV", "AV"), 0, -1, 0
+    name, vehicles, principal, ahead, crosses, follows = "fake", ("POV", "AV"), 0, -1, 0, False
     model, default_parameters, ladders, n_uniforms = Numbers, "two-events", {False: "ladder-2"}, 1
     columns = Column("gap_m", pa.float64(), "m", "initial gap"), Column("event", pa.int64(), "1", "of two; -1: none")
 

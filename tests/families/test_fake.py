@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from importlib.metadata import EntryPoint
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from harness import families
 from harness.campaign.files import load_campaign
 from harness.resolved import resolve
 from harness.sampling import prepare
+from harness.vehicles.sideways import TO_OVERLAP_M
 from tests.families.fake import FAKE, P_EVENT, RATE
 from tests.in_process import run_here
 from tests.stored_runs import ROOT
@@ -72,6 +74,28 @@ def test_the_pool_knows_the_rate_and_a_run_of_shells_finds_it(engine, tmp_path):
     assert set(crashed["gap_m"]) == {8.0}
     again = harness.replay(tmp_path / "run", int(crashed["episode"].iloc[0]))
     assert again.row["outcome"] == "crash"
+
+
+class Table(NamedTuple):
+    probability: object
+
+
+def test_the_hash_of_a_traffic_is_of_all_its_numbers_or_the_family_is_told_to_make_its_own():
+    known = FAKE.digest(Table(np.array([0.1, 0.2])))
+    assert known == FAKE.digest(Table(np.array([0.1, 0.2])))
+    assert known != FAKE.digest(Table(np.array([0.1, 0.3]))) != FAKE.digest(Table(np.array([[0.1], [0.3]])))
+    with pytest.raises(TypeError, match=r"dict in a traffic is no number: .* digest of its own"):
+        FAKE.digest(Table({"a": 0.1}))
+
+
+def test_how_far_a_vehicle_moves_sideways_is_said_by_its_family_unless_it_comes_over_into_the_lane_or_nobody_does():
+    class Another(type(FAKE)):
+        crosses = -1
+
+    assert (FAKE.sideways_m(None), Another().sideways_m(None)) == (TO_OVERLAP_M, 0.0)
+    Another.principal, Another.crosses = 1, 0
+    with pytest.raises(NotImplementedError, match="fake says how far its vehicle 0 moves"):
+        Another().sideways_m(None)
 
 
 def test_an_installed_package_brings_a_family_by_an_entry_point(monkeypatch):

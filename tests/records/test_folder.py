@@ -22,10 +22,10 @@ import pytest
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
 from harness.records.folder import parquet, write_json, write_part, write_together
-from harness.records.reader import read
 from harness.records.schemas import ShardTables
 from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
+from harness.runner.tables import read
 from tests.golden.record import column_hash
 from tests.in_process import controllers_here, run_here
 from tests.stored_runs import copy_of, edit, golden, manifest, part_files, stored_table, unlike_columns

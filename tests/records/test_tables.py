@@ -12,8 +12,8 @@ import harness
 from harness.errors import RunFolderError
 from harness.families.cut_in.family import CUT_IN, STATE_FACTS
 from harness.loop.loop import hash_of_index
+from harness.records.reader import by_kind
 from harness.records.schemas import episodes_schema, moments_schema, traces_schema
-from harness.records.shown import by_kind
 from harness.vocabulary import AV
 from tests.in_process import run_here
 from tests.stored_runs import copy_of, edit, golden, manifest, stored_table

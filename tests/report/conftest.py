@@ -7,7 +7,7 @@ import pytest
 import harness
 from harness.campaign.files import load_campaign
 from harness.report.summary import RunFolder, read_run_folder
-from harness.runner.pages import write_report
+from harness.runner.stored import write_report
 from tests.golden.campaigns import SHELLS
 from tests.golden.record import load
 from tests.in_process import controllers_here, one_process, run_here, without_page

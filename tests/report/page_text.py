@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 from harness.campaign.files import load_campaign
-from harness.runner.pages import write_report
+from harness.runner.stored import write_report
 from tests.golden.campaigns import BASE, FAILING, FORCED, MIXTURE, RUNS, SHELLS
 from tests.in_process import run_here
 from tests.stored_runs import edit, unnoted

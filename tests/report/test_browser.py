@@ -12,7 +12,7 @@ import harness
 from harness.fitting.files import fit_files
 from harness.report.compare_page import write_sum
 from harness.report.page import write_hours
-from harness.runner.pages import write_report
+from harness.runner.stored import write_report
 from tests.fitting.trajectories import overtaking
 from tests.report.test_player import crashed, scenes_in
 from tests.stored_runs import copy_of

@@ -15,7 +15,7 @@ from harness.report.compare_page import crashing_pairs
 from harness.report.pair_words import deciding_words, pair_lines
 from harness.report.plots import WHO
 from harness.report.summary import read_run_folder
-from harness.runner.pages import write_report
+from harness.runner.stored import write_report
 from tests.report.page_text import Page
 from tests.report.test_player import motion, scenes_in
 from tests.stored_runs import answer_in, copy_of, stored_table

@@ -13,7 +13,7 @@ from junitparser import JUnitXml
 from harness.errors import RunFolderError
 from harness.records.folder import write_sealed
 from harness.report.junit import difference_case, statement_case, write_junit
-from harness.runner.pages import write_report
+from harness.runner.stored import write_report
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
 from tests.stored_runs import copy_of, truncate
 

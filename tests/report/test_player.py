@@ -18,7 +18,7 @@ from harness.report import crashes, player
 from harness.report.player import UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
 from harness.resolved import resolve
-from harness.runner.pages import write_report
+from harness.runner.stored import write_report
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M
 from tests.stored_runs import copy_of, stored_table
 

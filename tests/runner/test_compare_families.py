@@ -12,7 +12,7 @@ from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import read_manifest
 from harness.runner.compare import compare_campaigns
-from harness.runner.pages import write_report
+from harness.runner.stored import write_report
 from tests.in_process import one_process
 from tests.runner.test_families import NAMES, QUICK
 

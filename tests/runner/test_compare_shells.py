@@ -14,9 +14,9 @@ import pytest
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.pairs import PairDecision
-from harness.records.reader import read
 from harness.report.pair_words import deciding_words, pair_warnings, pair_words
 from harness.runner.compare import _decided, compare_campaigns
+from harness.runner.tables import read
 from harness.runner.workers import ShardRunner, Workers
 from tests.in_process import one_process, without_page
 from tests.pool.conftest import SMALL_POOL

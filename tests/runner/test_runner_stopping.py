@@ -9,7 +9,7 @@ import pytest
 from harness import estimate
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
 from harness.progress import Progress
-from harness.runner.pages import write_report
+from harness.runner.stored import write_report
 from tests.runner.conftest import SHELLS
 from tests.stored_runs import answer_in, copy_of, estimates, manifest, part_files, unlike_columns
 

@@ -16,7 +16,7 @@ import harness
 from harness import cache
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.runner import kept
-from harness.runner.pages import write_report
+from harness.runner.stored import write_report
 from harness.vehicles import library
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import controllers_here, one_process, run_here, run_with_workers

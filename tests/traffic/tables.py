@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from harness.campaign.files import read_model
+from harness.campaign.models import read_model
 from harness.campaign.yaml_text import read_yaml
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.sections import REPLACED

@@ -22,7 +22,7 @@ from harness.families.cut_in.script import facts_of, script_of
 from harness.families.cut_in.words import AT_OVERLAP, STAND_INS, WORDS
 from harness.families.protocol import Chosen, Column, Exposure, Family, Paths
 from harness.families.words import CLOSING
-from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, Method, RecordArray
+from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, RecordArray
 
 STATE_FACTS = (
     Column("v_bv_mps", pa.float64(), "m/s", "speed of BV"),
@@ -62,7 +62,8 @@ class CutIn(Family):
     ladders = {False: "ladder-2", True: "ladder-lateral-1"}
 
     fitter = "harness.families.cut_in.fitting.fitter:CutInFitter"
-    crosses, words = BV, WORDS
+    sources = dict.fromkeys(("nde", "step_mixture", "episode_mixture"), "harness.families.cut_in.nade.in_loop:InLoop")
+    follows, crosses, words = False, BV, WORDS
     maps = ((AT_OVERLAP, CLOSING),)
     stand_ins = STAND_INS
 
@@ -108,11 +109,6 @@ class CutIn(Family):
 
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:  # counted, whatever the laws
         return EXPOSURE
-
-    def sources(self) -> Mapping[Method, type[Any]]:
-        from harness.families.cut_in.nade.in_loop import InLoop  # noqa: PLC0415 - imports what draws on families
-
-        return dict.fromkeys(("nde", "step_mixture", "episode_mixture"), InLoop)
 
     def start(self, traffic: Environment, u: FloatArray) -> RecordArray:
         return InitialStates(traffic.numbers).from_uniforms(u)

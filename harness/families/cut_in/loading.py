@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.campaign.files import read_model, shipped_or_own
+from harness.campaign.models import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads, unboxed
 from harness.errors import CampaignError

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from harness.families.following.words import words_of
+from harness.families.following.words import words_of_following
 from harness.families.words import Shown
 
-WORDS = words_of(
+WORDS = words_of_following(
     called="cut-out",
     event="cut-out",
     since="the lane was clear",

@@ -22,7 +22,7 @@ STAND_INS = MappingProxyType(
 )
 
 
-def words_of(*, event: str, then: str, depend: str, strikes: str, **own: Any) -> Words:
+def words_of_following(*, event: str, then: str, depend: str, strikes: str, **own: Any) -> Words:
     """What pages say of events: what the one ahead does ``then``, and on what assumed numbers rates ``depend``."""
     return Words(
         event=event,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness.families.following.words import words_of
+from harness.families.following.words import words_of_following
 from harness.families.words import Shown
 
-WORDS = words_of(
+WORDS = words_of_following(
     called="lead brakes",
     event="braking",
     since="the onset",

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from harness.campaign.files import Places, validated
+from harness.campaign.models import Places, validated
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import CampaignError, TrajectoryError
 from harness.families.cut_in.family import CUT_IN

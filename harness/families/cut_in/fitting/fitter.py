@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from harness.campaign.files import read_model
+from harness.campaign.models import read_model
 from harness.campaign.yaml_text import yaml_text
 from harness.families.cut_in.fitting.fit import Fit, fit_traffic, replicates
 from harness.families.cut_in.fitting.laws import ObservedTraffic

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special, stats
 
 from harness import numbers
-from harness.campaign.files import read_model
+from harness.campaign.models import read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import printable
 from harness.estimators.limits import garwood
