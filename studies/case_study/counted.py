@@ -11,7 +11,6 @@ import pandas as pd
 import pyarrow as pa
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import FailureBounds
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import refusal
 from harness.estimators.scv import CHUNK_ROWS as CHUNK
@@ -31,8 +30,7 @@ class Claims:
     """Both estimators, fed with the same blocks; SCV only where it is defined and wanted."""
 
     def __init__(self, *, with_scv: bool = True, leave_one_out: bool = False) -> None:
-        self.nade, self.scv = FailureBounds(Nade()), Scv(leave_one_out=leave_one_out)
-        self._scv, self._with_scv = FailureBounds(self.scv), with_scv
+        self.nade, self.scv, self._with_scv = Nade(), Scv(leave_one_out=leave_one_out), with_scv
         self._n, self._weight = 0, 0.0
         self._method: Method = "nde"
 
@@ -44,7 +42,7 @@ class Claims:
         self._weight += float(block.weights().sum())
         self.nade.add(block)
         if self._with_scv:
-            self._scv.add(block)
+            self.scv.add(block)
 
     def rates(self) -> tuple[float, float]:
         """Both estimates."""
@@ -54,7 +52,7 @@ class Claims:
     def row(self, rhw: float, confidence: float) -> dict[str, Any]:
         """Figures of what is claimed so far; ``settled`` says whether it means anything."""
         nade, z = self.nade.result(confidence), Level.two_sided(confidence).z
-        scv = self._scv.result(confidence) if self._with_scv else None
+        scv = self.scv.result(confidence) if self._with_scv else None
         mean_weight = self._weight / self._n
         settled = figures.weights_are_in(self._method, mean_weight)
         row: dict[str, Any] = {"n": self._n, "mean_weight": mean_weight, "settled": settled}

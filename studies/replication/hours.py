@@ -11,30 +11,31 @@ import argparse
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import harness
-from harness.campaign.drivers import IDMParameters, Reaction
 from harness.campaign.sections import EnvironmentSettings
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.families import family_named
 from harness.families.protocol import Paths
 from harness.random_stream import INITIAL, uniforms
 from harness.runner.families import Hours
-from harness.vehicles.drivers import Followers, driver_records
+from harness.vehicles.drivers import Followers
+from studies.replication.populations import reactions
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
-VEHICLES = {
-    "idm": (IDMParameters(), Reaction()),
-    "late 1 s": (IDMParameters(), Reaction(delay_s=1.0)),
-    "brakes 6 m/s²": (IDMParameters(min_acceleration_mps2=-6.0), Reaction()),
-    "0.5 s behind, late 1 s": (IDMParameters(time_headway_s=0.5), Reaction(delay_s=1.0)),
+_GIVEN: dict[str, dict[str, Any]] = {
+    "idm": {},
+    "late 1 s": {"reaction": {"delay_s": 1.0}},
+    "brakes 6 m/s²": {"parameters": {"min_acceleration_mps2": -6.0}},
+    "0.5 s behind, late 1 s": {"parameters": {"time_headway_s": 0.5}, "reaction": {"delay_s": 1.0}},
 } | {
-    f"late 2.5 s in {p:.0%} of tests": (
-        IDMParameters(), Reaction(inattention_probability=p, inattention_delay_s=2.5),
-    )
+    f"late 2.5 s in {p:.0%} of tests": {"reaction": {"inattention_probability": p, "inattention_delay_s": 2.5}}
     for p in (0.01, 0.1, 0.3)
-}  # fmt: skip
+}
+VEHICLES = {name: AutomatedVehicle.model_validate(given) for name, given in _GIVEN.items()}
 """The first are alike in all tests, so that most strata's shares are 0 or 1; the last fail at random in each."""
 TRUTH_SEED, BLOCK = 77_000_001, 1024
 POOL_ERROR = 0.03
@@ -43,17 +44,13 @@ POOL_ERROR = 0.03
 
 def truths(paths: int) -> dict[str, tuple[float, float]]:
     """Crashes per hour of each vehicle, with standard errors, from so many paths of each scenario."""
-    drivers, reactions = zip(*VEHICLES.values(), strict=True)
-    late = [{"delay_s": each.delay_s + each.inattention_delay_s, "inattention_probability": 0.0} for each in reactions]
-    attentive = [each.model_copy(update={"inattention_probability": 0.0}) for each in reactions]
-    inattentive = [each.model_copy(update=given) for each, given in zip(reactions, late, strict=True)]
-    part = np.array([each.inattention_probability for each in reactions])
     total, variance = np.zeros((2, len(VEHICLES)))
     for name in NAMES:
         family, settings = family_named(name), EnvironmentSettings()
         traffic = family.traffic(settings)
-        both = driver_records(drivers * 2, attentive + inattentive, see_onset=family.shows(traffic))
-        followers = Followers(both)
+        each = [reactions(av, family.shows(traffic)) for av in VEHICLES.values()]
+        followers = Followers(np.concatenate([records for records, _ in each]))
+        drivers = [(i, share) for i, (_, shares) in enumerate(each) for share in shares]
         n = paths if family.follows else 16 * paths
         rates = np.zeros((n, len(VEHICLES) + 1))
         for first in range(0, n, BLOCK):
@@ -62,8 +59,8 @@ def truths(paths: int) -> dict[str, tuple[float, float]]:
             offset = np.random.default_rng(first).integers(0, family.stride, BLOCK)
             found = family.events(traffic, TRUTH_SEED, given, followers, stride=family.stride, offset=offset)
             rows = slice(first, first + BLOCK)
-            for d, p in enumerate(np.concatenate([1.0 - part, part])):
-                rates[rows, d % part.size] += p * np.where(found.crashes >> d & 1, found.probability, 0.0).sum(1)
+            for d, (i, share) in enumerate(drivers):
+                rates[rows, i] += share * np.where(found.crashes >> d & 1, found.probability, 0.0).sum(1)
             rates[rows, -1] = found.probability.sum(1)
         per_hour = family.exposure(traffic, family.parameters(settings)).per_hour / rates[:, -1].mean()
         total += per_hour * rates[:, :-1].mean(0)
@@ -73,15 +70,12 @@ def truths(paths: int) -> dict[str, tuple[float, float]]:
 
 def one(vehicle: str, seed: int, folder: Path) -> tuple[float, float, float, int]:
     """Rate per hour with its limits, and tests, of one campaign."""
-    parameters, reaction = VEHICLES[vehicle]
-    given = [f"av.parameters.{key}={value}" for key, value in parameters.model_dump(exclude_defaults=True).items()]
-    given += [f"av.reaction.{key}={value}" for key, value in reaction.model_dump(exclude_defaults=True).items()]
     campaign = harness.load_campaign(
         "idm",
-        [f"scenarios=[{', '.join(NAMES)}]", "world.engine=twin", f"seed={seed}", f"pool.seed={seed}", *given,
+        [f"scenarios=[{', '.join(NAMES)}]", "world.engine=twin", f"seed={seed}", f"pool.seed={seed}",
          f"pool.relative_error={POOL_ERROR}", "pool.events_per_shell=5000", "stop.below_reference=null",
          "stop.episodes=60000"],
-    )  # fmt: skip
+    ).replaced(("av",), VEHICLES[vehicle])  # fmt: skip
     found = harness.run(campaign, folder, workers=1)
     assert isinstance(found, Hours)
     hour = found.content["per_hour"]

@@ -103,7 +103,7 @@ class Drivers:
         """
         (records, envelope, *_), vehicles = library.followers(see_onset), dict[str, Mixed]()
         for name, av in avs.items():
-            of_av, shares = _reactions(av, see_onset)
+            of_av, shares = reactions(av, see_onset)
             vehicles[name] = dict(enumerate(shares, start=records.size))
             records = np.concatenate([records, of_av])
         if records.size > MOST_DRIVERS:
@@ -128,7 +128,7 @@ def reference_drivers(library: Library) -> dict[str, int]:
     return {name: len(library.surrogates) + r for r, name in enumerate(library.references)}
 
 
-def _reactions(av: AutomatedVehicle, see_onset: bool) -> tuple[RecordArray, list[float]]:
+def reactions(av: AutomatedVehicle, see_onset: bool) -> tuple[RecordArray, list[float]]:
     """The drivers that a vehicle can be in an episode, attentive or not, and how probable each is."""
     own = av_records(av, see_onset=see_onset)
     late = float(own["inattention_probability"][0] * (own["inattention_steps"][0] > 0.0))

@@ -54,6 +54,13 @@ def test_a_value_that_is_not_what_the_surrogate_predicts_is_seen(of_episodes):
         assert np.all(np.abs(p @ d) > 1e-3 * (p @ np.abs(d)))
 
 
+def test_the_mean_over_tests_with_as_many_control_steps_is_not_zero():
+    """So a β of each number of control steps, as `scv` has them, is biased."""
+    steps, (p, _, d) = enumerate_episodes(NOISY).n_control_steps, exactly(NOISY, of_episodes=False)
+    by_steps = np.array([np.bincount(steps, p * each) for each in d.T])
+    assert np.all(np.abs(by_steps).max(axis=1) > 0.01 * (p @ np.abs(d)))
+
+
 def test_a_surrogate_that_is_the_vehicle_leaves_less():
     """What is left is the first V, and what the vehicle's own luck, in which no maneuver has a part, makes of it."""
     p, y, d = exactly(CERTAIN, of_episodes=False)

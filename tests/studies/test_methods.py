@@ -13,9 +13,8 @@ from harness.campaign.campaign import Campaign
 from harness.families import family_named
 from harness.progress import Progress
 from harness.strata import LIBRARY_STATEMENT
-from studies.chains.chain import CHAINS, DECISIVE, REPLAYED
+from studies.chains.chain import CHAINS, REPLAYED
 from studies.chains.shells import ChainShells
-from studies.replication.doubly_robust import CHUNK, SIZES, by_strata, line, rows_of
 from studies.replication.experiment import Experiment, load_experiment
 from studies.replication.judgement import FORMER, Judgement, Row, Subject, corrected, judge
 from studies.replication.populations import Known, preventable_by, ratio_to
@@ -150,22 +149,3 @@ def test_committed_experiments_are_what_the_command_gives(name, tmp_path):
     found = json.loads((tmp_path / "results.json").read_text())["judgements"]
     as_trees = (dict(enumerate(judgements)) for judgements in (found, stored.values()))
     assert unlike(*as_trees, digits=1e-9) == []  # in all digits on one CPU family
-
-
-# -- the study of `dr` on a chain, whose truth is exact --
-
-
-def test_rows_of_the_tables():
-    chain = DECISIVE[1]
-    subject = Subject(chain.name, Known.exactly(chain.crash_rate))
-    source = partial(chain_episodes, chain, "step_mixture", 1)
-    repeated = WeightedCampaign(Campaign(name="chain"), source, ("nade", "dr"))
-    rows = rows_of(repeated, CHUNK)
-    assert [(n, len(each)) for n, each in rows.items()] == [(n, 2 * CHUNK // n) for n in SIZES]
-    *_, covered, gain = line("a setting", subject, 500, rows[500]).strip("| ").split(" | ")
-    assert 0.7 < float(covered) <= 1.0
-    assert float(gain) > 1.2
-    blocks = [source(k * CHUNK, CHUNK) for k in range(2)]
-    _, _, one, by_steps, _ = by_strata("a setting", subject, blocks).strip("| ").split(" | ")
-    assert float(one) > 1.2
-    assert float(by_steps) > 0.0
