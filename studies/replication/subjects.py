@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.families.cut_in.loading import load_environment
@@ -49,8 +48,8 @@ def _chain(experiment: Experiment, place: int, chain: Chain) -> Tested:
     campaign, seed, rate = experiment.campaign, experiment.seed_of(place), Known.exactly(chain.crash_rate)
     if (method := campaign.testing.method) == "shells":
         source = ChainShells(chain, experiment.super_population.pool_paths)
-        outside = {LIBRARY_STATEMENT: source.crashes_outside}
-        return _of_shells(experiment, campaign, chain.name, source.draw, seed, {RATE: rate}, rate.value, outside)
+        own = source.draw, seed, {RATE: rate}, rate.value, source.crashes_outside
+        return _of_shells(experiment, campaign, chain.name, *own)
     episodes = partial(chain_episodes, chain, method, seed)
     return Subject(chain.name, rate), WeightedCampaign(campaign, episodes, experiment.results)
 
@@ -97,10 +96,9 @@ def _seed(experiment: Experiment, name: str) -> int:
 def _vehicle(experiment: Experiment, name: str, source: shells.OvertakingShells, known: Mapping[str, Known]) -> Tested:
     """A vehicle by what is known about it, its crash rate among it; adversaries have the seed of what they are of."""
     of = experiment.adversaries[name].of if name in experiment.adversaries else name
-    outside, boundary = source.crashes_outside(source.crashing[0]), source.template.library.boundary
-    own = experiment.subject(of), name, source.draw, _seed(experiment, of), known, source.crash_rate, outside
+    own = source.draw, _seed(experiment, of), known, source.crash_rate, source.crashes_outside(source.crashing[0])
     unit = 1.0 if experiment.beside is None else source.reference_rate(experiment.beside)
-    return _of_shells(experiment, *own, unit, left_out=source.left_out, boundary=boundary)
+    return _of_shells(experiment, experiment.subject(of), name, *own, unit)
 
 
 def _of_shells(
@@ -111,23 +109,22 @@ def _of_shells(
     seed: int,
     known: Mapping[str, Known],
     own_rate: float,
-    beyond: Mapping[str, float],
+    beyond: float,
     unit: float = 1.0,
-    **more: Any,
 ) -> Tested:
     """A subject whose bounds and limits are judged by its own rate, that of the population which pools are drawn from.
 
-    ``beyond`` is the share of that rate beyond the boundary of each statement, ``unit`` what limits are multiples of.
+    ``beyond`` is the share of that rate beyond the library's boundary, ``unit`` what limits are multiples of.
     """
     limits, budgets = {factor: factor * own_rate / unit for factor in experiment.limits}, experiment.all_budgets
     limits |= {limit * unit / own_rate: limit for limit in experiment.verdicts}
     decisions = [result for pair in product(limits, budgets) for result in shells.limit_at(*pair)]
-    outside = {shells.result_of(each): share for each, share in beyond.items()}
-    outside |= dict.fromkeys(decisions, outside.get(shells.result_of(campaign.testing.shells.statement), 0.0))
+    assumes = campaign.testing.shells.statement == LIBRARY_STATEMENT
+    outside = dict.fromkeys([shells.WITHIN, *(decisions if assumes else ())], beyond)
     others = {result: value for result, value in known.items() if result != RATE}
     others |= dict.fromkeys([shells.BOUND, *decisions], Known.exactly(own_rate))
-    others |= {shells.bound_outside(each): Known(share * own_rate, 0.0, own_rate) for each, share in beyond.items()}
-    subject = Subject(name, known[RATE], others, outside, **more)
+    others[shells.BOUND_OUTSIDE] = Known(beyond * own_rate, 0.0, own_rate)
+    subject = Subject(name, known[RATE], others, outside)
     more_of = experiment.siblings, experiment.beside, experiment.levels, bool(experiment.verdicts)
     return subject, shells.ShellCampaign(campaign, draw, seed, limits, budgets, *more_of)
 
@@ -174,7 +171,6 @@ def _pairs(
         # Shares of the larger rate, as widths are; what only one of them does counts, whichever it is.
         differing = source.crashing[1] + source.crashing[2]
         rate = float(differing.sum()) / len(differing)
-        outside = {CONDITIONAL_DIFFERENCE: source.crashes_outside(differing)[LIBRARY_STATEMENT] * rate / scale}
-        facts = dict(known), outside, source.left_out, source.template.library.boundary
-        campaign, seed = experiment.subject(base[0]), experiment.seed_of(place)
-        yield Subject(name, Known.exactly(scale), *facts), shells.PairedCampaign(campaign, source.draw, seed)
+        outside = {CONDITIONAL_DIFFERENCE: source.crashes_outside(differing) * rate / scale}
+        repeated = shells.PairedCampaign(experiment.subject(base[0]), source.draw, experiment.seed_of(place))
+        yield Subject(name, Known.exactly(scale), dict(known), outside), repeated

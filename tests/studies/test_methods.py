@@ -12,14 +12,13 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.families import family_named
 from harness.progress import Progress
-from harness.strata import LIBRARY_STATEMENT
 from studies.chains.chain import CHAINS, REPLAYED
 from studies.chains.shells import ChainShells
 from studies.replication.experiment import Experiment, load_experiment
 from studies.replication.judgement import FORMER, Judgement, Row, Subject, corrected, judge
 from studies.replication.populations import Known, preventable_by, ratio_to
 from studies.replication.run import validate
-from studies.replication.shells import FREE, ShellCampaign, result_of
+from studies.replication.shells import FREE, WITHIN, ShellCampaign
 from studies.replication.weighted import WeightedCampaign, chain_episodes
 from tests.golden.record import unlike
 from tests.stored_runs import ROOT
@@ -90,7 +89,6 @@ def test_limits_are_decided_rightly_but_where_a_shell_counts_twice(wrong, caught
 
 COMMITTED = {"chains_shells": 5000, "chains_forced": 5000, "shells_panel": 2000, "gate": 500, "shells_bounds": 300}
 """Results in docs/, and how often each was repeated."""
-CONDITIONAL = result_of(LIBRARY_STATEMENT)
 
 
 def committed(name: str) -> tuple[dict[tuple[str, str], Judgement], Experiment]:
@@ -118,16 +116,16 @@ def test_committed_experiments_were_run_at_full_length_and_right_methods_cover(n
     for (_, result), one in found.items():
         assert one["replications"] >= COMMITTED[name]
         assert not one["coverage_too_low"] or FORMER in result
-        assert "chains" not in name or abs(one["bias"]) <= LARGEST_BIAS or result == CONDITIONAL
+        assert "chains" not in name or abs(one["bias"]) <= LARGEST_BIAS or result == WITHIN
 
 
 def test_committed_numbers_of_tests_and_errors_are_those_that_docs_promise():
     panel, _ = committed("shells_panel")
-    most = {FREE: 3000, CONDITIONAL: 110}
+    most = {FREE: 3000, WITHIN: 110}
     assert all(one["tests_median"] <= most.get(result, most[FREE]) for (_, result), one in panel.items())
     assert panel["idm", FREE]["tests_median"] <= 1300
     assert {ratio_to("r157-cc"), preventable_by("r157-cc")} < {result for _, result in panel}
-    assert not panel["SM-II", CONDITIONAL]["assumption_met"]
+    assert not panel["SM-II", WITHIN]["assumption_met"]
     assert panel["SM-II", FREE]["alarm"] == panel["never-brakes", FREE]["alarm"] == 1.0
     gate, _ = committed("gate")
     assert all(one["p_value"] >= 0.05 or FORMER in result for (_, result), one in gate.items())  # of 95 %, each alone
