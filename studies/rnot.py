@@ -16,10 +16,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from harness.estimators.likelihood import Level
 from harness.estimators.scv import Scv
 from harness.runner.stored import stored_blocks
 from harness.vocabulary import BoolArray, FloatArray, IntArray
+from studies.case_study.figures import figure, marked, mean_of, ratio_of_means
 
 
 @dataclass(frozen=True)
@@ -114,15 +115,36 @@ def cut_at(blocks: Iterator[Block], ends: Sequence[int]) -> Iterator[Block]:
 
 @dataclass(frozen=True, eq=False)
 class RequiredTests:
-    """RNoT ``n`` of every shuffle (s,), all tests where the threshold is never reached: above it at the last look."""
+    """RNoT ``n`` of every shuffle (s,), all tests where the threshold is never reached: above it at the last look.
+
+    ``settled`` says whether the weights of the tests have come in.
+    """
 
     n: IntArray
     never_reached: BoolArray
+    settled: bool = True
 
     @property
     def is_lower_limit(self) -> bool:
         """Whether some shuffle would have needed more tests than the total, and the mean is a lower limit."""
         return bool(self.never_reached.any())
+
+    def figure(self, confidence: float) -> dict[str, Any]:
+        """Mean over shuffles with its interval; a lower limit where some needed more tests than there were."""
+        mean = mean_of(self.n.tolist(), confidence)
+        if self.is_lower_limit:
+            mean = figure(None if self.never_reached.all() else mean["value"], mean["low"] or mean["value"])
+        return marked(mean, settled=self.settled)
+
+    def over(self, other: RequiredTests, confidence: float) -> dict[str, Any]:
+        """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
+        value, low, high = ratio_of_means(self.n, other.n, confidence).values()
+        if self.is_lower_limit:
+            low, high = low or value, None
+        if other.is_lower_limit:
+            low, high = None, None if self.is_lower_limit else high or value
+        nothing = self.is_lower_limit and other.is_lower_limit
+        return marked(figure(None if nothing else value, low, high), settled=self.settled and other.settled)
 
 
 def required_tests(rhw: FloatArray, grid: IntArray, threshold: float) -> RequiredTests:
@@ -183,10 +205,10 @@ def scv_rhw(tests: Block, procedure: Procedure) -> FloatArray:
     return rhw
 
 
-def over_shuffles(tests: Tests, procedure: Procedure, *, scv_of: Block | None = None) -> RequiredTests:
+def over_shuffles(tests: Tests, procedure: Procedure, *, settled: bool, scv_of: Block | None = None) -> RequiredTests:
     """RNoT of the mean of Y of tests; or, of a block of the same tests, of what `scv` claims."""
     rhw = plain_rhw(tests.y, tests.n, procedure) if scv_of is None else scv_rhw(scv_of, procedure)
-    return required_tests(rhw, procedure.grid(tests.n), procedure.rhw)
+    return replace(required_tests(rhw, procedure.grid(tests.n), procedure.rhw), settled=settled)
 
 
 def _crash_places(seed: int, shuffle: int, n_tests: int, n_crashes: int) -> tuple[np.random.Generator, IntArray]:

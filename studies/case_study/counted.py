@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -201,30 +201,6 @@ def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
     return {"figures": answers}
 
 
-class Counted(NamedTuple):
-    """RNoT of every shuffle of some tests, and whether their weights have come in."""
-
-    shuffles: rnot.RequiredTests
-    settled: bool
-
-    def figure(self, confidence: float) -> dict[str, Any]:
-        """Mean over shuffles with its interval; a lower limit where some needed more tests than there were."""
-        mean = figures.mean_of(self.shuffles.n.tolist(), confidence)
-        if self.shuffles.is_lower_limit:
-            mean = figure(None if self.shuffles.never_reached.all() else mean["value"], mean["low"] or mean["value"])
-        return marked(mean, settled=self.settled)
-
-    def over(self, other: Counted, confidence: float) -> dict[str, Any]:
-        """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
-        value, low, high = figures.ratio_of_means(self.shuffles.n, other.shuffles.n, confidence).values()
-        found = {
-            (False, False): figure(value, low, high),
-            (True, False): figure(value, low or value),
-            (False, True): figure(value, None, high or value),
-        }.get((self.shuffles.is_lower_limit, other.shuffles.is_lower_limit), figure(None))
-        return marked(found, settled=self.settled and other.settled)
-
-
 def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, Any]:
     """RNoT of every step that is named, and of SCV beside NADE on the same shuffles of the same tests."""
     asked = context.rhw, context.confidence
@@ -242,10 +218,9 @@ def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, A
 
 def _required(
     made: Made, procedure: rnot.Procedure, context: Context, first: int | None = None, *, scv: bool = False
-) -> Counted:
+) -> rnot.RequiredTests:
     """Of the mean of Y, or of what SCV claims, on all tests of a step or its first ones."""
     tests = tests_of(made).first(first)
     context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", None)
     block = rnot.first_block(made.folder / "run", tests.n) if scv else None
-    found = rnot.over_shuffles(tests, procedure, scv_of=block)
-    return Counted(found, settled(made))
+    return rnot.over_shuffles(tests, procedure, settled=settled(made), scv_of=block)

@@ -77,7 +77,6 @@ class Experiment(Section):
     """judge decisions, too: limits as multiples of the rate of `beside`; which is wrong follows from one's own ratio"""
     beside: str | None = Field(None, description="decide limits beside this reference driver: accept.times_reference")
     budgets: list[Whole] = Field([], description="numbers of tests within which limits are judged, and stop.episodes")
-    levels: list[Positive] = Field([], description="further levels at which the same tests of shells are judged")
     siblings: bool = Field(False, description="also judge former rules of limits and bounds, which err more often")
     super_population: SuperPopulation = SuperPopulation()
 
@@ -93,10 +92,8 @@ class Experiment(Section):
         return (1.0 + confidence) / 2.0 if self.limits else confidence
 
     def nominal_of(self, result: str) -> float:
-        """`nominal`, or the further level that a result is at."""
-        if result.startswith("limit "):
-            return (1.0 + self.campaign.stop.confidence) / 2.0
-        return next((level for level in self.levels if result.endswith(f" at {level:g}")), self.nominal)
+        """`nominal`, or that of a decision beside which intervals are judged, too."""
+        return (1.0 + self.campaign.stop.confidence) / 2.0 if result.startswith("limit ") else self.nominal
 
     @property
     def all_budgets(self) -> tuple[int, ...]:

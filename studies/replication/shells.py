@@ -31,7 +31,7 @@ from harness.pool.kept import KeptEvents, Pool
 from harness.pool.shells import boundary_shell, cells_in_strata, design_shells, shells_in_strata, shells_of
 from harness.sampling.allocation import Allocation
 from harness.sampling.shells import PairRounds, ShellRounds
-from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT, ShellDesign
+from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 from studies.replication.experiment import Adversary
@@ -62,11 +62,6 @@ def limit_at(factor: float, budget: int) -> dict[str, str]:
     """
     wrong = ["accepted"] * (factor <= 1.0) + ["rejected"] * (factor >= 1.0)
     return {f"limit {factor:g} x rate, {verdict} within {budget:,} tests": verdict for verdict in wrong}
-
-
-def at_level(level: float) -> str:
-    """Name of the rows of results at another level."""
-    return f"{FREE} at {level:g}"
 
 
 class CrashingCutIns(NamedTuple):
@@ -247,7 +242,6 @@ class ShellCampaign(_Drawn):
     budgets: Sequence[int] = ()
     siblings: bool = False
     beside: str | None = None
-    levels: Sequence[float] = ()
     estimated: bool = False
 
     def _replicate(self, replication: int, drawn: Sequence[DrawnPool], rng: np.random.Generator) -> Iterator[Row]:
@@ -305,9 +299,6 @@ class ShellCampaign(_Drawn):
         outside = int(estimate.details["within"]["n_crashes_outside"])
         row = estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
         yield row
-        for level in self.levels:
-            limits = planner.seen.limits_of(ASSUMPTION_FREE, Level.two_sided(level))
-            yield replace(row, result=at_level(level), ci_low=limits.low, ci_high=limits.high)
         found = estimate.details["within"]
         beyond_it = estimate.crash_rate - found["crash_rate"]  # whose error nobody claims to know
         for name, first, rate, error, bound in (

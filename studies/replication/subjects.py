@@ -125,7 +125,7 @@ def _of_shells(
     others |= dict.fromkeys([shells.BOUND, *decisions], Known.exactly(own_rate))
     others[shells.BOUND_OUTSIDE] = Known(beyond * own_rate, 0.0, own_rate)
     subject = Subject(name, known[RATE], others, outside)
-    more_of = experiment.siblings, experiment.beside, experiment.levels, bool(experiment.verdicts)
+    more_of = experiment.siblings, experiment.beside, bool(experiment.verdicts)
     return subject, shells.ShellCampaign(campaign, draw, seed, limits, budgets, *more_of)
 
 

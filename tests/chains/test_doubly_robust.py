@@ -16,9 +16,9 @@ from harness.estimators.weighted import Nade
 from harness.sampling.protocol import KnownRounds
 from studies.case_study.theorems import small_chains
 from studies.chains.chain import CHAINS, DECISIVE, decisive, enumerate_episodes, overtaking
-from studies.chains.sampler import Sampler, blocks, draw
+from studies.chains.sampler import Sampler, draw
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import fed
+from tests.estimators.small_blocks import blocks, fed
 
 IMMEDIATE = overtaking("immediate", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], challenge="immediate")
 NOISY = overtaking("noisy", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], epsilon=0.5)

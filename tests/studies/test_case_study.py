@@ -17,7 +17,8 @@ from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
 from studies.case_study.theorems import bound
 from studies.chains.chain import CHAINS, Episodes
-from studies.chains.sampler import blocks, with_optimal_function
+from studies.chains.sampler import with_optimal_function
+from tests.estimators.small_blocks import blocks
 from tests.stored_runs import SCENARIOS
 
 pytestmark = pytest.mark.slow

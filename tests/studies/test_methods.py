@@ -95,7 +95,8 @@ def committed(name: str) -> tuple[dict[tuple[str, str], Judgement], Experiment]:
     """Judgements by subject and result, and the experiment that they are of: shards have no part in it."""
     content = json.loads((ROOT / "docs" / "validation" / f"{name}.json").read_text())
     experiment = content["experiment"]
-    experiment.pop("fault", None)  # keys of earlier versions, all at their defaults
+    for key in ("fault", "levels"):  # keys of earlier versions, all at their defaults
+        experiment.pop(key, None)
     for key in ("boundary", "statements", "stopping"):
         experiment["campaign"]["testing"]["shells"].pop(key, None)
     experiment["campaign"]["stop"].pop("estimator", None)

@@ -7,12 +7,10 @@ import pytest
 
 from harness.estimators.scv import Scv
 from studies import rnot
-from studies.case_study.counted import Counted
 from studies.case_study.figures import figure
 from studies.chains.chain import overtaking
-from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import fed
+from tests.estimators.small_blocks import blocks, fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 GRID = np.array([10, 20, 30, 40, 50])
@@ -39,7 +37,7 @@ def test_the_required_number_is_the_first_look_from_which_on_the_width_stays_bel
 
 def test_the_acceleration_is_open_on_the_side_where_nothing_is_known():
     slow, fast, never = (
-        Counted(rnot.required_tests(np.array([[0.9, *rhw]] * 2), GRID, 0.3), settled=True)
+        rnot.required_tests(np.array([[0.9, *rhw]] * 2), GRID, 0.3)
         for rhw in ((0.9, 0.9, 0.1, 0.1), (0.1, 0.1, 0.1, 0.1), (0.9, 0.9, 0.9, 0.9))
     )
     assert slow.over(fast, 0.9) == figure(2.0, 2.0, 2.0)
