@@ -34,11 +34,11 @@ def cli() -> None:
 def validate(experiment_file: Path, folder: Path, overrides: Sequence[str], workers: int | None) -> None:
     """Repeat the campaign of EXPERIMENT thousands of times, to see what its intervals are worth.
 
-    Printed, and written to results.json, is a line per vehicle, pair or chain, and result: the truth; bias over it, ±
-    its standard error; mean squared error over the truth's square, true and as claimed; the share of intervals that
-    hold the truth, with its 95 % interval; p of so low a coverage if intervals were right, for as many lines (too low
-    below 0.05); tests, 5 to 95 %; the share of campaigns with a crash outside the library's boundary; the share without
-    an interval, as crashes lie on too few paths, which count as covered.
+    Printed is a line per vehicle, pair or chain, and result: the truth; bias over it; mean squared error over the
+    truth's square (relvar), true and as claimed; the share of intervals that hold the truth, and p of so low a coverage
+    if intervals were right, for as many lines (too low below 0.05); tests; alarm, the share of campaigns with a crash
+    outside the library's boundary; refused, the share without an interval, as crashes lie on too few paths, which count
+    as covered. results.json has these with their errors.
     """
     from studies.replication.experiment import load_experiment
 
@@ -47,7 +47,8 @@ def validate(experiment_file: Path, folder: Path, overrides: Sequence[str], work
 
     with (bar := progress_bar()):
         judgements = run.validate(experiment, folder, workers, bar)
-    print_table(f"{experiment.replications:,} replications", [run.table_row(one) for one in judgements])
+    rows = [{key: one[key] for key in run.SHOWN} for one in judgements]
+    print_table(f"{experiment.replications:,} replications", rows)
     say(folder / run.RESULTS)
 
 

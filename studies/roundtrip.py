@@ -75,28 +75,19 @@ def truth() -> EnvironmentParameters:
     return load_parameters(TRAFFIC).with_values({"cut_in__ignore_share": IGNORE_SHARE})
 
 
-def simulated(folder: Path, n_parts: int, progress: Progress) -> ObservedTraffic:
-    """Observations of ``n_parts`` of 10 vehicle-hours, 20 recordings each, as a fit reads them from files; kept."""
+@functools.cache
+def simulated(n_parts: int, progress: Progress) -> ObservedTraffic:
+    """Observations of ``n_parts`` of 10 vehicle-hours, 20 recordings each, as a fit reads them from files."""
     progress.stage("trajectories", n_parts)
-    parts: list[ObservedTraffic] = []
-    for part in range(n_parts):
-        path = folder / "observations" / f"{part:04d}.npz"
-        if not path.exists():
-            write_atomically(path, functools.partial(_observe, part))
-        with np.load(path) as kept:
-            recording = kept["recording"] + RECORDINGS_OF_PART * part
-            parts.append(ObservedTraffic(**{name: kept[name] for name in KINDS}, recording=recording))
-        progress.advance(1)
-    return ObservedTraffic.joined(parts)
-
-
-def _observe(part: int, path: Path) -> None:
+    parts = list[ObservedTraffic]()
     with tempfile.TemporaryDirectory() as name:
         file = Path(name, "trajectories.parquet")
-        write(simulate(load_environment(TRAFFIC, truth()), PART_H, SEED + part, Differences()), file)
-        traffic = ObservedTraffic.of(map(observe, recordings([file], load_mapping())))
-    with path.open("wb") as out:
-        np.savez(out, recording=traffic.recording, **{kind: getattr(traffic, kind) for kind in KINDS})
+        for part in range(n_parts):
+            write(simulate(load_environment(TRAFFIC, truth()), PART_H, SEED + part, Differences()), file)
+            traffic = ObservedTraffic.of(map(observe, recordings([file], load_mapping())))
+            parts.append(replace(traffic, recording=traffic.recording + RECORDINGS_OF_PART * part))
+            progress.advance(1)
+    return ObservedTraffic.joined(parts)
 
 
 def data_set(pool: ObservedTraffic, hours: float, index: int) -> ObservedTraffic:
@@ -267,7 +258,7 @@ def data_sets(folder: Path, hours: float, n: int, n_replicates: int, progress: P
     """Rows of ``n`` data sets of so many vehicle-hours; those that the folder does not have yet are fitted."""
     paths = [folder / f"{hours:g}h" / f"{index:04d}.parquet" for index in range(n)]
     if missing := [(index, path) for index, path in enumerate(paths) if not path.exists()]:
-        pool = simulated(folder, n, progress)
+        pool = simulated(n, progress)
         progress.stage(f"fits of {hours:g} vehicle-hours", n, done=n - len(missing))
         for index, path in missing:
             rows = fit_data_set(data_set(pool, hours, index), index, n_replicates)

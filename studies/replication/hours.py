@@ -18,6 +18,7 @@ import numpy as np
 import harness
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.vehicle import AutomatedVehicle
+from harness.commands.printing import print_table
 from harness.families import family_named
 from harness.families.protocol import Paths
 from harness.random_stream import INITIAL, uniforms
@@ -97,12 +98,12 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 rows.append(one(name, seed, Path(folder) / "run"))
             sys.stderr.write(f"{seed} {name}: {rows[-1]}, truth {truth[name][0]:.4g}\n")
-    print("| vehicle | truth per hour | held | mean rate / truth | tests, median |\n| --- | --- | --- | --- | --- |")  # noqa: T201
+    table = []
     for name, rows in seen.items():
-        rate, low, high, n = np.array(rows).T
-        (mu, error), held = truth[name], int(((low <= truth[name][0]) & (truth[name][0] <= high)).sum())
-        told = f"{mu:.3g} ± {error:.1g} | {held} of {len(rows)} | {rate.mean() / mu:.2f} | {np.median(n):,.0f} |"
-        print(f"| {name} | {told}")  # noqa: T201
+        (rate, low, high, n), (mu, error) = np.array(rows).T, truth[name]
+        told = {"vehicle": name, "truth per hour": mu, "±": error, "held": int(((low <= mu) & (mu <= high)).sum())}
+        table.append(told | {"of": len(rows), "mean rate / truth": rate.mean() / mu, "median tests": np.median(n)})
+    print_table("Crashes per hour", table)
 
 
 if __name__ == "__main__":

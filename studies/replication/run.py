@@ -5,7 +5,6 @@ The folder receives results.json, and all replications as Parquet.
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,6 +20,8 @@ from studies.work import results_of, worker_processes, write_table
 
 TASKS_PER_SUBJECT = 8
 RESULTS, REPLICATIONS = "results.json", "replications.parquet"
+SHOWN = "subject result truth bias true_relvar claimed_relvar coverage p_value_holm tests_median alarm refused".split()
+"""What a terminal shows of a judgement."""
 
 
 def validate(experiment: Experiment, folder: Path, workers: int | None, progress: Progress) -> list[Judgement]:
@@ -55,25 +56,3 @@ def validate(experiment: Experiment, folder: Path, workers: int | None, progress
     }
     write_json(folder / RESULTS, finite_json(content))  # of what never crashes nothing relative is known
     return judgements
-
-
-COLUMNS = {
-    "subject": "{subject}",
-    "result": "{result}",
-    "truth": "{truth:.3g}",
-    "bias": "{bias:+.1%} ± {bias_std_error:.1%}",
-    "relvar true": "{true_relvar:.3g}",
-    "claimed": "{claimed_relvar:.3g}",
-    "coverage": "{coverage:.3f} [{coverage_low:.3f}, {coverage_high:.3f}]",
-    "p (Holm)": "{p_value_holm:.2g}",
-    "tests": "{tests_median:,.0f} [{tests_5:,.0f}, {tests_95:,.0f}]",
-    "alarm": "{alarm:.1%}",
-    "refused": "{refused:.1%}",
-}
-"""What a terminal shows of a judgement."""
-
-
-def table_row(one: Judgement) -> dict[str, str]:
-    """Row of a table; NaN where nothing is known or judged."""
-    known = {key: math.nan if value is None else value for key, value in one.items()}
-    return {heading: form.format_map(known) for heading, form in COLUMNS.items()}

@@ -91,8 +91,8 @@ def test_a_data_set_is_fitted_once_and_near_what_was_put_in(folder: Path) -> Non
     assert (gap["n"], gap["coverage"]) == (2, 0.5)  # the second set is off by half
 
 
-def test_sets_of_a_part_share_no_recording(folder: Path) -> None:
-    pool = roundtrip.simulated(folder, 1, Progress())
+def test_sets_of_a_part_share_no_recording() -> None:
+    pool = roundtrip.simulated(1, Progress())
     assert roundtrip.data_set(pool, 10.0, 0).at_risk.size == pool.at_risk.size
     small = roundtrip.data_set(pool, 5.0, 3)
     assert np.unique(small.recording).size == 10
