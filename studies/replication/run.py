@@ -20,7 +20,10 @@ from studies.work import results_of, worker_processes, write_table
 
 TASKS_PER_SUBJECT = 8
 RESULTS, REPLICATIONS = "results.json", "replications.parquet"
-SHOWN = "subject result truth bias true_relvar claimed_relvar coverage p_value_holm tests_median alarm refused".split()
+SHOWN = (
+    *("subject", "result", "truth", "bias", "true_relvar", "claimed_relvar"),
+    *("coverage", "p_value_holm", "tests_median", "alarm", "refused"),
+)
 """What a terminal shows of a judgement."""
 
 
