@@ -17,7 +17,7 @@ from harness.estimators.scv import CHUNK_ROWS as CHUNK
 from harness.estimators.scv import Scv, StratumFit, fill_product_columns
 from harness.estimators.weighted import Nade
 from harness.runner.stored import stored_blocks
-from harness.vocabulary import FloatArray, Method
+from harness.vocabulary import FloatArray
 from studies import rnot
 from studies.case_study import figures
 from studies.case_study.figures import exactly, figure, marked
@@ -31,14 +31,12 @@ class Claims:
 
     def __init__(self, *, with_scv: bool = True, leave_one_out: bool = False) -> None:
         self.nade, self.scv, self._with_scv = Nade(), Scv(leave_one_out=leave_one_out), with_scv
-        self._n, self._weight = 0, 0.0
-        self._method: Method = "nde"
+        self._weight, self._method = 0.0, "nde"  # type: float, Method
 
     def add(self, block: Block) -> None:
         """Add tests."""
         self._method = block.drawn.method
         self._with_scv = self._with_scv and refusal(block, "scv") is None
-        self._n += len(block)
         self._weight += float(block.weights().sum())
         self.nade.add(block)
         if self._with_scv:
@@ -46,23 +44,23 @@ class Claims:
 
     def rates(self) -> tuple[float, float]:
         """Both estimates."""
-        fits = [fit for _, fit in self.scv.fits()]
-        return self.nade.result(0.9).crash_rate, sum(fit.n * fit.intercept for fit in fits) / self._n
+        of_strata = sum(fit.n * fit.intercept for _, fit in self.scv.fits())
+        return self.nade.y.mean(self.nade.n), of_strata / self.nade.n
 
     def row(self, rhw: float, confidence: float) -> dict[str, Any]:
         """Figures of what is claimed so far; ``settled`` says whether it means anything."""
         nade, z = self.nade.result(confidence), Level.two_sided(confidence).z
         scv = self.scv.result(confidence) if self._with_scv else None
-        mean_weight = self._weight / self._n
+        mean_weight = self._weight / self.nade.n
         settled = figures.weights_are_in(self._method, mean_weight)
-        row: dict[str, Any] = {"n": self._n, "mean_weight": mean_weight, "settled": settled}
+        row: dict[str, Any] = {"n": self.nade.n, "mean_weight": mean_weight, "settled": settled}
         row["largest_weight_share"] = nade.largest_weight_share
         for name, found in (("nade", nade), ("scv", scv)):
             rate, half = (0.0, 0.0) if found is None else (found.crash_rate, z * found.std_error)
             interval = figure(rate, max(rate - half, 0.0), rate + half) if rate > 0.0 else figure(None)
             row[f"{name}_rate"] = marked(interval, settled=settled)
             row[f"{name}_rhw"] = half / rate if rate > 0.0 else None
-            needed = figures.tests_for(self._n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
+            needed = figures.tests_for(self.nade.n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
             row[f"{name}_tests"] = needed
         row |= dict.fromkeys(("gain_claimed", "gain_degrees_of_freedom", "gain_leave_one_out", "difference"))
         row["n_saturated"] = 0 if scv is None else len(scv.details["gain"]["saturated"])
