@@ -31,7 +31,7 @@ class Claims:
 
     def __init__(self, *, with_scv: bool = True, leave_one_out: bool = False) -> None:
         self.nade, self.scv, self._with_scv = Nade(), Scv(leave_one_out=leave_one_out), with_scv
-        self._weight, self._method = 0.0, "nde"  # type: float, Method
+        self._weight = 0.0
 
     def add(self, block: Block) -> None:
         """Add tests."""

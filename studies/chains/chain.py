@@ -69,6 +69,21 @@ class Chain:
         """Bound on P(cut-in | path) over all paths."""
         return -float(np.expm1(self.horizon * np.log1p(-self.hazard.max())))
 
+    @cached_property
+    def step_mixture_variance(self) -> float:
+        """Var(Y) of one episode under the step mixture with equal weights, by backward induction of E[Y² | state]."""
+        proposals, before = self.proposals, np.zeros(len(self.start))
+        after = np.zeros(self.crashed + 1)
+        after[self.crashed] = 1.0
+        for t in range(self.horizon - 1, -1, -1):
+            cut = np.where(proposals.critical_before[t], proposals.cut[:, t].mean(axis=0), self.hazard)
+            staying = (1.0 - self.hazard) ** 2 / (1.0 - cut) * (self.approach @ before)
+            cutting = np.divide(self.hazard**2, cut, out=np.zeros_like(cut), where=cut > 0.0) * (self.entry @ after)
+            mixed = np.where(proposals.critical_after[t][:, None], proposals.maneuver[:, t].mean(axis=0), self.exposure)
+            after[:-2] = np.einsum("da,dae,e->d", self.exposure**2 / mixed, self.response, after)
+            before = staying + cutting
+        return float(self.start @ before) - self.crash_rate**2
+
     def values(self, response: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Crash probability by time and state: before (T + 1, G) and after the cut-in (T + 1, D + 2)."""
         before = np.zeros((self.horizon + 1, len(self.start)))

@@ -42,21 +42,6 @@ def cut_in_rate(chain: Chain) -> float:
     return 1.0 - float(chain.start @ none)
 
 
-def step_mixture_variance(chain: Chain) -> float:
-    """Var(Y) of one episode under the step mixture with equal weights, by backward induction of E[Y² | state]."""
-    proposals, before = chain.proposals, np.zeros(len(chain.start))
-    after = np.zeros(chain.crashed + 1)
-    after[chain.crashed] = 1.0
-    for t in range(chain.horizon - 1, -1, -1):
-        cut = np.where(proposals.critical_before[t], proposals.cut[:, t].mean(axis=0), chain.hazard)
-        staying = (1.0 - chain.hazard) ** 2 / (1.0 - cut) * (chain.approach @ before)
-        cutting = np.divide(chain.hazard**2, cut, out=np.zeros_like(cut), where=cut > 0.0) * (chain.entry @ after)
-        mixed = np.where(proposals.critical_after[t][:, None], proposals.maneuver[:, t].mean(axis=0), chain.exposure)
-        after[:-2] = np.einsum("da,dae,e->d", chain.exposure**2 / mixed, chain.response, after)
-        before = staying + cutting
-    return float(chain.start @ before) - chain.crash_rate**2
-
-
 def standard_errors_off(chain, estimate: Estimate, std_error: float | None = None) -> float:
     return abs(estimate.crash_rate - chain.crash_rate) / (estimate.std_error if std_error is None else std_error)
 
@@ -71,7 +56,7 @@ def test_estimates_are_right(chain, method):
         assert binomtest(found["nde"].n_crashes, sum(SIZES), chain.crash_rate).pvalue > 6e-5
         assert found["nade"].crash_rate == found["nde"].crash_rate
         return
-    known_error = math.sqrt(step_mixture_variance(chain) / sum(SIZES)) if method == "step_mixture" else None
+    known_error = math.sqrt(chain.step_mixture_variance / sum(SIZES)) if method == "step_mixture" else None
     for estimate in found.values():
         assert standard_errors_off(chain, estimate, known_error) < 4.0
         assert estimate.upper_bound > estimate.crash_rate
@@ -129,7 +114,7 @@ def test_nade_covers_and_the_published_scv_does_not(chain):
     assert scv["bias"] == pytest.approx(nade["bias"], abs=1e-12)
     assert covers(nade["covered"])
     assert scv["p_value"] < 1e-9
-    assert N * nade["claimed_relvar"] == pytest.approx(step_mixture_variance(chain) / chain.crash_rate**2, rel=0.1)
+    assert N * nade["claimed_relvar"] == pytest.approx(chain.step_mixture_variance / chain.crash_rate**2, rel=0.1)
     assert scv["true_relvar"] > 1.5 * scv["claimed_relvar"]
 
 
