@@ -19,7 +19,7 @@ from harness.runner.run import run_campaign
 from harness.runner.stored import stored_blocks
 from harness.runner.underway import RunResult
 from harness.sampling import prepare
-from harness.vocabulary import FloatArray, Method
+from harness.vocabulary import Method
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in
 from studies.case_study.study import Context, Made, Run, TwinTests
 from studies.replication.weighted import EpisodeSource, twin_episodes
@@ -130,16 +130,9 @@ def relative_variance(tests: Tests) -> dict[str, Any]:
     y = tests.y
     group = np.minimum(tests.episode * GROUPS // tests.n, GROUPS - 1)
     sums = np.array([np.bincount(group, weights=power, minlength=GROUPS) for power in (y, y * y)])
-    value = _relvar(sums.sum(axis=1), tests.n)
-    if value is None:
-        return figure(None)
-    left = [_relvar(sums.sum(axis=1) - sums[:, k], tests.n * (GROUPS - 1) / GROUPS) for k in range(GROUPS)]
-    if None in left:
-        return figure(value)
-    error = float(np.std(np.array(left, dtype=np.float64))) * np.sqrt(GROUPS - 1)
-    return figure(value, max(value - 2.0 * error, 0.0), value + 2.0 * error)
-
-
-def _relvar(sums: FloatArray, n: float) -> float | None:
-    total, squares = sums
-    return float(n * squares / (total * total) - 1.0) if total > 0.0 else None
+    every = sums.sum(axis=1, keepdims=True)
+    total, squares = np.hstack([every, every - sums])
+    n = np.append(tests.n, np.full(GROUPS, tests.n * (GROUPS - 1) / GROUPS))
+    value, *left = np.divide(n * squares, total * total, out=np.full(1 + GROUPS, np.nan), where=total > 0.0) - 1.0
+    error = 2.0 * float(np.std(left)) * np.sqrt(GROUPS - 1)
+    return figure(value, max(value - error, 0.0), value + error)

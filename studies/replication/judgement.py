@@ -76,11 +76,6 @@ class Subject:
         """What a result estimates."""
         return self.others.get(result.removesuffix(FORMER), self.crash_rate)
 
-    @property
-    def relative_error(self) -> float:
-        """The largest one of what is known about it, each over its scale."""
-        return max(known.relative_error for known in (self.crash_rate, *self.others.values()))
-
     def meets_assumption_of(self, result: str) -> bool:
         """Whether what a result assumes holds for it."""
         return self.crashes_outside.get(result.removesuffix(FORMER), 0.0) < NEGLIGIBLE_OUTSIDE

@@ -72,7 +72,6 @@ def validate(experiment: Experiment, folder: Path, workers: int | None, progress
         "experiment": experiment.model_dump(mode="json"),
         "confidence": experiment.nominal,
         "truth": "exact, by backward induction" if experiment.chains else "independent enumeration with another seed",
-        "largest_relative_error_of_truth": max(subject.relative_error for subject in found),
         "subjects": [asdict(subject) for subject in found],
         "judgements": judgements,
     }
