@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from harness.errors import HarnessError
 from harness.estimators.scv import Scv
 from studies import rnot
 from studies.case_study.figures import figure
 from studies.chains.chain import overtaking
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import blocks, fed
+from tests.estimators.small_blocks import block, blocks, fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 GRID = np.array([10, 20, 30, 40, 50])
@@ -44,6 +45,13 @@ def test_the_acceleration_is_open_on_the_side_where_nothing_is_known():
     assert never.over(fast, 0.9) == figure(2.5, 2.5)
     assert fast.over(never, 0.9) == figure(0.4, None, 0.4)
     assert never.over(never, 0.9) == figure(None)
+
+
+def test_tests_that_failed_are_refused():
+    """The paper's counts know of none; who failed might have crashed."""
+    assert rnot.Tests.of_block(block([True, False, True])).episode.tolist() == [0, 2]
+    with pytest.raises(HarnessError, match="1 failed"):
+        rnot.Tests.of_block(block([True, False, False], failed=[False, True, False]))
 
 
 def test_the_grid_rises_to_the_total():
