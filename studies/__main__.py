@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 
 from harness.cli import main as run_main
-from harness.commands.options import CAMPAIGN, FILE, FOLDER, json_option, progress_bar, quiet_option, written_file
-from harness.commands.printing import print_json, print_table, say
+from harness.commands.options import CAMPAIGN, FILE, FOLDER, progress_bar, quiet_option, written_file
+from harness.commands.printing import print_table, say
 from harness.errors import HarnessError
 
 _out_option = click.option("--out", "folder", type=FOLDER, required=True, help="Folder of the results; may be new.")
@@ -34,11 +34,11 @@ def cli() -> None:
 def validate(experiment_file: Path, folder: Path, overrides: Sequence[str], workers: int | None) -> None:
     """Repeat the campaign of EXPERIMENT thousands of times, to see what its intervals are worth.
 
-    Printed, and written to results.json, is a line per vehicle, pair or chain, and result: the truth; bias over it, ±
-    its standard error; mean squared error over the truth's square, true and as claimed; the share of intervals that
-    hold the truth, with its 95 % interval; p of so low a coverage if intervals were right, for as many lines (too low
-    below 0.05); tests, 5 to 95 %; the share of campaigns with a crash outside the library's boundary; the share without
-    an interval, as crashes lie on too few paths, which count as covered.
+    Printed is a line per vehicle, pair or chain, and result: the truth; bias over it; mean squared error over the
+    truth's square (relvar), true and as claimed; the share of intervals that hold the truth, and p of so low a coverage
+    if intervals were right, for as many lines (too low below 0.05); tests; alarm, the share of campaigns with a crash
+    outside the library's boundary; refused, the share without an interval, as crashes lie on too few paths, which count
+    as covered. results.json has these with their errors.
     """
     from studies.replication.experiment import load_experiment
 
@@ -47,7 +47,8 @@ def validate(experiment_file: Path, folder: Path, overrides: Sequence[str], work
 
     with (bar := progress_bar()):
         judgements = run.validate(experiment, folder, workers, bar)
-    print_table(f"{experiment.replications:,} replications", [run.table_row(one) for one in judgements])
+    rows = [{key: one[key] for key in run.SHOWN} for one in judgements]
+    print_table(f"{experiment.replications:,} replications", rows)
     say(folder / run.RESULTS)
 
 
@@ -85,8 +86,7 @@ def case(study_file: Path, folder: Path, *, quick: bool, workers: int | None) ->
 @click.option("--hours", type=click.FloatRange(0, 1000, min_open=True), default=10.0, help="Vehicle-hours.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, help="Of all random numbers.")
 @click.option("--level", type=click.FloatRange(0, 1e8, min_open=True), default=1000.0, help="Of lane changing.")
-@click.option("--exact", is_flag=True, help="Vehicles that are alike, measured without error.")
-def trajectories(environment: str, file: Path, *, hours: float, seed: int, level: float, exact: bool) -> None:
+def trajectories(environment: str, file: Path, *, hours: float, seed: int, level: float) -> None:
     """Make trajectories of ENVIRONMENT, a shipped name or a file of your own, to try `harness fit` on.
 
     Vehicles differ, and are measured with errors that change slowly (0.1 m, 0.1 m/s). A level of 270 makes lane changes
@@ -94,27 +94,23 @@ def trajectories(environment: str, file: Path, *, hours: float, seed: int, level
     """
     from harness.campaign.sections import EnvironmentSettings
     from harness.families.cut_in.loading import load_environment
-    from studies.trajectories import ALIKE, Differences, simulate, write
+    from studies.trajectories import Differences, simulate, write
 
     settings = EnvironmentSettings(parameters=environment, lane_change_level=level)
-    table = simulate(load_environment(settings), hours, seed, ALIKE if exact else Differences())
+    table = simulate(load_environment(settings), hours, seed, Differences())
     write(table, file)
     say(f"{file}: {len(table):,} rows")
 
 
 @cli.command()
 @click.argument("environment", default="ndd-overtaking-2")
-@json_option
 @click.pass_context
-def traffic(ctx: click.Context, environment: str, *, as_json: bool) -> None:
+def traffic(ctx: click.Context, environment: str) -> None:
     """Put ENVIRONMENT, a shipped name or a file of your own, beside published figures (studies/published.yaml)."""
     from studies.traffic import beside_published
 
     rows = beside_published(environment)
-    if as_json:
-        print_json(rows)
-    else:
-        print_table(f"{Path(environment).stem} beside what is published", rows)
+    print_table(f"{Path(environment).stem} beside what is published", rows)
     ctx.exit(int(any(row["verdict"] == "fail" for row in rows)))
 
 

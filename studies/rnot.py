@@ -16,19 +16,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from harness.errors import HarnessError
 from harness.estimators.block import Block, joined
-from harness.estimators.estimate import FailureBounds
 from harness.estimators.likelihood import Level
 from harness.estimators.scv import Scv
 from harness.runner.stored import stored_blocks
-from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, Int8Array, IntArray
+from harness.vocabulary import BoolArray, FloatArray, IntArray
+from studies.case_study.figures import figure, marked, mean_of, ratio_of_means
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Procedure:
 
 
 class Tests(NamedTuple):
-    """So many tests ``n`` from a first one on, and (k,) rows in index order of those that crashed or failed.
+    """So many tests ``n`` from a first one on, and (k,) indices and weights, in index order, of those that crashed.
 
     ``sum_of_weights`` is that of all.
     """
@@ -68,21 +69,19 @@ class Tests(NamedTuple):
     n: int
     sum_of_weights: float
     episode: IntArray
-    weight: FloatArray
-    failed: BoolArray
-
-    @classmethod
-    def of(cls, first: int, outcome: Int8Array, log_weight: FloatArray) -> Tests:
-        """Those of consecutive rows (n,) of records."""
-        at = np.flatnonzero((outcome == CRASH) | (outcome == FAILED))
-        weight = np.exp(np.where(np.isfinite(log_weight[at]), log_weight[at], 0.0))
-        with np.errstate(over="ignore"):
-            return cls(len(outcome), float(np.exp(log_weight).sum()), first + at, weight, outcome[at] == FAILED)
+    y: FloatArray
 
     @classmethod
     def of_block(cls, block: Block) -> Tests:
-        """Those of a block."""
-        return cls.of(block.first_episode, block.outcome, block.log_weight)
+        """Those of a block.
+
+        Raises `HarnessError`: some failed, of which the paper's counts know nothing.
+        """
+        if n_failed := np.count_nonzero(block.failed):
+            mend = "Mend the vehicle, or estimate its crash rate by `harness run`, which bounds what failed tests hide."
+            raise HarnessError(f"tests from {block.first_episode:,} on", f"{n_failed:,} failed", "none", mend)
+        at = np.flatnonzero(block.crash)
+        return cls(len(block), float(block.weights().sum()), block.first_episode + at, block.weighted_crashes()[at])
 
     @classmethod
     def joined(cls, parts: Iterable[Tests]) -> Tests:
@@ -95,12 +94,7 @@ class Tests(NamedTuple):
         if n is None or n >= self.n:
             return self
         kept = self.episode < n
-        return Tests(n, math.nan, self.episode[kept], self.weight[kept], self.failed[kept])
-
-    @property
-    def y(self) -> FloatArray:
-        """Weighted crashes (k,); a failed test counts as none."""
-        return np.where(self.failed, 0.0, self.weight)
+        return Tests(n, math.nan, self.episode[kept], self.y[kept])
 
 
 def first_block(folder: Path, n: int) -> Block:
@@ -121,15 +115,36 @@ def cut_at(blocks: Iterator[Block], ends: Sequence[int]) -> Iterator[Block]:
 
 @dataclass(frozen=True, eq=False)
 class RequiredTests:
-    """RNoT ``n`` of every shuffle (s,), all tests where the threshold is never reached: above it at the last look."""
+    """RNoT ``n`` of every shuffle (s,), all tests where the threshold is never reached: above it at the last look.
+
+    ``settled`` says whether the weights of the tests have come in.
+    """
 
     n: IntArray
     never_reached: BoolArray
+    settled: bool = True
 
     @property
     def is_lower_limit(self) -> bool:
         """Whether some shuffle would have needed more tests than the total, and the mean is a lower limit."""
         return bool(self.never_reached.any())
+
+    def figure(self, confidence: float) -> dict[str, Any]:
+        """Mean over shuffles with its interval; a lower limit where some needed more tests than there were."""
+        mean = mean_of(self.n.tolist(), confidence)
+        if self.is_lower_limit:
+            mean = figure(None if self.never_reached.all() else mean["value"], mean["low"] or mean["value"])
+        return marked(mean, settled=self.settled)
+
+    def over(self, other: RequiredTests, confidence: float) -> dict[str, Any]:
+        """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
+        value, low, high = ratio_of_means(self.n, other.n, confidence).values()
+        if self.is_lower_limit:
+            low, high = low or value, None
+        if other.is_lower_limit:
+            low, high = None, None if self.is_lower_limit else high or value
+        nothing = self.is_lower_limit and other.is_lower_limit
+        return marked(figure(None if nothing else value, low, high), settled=self.settled and other.settled)
 
 
 def required_tests(rhw: FloatArray, grid: IntArray, threshold: float) -> RequiredTests:
@@ -144,27 +159,24 @@ def required_tests(rhw: FloatArray, grid: IntArray, threshold: float) -> Require
     return RequiredTests(grid[at], above[:, -1])
 
 
-def plain_rhw(weights: FloatArray, n_tests: int, procedure: Procedure, failed: BoolArray | bool = False) -> FloatArray:
+def plain_rhw(weights: FloatArray, n_tests: int, procedure: Procedure) -> FloatArray:
     """RHW of the mean of Y on prefixes of shuffled tests, shape (s, g); infinite before the first crash.
 
     Tests without a crash only take up places, so that the places of the crashes are all that a shuffle has to draw: a
-    hundred million naturalistic tests cost no more than their crashes. Failed tests count as no crash in the lower
-    limit and as crashes in the upper one.
+    hundred million naturalistic tests cost no more than their crashes.
 
-    ``weights`` (k,) are those of the tests that crashed or ``failed`` (k,), in the order of the records.
+    ``weights`` (k,) are those of the tests that crashed, in the order of the records.
     """
-    grid, z = procedure.grid(n_tests), procedure.z
+    grid = procedure.grid(n_tests)
     # A unit that makes equal weights 1, whose sums are exact; the smallest squares would underflow besides.
-    worst = weights / np.max(weights, initial=0.0)
-    y = np.where(failed, 0.0, worst) if np.any(failed) else worst
+    y = weights / np.max(weights, initial=0.0)
     rhw = np.empty((procedure.n_shuffles, len(grid)))
     for shuffle in range(procedure.n_shuffles):
         _, places = _crash_places(procedure.seed, shuffle, n_tests, len(y))
         order = np.argsort(places)
         n_placed = np.searchsorted(places[order], grid)
-        total, below = total_and_half_width(y[order], n_placed, grid, z)
-        most, above = (total, below) if y is worst else total_and_half_width(worst[order], n_placed, grid, z)
-        rhw[shuffle] = ((most - total) + above + below) / 2.0 / total
+        total, half_width = total_and_half_width(y[order], n_placed, grid, procedure.z)
+        rhw[shuffle] = half_width / total
     return rhw
 
 
@@ -186,19 +198,17 @@ def scv_rhw(tests: Block, procedure: Procedure) -> FloatArray:
     grid = procedure.grid(len(tests))
     rhw = np.empty((procedure.n_shuffles, len(grid)))
     for shuffle in range(procedure.n_shuffles):
-        state = FailureBounds(Scv())
-        order = shuffled(procedure.seed, shuffle, tests.crash | tests.failed)
+        state, order = Scv(), shuffled(procedure.seed, shuffle, tests.crash)
         for at, (start, stop) in enumerate(pairwise([0, *grid.tolist()])):
             state.add(tests.chosen(order[start:stop]))
             rhw[shuffle, at] = state.result(procedure.confidence).rhw
     return rhw
 
 
-def over_shuffles(tests: Tests, procedure: Procedure, *, scv_of: Block | None = None) -> RequiredTests:
+def over_shuffles(tests: Tests, procedure: Procedure, *, settled: bool, scv_of: Block | None = None) -> RequiredTests:
     """RNoT of the mean of Y of tests; or, of a block of the same tests, of what `scv` claims."""
-    plain = tests.weight, tests.n, procedure, tests.failed
-    rhw = plain_rhw(*plain) if scv_of is None else scv_rhw(scv_of, procedure)
-    return required_tests(rhw, procedure.grid(tests.n), procedure.rhw)
+    rhw = plain_rhw(tests.y, tests.n, procedure) if scv_of is None else scv_rhw(scv_of, procedure)
+    return replace(required_tests(rhw, procedure.grid(tests.n), procedure.rhw), settled=settled)
 
 
 def _crash_places(seed: int, shuffle: int, n_tests: int, n_crashes: int) -> tuple[np.random.Generator, IntArray]:
@@ -208,7 +218,7 @@ def _crash_places(seed: int, shuffle: int, n_tests: int, n_crashes: int) -> tupl
 
 
 def shuffled(seed: int, shuffle: int, placed: BoolArray) -> IntArray:
-    """Rows in the order of a shuffle, shape (n,): crashed and failed ones in their places, the others between them."""
+    """Rows in the order of a shuffle, shape (n,): crashed ones in their places, the others between them."""
     n = len(placed)
     generator, places = _crash_places(seed, shuffle, n, int(np.count_nonzero(placed)))
     order = np.full(n, -1, dtype=np.int64)

@@ -30,10 +30,9 @@ from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.estimators.traffic import ONE_LAW
 from harness.families.cut_in.fitting.fit import fit_traffic, replicates
-from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
 from harness.families.cut_in.fitting.laws import ObservedTraffic
 from harness.families.cut_in.fitting.observations import KINDS, observe
-from harness.families.cut_in.loading import evaluate_laws, load_environment, load_parameters
+from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.families.cut_in.parameters import FIXED, EnvironmentParameters
 from harness.families.cut_in.sections import REPLACED
 from harness.files import write_atomically
@@ -76,28 +75,19 @@ def truth() -> EnvironmentParameters:
     return load_parameters(TRAFFIC).with_values({"cut_in__ignore_share": IGNORE_SHARE})
 
 
-def simulated(folder: Path, n_parts: int, progress: Progress) -> ObservedTraffic:
-    """Observations of ``n_parts`` of 10 vehicle-hours, 20 recordings each, as a fit reads them from files; kept."""
+@functools.cache
+def simulated(n_parts: int, progress: Progress) -> ObservedTraffic:
+    """Observations of ``n_parts`` of 10 vehicle-hours, 20 recordings each, as a fit reads them from files."""
     progress.stage("trajectories", n_parts)
-    parts: list[ObservedTraffic] = []
-    for part in range(n_parts):
-        path = folder / "observations" / f"{part:04d}.npz"
-        if not path.exists():
-            write_atomically(path, functools.partial(_observe, part))
-        with np.load(path) as kept:
-            recording = kept["recording"] + RECORDINGS_OF_PART * part
-            parts.append(ObservedTraffic(**{name: kept[name] for name in KINDS}, recording=recording))
-        progress.advance(1)
-    return ObservedTraffic.joined(parts)
-
-
-def _observe(part: int, path: Path) -> None:
+    parts = list[ObservedTraffic]()
     with tempfile.TemporaryDirectory() as name:
         file = Path(name, "trajectories.parquet")
-        write(simulate(load_environment(TRAFFIC, truth()), PART_H, SEED + part, Differences()), file)
-        traffic = ObservedTraffic.of(map(observe, recordings([file], load_mapping())))
-    with path.open("wb") as out:
-        np.savez(out, recording=traffic.recording, **{kind: getattr(traffic, kind) for kind in KINDS})
+        for part in range(n_parts):
+            write(simulate(load_environment(TRAFFIC, truth()), PART_H, SEED + part, Differences()), file)
+            traffic = ObservedTraffic.of(map(observe, recordings([file], load_mapping())))
+            parts.append(replace(traffic, recording=traffic.recording + RECORDINGS_OF_PART * part))
+            progress.advance(1)
+    return ObservedTraffic.joined(parts)
 
 
 def data_set(pool: ObservedTraffic, hours: float, index: int) -> ObservedTraffic:
@@ -268,7 +258,7 @@ def data_sets(folder: Path, hours: float, n: int, n_replicates: int, progress: P
     """Rows of ``n`` data sets of so many vehicle-hours; those that the folder does not have yet are fitted."""
     paths = [folder / f"{hours:g}h" / f"{index:04d}.parquet" for index in range(n)]
     if missing := [(index, path) for index, path in enumerate(paths) if not path.exists()]:
-        pool = simulated(folder, n, progress)
+        pool = simulated(n, progress)
         progress.stage(f"fits of {hours:g} vehicle-hours", n, done=n - len(missing))
         for index, path in missing:
             rows = fit_data_set(data_set(pool, hours, index), index, n_replicates)
@@ -300,84 +290,49 @@ def fitted_numbers(sets: pd.DataFrame) -> list[str]:
     return [name for name in map(str, sets) if not name.startswith(others) and sets[name].std() > 1e-9]
 
 
-def judge_numbers(
-    sets: Sequence[pd.DataFrame], true: Mapping[str, float], mean: Mapping[str, float]
-) -> list[dict[str, Any]]:
-    """Of each number: how often intervals hold the environment's (None for tables), and that of the mean law."""
-    z, judged = float(stats.norm.ppf(ENDS[1])), list[dict[str, Any]]()
+def judge_numbers(sets: Sequence[pd.DataFrame], mean: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Of each number, and of hazards in `STATES`: how often replicates' intervals hold that of the mean law.
+
+    Sets that kept a number of the base, which has no standard error then, are left out, unless all did.
+    """
     estimates, errors = (pd.DataFrame([each.loc[kind] for each in sets]) for kind in (ESTIMATE, ERROR))
+    judged = list[dict[str, Any]]()
+
+    def judge(name: str, law: float, found: Any, replicates: Sequence[FloatArray], told: BoolArray) -> None:
+        held = np.array([_within(each, law) for each in replicates])[told | ~told.any()]
+        judged.append({"number": name, "mean_law": law, "mean": float(np.mean(found)), "interval": coverage(held)})
+
     for name in fitted_numbers(estimates):
-        if name.startswith("hazard_table"):
-            continue
-        told, of = errors[name].notna().to_numpy(), estimates[name]
-        aims = {"environment": true.get(name), "mean_law": mean[name]}
-        row: dict[str, Any] = {"number": name, **aims, "mean": float(of.mean()), "spread": float(of.std())}
-        row["kept"] = int((~told).sum())
-        if told.any():
-            row["std_error"] = float(errors[name].median())
-        for aim, value in aims.items():
-            if value is None:
-                continue
-            if told.any():
-                off = (of - value).abs().to_numpy()[told] / errors[name].to_numpy()[told]
-                row[f"{aim}_by_se"] = coverage(off <= z)
-            of_replicates = [_within(each.loc[[REPLICATE], name].to_numpy(), value) for each in sets]
-            row[f"{aim}_by_replicates"] = coverage(np.array(of_replicates)[told | ~told.any()])
-        judged.append(row)
+        if not name.startswith("hazard_table"):
+            replicates = [each.loc[[REPLICATE], name].to_numpy() for each in sets]
+            judge(name, mean[name], estimates[name], replicates, errors[name].notna().to_numpy())
     for state in STATES:
         values = [log_hazard(each.loc[[ESTIMATE, REPLICATE]], state) for each in sets]
-        of_law, of_environment = log_hazard(pd.DataFrame([mean]), state)[0], np.log(true_hazard(state))
-        aims = {"mean_law": float(of_law), "environment": float(of_environment)}
-        first = np.array([each[0] for each in values])
-        row = {"number": f"log-hazard at {state}", **aims, "mean": float(first.mean()), "spread": float(first.std())}
-        for aim, value in aims.items():
-            row[f"{aim}_by_replicates"] = coverage(np.array([_within(each[1:], value) for each in values]))
-        judged.append(row)
+        law = float(log_hazard(pd.DataFrame([mean]), state)[0])
+        every = np.ones(len(sets), np.bool_)
+        judge(f"log-hazard at {state}", law, [each[0] for each in values], [each[1:] for each in values], every)
     return judged
 
 
-def true_hazard(state: Sequence[float]) -> float:
-    """Rate (1/s) at which lane changes are wished in the environment."""
-    values = evaluate_laws(load_environment(TRAFFIC, truth()), np.array([state]))
-    return float(-np.log1p(-values.chance[0]))
+def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray) -> dict[str, Any]:
+    """How often the replicates' intervals hold the environment's crash rates (drivers,), and ratios to the first.
 
-
-def true_shares(pool: ObservedTraffic) -> dict[str, float]:
-    """Share that the environment accepts of the lane changes that are wished in each step, in the moments at risk."""
-    risk = pool.at_risk
-    nobody = ~np.isfinite(risk["r2_m"])
-    states = np.column_stack([risk[name] for name in HAZARD.values()])
-    behind = np.column_stack([np.where(nobody, 1.0, risk[name]) for name in ("r2_m", "r2dot_mps")])
-    *_, chance, accepted = evaluate_laws(load_environment(TRAFFIC, truth()), states, behind)
-    wished, step = chance * risk["duration_s"], np.searchsorted(TTC_EDGES_S, risk["ttc_s"], side="right")
-    all_wished, done = (np.bincount(step, each, N_STEPS) for each in (wished, wished * accepted))
-    return {f"acceptance_steps__share__{i}": value for i, value in enumerate((done / all_wished).tolist())}
-
-
-def judge_rates(sets: Sequence[pd.DataFrame], near: Surrogate, true: FloatArray, of_mean: FloatArray) -> dict[str, Any]:
-    """How often the replicates' intervals hold crash rates and ratios to the first driver.
-
-    Those of the environment are ``true``, those of the mean law ``of_mean``, (drivers,) each: sets that share
-    recordings miss the former together where these have by chance too many lane changes of a kind, or too few.
+    Sets that share recordings miss these together where recordings have by chance too many lane changes of a kind.
     """
-    logs = [near.log_rates(each.loc[[ESTIMATE, REPLICATE]]) for each in sets]
+    logs = np.array([near.log_rates(each.loc[[ESTIMATE, REPLICATE]]) for each in sets])
     judged: dict[str, Any] = {}
-    ratio = np.array([each - each[:, :1] for each in logs])
-    for d, driver in enumerate(DRIVERS):
-        for of, values, aim, mean in (
-            ("rate", np.array(logs)[:, :, d], np.log(true[d]), np.log(of_mean[d])),
-            (f"ratio to {DRIVERS[0]}", ratio[:, :, d], np.log(true[d] / true[0]), np.log(of_mean[d] / of_mean[0])),
-        ):
+    for of, values, aims, wider in (
+        ("rate", logs, np.log(true), 0.0),
+        (f"ratio to {DRIVERS[0]}", logs - logs[:, :, :1], np.log(true / true[0]), np.log1p(ONE_LAW)),
+    ):
+        for d, driver in enumerate(DRIVERS):
             if of != "rate" and d == 0:
                 continue
-            wider = np.log1p(ONE_LAW if of != "rate" else 0.0) * np.array([-1.0, 1.0])
-            low, high = np.quantile(values[:, 1:], ENDS, axis=1, method="weibull") + wider[:, None]
+            low, high = np.quantile(values[:, 1:, d], ENDS, axis=1, method="weibull") + np.array([[-wider], [wider]])
             judged[f"{driver}: {of}"] = {
-                "true": float(np.exp(aim)),
-                "interval": coverage((low <= aim) & (aim <= high)),
-                "upper_limit": coverage(aim <= high),
-                "interval_of_mean_law": coverage((low <= mean) & (mean <= high)),
-                "median_estimate_over_true": float(np.exp(np.median(values[:, 0]) - aim)),
+                "true": float(np.exp(aims[d])),
+                "interval": coverage((low <= aims[d]) & (aims[d] <= high)),
+                "median_estimate_over_true": float(np.exp(np.median(values[:, 0, d]) - aims[d])),
                 "median_factor": float(np.exp(np.median(0.5 * (high - low)))),
             }
     return judged
@@ -395,21 +350,19 @@ def judged_data_sets(folder: Path, hours: Sequence[float], n: int, n_replicates:
     sets = {each: data_sets(folder, each, n, n_replicates, progress) for each in sorted(hours)}
     largest = pd.DataFrame([each.loc[ESTIMATE] for each in sets[max(sets)]])
     drivers, mean = Drivers(), on_common_knots(largest)
-    near = surrogate(drivers, largest, progress)
-    true = truth().values() | true_shares(simulated(folder, 1, progress))
-    of_mean = drivers.rates(parameters_of(mean))
+    near, mean_rates = surrogate(drivers, largest, progress), drivers.rates(parameters_of(mean)) / drivers.true
     found: dict[str, Any] = {
         "command": "python -m studies roundtrip --out DIR",
         "traffic": f"{TRAFFIC.parameters}, ignore_share {IGNORE_SHARE:g}, level {TRAFFIC.lane_change_level:g}",
-        "mean_law_over_environment": dict(zip(DRIVERS, (of_mean / drivers.true).tolist(), strict=True)),
+        "mean_law_over_environment": dict(zip(DRIVERS, mean_rates.tolist(), strict=True)),
     }
     for each, of in sets.items():
         found[f"{each:g} vehicle-hours"] = {
             "data_sets": len(of),
             "without_an_event": [int(sum(one[f"{SEEN}__{i}"].iloc[0] == 0 for one in of)) for i in range(N_STEPS)],
-            "rates": judge_rates(of, near, drivers.true, of_mean),
+            "rates": judge_rates(of, near, drivers.true),
             "gradient": check(of, near, drivers),
-            "numbers": judge_numbers(of, true, mean),
+            "numbers": judge_numbers(of, mean),
         }
     four_digits = json.loads(json.dumps(found), parse_float=lambda text: float(f"{float(text):.4g}"))
     write_json(folder / "roundtrip.json", four_digits)

@@ -47,20 +47,13 @@ def beside_published(environment: str) -> list[dict[str, Any]]:
 
 def _leads(environment: Environment) -> dict[str, float]:
     """Quantiles of the time from onset to overlap, of twice that, and of the lateral speed."""
-    distance_m, cumulative = environment.lateral
-    upto_s = STEP_S * (np.arange(cumulative.size) + 0.5)
-
-    def lead(percent: int) -> float:
-        return float(np.interp(percent / 100, cumulative, upto_s)) if environment.lateral.present else 0.0
-
-    def speed(percent: int) -> float:
-        return distance_m / lead(100 - percent) if environment.lateral.present else np.inf
-
-    return {
-        **{f"lead_p{p}_s": lead(p) for p in (1, 5, 50, 95)},
-        "duration_p50_s": 2.0 * lead(50),
-        **{f"lateral_p{p}_mps": speed(p) for p in (50, 95, 99)},
-    }
+    (distance_m, cumulative), lead = environment.lateral, dict.fromkeys((1, 5, 50, 95), 0.0)
+    if environment.lateral.present:
+        upto_s = STEP_S * (np.arange(cumulative.size) + 0.5)
+        lead = {percent: float(np.interp(percent / 100, cumulative, upto_s)) for percent in lead}
+    speed = {percent: distance_m / lead[100 - percent] if lead[50] else np.inf for percent in (50, 95, 99)}
+    found = {f"lead_p{p}_s": lead_s for p, lead_s in lead.items()} | {"duration_p50_s": 2.0 * lead[50]}
+    return found | {f"lateral_p{p}_mps": speed_mps for p, speed_mps in speed.items()}
 
 
 def _kept(environment: Environment, approach: SimpleNamespace) -> dict[str, float]:

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import FailureBounds
 from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import refusal
 from harness.estimators.scv import CHUNK_ROWS as CHUNK
 from harness.estimators.scv import Scv, StratumFit, fill_product_columns
 from harness.estimators.weighted import Nade
 from harness.runner.stored import stored_blocks
-from harness.vocabulary import FloatArray, Method
+from harness.vocabulary import FloatArray
 from studies import rnot
 from studies.case_study import figures
 from studies.case_study.figures import exactly, figure, marked
@@ -31,40 +30,37 @@ class Claims:
     """Both estimators, fed with the same blocks; SCV only where it is defined and wanted."""
 
     def __init__(self, *, with_scv: bool = True, leave_one_out: bool = False) -> None:
-        self.nade, self.scv = FailureBounds(Nade()), Scv(leave_one_out=leave_one_out)
-        self._scv, self._with_scv = FailureBounds(self.scv), with_scv
-        self._n, self._weight = 0, 0.0
-        self._method: Method = "nde"
+        self.nade, self.scv, self._with_scv = Nade(), Scv(leave_one_out=leave_one_out), with_scv
+        self._weight = 0.0
 
     def add(self, block: Block) -> None:
         """Add tests."""
         self._method = block.drawn.method
         self._with_scv = self._with_scv and refusal(block, "scv") is None
-        self._n += len(block)
         self._weight += float(block.weights().sum())
         self.nade.add(block)
         if self._with_scv:
-            self._scv.add(block)
+            self.scv.add(block)
 
     def rates(self) -> tuple[float, float]:
         """Both estimates."""
-        fits = [fit for _, fit in self.scv.fits()]
-        return self.nade.result(0.9).crash_rate, sum(fit.n * fit.intercept for fit in fits) / self._n
+        of_strata = sum(fit.n * fit.intercept for _, fit in self.scv.fits())
+        return self.nade.y.mean(self.nade.n), of_strata / self.nade.n
 
     def row(self, rhw: float, confidence: float) -> dict[str, Any]:
         """Figures of what is claimed so far; ``settled`` says whether it means anything."""
         nade, z = self.nade.result(confidence), Level.two_sided(confidence).z
-        scv = self._scv.result(confidence) if self._with_scv else None
-        mean_weight = self._weight / self._n
+        scv = self.scv.result(confidence) if self._with_scv else None
+        mean_weight = self._weight / self.nade.n
         settled = figures.weights_are_in(self._method, mean_weight)
-        row: dict[str, Any] = {"n": self._n, "mean_weight": mean_weight, "settled": settled}
+        row: dict[str, Any] = {"n": self.nade.n, "mean_weight": mean_weight, "settled": settled}
         row["largest_weight_share"] = nade.largest_weight_share
         for name, found in (("nade", nade), ("scv", scv)):
             rate, half = (0.0, 0.0) if found is None else (found.crash_rate, z * found.std_error)
             interval = figure(rate, max(rate - half, 0.0), rate + half) if rate > 0.0 else figure(None)
             row[f"{name}_rate"] = marked(interval, settled=settled)
             row[f"{name}_rhw"] = half / rate if rate > 0.0 else None
-            needed = figures.tests_for(self._n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
+            needed = figures.tests_for(self.nade.n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
             row[f"{name}_tests"] = needed
         row |= dict.fromkeys(("gain_claimed", "gain_degrees_of_freedom", "gain_leave_one_out", "difference"))
         row["n_saturated"] = 0 if scv is None else len(scv.details["gain"]["saturated"])
@@ -203,30 +199,6 @@ def draw_convergence(step: Convergence, context: Context) -> dict[str, Any]:
     return {"figures": answers}
 
 
-class Counted(NamedTuple):
-    """RNoT of every shuffle of some tests, and whether their weights have come in."""
-
-    shuffles: rnot.RequiredTests
-    settled: bool
-
-    def figure(self, confidence: float) -> dict[str, Any]:
-        """Mean over shuffles with its interval; a lower limit where some needed more tests than there were."""
-        mean = figures.mean_of(self.shuffles.n.tolist(), confidence)
-        if self.shuffles.is_lower_limit:
-            mean = figure(None if self.shuffles.never_reached.all() else mean["value"], mean["low"] or mean["value"])
-        return marked(mean, settled=self.settled)
-
-    def over(self, other: Counted, confidence: float) -> dict[str, Any]:
-        """AAR of the other one: ratio of the means, open where one of them is a lower limit."""
-        value, low, high = figures.ratio_of_means(self.shuffles.n, other.shuffles.n, confidence).values()
-        found = {
-            (False, False): figure(value, low, high),
-            (True, False): figure(value, low or value),
-            (False, True): figure(value, None, high or value),
-        }.get((self.shuffles.is_lower_limit, other.shuffles.is_lower_limit), figure(None))
-        return marked(found, settled=self.settled and other.settled)
-
-
 def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, Any]:
     """RNoT of every step that is named, and of SCV beside NADE on the same shuffles of the same tests."""
     asked = context.rhw, context.confidence
@@ -244,10 +216,9 @@ def count_required_tests(step: RequiredNumbers, context: Context) -> dict[str, A
 
 def _required(
     made: Made, procedure: rnot.Procedure, context: Context, first: int | None = None, *, scv: bool = False
-) -> Counted:
+) -> rnot.RequiredTests:
     """Of the mean of Y, or of what SCV claims, on all tests of a step or its first ones."""
     tests = tests_of(made).first(first)
     context.progress.stage(f"shuffles of {made.folder.name.rpartition('-')[0]}", None)
     block = rnot.first_block(made.folder / "run", tests.n) if scv else None
-    found = rnot.over_shuffles(tests, procedure, scv_of=block)
-    return Counted(found, settled(made))
+    return rnot.over_shuffles(tests, procedure, settled=settled(made), scv_of=block)

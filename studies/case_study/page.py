@@ -23,10 +23,8 @@ PAGE, CLAIMS = "case_study.md", "claims.json"
 _POWER = re.compile(r"([\d.]+)((?: \([^()]*\))?) × 10([⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)")
 
 
-def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Path, list[dict[str, Any]]]:
+def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> Path:
     """Write ``case_study.md``, ``claims.json`` and ``plots/``; files that would not change are left as they are.
-
-    Returned are the page, and the content of ``claims.json``.
 
     Raises `HarnessError`: a claim or the picture asks for a figure that its step does not have.
     """
@@ -58,7 +56,7 @@ def write_page(study: Study, folder: Path, made: Mapping[str, Made]) -> tuple[Pa
     answers = json.dumps({"conclusive": study.conclusive, "claims": claims}, indent=2, ensure_ascii=False)
     _write(folder / CLAIMS, f"{answers}\n".encode())
     _write(folder / PAGE, with_exponents(page).encode())
-    return folder / PAGE, claims
+    return folder / PAGE
 
 
 def _remarks(claims: list[dict[str, Any]]) -> dict[str, list[int]]:

@@ -18,7 +18,7 @@ from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.vocabulary import EstimatorName, FloatArray
 from studies.case_study import figures
-from studies.case_study.counted import Claims, Counted, KnownMeans
+from studies.case_study.counted import Claims, KnownMeans
 from studies.case_study.figures import figure, marked, range_of
 from studies.case_study.study import Context, Variants
 from studies.case_study.tested import AT_ONCE, IN_THE_TWIN
@@ -119,8 +119,8 @@ def claims_in_twin(
     rates = {name: np.array([each[f"{name}_rate"]["value"] or 0.0 for each in rows]) for name in ("nade", "scv")}
     rnot = figure(None)
     if step.shuffles:
-        found = over_shuffles(Tests.joined(parts), Procedure(rhw, confidence, step.shuffles))
-        rnot = Counted(found, row["settled"]).figure(confidence)
+        procedure = Procedure(rhw, confidence, step.shuffles)
+        rnot = over_shuffles(Tests.joined(parts), procedure, settled=row["settled"]).figure(confidence)
     return {
         **row,
         "claimed": marked(figures.mean_of(tests["nade"], confidence), settled=row["settled"]),

@@ -45,8 +45,8 @@ _MAKERS: dict[str, Callable[[Any, Context], dict[str, Any]]] = {
 def run_study(study: Study, folder: Path, workers: int | None, progress: Progress) -> dict[str, Any]:
     """Make what is missing, and the page, in a folder that is new, empty, or that of an earlier study.
 
-    Worker processes, one per core by default, change no result. Returned are the place of the page, all claims with
-    verdicts, and the seconds that each step took, None for one that was there before.
+    Worker processes, one per core by default, change no result. Returned are the place of the page, and the seconds
+    that each step took, None for one that was there before.
 
     Raises `HarnessError`: a file that a step names is wrong, which shows before any step is made; or the folder cannot
     be used.
@@ -65,8 +65,7 @@ def run_study(study: Study, folder: Path, workers: int | None, progress: Progres
                 seconds[name] = time.monotonic() - began
             result = read_as(dict[str, Any], place / RESULT, mend="Delete the folder of this step; it is made again.")
             made[name] = Made(place, result)
-        page, claims = write_page(study, folder, made)
-        return {"page": str(page), "claims": claims, "seconds": seconds}
+        return {"page": str(write_page(study, folder, made)), "seconds": seconds}
 
 
 def step_keys(study: Study) -> dict[str, str]:

@@ -184,21 +184,14 @@ def inputs_of(step: Step) -> list[tuple[str, str]]:
 def load_study(path: Path, *, quick: bool = False) -> Study:
     """Read a study, with its ``quick`` sizes laid over its steps if they are asked for.
 
-    Both forms are validated whichever is asked for, so that a file is right or wrong whatever is made of it.
-
     Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
     """
-    full = read_model(path, Study)
-    changes = [
-        Override(("steps", name, key), value, f"quick: steps.{name}.{key}")
-        for name, values in full.quick.items()
-        for key, value in values.items()
-    ]
-    small = read_model(path, Study, changes)
-    study = full
+    study = read_model(path, Study)
     if quick:
-        title = f"{small.title} (quick: too few tests for conclusions)"
-        study = small.model_copy(update={"title": title, "conclusive": False})
+        given = ((name, key, value) for name, values in study.quick.items() for key, value in values.items())
+        changes = [Override(("steps", name, key), value, f"quick: steps.{name}.{key}") for name, key, value in given]
+        title = f"{study.title} (quick: too few tests for conclusions)"
+        study = read_model(path, Study, changes).model_copy(update={"title": title, "conclusive": False})
     placed = {}
     for name, step in study.steps.items():
         file = getattr(step, "campaign", None)

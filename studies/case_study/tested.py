@@ -19,15 +19,15 @@ from harness.runner.run import run_campaign
 from harness.runner.stored import stored_blocks
 from harness.runner.underway import RunResult
 from harness.sampling import prepare
-from harness.vocabulary import FloatArray, Method
+from harness.vocabulary import Method
 from studies.case_study.figures import exactly, figure, is_settled, marked, tests_for, weights_are_in
 from studies.case_study.study import Context, Made, Run, TwinTests
-from studies.replication.weighted import prepared_twin
+from studies.replication.weighted import EpisodeSource, twin_episodes
 from studies.rnot import Tests
 from studies.work import write_table
 
-PART, AT_ONCE = 500_000, 50_000
-"""Tests that a worker hands back together, and of a call of the twin."""
+AT_ONCE = 50_000
+"""Tests of a call of the twin."""
 GROUPS = 20
 CRASHES = "crashes.parquet"
 IN_THE_TWIN = ("world.engine=twin", "records.traces=none", "records.trace_share=0.0")
@@ -50,20 +50,14 @@ def test_in_twin(step: TwinTests, context: Context) -> dict[str, Any]:
     """Test in worker processes, part by part."""
     campaign = campaign_of(step)
     prepare(resolve(campaign), context.progress)  # tables and kernels are built once, before the workers start
-    make = partial(crashes_in_twin, campaign.model_dump_json())
-    jobs = [(first, min(PART, step.tests - first)) for first in range(0, step.tests, PART)]
-    found = context.by_workers(jobs, make)
+    make = partial(crashes_in_twin, twin_episodes(campaign, campaign.seed, ()), step.tests)
+    found = context.by_workers(range(0, step.tests, AT_ONCE), make)
     return _kept(context, campaign.testing.method, Tests.joined(found))
 
 
-def crashes_in_twin(campaign_json: str, part: tuple[int, int]) -> Tests:
-    """Crashed and failed ones of the tests ``first … first + n - 1``."""
-    prepared, loop = prepared_twin(campaign_json)
-    (first, n), parts = part, []
-    for start in range(first, first + n, AT_ONCE):
-        rows = loop.run(start, prepared.tests(start, min(AT_ONCE, first + n - start))).episode
-        parts.append(Tests.of(start, rows["outcome"], rows["log_weight"]))
-    return Tests.joined(parts)
+def crashes_in_twin(source: EpisodeSource, n: int, first: int) -> Tests:
+    """Crashed ones of n tests, from a first one on."""
+    return Tests.of_block(source(first, min(AT_ONCE, n - first)))
 
 
 def keep_run(step: Run, context: Context) -> dict[str, Any]:
@@ -93,7 +87,7 @@ def _kept(context: Context, method: Method, tests: Tests) -> dict[str, Any]:
         "plain_tests": figure(plain, least, most),  # of plain simulation at this crash rate: z²(1 - μ)/(RHW² μ)
     }
     is_in = weights_are_in(method, mean_weight)
-    counts: dict[str, float] = {"tests": tests.n, "crashes": int(np.sum(~tests.failed)), "mean_weight": mean_weight}
+    counts: dict[str, float] = {"tests": tests.n, "crashes": len(tests.y), "mean_weight": mean_weight}
     figures = {name: marked(each, settled=is_in) for name, each in figures.items()}
     return {"n": tests.n, "figures": {**figures, **{name: exactly(each) for name, each in counts.items()}}}
 
@@ -121,8 +115,8 @@ def crash_rate(tests: Tests, confidence: float) -> dict[str, Any]:
     """Mean of Y with the paper's normal interval; of tests without weights with that of Clopper and Pearson."""
     y, n = tests.y, tests.n
     rate = float(y.sum()) / n
-    if np.all(y[~tests.failed] == 1.0):
-        low, high = map(float, clopper_pearson(np.count_nonzero(y), n, (1.0 - confidence) / 2.0))
+    if np.all(y == 1.0):
+        low, high = map(float, clopper_pearson(len(y), n, (1.0 - confidence) / 2.0))
         return figure(rate, low, high)
     half = Level.two_sided(confidence).z * float(np.sqrt(max(float(y @ y) / n - rate * rate, 0.0) / max(n - 1, 1)))
     return figure(rate, max(rate - half, 0.0), rate + half)
@@ -136,16 +130,9 @@ def relative_variance(tests: Tests) -> dict[str, Any]:
     y = tests.y
     group = np.minimum(tests.episode * GROUPS // tests.n, GROUPS - 1)
     sums = np.array([np.bincount(group, weights=power, minlength=GROUPS) for power in (y, y * y)])
-    value = _relvar(sums.sum(axis=1), tests.n)
-    if value is None:
-        return figure(None)
-    left = [_relvar(sums.sum(axis=1) - sums[:, k], tests.n * (GROUPS - 1) / GROUPS) for k in range(GROUPS)]
-    if None in left:
-        return figure(value)
-    error = float(np.std(np.array(left, dtype=np.float64))) * np.sqrt(GROUPS - 1)
-    return figure(value, max(value - 2.0 * error, 0.0), value + 2.0 * error)
-
-
-def _relvar(sums: FloatArray, n: float) -> float | None:
-    total, squares = sums
-    return float(n * squares / (total * total) - 1.0) if total > 0.0 else None
+    every = sums.sum(axis=1, keepdims=True)
+    total, squares = np.hstack([every, every - sums])
+    n = np.append(tests.n, np.full(GROUPS, tests.n * (GROUPS - 1) / GROUPS))
+    value, *left = np.divide(n * squares, total * total, out=np.full(1 + GROUPS, np.nan), where=total > 0.0) - 1.0
+    error = 2.0 * float(np.std(left)) * np.sqrt(GROUPS - 1)
+    return figure(value, max(value - error, 0.0), value + error)

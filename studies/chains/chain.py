@@ -65,14 +65,6 @@ class Chain:
         return np.array([self.start @ self.values(response)[0][0] for response in self.surrogate_responses])
 
     @cached_property
-    def cut_in_rate(self) -> float:
-        """P(cut-in within the horizon)."""
-        none = np.ones(len(self.start))
-        for _ in range(self.horizon):
-            none = (1.0 - self.hazard) * (self.approach @ none)
-        return 1.0 - float(self.start @ none)
-
-    @cached_property
     def cut_in_cap(self) -> float:
         """Bound on P(cut-in | path) over all paths."""
         return -float(np.expm1(self.horizon * np.log1p(-self.hazard.max())))

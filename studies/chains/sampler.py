@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,14 +14,6 @@ from studies.chains.chain import Chain
 DEFENSIVE_SHARE = 0.1
 Seen = tuple[BoolArray, FloatArray]
 """Whether a step is critical (m,), and C_j of its maneuvers (J, m, A)."""
-
-
-def blocks(chain: Chain, method: Method, sizes: list[int], seed: int) -> Iterator[Block]:
-    """Consecutive blocks of the given sizes; each has its own random stream."""
-    first = 0
-    for k, size in enumerate(sizes):
-        yield draw(chain, method, size, np.random.default_rng([seed, k]), first_episode=first)
-        first += size
 
 
 def mixture_weights(chain: Chain, method: Method) -> FloatArray:

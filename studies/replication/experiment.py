@@ -13,10 +13,9 @@ from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.models import parse_override, read_model
 from harness.campaign.sections import Positive, Section, Whole
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.errors import CampaignError
 from harness.families.cut_in.loading import load_environment
 from harness.problems import NAME_PATTERN, broken_rule
-from harness.vehicles.library import OF_TRAFFIC
+from harness.vehicles.library import OF_TRAFFIC, load_library
 from harness.vocabulary import SAMPLING, EstimatorName
 from studies.chains.chain import CHAINS
 
@@ -78,7 +77,6 @@ class Experiment(Section):
     """judge decisions, too: limits as multiples of the rate of `beside`; which is wrong follows from one's own ratio"""
     beside: str | None = Field(None, description="decide limits beside this reference driver: accept.times_reference")
     budgets: list[Whole] = Field([], description="numbers of tests within which limits are judged, and stop.episodes")
-    levels: list[Positive] = Field([], description="further levels at which the same tests of shells are judged")
     siblings: bool = Field(False, description="also judge former rules of limits and bounds, which err more often")
     super_population: SuperPopulation = SuperPopulation()
 
@@ -94,10 +92,8 @@ class Experiment(Section):
         return (1.0 + confidence) / 2.0 if self.limits else confidence
 
     def nominal_of(self, result: str) -> float:
-        """`nominal`, or the further level that a result is at."""
-        if result.startswith("limit "):
-            return (1.0 + self.campaign.stop.confidence) / 2.0
-        return next((level for level in self.levels if result.endswith(f" at {level:g}")), self.nominal)
+        """`nominal`, or that of a decision beside which intervals are judged, too."""
+        return (1.0 + self.campaign.stop.confidence) / 2.0 if result.startswith("limit ") else self.nominal
 
     @property
     def all_budgets(self) -> tuple[int, ...]:
@@ -169,15 +165,10 @@ class Experiment(Section):
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
     """Read an experiment, with ``section.key=value`` laid over what the file says.
 
-    Raises `CampaignError`: the file cannot be read or says something wrong; the error names every place.
+    Raises `CampaignError`: the file, or the library that it names, cannot be read or says something wrong.
     """
     experiment = read_model(path, Experiment, [parse_override(text) for text in overrides])
     shows = load_environment(experiment.campaign.environment).lateral.present
     library = experiment.campaign.pool.library or OF_TRAFFIC[shows]
-    if "/" not in library and not library.endswith((".yaml", ".yml")):
-        return experiment.replaced(("campaign", "pool", "library"), library)
-    file = (path.parent / library).resolve()
-    if not file.is_file():
-        expected, mend = "a library, or the name of a shipped one", "Correct the path, relative to the experiment's."
-        raise CampaignError(f"{path}: campaign.pool.library", f"{library}, but there is no file {file}", expected, mend)
-    return experiment.replaced(("campaign", "pool", "library"), str(file))
+    load_library(library)
+    return experiment.replaced(("campaign", "pool", "library"), library)

@@ -11,33 +11,33 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import harness
-from harness.campaign.drivers import IDMParameters, Reaction
+from harness.campaign.vehicle import AutomatedVehicle
+from harness.commands.printing import print_table
 from harness.families.protocol import Paths
 from harness.random_stream import INITIAL, uniforms
 from harness.resolved import resolve
 from harness.runner.run import Hours
-from harness.vehicles.drivers import Followers, driver_records
+from harness.vehicles.drivers import Followers
 from harness.vehicles.library import library_records
+from studies.replication.populations import reactions
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
-VEHICLES = {
-    "idm": (IDMParameters(), Reaction()),
-    "late 1 s": (IDMParameters(), Reaction(delay_s=1.0)),
-    "brakes 6 m/s²": (IDMParameters(min_acceleration_mps2=-6.0), Reaction()),
-    "0.5 s behind, late 1 s": (IDMParameters(time_headway_s=0.5), Reaction(delay_s=1.0)),
+_GIVEN: dict[str, dict[str, Any]] = {
+    "idm": {},
+    "late 1 s": {"reaction": {"delay_s": 1.0}},
+    "brakes 6 m/s²": {"parameters": {"min_acceleration_mps2": -6.0}},
+    "0.5 s behind, late 1 s": {"parameters": {"time_headway_s": 0.5}, "reaction": {"delay_s": 1.0}},
 } | {
-    f"late 2.5 s in {p:.0%} of tests": (
-        IDMParameters(), Reaction(inattention_probability=p, inattention_delay_s=2.5),
-    )
+    f"late 2.5 s in {p:.0%} of tests": {"reaction": {"inattention_probability": p, "inattention_delay_s": 2.5}}
     for p in (0.01, 0.1, 0.3)
-}  # fmt: skip
+}
+VEHICLES = {name: AutomatedVehicle.model_validate(given) for name, given in _GIVEN.items()}
 """The first are alike in all tests, so that most strata's shares are 0 or 1; the last fail at random in each."""
 TRUTH_SEED, BLOCK = 77_000_001, 1024
 DRIVER = "r157-cc"
@@ -47,18 +47,15 @@ POOL_ERROR = 0.03
 
 def truths(paths: int) -> dict[str, tuple[float, float]]:
     """Crashes per hour of each vehicle and of `DRIVER`, with standard errors, from so many paths of each scenario."""
-    drivers, reactions = zip(*VEHICLES.values(), strict=True)
-    late = [{"delay_s": each.delay_s + each.inattention_delay_s, "inattention_probability": 0.0} for each in reactions]
-    attentive = [each.model_copy(update={"inattention_probability": 0.0}) for each in reactions]
-    inattentive = [each.model_copy(update=given) for each, given in zip(reactions, late, strict=True)]
-    part = np.array([each.inattention_probability for each in reactions])
-    parts, asked = np.concatenate([1.0 - part, part, [1.0]]), [*VEHICLES, DRIVER]
+    asked = [*VEHICLES, DRIVER]
     total, variance = np.zeros((2, len(asked)))
     for name in NAMES:
         of = resolve(harness.load_campaign("idm", [f"scenario={name}"]))
-        family, traffic, see_onset = of.family, of.environment, of.family.shows(of.environment)
-        both = driver_records(drivers * 2, attentive + inattentive, see_onset=see_onset)
-        followers = Followers(np.concatenate([both, library_records([of.library.references[DRIVER]], see_onset)]))
+        family, traffic, shows = of.family, of.environment, of.family.shows(of.environment)
+        each = [reactions(av, shows) for av in VEHICLES.values()]
+        each.append((library_records([of.library.references[DRIVER]], shows), [1.0]))
+        followers = Followers(np.concatenate([records for records, _ in each]))
+        drivers = [(i, share) for i, (_, shares) in enumerate(each) for share in shares]
         n = paths if family.follows else 16 * paths
         rates = np.zeros((n, len(asked) + 1))
         for first in range(0, n, BLOCK):
@@ -67,9 +64,8 @@ def truths(paths: int) -> dict[str, tuple[float, float]]:
             offset = np.random.default_rng(first).integers(0, family.stride, BLOCK)
             found = family.events(traffic, TRUTH_SEED, given, followers, stride=family.stride, offset=offset)
             rows = slice(first, first + BLOCK)
-            for d, p in enumerate(parts):
-                column = d % part.size if d < 2 * part.size else part.size
-                rates[rows, column] += p * np.where(found.crashes >> d & 1, found.probability, 0.0).sum(1)
+            for d, (i, share) in enumerate(drivers):
+                rates[rows, i] += share * np.where(found.crashes >> d & 1, found.probability, 0.0).sum(1)
             rates[rows, -1] = found.probability.sum(1)
         per_hour = family.exposure(traffic, of.parameters).per_hour / rates[:, -1].mean()
         total += per_hour * rates[:, :-1].mean(0)
@@ -79,14 +75,11 @@ def truths(paths: int) -> dict[str, tuple[float, float]]:
 
 def one(vehicle: str, seed: int, folder: Path, *asked: str) -> dict[str, Any]:
     """The answer of one campaign with these settings."""
-    parameters, reaction = VEHICLES[vehicle]
-    given = [f"av.parameters.{key}={value}" for key, value in parameters.model_dump(exclude_defaults=True).items()]
-    given += [f"av.reaction.{key}={value}" for key, value in reaction.model_dump(exclude_defaults=True).items()]
     campaign = harness.load_campaign(
         "idm",
-        [f"scenarios=[{', '.join(NAMES)}]", "world.engine=twin", f"seed={seed}", f"pool.seed={seed}", *given,
+        [f"scenarios=[{', '.join(NAMES)}]", "world.engine=twin", f"seed={seed}", f"pool.seed={seed}",
          f"pool.relative_error={POOL_ERROR}", "pool.events_per_shell=5000", "stop.below_reference=null", *asked],
-    )  # fmt: skip
+    ).replaced(("av",), VEHICLES[vehicle])  # fmt: skip
     found = harness.run(campaign, folder, workers=1)
     assert isinstance(found, Hours)
     return found.content
@@ -113,31 +106,19 @@ def main() -> None:
                 answers.append(one(name, seed, Path(folder) / "run", *settings))
             told = answers[-1]["decision"]["verdict"] if asked.accept else answers[-1]["per_hour"]
             sys.stderr.write(f"{seed} {name}: {told}, truth {truth[name][0]:.4g}\n")
-    print(_verdicts(seen, truth) if asked.accept else _intervals(seen, truth))  # noqa: T201
-
-
-def _intervals(seen: Mapping[str, list[dict[str, Any]]], truth: Mapping[str, tuple[float, float]]) -> str:
-    lines = [
-        "| vehicle | truth per hour | held | mean rate / truth | tests, median |",
-        "| --- | --- | --- | --- | --- |",
-    ]
+    table = []
     for name, answers in seen.items():
-        rate, low, high = np.array([[of["per_hour"][k] for k in ("rate", "ci_low", "ci_high")] for of in answers]).T
-        (mu, error), held = truth[name], int(((low <= truth[name][0]) & (truth[name][0] <= high)).sum())
-        n = np.median([of["n_episodes"] for of in answers])
-        told = f"{mu:.3g} ± {error:.1g} | {held} of {len(rate)} | {rate.mean() / mu:.2f} | {n:,.0f} |"
-        lines.append(f"| {name} | {told}")
-    return "\n".join(lines)
+        told = [of["decision"]["verdict"] for of in answers] if asked.accept else []
+        row = {"limit": truth[name][0] / truth[DRIVER][0]} | {v: told.count(v) for v in ("accepted", "rejected")}
+        table.append({"vehicle": name, **(row if asked.accept else _held(answers, *truth[name])), "of": len(answers)})
+    print_table("Gates at their limit" if asked.accept else "Crashes per hour", table)
 
 
-def _verdicts(seen: Mapping[str, list[dict[str, Any]]], truth: Mapping[str, tuple[float, float]]) -> str:
-    lines = ["| vehicle | limit | accepted | rejected | campaigns |", "| --- " * 5 + "|"]
-    for name, answers in seen.items():
-        verdicts = [of["decision"]["verdict"] for of in answers]
-        limit = f"{truth[name][0] / truth[DRIVER][0]:.3g} × {DRIVER}"
-        counted = f"{verdicts.count('accepted')} | {verdicts.count('rejected')} | {len(verdicts)} |"
-        lines.append(f"| {name} | {limit} | {counted}")
-    return "\n".join(lines)
+def _held(answers: list[dict[str, Any]], mu: float, error: float) -> dict[str, Any]:
+    rate, low, high = np.array([[of["per_hour"][key] for key in ("rate", "ci_low", "ci_high")] for of in answers]).T
+    told = {"truth per hour": mu, "±": error, "mean rate / truth": rate.mean() / mu}
+    told["median tests"] = np.median([of["n_episodes"] for of in answers])
+    return told | {"held": int(((low <= mu) & (mu <= high)).sum())}
 
 
 if __name__ == "__main__":

@@ -64,25 +64,17 @@ class Subject:
     """What the experimenter knows about a vehicle or a chain.
 
     Its crash rate is the truth for all results but ``others``. ``crashes_outside`` is, for each result that assumes a
-    boundary, the share of its crash rate beyond it. Surrogates that are its equals are ``left_out``; strata up to that
-    of the surrogate ``boundary`` are inside.
+    boundary, the share of its crash rate beyond it.
     """
 
     name: str
     crash_rate: Known
     others: dict[str, Known] = field(default_factory=dict)
     crashes_outside: dict[str, float] = field(default_factory=dict)
-    left_out: tuple[str, ...] = ()
-    boundary: str | None = None
 
     def truth(self, result: str) -> Known:
         """What a result estimates."""
         return self.others.get(result.removesuffix(FORMER), self.crash_rate)
-
-    @property
-    def relative_error(self) -> float:
-        """The largest one of what is known about it, each over its scale."""
-        return max(known.relative_error for known in (self.crash_rate, *self.others.values()))
 
     def meets_assumption_of(self, result: str) -> bool:
         """Whether what a result assumes holds for it."""

@@ -37,7 +37,7 @@ from harness.pool.kept import onset_steps
 from harness.pool.shells import CANDIDATES, acceleration_limit
 from harness.pool.vehicle_pool import BaselinePaths, walk_candidates
 from harness.progress import Progress
-from harness.resolved import Resolved, resolve
+from harness.resolved import resolve
 from harness.sampling.baseline import recorded, without_event
 from harness.vehicles.drivers import Followers, av_records
 from harness.vehicles.library import Library
@@ -103,7 +103,7 @@ class Drivers:
         """
         (records, envelope, *_), vehicles = library.followers(see_onset), dict[str, Mixed]()
         for name, av in avs.items():
-            of_av, shares = _reactions(av, see_onset)
+            of_av, shares = reactions(av, see_onset)
             vehicles[name] = dict(enumerate(shares, start=records.size))
             records = np.concatenate([records, of_av])
         if records.size > MOST_DRIVERS:
@@ -128,7 +128,7 @@ def reference_drivers(library: Library) -> dict[str, int]:
     return {name: len(library.surrogates) + r for r, name in enumerate(library.references)}
 
 
-def _reactions(av: AutomatedVehicle, see_onset: bool) -> tuple[RecordArray, list[float]]:
+def reactions(av: AutomatedVehicle, see_onset: bool) -> tuple[RecordArray, list[float]]:
     """The drivers that a vehicle can be in an episode, attentive or not, and how probable each is."""
     own = av_records(av, see_onset=see_onset)
     late = float(own["inattention_probability"][0] * (own["inattention_steps"][0] > 0.0))
@@ -264,13 +264,6 @@ def choose_paths(
     return walk_candidates(resolved, "walked", progress, max(n_paths, candidates)).draw(n_paths)
 
 
-def _ready(campaign: Campaign) -> tuple[Resolved, EpisodeLoop]:
-    """A campaign and the loop of its vehicle, which keeps all of its motion."""
-    resolved = resolve(campaign)
-    host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
-    return resolved, EpisodeLoop(TwinWorld(CELLS), resolved.scenario, RecordPolicy("none", 0.0), host)
-
-
 def walk_paths(
     campaign: Campaign,
     paths: BaselinePaths,
@@ -293,8 +286,10 @@ def walk_paths(
 def _walk(campaign_json: str, stride: int, job: tuple[int, BaselinePaths]) -> SuperPopulation:
     """Walk paths that have numbers from a first one on, and drive the vehicle on their cut-ins as tests would be."""
     first, paths = job
-    resolved, loop = _ready(Campaign.model_validate_json(campaign_json))
+    resolved = resolve(Campaign.model_validate_json(campaign_json))
     campaign, environment, library = resolved.campaign, resolved.environment, resolved.library
+    host = build_host(campaign.av, n_cells=CELLS, seed=campaign.seed)
+    loop = EpisodeLoop(TwinWorld(CELLS), resolved.scenario, RecordPolicy("none", 0.0), host)  # keeps all of its motion
     runs = recorded(without_event(loop, resolved, paths.seed, paths.paths, first))
     offset = np.random.default_rng([paths.seed, first]).integers(0, stride, len(paths))
     followers = library.followers(environment.lateral.present)

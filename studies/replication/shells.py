@@ -31,7 +31,7 @@ from harness.pool.kept import KeptEvents, Pool
 from harness.pool.shells import boundary_shell, cells_in_strata, design_shells, shells_in_strata, shells_of
 from harness.sampling.allocation import Allocation
 from harness.sampling.shells import PairRounds, ShellRounds
-from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT, ShellDesign
+from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 from studies.replication.experiment import Adversary
@@ -51,8 +51,8 @@ _CRASHING = ((CRASH, CRASH), (CRASH, NO_CRASH), (NO_CRASH, CRASH))
 """How A and B end: both crash, only A, only B."""
 _STATEMENT = ("testing", "shells", "statement")
 BOUND = "shells, upper bound"
-result_of, bound_outside = f"{FREE}, {{}}".format, f"{FREE}, upper bound beyond {{}}".format
-"""Names of a statement's rows, and of the bound on the crash rate beyond its boundary."""
+WITHIN, BOUND_OUTSIDE = f"{FREE}, {LIBRARY_STATEMENT}", f"{FREE}, upper bound beyond {LIBRARY_STATEMENT}"
+"""Names of the statement's rows, and of the bound on the crash rate beyond its boundary."""
 
 
 def limit_at(factor: float, budget: int) -> dict[str, str]:
@@ -62,11 +62,6 @@ def limit_at(factor: float, budget: int) -> dict[str, str]:
     """
     wrong = ["accepted"] * (factor <= 1.0) + ["rejected"] * (factor >= 1.0)
     return {f"limit {factor:g} x rate, {verdict} within {budget:,} tests": verdict for verdict in wrong}
-
-
-def at_level(level: float) -> str:
-    """Name of the rows of results at another level."""
-    return f"{FREE} at {level:g}"
 
 
 class CrashingCutIns(NamedTuple):
@@ -247,7 +242,6 @@ class ShellCampaign(_Drawn):
     budgets: Sequence[int] = ()
     siblings: bool = False
     beside: str | None = None
-    levels: Sequence[float] = ()
     estimated: bool = False
 
     def _replicate(self, replication: int, drawn: Sequence[DrawnPool], rng: np.random.Generator) -> Iterator[Row]:
@@ -305,14 +299,11 @@ class ShellCampaign(_Drawn):
         outside = int(estimate.details["within"]["n_crashes_outside"])
         row = estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
         yield row
-        for level in self.levels:
-            limits = planner.seen.limits_of(ASSUMPTION_FREE, Level.two_sided(level))
-            yield replace(row, result=at_level(level), ci_low=limits.low, ci_high=limits.high)
         found = estimate.details["within"]
         beyond_it = estimate.crash_rate - found["crash_rate"]  # whose error nobody claims to know
         for name, first, rate, error, bound in (
             (BOUND, 0, estimate.crash_rate, row.std_error, estimate.upper_bound),
-            (bound_outside(LIBRARY_STATEMENT), found["n_shells"], beyond_it, 0.0, found["upper_bound_outside"]),
+            (BOUND_OUTSIDE, found["n_shells"], beyond_it, 0.0, found["upper_bound_outside"]),
         ):
             beyond = replace(row, result=name, crash_rate=rate, std_error=error, ci_low=0.0, ci_high=bound)
             yield beyond
@@ -328,7 +319,7 @@ class ShellCampaign(_Drawn):
         found = seen.within(self.campaign.stop.confidence)
         error, refused = seen.std_error(found.n_shells), math.isinf(found.rhw_from_pool)
         numbers = found.n_episodes, found.n_crashes, found.crash_rate, error, found.ci_low, found.ci_high
-        return Row(result_of(LIBRARY_STATEMENT), replication, *numbers, reached, found.n_crashes_outside, refused)
+        return Row(WITHIN, replication, *numbers, reached, found.n_crashes_outside, refused)
 
 
 def _reference_rows(estimate: Estimate, reference: str, replication: int, *, reached: bool) -> Iterator[Row]:
@@ -389,14 +380,13 @@ def _with_round(pairs: PairCounts, drawn: Sequence[DrawnPool], added: IntArray, 
 class OvertakingShells:
     """Cells of a super-population's paths, of which pools of a vehicle, or of two, are drawn.
 
-    The ``template`` is a pool without cut-ins, whose probabilities each draw replaces; ``left_out`` are surrogates that
-    are equals of a vehicle, ``limit_mps2`` is the hardest acceleration of the vehicles, and ``mass`` (n, C) the
-    probability of a cut-in of each cell, by path of the super-population. ``crashing`` are the parts of it on which the
+    The ``template`` is a pool without cut-ins, whose probabilities each draw replaces, and whose library has no equal
+    of a vehicle; ``limit_mps2`` is the hardest acceleration of the vehicles, and ``mass`` (n, C) the probability of a
+    cut-in of each cell, by path of the super-population. ``crashing`` are the parts of it on which the
     vehicle crashes, or both of two, only A, only B; ``failing``, ``failing_tests`` and ``events`` see `DrawnPool`.
     """
 
     template: Pool
-    left_out: tuple[str, ...]
     limit_mps2: float
     mass: FloatArray
     crashing: tuple[FloatArray, ...] = ()
@@ -415,11 +405,11 @@ class OvertakingShells:
         crashes = ((self.template.cell_references >> r) & 1).astype(np.bool_)
         return float(self.mass[:, crashes].sum()) / len(self.mass)
 
-    def crashes_outside(self, crashing: FloatArray) -> dict[str, float]:
-        """Share of a crash mass by cell (n, C) that lies beyond the boundary, by statement; 0 of no crash."""
+    def crashes_outside(self, crashing: FloatArray) -> float:
+        """Share of a crash mass by cell (n, C) that lies beyond the boundary; 0 of no crash."""
         by_cell = crashing.sum(0)
         beyond = by_cell[self.template.cell_shell > boundary_shell(self.template)].sum()
-        return {LIBRARY_STATEMENT: float(beyond / (by_cell.sum() or 1.0))}
+        return float(beyond / (by_cell.sum() or 1.0))
 
     def draw(self, rng: np.random.Generator) -> list[DrawnPool]:
         """A new pool: its design, and what vehicles do on its paths by the design's cells; see `Draw`."""
@@ -474,7 +464,6 @@ class Division:
         self._cell, self._n_cells = cell[:-1], kinds.size
         mass = self.by_cell(population.mass)
         mass[:, cell[-1]] += np.maximum(population.cut_in - mass.sum(1), 0.0)
-        left_out = tuple(name for name in conservative_first if name not in reduced.surrogates)
         unknown: Any = np.zeros(0)
         content: dict[str, Any] = dict.fromkeys(Pool.__dataclass_fields__, unknown) | {
             "cell_shell": kinds >> n_references,
@@ -487,7 +476,7 @@ class Division:
             "p_after_failure": 0.0,
         }
         template = Pool(**content | {"key": "drawn", "library": reduced, "names": names, "n_paths": pool_paths})
-        self._shells = OvertakingShells(template, left_out, limit_mps2, mass)
+        self._shells = OvertakingShells(template, limit_mps2, mass)
 
     def by_cell(self, mass: FloatArray) -> FloatArray:
         """A mass of cut-ins (m,) by path and cell, (n, C)."""

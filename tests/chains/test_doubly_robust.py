@@ -16,9 +16,9 @@ from harness.estimators.weighted import Nade
 from harness.sampling.protocol import KnownRounds
 from studies.case_study.theorems import small_chains
 from studies.chains.chain import CHAINS, DECISIVE, decisive, enumerate_episodes, overtaking
-from studies.chains.sampler import Sampler, blocks, draw
+from studies.chains.sampler import Sampler, draw
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import fed
+from tests.estimators.small_blocks import blocks, fed
 
 IMMEDIATE = overtaking("immediate", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], challenge="immediate")
 NOISY = overtaking("noisy", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], epsilon=0.5)
@@ -52,6 +52,13 @@ def test_a_value_that_is_not_what_the_surrogate_predicts_is_seen(of_episodes):
     for wrong in (lambda e: e.value[:, :, ::-1], lambda e: np.roll(e.value, -1, axis=1)):
         p, _, d = exactly(NOISY, of_episodes, wrong)
         assert np.all(np.abs(p @ d) > 1e-3 * (p @ np.abs(d)))
+
+
+def test_the_mean_over_tests_with_as_many_control_steps_is_not_zero():
+    """So a β of each number of control steps, as `scv` has them, is biased."""
+    steps, (p, _, d) = enumerate_episodes(NOISY).n_control_steps, exactly(NOISY, of_episodes=False)
+    by_steps = np.array([np.bincount(steps, p * each) for each in d.T])
+    assert np.all(np.abs(by_steps).max(axis=1) > 0.01 * (p @ np.abs(d)))
 
 
 def test_a_surrogate_that_is_the_vehicle_leaves_less():

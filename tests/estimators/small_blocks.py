@@ -1,6 +1,6 @@
 """Blocks by hand, for tests that need particular outcomes and weights, and estimators fed with blocks."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -9,6 +9,8 @@ from harness.estimators.block import Block, SamplingPlan
 from harness.estimators.tally import Tally
 from harness.strata import ShellDesign
 from harness.vocabulary import CRASH, FAILED, TIMEOUT, Method
+from studies.chains.chain import Chain
+from studies.chains.sampler import draw
 
 State = TypeVar("State")
 SHELLS = ShellDesign(
@@ -24,6 +26,14 @@ RARE = ShellDesign(
 """Others, of rare cut-ins."""
 EXACT = 10**12
 """Paths of another."""
+
+
+def blocks(chain: Chain, method: Method, sizes: list[int], seed: int) -> Iterator[Block]:
+    """Consecutive blocks of a chain, of the given sizes; each has its own random stream."""
+    first = 0
+    for k, size in enumerate(sizes):
+        yield draw(chain, method, size, np.random.default_rng([seed, k]), first_episode=first)
+        first += size
 
 
 def block(

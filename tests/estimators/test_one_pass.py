@@ -10,9 +10,8 @@ from harness.estimators.estimate import Unavailable, finite_json
 from harness.estimators.one_pass import ACCUMULATORS, Diagnostics, accumulator, one_pass, refusal
 from harness.vocabulary import CONTACT, ESTIMATORS, FAILED, SAMPLING, TIMEOUT
 from studies.chains.chain import overtaking
-from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import block, fed, in_shells
+from tests.estimators.small_blocks import block, blocks, fed, in_shells
 from tests.stored_runs import answer
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)

@@ -17,7 +17,8 @@ from studies.case_study.steps import step_keys
 from studies.case_study.study import Made, load_study
 from studies.case_study.theorems import bound
 from studies.chains.chain import CHAINS, Episodes
-from studies.chains.sampler import blocks, with_optimal_function
+from studies.chains.sampler import with_optimal_function
+from tests.estimators.small_blocks import blocks
 from tests.stored_runs import SCENARIOS
 
 pytestmark = pytest.mark.slow
@@ -226,7 +227,7 @@ def test_relative_variance_of_known_weights():
     n = 4_000
     episode = np.arange(0, n, 10)
     weight = np.where(episode % 20 == 0, 1.0, 3.0)
-    tests = tested.Tests(n, float(n), episode, weight, np.zeros(len(episode), bool))
+    tests = tested.Tests(n, float(n), episode, weight)
     found = tested.relative_variance(tests)
     assert found["value"] == pytest.approx(0.5 / 0.2**2 - 1.0, rel=1e-12)
     assert found["low"] == pytest.approx(found["value"], rel=1e-9)

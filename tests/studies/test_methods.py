@@ -12,15 +12,13 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.families import family_named
 from harness.progress import Progress
-from harness.strata import LIBRARY_STATEMENT
-from studies.chains.chain import CHAINS, DECISIVE, REPLAYED
+from studies.chains.chain import CHAINS, REPLAYED
 from studies.chains.shells import ChainShells
-from studies.replication.doubly_robust import CHUNK, SIZES, by_strata, line, rows_of
 from studies.replication.experiment import Experiment, load_experiment
 from studies.replication.judgement import FORMER, Judgement, Row, Subject, corrected, judge
 from studies.replication.populations import Known, preventable_by, ratio_to
 from studies.replication.run import validate
-from studies.replication.shells import FREE, ShellCampaign, result_of
+from studies.replication.shells import FREE, WITHIN, ShellCampaign
 from studies.replication.weighted import WeightedCampaign, chain_episodes
 from tests.golden.record import unlike
 from tests.stored_runs import ROOT
@@ -91,14 +89,14 @@ def test_limits_are_decided_rightly_but_where_a_shell_counts_twice(wrong, caught
 
 COMMITTED = {"chains_shells": 5000, "chains_forced": 5000, "shells_panel": 2000, "gate": 500, "shells_bounds": 300}
 """Results in docs/, and how often each was repeated."""
-CONDITIONAL = result_of(LIBRARY_STATEMENT)
 
 
 def committed(name: str) -> tuple[dict[tuple[str, str], Judgement], Experiment]:
     """Judgements by subject and result, and the experiment that they are of: shards have no part in it."""
     content = json.loads((ROOT / "docs" / "validation" / f"{name}.json").read_text())
     experiment = content["experiment"]
-    experiment.pop("fault", None)  # keys of earlier versions, all at their defaults
+    for key in ("fault", "levels"):  # keys of earlier versions, all at their defaults
+        experiment.pop(key, None)
     for key in ("boundary", "statements", "stopping"):
         experiment["campaign"]["testing"]["shells"].pop(key, None)
     experiment["campaign"]["stop"].pop("estimator", None)
@@ -119,16 +117,16 @@ def test_committed_experiments_were_run_at_full_length_and_right_methods_cover(n
     for (_, result), one in found.items():
         assert one["replications"] >= COMMITTED[name]
         assert not one["coverage_too_low"] or FORMER in result
-        assert "chains" not in name or abs(one["bias"]) <= LARGEST_BIAS or result == CONDITIONAL
+        assert "chains" not in name or abs(one["bias"]) <= LARGEST_BIAS or result == WITHIN
 
 
 def test_committed_numbers_of_tests_and_errors_are_those_that_docs_promise():
     panel, _ = committed("shells_panel")
-    most = {FREE: 3000, CONDITIONAL: 110}
+    most = {FREE: 3000, WITHIN: 110}
     assert all(one["tests_median"] <= most.get(result, most[FREE]) for (_, result), one in panel.items())
     assert panel["idm", FREE]["tests_median"] <= 1300
     assert {ratio_to("r157-cc"), preventable_by("r157-cc")} < {result for _, result in panel}
-    assert not panel["SM-II", CONDITIONAL]["assumption_met"]
+    assert not panel["SM-II", WITHIN]["assumption_met"]
     assert panel["SM-II", FREE]["alarm"] == panel["never-brakes", FREE]["alarm"] == 1.0
     gate, _ = committed("gate")
     assert all(one["p_value"] >= 0.05 or FORMER in result for (_, result), one in gate.items())  # of 95 %, each alone
@@ -150,22 +148,3 @@ def test_committed_experiments_are_what_the_command_gives(name, tmp_path):
     found = json.loads((tmp_path / "results.json").read_text())["judgements"]
     as_trees = (dict(enumerate(judgements)) for judgements in (found, stored.values()))
     assert unlike(*as_trees, digits=1e-9) == []  # in all digits on one CPU family
-
-
-# -- the study of `dr` on a chain, whose truth is exact --
-
-
-def test_rows_of_the_tables():
-    chain = DECISIVE[1]
-    subject = Subject(chain.name, Known.exactly(chain.crash_rate))
-    source = partial(chain_episodes, chain, "step_mixture", 1)
-    repeated = WeightedCampaign(Campaign(name="chain"), source, ("nade", "dr"))
-    rows = rows_of(repeated, CHUNK)
-    assert [(n, len(each)) for n, each in rows.items()] == [(n, 2 * CHUNK // n) for n in SIZES]
-    *_, covered, gain = line("a setting", subject, 500, rows[500]).strip("| ").split(" | ")
-    assert 0.7 < float(covered) <= 1.0
-    assert float(gain) > 1.2
-    blocks = [source(k * CHUNK, CHUNK) for k in range(2)]
-    _, _, one, by_steps, _ = by_strata("a setting", subject, blocks).strip("| ").split(" | ")
-    assert float(one) > 1.2
-    assert float(by_steps) > 0.0

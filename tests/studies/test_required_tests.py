@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from harness.errors import HarnessError
 from harness.estimators.scv import Scv
 from studies import rnot
-from studies.case_study.counted import Counted
 from studies.case_study.figures import figure
 from studies.chains.chain import overtaking
-from studies.chains.sampler import blocks
 from tests.chains.seed import SEED
-from tests.estimators.small_blocks import fed
+from tests.estimators.small_blocks import block, blocks, fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)
 GRID = np.array([10, 20, 30, 40, 50])
@@ -39,13 +38,20 @@ def test_the_required_number_is_the_first_look_from_which_on_the_width_stays_bel
 
 def test_the_acceleration_is_open_on_the_side_where_nothing_is_known():
     slow, fast, never = (
-        Counted(rnot.required_tests(np.array([[0.9, *rhw]] * 2), GRID, 0.3), settled=True)
+        rnot.required_tests(np.array([[0.9, *rhw]] * 2), GRID, 0.3)
         for rhw in ((0.9, 0.9, 0.1, 0.1), (0.1, 0.1, 0.1, 0.1), (0.9, 0.9, 0.9, 0.9))
     )
     assert slow.over(fast, 0.9) == figure(2.0, 2.0, 2.0)
     assert never.over(fast, 0.9) == figure(2.5, 2.5)
     assert fast.over(never, 0.9) == figure(0.4, None, 0.4)
     assert never.over(never, 0.9) == figure(None)
+
+
+def test_tests_that_failed_are_refused():
+    """The paper's counts know of none; who failed might have crashed."""
+    assert rnot.Tests.of_block(block([True, False, True])).episode.tolist() == [0, 2]
+    with pytest.raises(HarnessError, match="1 failed"):
+        rnot.Tests.of_block(block([True, False, False], failed=[False, True, False]))
 
 
 def test_the_grid_rises_to_the_total():

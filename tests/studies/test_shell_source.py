@@ -76,7 +76,6 @@ def test_equals_are_found_and_left_out(drivers, population):
     vehicle = population.crash_mass(drivers.vehicles["equal"])
     assert equals(LIBRARY, population, vehicle) == {"brakes-3"}
     _, source = shells_of(drivers, population, "equal")
-    assert source.left_out == ("brakes-3",)
     assert "brakes-3" not in source.template.names
     assert equals(LIBRARY, population, population.crash_mass(drivers.vehicles["own"])) == set()
     assert equals(LIBRARY, population, np.zeros_like(vehicle)) == set()  # one that never crashes is nobody's equal

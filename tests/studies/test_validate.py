@@ -136,7 +136,7 @@ def test_budgets_end_with_that_of_the_campaign(tmp_path):
         (SHELLS, "avs", "neither"),
         ("avs: {a: {}}\nchains: [rare]\n" + SHELLS, "avs", "both"),
         ("chains: [rare]\ncampaign: {world: {engine: sumo}}\n", "campaign.world.engine", "sumo"),
-        ("chains: [rare]\ncampaign: {pool: {library: ./none.yaml}}\n", "campaign.pool.library", "no file"),
+        ("chains: [rare]\ncampaign: {pool: {library: ./none.yaml}}\n", "none.yaml", "no such file"),
     ],
 )
 def test_wrong_ones_name_the_place_before_anything_is_written(tmp_path, capsys, text, where, found):
