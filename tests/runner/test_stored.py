@@ -107,26 +107,15 @@ def test_stored_rows_and_traces_come_out_again(name, stored_run):
             assert all(column_hash(result.trace[name]) == column_hash(stored[name]) for name in stored.column_names)
 
 
-def with_value(table: pa.Table, name: str, row: int, value) -> pa.Table:
-    """The table with another value in a row."""
-    at, values = table.column_names.index(name), table.column(name).to_pylist()
-    values[row] = value(values[row])
-    type_of = pa.string() if name == "outcome" else table.schema.field(at).type
-    column = pa.array(values, type_of)
-    return table.set_column(at, name, column.dictionary_encode() if name == "outcome" else column)
-
-
-def one_bit(value: float) -> float:
-    return float(np.nextafter(value, np.inf))
-
-
 @pytest.mark.parametrize(("table", "column"), [("traces", "x_m"), ("episodes", "log_weight")])
 def test_a_record_that_was_tampered_with_is_noticed(table, column, twin_run, tmp_path, capsys):
     """By one unit in the last place."""
     folder = unnoted(copy_of(twin_run, tmp_path / "run"))
     path = part_files(folder, table)[1]
     rows = pq.read_table(path, partitioning=None)
-    pq.write_table(with_value(rows, column, 30, one_bit), path)
+    values, at = rows[column].to_pylist(), rows.column_names.index(column)
+    values[30] = float(np.nextafter(values[30], np.inf))
+    pq.write_table(rows.set_column(at, rows.schema.field(at), pa.array(values)), path)
     episode = rows["episode"][30].as_py()
     assert replay_episode(folder, episode).bit_equal is False
     assert main(["replay", str(folder), str(episode)]) == 3
