@@ -214,13 +214,6 @@ def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
     assert again["shells"] == done.content["shells"]
 
 
-@pytest.mark.parametrize("margin", ["1e308", "inf", "nan"])
-def test_a_margin_that_is_none_is_refused(margin, tmp_path, capsys):
-    assert main(["compare", "idm", "--against-av", "idm", "--margin", margin, "--out", str(tmp_path / "out")]) == 2
-    assert "margin" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_run_that_nobody_limited_is_to_be_run_again(done, campaign, tmp_path):
     """Which the folder of the comparison does not hinder: the run is not copied."""
     early = "av={controller: 'tests.controllers.early:Speeds'}"

@@ -263,15 +263,6 @@ def test_what_the_answer_of_one_scenario_depends_on(run, monkeypatch):
     assert rates["exposure.per_hour"] == [1.0, 1.0]
 
 
-@pytest.mark.parametrize(
-    ("given", "said"), [("lead_brakes=abc", "exposure.lead_brakes"), ("cut_off=1", "not among scenarios")]
-)
-def test_an_exposure_on_the_command_line_is_one_of_the_campaign(given, said, tmp_path, capsys):
-    assert main(["run", "idm", "--scenario", "all", "--exposure", given, "--out", str(tmp_path / "out")]) == 2
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_run_that_goes_on_to_another_end_says_so(run, tmp_path, capsys):
     folder = tmp_path / "run"
     shutil.copytree(run.folder, folder)
