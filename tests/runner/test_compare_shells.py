@@ -96,11 +96,14 @@ def test_what_makes_a_rate_doubtful_is_told_of_each_vehicle(done):
         "a": {"repeated": {"differing": [1, 2], "n_episodes": 3}},
         "b": {"n_crashes_before_event": 4, "cut_off": 1.0, "details": {"n_failed": 5}},
     }
-    told = list(pair_warnings({**done.content, **{side: {**done.content[side], **doubts[side]} for side in "ab"}}))
+    doubts["b"]["milder"] = {"n_crashes": 3, "n_failed": 0, "n_tests": 36, "per_hour": 0.1}
+    sides = {side: {**done.content[side], **doubts[side]} for side in "ab"}
+    told = list(pair_warnings({**done.content, **sides, "scenario": "cut_out"}))
     assert [text for text in told if text.startswith("A: NOT REPRODUCIBLE: 2 of 3 tests")]
     assert len([text for text in told if text.startswith("B: 4 tests crashed BEFORE the event")]) == 1
     assert len([text for text in told if "still closing in" in text]) == 1
-    assert len([text for text in told if "tests FAILED" in text]) == 1
+    assert [text[:6] for text in told if "tests FAILED; had they all crashed, the rate would be" in text] == ["B: 5 o"]
+    assert [text[:7] for text in told if "MILDER cut-outs end in a crash, too" in text] == ["B: 3 of"]
     assert all(": no test in outside" in text for text in pair_warnings(done.content))
 
 
