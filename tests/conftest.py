@@ -6,6 +6,7 @@ Hypothesis looks elsewhere on every run, as the statistical tests do with that s
 
 import fcntl
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -39,6 +40,13 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     compiling = [subprocess.Popen([sys.executable, "-m", "tests.compiling", half]) for half in "01"]
     if not any([process.wait() for process in compiling]):  # noqa: C419 - wait for all
         cache.keep(mark, b"done")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Files of slow tests alone need not be imported to be left out: it takes each worker seconds."""
+    text = collection_path.read_text("utf-8") if collection_path.suffix == ".py" else ""
+    slow = re.search(r"^pytestmark = \[?\s*pytest\.mark\.slow", text, re.MULTILINE)
+    return True if slow and config.option.markexpr == "not slow" else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

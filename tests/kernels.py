@@ -6,7 +6,6 @@ What is called in bulk is cached, by the name of this module: import it as ``tes
 import functools
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from harness.campaign.campaign import Campaign
@@ -21,15 +20,6 @@ from harness.families.cut_in.nade.decide import draw_from
 from harness.families.cut_in.nade.grid import AFTER, interpolate, locate
 from harness.vehicles import drivers, kinematics, references
 from harness.vocabulary import State
-
-
-def alone(part):
-    """What is made to be inlined into kernels (`harness.compiled.compiled_inline`), compiled as they are.
-
-    Not cached: under its name stands what kernels inline, which cannot be called.
-    """
-    return numba.njit(part, error_model="numpy")
-
 
 # -- traffic --
 

@@ -22,8 +22,8 @@ import pytest
 import harness
 from harness.cli import main
 from harness.resolved import resolve
-from tests.in_process import one_process, without_page
-from tests.stored_runs import MIXTURE_FILE, ROOT, estimates, sets, unlike_columns
+from tests.in_process import one_process
+from tests.stored_runs import MIXTURE_FILE, ROOT, estimates, sets
 
 BUDGET = ("stop.episodes=3000", "stop.rhw=0.5", "stop.min_crashes=20", "run.shard_size=60")
 SMALL = ["world.engine=twin", "testing.method=forced", "av={model: fvdm}", *BUDGET]
@@ -109,13 +109,6 @@ def test_arguments_that_are_wrong_are_named(call, where, said, stored_run, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_path_is_taken_where_a_campaign_is_and_a_number_of_numpy_s_where_a_number_is(stored_run, tmp_path):
-    with one_process(), without_page():
-        harness.run(stored_run(RUN) / "campaign.yaml", tmp_path / "run", workers=np.int64(1))
-    assert unlike_columns(stored_run(RUN), tmp_path / "run") == []
-    assert harness.replay(tmp_path / "run", np.int16(3)).bit_equal
-
-
 EXAMPLES = ("run", "estimate", "read", "replay", "compare")
 
 
@@ -133,10 +126,11 @@ def test_examples_in_docstrings_give_what_they_say(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["run", pytest.param("compare", marks=pytest.mark.slow)])
 def test_in_a_notebook_it_is_the_short_answer_and_the_map(name, stored_run, tmp_path):
+    """Of a campaign by its path, with a number of numpy's."""
     campaign = stored_run(RUN) / "campaign.yaml"
     given = {"run": (campaign,), "compare": (campaign, harness.load_campaign(campaign, av="r157-cc"))}[name]
     with one_process():
-        result = getattr(harness, name)(*given, tmp_path / "out")
+        result = getattr(harness, name)(*given, tmp_path / "out", workers=np.int64(1))
     text, image = result._repr_html_().split("</pre>")
     assert html.unescape(text) == f"<pre>{result!r}"
     assert len(repr(result).splitlines()) <= 10

@@ -73,6 +73,9 @@ BROKEN_RULES = (
     ("stop:\n  below_reference: 0.3", "stop.below_reference", 3, "ask for that limit alone"),
     ("testing: {method: forced}\nstop:\n  below_reference: 1\n  rhw: 1", "stop.below_reference", 4, "Write null"),
     ("testing: {method: forced}\naccept: {crash_rate_below: 0.1}", "accept", 3, "testing.method shells"),
+    ("accept: {crash_rate_below: 1e-7, statement: library}", "accept.statement", 2, "belongs under testing.shells"),
+    ("accept: {crash_rate_below: 1e-7, times_reference: {driver: r157-cc}}", "accept", 2, "both"),
+    ("accept: {}", "accept", 2, "neither"),
 )
 SCHEMA = jsonschema.Draft202012Validator(json.loads(schema_text()))
 

@@ -39,6 +39,7 @@ def exactly(chain, of_episodes, value=None):
 @pytest.mark.parametrize("of_episodes", [False, True])
 @pytest.mark.parametrize("chain", [*small_chains(), IMMEDIATE, NOISY, CERTAIN], ids=lambda c: c.name)
 def test_the_mean_over_all_episodes_is_zero(chain, of_episodes):
+    """And their sum is what backward induction says."""
     p, y, d = exactly(chain, of_episodes)
     assert p.sum() == pytest.approx(1.0, rel=1e-12)
     assert p @ y == pytest.approx(chain.crash_rate, rel=1e-11)

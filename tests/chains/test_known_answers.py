@@ -15,8 +15,7 @@ from harness.estimators.estimate import Accumulator, Estimate
 from harness.estimators.one_pass import one_pass
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.weighted import Nade
-from studies.case_study.theorems import small_chains
-from studies.chains.chain import DECISIVE, PANEL, REPLAYED, Chain, enumerate_episodes, overtaking
+from studies.chains.chain import DECISIVE, PANEL, REPLAYED, Chain
 from studies.chains.sampler import Sampler, draw, with_optimal_function
 from studies.chains.shells import ChainShells, joint_outcomes
 from studies.replication.judgement import Judgement, Subject, estimate_row, judge
@@ -149,19 +148,6 @@ def test_known_mean_control_variates_cover_on_a_chain():
     one = {"mixture_cv": MixtureCv}
     found = replicate(lambda rng: draw(chain, "episode_mixture", N, rng), 12, one, chain.crash_rate)
     assert covers(found["mixture_cv"]["covered"])
-
-
-# -- the chain itself: backward induction, and the identities of its samplers --
-
-
-IMMEDIATE = overtaking("immediate", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], challenge="immediate")
-
-
-@pytest.mark.parametrize("chain", [*small_chains(), IMMEDIATE], ids=lambda c: c.name)
-def test_backward_induction_is_the_sum_over_all_episodes(chain):
-    episodes = enumerate_episodes(chain)
-    assert episodes.p.sum() == pytest.approx(1.0, rel=1e-12)
-    assert episodes.p @ episodes.crash == pytest.approx(chain.crash_rate, rel=1e-11)
 
 
 # -- vehicles on the same cut-ins: joint outcomes, and shells that they make --

@@ -19,7 +19,7 @@ from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.printed import PRINTED
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
-from tests.in_process import controllers_here
+from tests.in_process import controllers_here, one_process
 from tests.stored_runs import sets, stored_table
 from tests.worlds.running import drive, forced
 
@@ -70,7 +70,8 @@ def _episodes(folder):
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("undisturbed")
-    assert _run(folder, "{model: idm}") == EXIT_DONE
+    with one_process():
+        assert _run(folder, "{model: idm}") == EXIT_DONE
     return _episodes(folder)
 
 

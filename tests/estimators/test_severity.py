@@ -9,23 +9,19 @@ import numpy as np
 import pytest
 
 import harness
-from harness.compiled import unboxed
 from harness.estimators.block import Block, SamplingPlan, joined
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import SPEEDS_MPS, Impacts
 from harness.estimators.shells import SeenShells
-from harness.families.cut_in.path import empty_trajectory
-from harness.families.cut_in.replay import StoredPaths
-from harness.families.cut_in.script import maneuvers_of, states_of
-from harness.families.protocol import Chosen
+from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.pool.build import campaign_pool
 from harness.resolved import resolve
 from harness.runner.stored import stored_blocks
 from harness.sampling import prepare
 from harness.sampling.shells import ShellRounds, Shells
 from harness.vocabulary import CRASH, FAILED, SAMPLING, TIMEOUT
+from harness.worlds.twin import TwinWorld
 from tests.in_process import run_here
-from tests.retracing import RETRACED_DTYPE, retrace
 from tests.stored_runs import answer_in, estimates, golden, stored_table
 
 
@@ -93,17 +89,13 @@ def source():
 
 def driven(source, name):
     """Whether the vehicle crashes on each cut-in of the pool, and how hard; one only touches but for one in fifty."""
-    campaign = golden("shells-twin", VEHICLES[name])
-    events = source.prescribed._kept
-    n, environment = events.step.size, source.resolved.environment
-    script = maneuvers_of(Chosen(events.facts, events.at, events.lead))
-    stored = StoredPaths(1, np.arange(n), states_of(events.facts), np.full(n, 200), events.step, script)
-    twin, scratch = np.zeros(n, RETRACED_DTYPE), empty_trajectory(environment)
-    retrace(unboxed(stored), unboxed(environment), resolve(campaign).av, unboxed(scratch), twin)
-    impact = twin["impact"]
+    n, scenario = source.pool.events.step.size, resolve(golden("shells-twin", VEHICLES[name])).scenario
+    traffic = source.prescribed.of_rows(np.arange(n), np.zeros(n, np.int64))
+    episode = EpisodeLoop(TwinWorld(256), scenario, RecordPolicy("none", 0.0)).run(0, traffic).episode
+    impact = episode["impact_speed_mps"]
     if name == "touches":
         impact = np.where(np.arange(n) % 50 > 0, 0.05 * impact, impact)
-    return twin["outcome"] == CRASH, impact
+    return episode["outcome"] == CRASH, impact
 
 
 def campaign_of(source, crashed, impact, rows, rng):

@@ -54,10 +54,12 @@ def test_a_recording_that_comes_again_under_a_guise_is_refused(guise, tmp_path):
         fit_files([tmp_path / "rows.parquet", tmp_path / "b.parquet"], tmp_path / "mine.yaml")
 
 
-@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
-def test_recordings_of_one_law_are_told_apart(noise):
+@pytest.mark.parametrize(
+    ("hours", "noise"), [(8.0, 0.1), *(pytest.param(20.0, noise, marks=pytest.mark.slow) for noise in (0.0, 0.1))]
+)
+def test_recordings_of_one_law_are_told_apart(hours, noise):
     """Three of five vehicles of each drive at one speed, the others speed up by one of three values."""
-    whole = [rows for _, rows in overtaking(20.0, 5, noise=noise).groupby("recording_id")]
+    whole = [rows for _, rows in overtaking(hours, 5, noise=noise).groupby("recording_id")]
     require_distinct([fingerprint(recording(rows)) for rows in whole])
 
 

@@ -148,6 +148,12 @@ FILES = {
     "cut.parquet": (b"PAR1 and no more", "cannot be read"),
     "latin.csv": (HEAD + b"\xfcber,0,0,30,0,5\n", "text in UTF-8"),
     "cut.csv.gz": (gzip.compress(ROWS.to_csv(index=False).encode())[:-2000], "cannot be read"),
+    "utf16.csv": ("vehicle_id,time_s\n1,0.1\n".encode("utf-16"), "text in UTF-16"),
+    "excel.csv": (b"PK\x03\x04" + bytes(40), "an Excel workbook"),
+    "gzip.csv": (gzip.compress(b"vehicle_id,time_s\n1,0.1\n"), "does not end in .gz"),
+    "parquet.csv": (b"PAR1" + bytes(40), "does not end in .parquet"),
+    "zeros.csv": (HEAD + b"1,0,0,30,0,5\n" + bytes(9), "zero bytes"),
+    "returns.csv": (HEAD[:-1] + b"\r1,0,0,30,0,5\r", "cannot be read .*new-line"),
     "headless.csv": (b"1,0,0,30,0,5\n1,0.1,3,30,0,5\n", r"numbers in place of a header: 6 columns.*header: \["),
 }
 
@@ -168,30 +174,12 @@ def test_wrong_trajectories_are_refused_by_name(case, tmp_path):
     assert file.name in error.where
 
 
-def test_missing_files(tmp_path):
+def test_what_is_no_file_is_refused_at_once(tmp_path):
     (tmp_path / "rows.parquet").touch()
-    with pytest.raises(TrajectoryError, match=r"no such file.*'rows\.parquet'"):
-        judged(tmp_path / "row.parquet")
-    with pytest.raises(TrajectoryError, match="a folder"):
-        judged(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("content", "kind"),
-    [
-        ("vehicle_id,time_s\n1,0.1\n".encode("utf-16"), "text in UTF-16"),
-        (b"PK\x03\x04" + bytes(40), "an Excel workbook"),
-        (gzip.compress(b"vehicle_id,time_s\n1,0.1\n"), "does not end in .gz"),
-        (b"PAR1" + bytes(40), "does not end in .parquet"),
-        (HEAD + b"1,0,0,30,0,5\n" + bytes(9), "zero bytes"),
-        (HEAD[:-1] + b"\r1,0,0,30,0,5\r", "cannot be read .*new-line"),
-    ],
-    ids=["utf-16", "excel", "gzip", "parquet", "zeros", "carriage returns"],  # gzip's bytes hold the time of day
-)
-def test_what_is_no_text_is_called_by_its_kind(content, kind, tmp_path):
-    (tmp_path / "rows.csv").write_bytes(content)
-    with pytest.raises(TrajectoryError, match=kind):
-        judged(tmp_path / "rows.csv")
+    os.mkfifo(tmp_path / "rows.csv")
+    for file, words in (("row.parquet", r"no such file.*'rows\.parquet'"), ("", "a folder"), ("rows.csv", "a pipe")):
+        with pytest.raises(TrajectoryError, match=words):
+            judged(tmp_path / file)
 
 
 @pytest.mark.parametrize(("cut", "n"), [(0, 0), (1, 1), (3, 1)])
@@ -201,12 +189,6 @@ def test_a_row_that_may_be_cut_is_told(cut, n, tmp_path, capsys):
     (tmp_path / "rows.csv").write_bytes(content[: len(content) - cut])
     judged(tmp_path / "rows.csv")
     assert capsys.readouterr().err.count("rows.csv has no line end after its last row: is it complete?") == n
-
-
-def test_a_pipe_is_refused_at_once(tmp_path):
-    os.mkfifo(tmp_path / "rows.csv")
-    with pytest.raises(TrajectoryError, match="a pipe"):
-        judged(tmp_path / "rows.csv")
 
 
 @pytest.mark.slow

@@ -43,7 +43,7 @@ def policy_of(challenge, epsilon):
 
 def recorded(challenge):
     """States, maneuvers and steps of BV's redraw times: before the cut-in, and after it."""
-    done = run("step_mixture", challenge, n=4_000, moments="all", surrogates=CHALLENGES[challenge])
+    done = run("step_mixture", challenge, n=1_500, moments="all", surrogates=CHALLENGES[challenge])
     moment = done.moment
     state = np.column_stack([moment[name] for name in STATE_COLUMNS])
     before = np.isin(moment["maneuver"], (CUT_IN, STAY)) & (moment["step"] % 10 == 0)

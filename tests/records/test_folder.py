@@ -253,12 +253,6 @@ def test_the_campaign_of_another_run_is_refused(crc32, stored, stored_run):
             reading(stored)
 
 
-def test_a_run_killed_while_it_replaces_its_campaign_can_be_read(stored):
-    """Its manifest tells of no checksum in between."""
-    edit(stored, campaign_crc32=None)
-    assert estimate_run(stored)
-
-
 def test_json_is_strict(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(tmp_path / "file.json", {"rhw": float("inf")})

@@ -10,11 +10,13 @@ import pytest
 
 import harness
 from harness.fitting.files import fit_files
-from harness.report.compare_page import write_sum
-from harness.report.page import write_hours
+from harness.runner.compare import compare_campaigns
 from harness.runner.stored import write_report
 from tests.fitting.trajectories import overtaking
+from tests.in_process import one_process
 from tests.report.test_player import crashed, scenes_in
+from tests.runner.test_compare_families import HARDER
+from tests.runner.test_families import campaign as hours
 from tests.stored_runs import copy_of
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -174,46 +176,10 @@ def pages(report, replayed, crashing, compared, tmp_path_factory) -> list[Path]:
     runs = [write_report(copy_of(crashing[name], place / name)) for name in ("lead_brakes", "cut_out")]
     with_player = [report, replayed, *runs, write_report(copy_of(compared, place / "compared"))]
     overtaking(2.0).to_parquet(place / "rows.parquet", index=False)
-    fit_files([place / "rows.parquet"], place / "mine.yaml", n_replicates=2)
-    (place / "sums").mkdir()
-    sums = write_hours(place, hour_content()), write_sum(place / "sums", pairs_content())
-    return [*with_player, *sums, place / "mine.html"]
-
-
-def pairs_content() -> dict[str, object]:
-    """Of the page of a comparison in several scenarios, of figures made up."""
-    alone = {"value": 1e-3, "ci_low": 9e-4, "ci_high": 2e-3}
-    decision = {"margin": 0.0, "verdict": "open", "confidence": 0.95, "given_the_library": False}
-    contrast = {
-        "difference": 1e-4, "ci_low": -1e-3, "ci_high": 2e-3, "ratio": 1.1, "ratio_low": 0.5, "ratio_high": None,
-        "only_a": alone, "only_b": alone, "n_pairs": 900, "n_only_a": 25, "n_only_b": 3, "decision": decision,
-    }  # fmt: skip
-    return {
-        **contrast, "seed": 1, "confidence": 0.9, "ended": "rhw", "a": hour_content(), "b": hour_content(),
-        "to_decide": {"pairs": 9_000, "settings": {}, "new_folder": False},
-        "campaigns": {"a": {"label": "a vehicle"}, "b": {"label": "another one"}},
-        "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), contrast),
-    }  # fmt: skip
-
-
-def hour_content() -> dict[str, object]:
-    """Of the page of a sum, of figures made up."""
-    exposure = {"per_hour": 0.1, "low": 0.02, "high": 0.5, "counted": None, "source": "assumed: no primary rate"}
-    part = {
-        "rate_per_hour": 1.26e-3, "reference_rate_per_hour": 2.6e-5, "ci_low": 1.19e-3, "ci_high": 1.89e-3,
-        "upper_bound": None, "share": 0.5, "ratio": 34.0, "n_episodes": 100, "n_crashes": 10,
-        "median_impact_mps": 7.0, "exposure": exposure,
-        "n_failed": 1, "if_failed_had_crashed": 1.3e-3, "cut_off": 0.0, "cautions": [], "repeated": None,
-        "milder": None, "n_crashes_before_event": 0,
-    }  # fmt: skip
-    beside = {"ratio": 15.0, "ratio_low": 14.0, "ratio_high": 22.0, "over_assumed": [4.4, 27.0], "reference": "r157-cc"}
-    return {
-        "vehicle": "idm", "name": "r157", "n_episodes": 300, "n_crashes": 30, "seed": 1, "confidence": 0.9,
-        "per_hour": {"rate": 1.27e-3, "ci_low": 1.2e-3, "ci_high": 1.9e-3, "upper_bound": None, "rhw": 0.3},
-        "per_1e6_km": 11.3, "beside": beside, "decision": None, "stopped_by": "rhw", "asked_rhw": 0.3,
-        "counts_in_interval": False, "readings": [beside],
-        "families": dict.fromkeys(("lead_brakes", "cut_in", "cut_out"), part),
-    }  # fmt: skip
+    fit_files([place / "rows.parquet"], (file := place / "mine.html").with_suffix(".yaml"), n_replicates=2)
+    with one_process():
+        sums = harness.run(hours(), place / "sum", workers=1).folder / "report.html"
+        return [*with_player, sums, compare_campaigns(hours(), hours(HARDER), place / "pairs", workers=1).report, file]
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark"), (390, "light")])

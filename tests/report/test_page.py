@@ -11,11 +11,10 @@ import pytest
 from junitparser import JUnitXml
 
 from harness.errors import RunFolderError
-from harness.records.folder import write_sealed
 from harness.report.junit import difference_case, statement_case, write_junit
 from harness.runner.stored import write_report
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
-from tests.stored_runs import copy_of, truncate
+from tests.stored_runs import copy_of, edit, estimates, truncate
 
 SEEN = {
     "weighted": ({"severity"}, ["defensive_share: 0.1"]),
@@ -25,13 +24,6 @@ SEEN = {
     "shells_refuted": ({"severity", "shells"}, ["refuted by these tests; by test", "outermost no. 1"]),
 }
 """Plots, and words that no other kind of run has."""
-
-
-def edit(path: Path, **changes) -> dict:
-    """Change top-level keys of a JSON file, and its checksum; returns what it held before."""
-    content = json.loads(path.read_text())
-    write_sealed(path, content | changes)
-    return content
 
 
 def test_a_verdict_is_said_first(stored_run, tmp_path):
@@ -72,10 +64,10 @@ def test_hostile_texts_are_escaped_and_no_formula(folders, tmp_path):
     text = (folder / "campaign.yaml").read_text()
     described = text.replace('\ndescription: ""', f"\ndescription: {json.dumps(hostile + chr(27) + '[31m')}")
     (folder / "campaign.yaml").write_text(described)
-    path = folder / "estimates.json"
-    estimates = edit(path, campaign=hostile, headline=hostile)["estimates"]
+    of = estimates(folder)["estimates"]
     warnings = [{"key": hostile}, {"key": "untested", "numbers": {"shells": [hostile]}}]
-    edit(path, estimates=estimates | {hostile: {**estimates["nade"], "warnings": warnings}})
+    named = of | {hostile: {**of["nade"], "warnings": warnings}}
+    edit(folder, "estimates.json", campaign=hostile, headline=hostile, estimates=named)
     write_report(folder)
     page = Page(folder)
     assert hostile not in page.html
@@ -105,7 +97,7 @@ def rewritten(change):
 
 
 def edited(**changes):
-    return lambda path: edit(path, **changes)
+    return lambda path: edit(path.parent, path.name, **changes)
 
 
 EPISODES = "episodes/000001000-000002000.parquet"

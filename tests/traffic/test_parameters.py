@@ -3,6 +3,7 @@
 import math
 from itertools import product
 
+import numba
 import numpy as np
 import pytest
 import yaml
@@ -15,7 +16,7 @@ from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.families.cut_in.parameters import EnvironmentParameters
 from harness.vehicles.sideways import lateral_position, perceived_in
 from tests.golden.campaigns import LATERAL_FILE
-from tests.kernels import alone, cut_in_terms
+from tests.kernels import cut_in_terms
 from tests.traffic.tables import DATA, SHIPPED, of, tabled
 
 PAPER, LATERAL = "ndd-overtaking-1", LATERAL_FILE
@@ -170,7 +171,7 @@ def of_all_but(parameters, section):
 # -- leads: by known answers, files by their rules, hashes that stay where nothing is said --
 
 
-draw_lead = alone(of_lateral.draw_lead)
+draw_lead = numba.njit(of_lateral.draw_lead, error_model="numpy")  # not cached: what kernels inline
 
 
 def leads(law, n=20_000, seed=1):

@@ -35,8 +35,9 @@ class Simulation:
         while traci.simulation.getMinExpectedNumber():
             traci.simulationStep()
             for name in traci.simulation.getDepartedIDList():
-                more = [tc.VAR_LEADER] * (name == self.settings.ego)
-                traci.vehicle.subscribe(name, [tc.VAR_SPEED, tc.VAR_LANEPOSITION, *more])
+                traci.vehicle.subscribe(name, [tc.VAR_SPEED, tc.VAR_LANEPOSITION])
+                if name == self.settings.ego:
+                    traci.vehicle.subscribeLeader(name)
             self.seen = traci.vehicle.getAllSubscriptionResults()
             self.own = traci.vehicle.getSubscriptionResults(self.settings.ego)
             self.history.append(self.own)
