@@ -11,7 +11,7 @@ from harness.estimators.estimate import WIDE_RHW
 from harness.families import family_named
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, wrapped
-from harness.report.rows import decided, ratio_texts
+from harness.report.rows import decided, looking_words, ratio_texts
 from harness.report.words import GO_ON, doubt_words, early_words, ended_words, milder_words, scope_words, unseen_words
 
 
@@ -108,6 +108,8 @@ def exposures(content: Mapping[str, Any]) -> str:
         given = found["low"] == found["high"] and found["source"] != "assumed"
         kind = "counted" if found["counted"] else "given" if given else "assumed"
         told.setdefault(kind, []).append(f"{called(name)} {plain(float(format(found['per_hour'], '.2g')))}")
+        if (left := of.get("assumed")) and (others := looking_words(moved := AssumedOfRate(**left))):
+            told[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
     return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
 
 

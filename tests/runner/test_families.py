@@ -206,6 +206,19 @@ def test_where_few_tests_reject_only_the_lower_ends_are_told(run, rhw, low, show
     assert ("crashes so far      > 1.00 × 10⁻³ per hour" in told, ratio, "to 900" in told) == (shown, shown, not shown)
 
 
+def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
+    """As in the answer of that scenario alone."""
+    content = run.content
+    told = " ".join(" ".join(hour_lines(content)).split())
+    said = "cut-in 0.048 (crashes × 25 if 25 %, not 1 %, do not look behind); assumed: lead brakes 0.1"
+    assert told.count(said) == 1
+    assert "25 %, not 1 %, do not look behind" in repr(run.runs["cut_in"])
+    assert (run.folder / "report.html").read_text().count("× 25 if 25 %, not 1 %") == 1
+    verdict = Decision(1.0, "assumption_free", 0.95, 2.5, 40.0, driver="r157-cc").to_json()
+    report = run.folder / "report.html"
+    assert (len(hour_lines(content, report)), len(hour_lines({**content, "decision": verdict}, report))) == (10, 11)
+
+
 @pytest.mark.parametrize(("times", "warned"), [([0.2, 4.0], True), ([0.99, 1.01], False), (None, False)])
 def test_a_rate_that_traffic_leaves_open_has_only_an_upper_limit_in_the_sum_too(run, times, warned):
     """Where no lane change was seen that a notable part of it comes from."""
