@@ -172,11 +172,13 @@ def hour_answer(
     follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
     speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
     found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
-    for name, (estimates, manifest) in told.items():
-        of = found["families"][name]
-        per_test = of["exposure"]["per_hour"] / of["p_event"]
+    for part, (name, (estimates, manifest)) in zip(hour.families, told.items(), strict=True):
+        of, p = found["families"][name], part.seen.design.p
         of["median_impact_mps"] = (estimates["severity"] or {}).get("median_mps")
-        of |= doubts_of(ready[name].campaign, estimates, manifest, per_test)
+        of |= doubts_of(ready[name].campaign, estimates, manifest, part.per_hour)
+        if (left := of["assumed"]) and left["times"]:  # per event, of which there are more per test in other traffic
+            moved = (p @ np.array(manifest["assumed"]["times"]).T / p.sum()).tolist()
+            of["assumed"] = {**left, "times": [rate / events for rate, events in zip(left["times"], moved, strict=True)]}
     return found
 
 
