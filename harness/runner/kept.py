@@ -293,8 +293,9 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
     def refusal(found: str, expected: str, mend: str) -> RunFolderError:
         return RunFolderError(str(folder), found, expected, mend)
 
+    nothing: dict[str, Any] = {"n_episodes": 0, "parts": [], "before": {}}
     if not any(folder.iterdir()):
-        return {"n_episodes": 0, "parts": [], "before": {}}
+        return nothing
     elsewhere = "Choose another folder with --out."
     if not (folder / MANIFEST).exists():
         expected = "a new or empty folder, or one that a run has left"
@@ -304,6 +305,8 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         found = f"another campaign ({manifest.get('name')}, {manifest['campaign_hash']})"
         mend = "Choose another folder with --out, or run the campaign.yaml that it holds."
         raise refusal(found, f"a folder for this one ({resolved.content_hash})", mend)
+    if not (manifest["n_episodes"] or manifest["before"]):  # it was interrupted before anything was finished
+        return nothing
     if not resume:
         mend = "Continue it with --resume, or choose another folder with --out."
         raise refusal("this campaign, already begun", "a new or empty folder", mend)
