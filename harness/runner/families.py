@@ -178,7 +178,7 @@ def hour_answer(
         of |= doubts_of(ready[name].campaign, estimates, manifest, part.per_hour)
         if (left := of["assumed"]) and left["times"]:  # per event, of which there are more per test in other traffic
             moved = (p @ np.array(manifest["assumed"]["times"]).T / p.sum()).tolist()
-            of["assumed"] = {**left, "times": [rate / events for rate, events in zip(left["times"], moved, strict=True)]}
+            of["assumed"] = {**left, "times": [a / b for a, b in zip(left["times"], moved, strict=True)]}
     return found
 
 
