@@ -109,12 +109,13 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     from harness.report.page import write_hours  # noqa: PLC0415 - draws
     from harness.report.words import vehicle_words  # noqa: PLC0415
 
+    vehicle, parameters = vehicle_words(campaign.av, script=next(iter(ready.values())).script)
     asked = {
         "format": 1, "name": campaign.name, "campaign_crc32": zlib.crc32(yaml),
         "seed": campaign.seed, "engine": campaign.world.engine,
         "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
         "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
-        "vehicle": vehicle_words(campaign.av)[0], "wall_time_s": round(time.monotonic() - began, 3),
+        "vehicle": vehicle, "parameters": parameters, "wall_time_s": round(time.monotonic() - began, 3),
     }  # fmt: skip
     content = finite_json({**asked, **answer})
     write_sealed(out / FAMILIES, content)
