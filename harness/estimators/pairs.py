@@ -49,6 +49,7 @@ class PairDecision:
     """Whether B's rate is at most 1 + ``margin`` times A's: at no margin, who crashes less often.
 
     It holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
+    ``ratio`` are the ends of B/A by which a margin was decided, None without one.
     No margin is kept by a B with ``n_milder`` crashes that its rate leaves out, nor where ``n_differing`` tests of
     either were not the same when they ran twice.
     """
@@ -59,6 +60,7 @@ class PairDecision:
     given_the_library: bool
     n_milder: int = 0
     n_differing: int = 0
+    ratio: tuple[float, float] | None = None
 
     def doubted(self, n_milder: int, n_differing: int) -> PairDecision:
         """The same after what was seen besides the crashes that count."""

@@ -60,6 +60,7 @@ def crash_gallery(
     """
     crashes, scenes, family = summary.crashes, Scenes(run.campaign, environment), family_named(run.campaign.scenario)
     facts = [each.of(crashes) for each in shown_of(family)]
+    told = list(zip(shown_of(family), facts, strict=True))[:2]
     episode = crashes["episode"]
     ends = _ends(run, scenes, episode, crashes["impact_speed_mps"])
     avoided = (ends < 0) & (ends != UNKNOWN)
@@ -82,7 +83,9 @@ def crash_gallery(
         if traces is not None and number in traced:
             impact, scene = tenths(crash["impact_speed_mps"]), len(shown)
             row, trace = (each.filter(pc.equal(each["episode"], number)) for each in (stored, traces))
-            shown.append(scenes.scene(row, trace, why=f"impact at {impact} m/s ({', '.join(why)})"))
+            event = " and ".join(f"{each.words} {tenths(float(of[place]))} {each.unit}" for each, of in told)
+            kinds = ", ".join(each.rpartition(" no. ")[0] for each in why)
+            shown.append(scenes.scene(row, trace, why=f"{event}, impact at {impact} m/s ({kinds})"))
         share = crash["weight"] / total if total > 0.0 else math.nan
         shown_facts = [float(each[place]) for each in facts]
         rows.append(GalleryRow(number, crash, shown_facts, ", ".join(why), share, component, by, scene))

@@ -163,8 +163,9 @@ def ratio_texts(found: Mapping[str, Any], *, wide: bool, from_below: bool) -> tu
     most = "no limit" if math.isinf(high) else ratio(high)
     if not seen:
         return f"< {most}", "no crash seen"
-    if wide and high < 1.0:
-        return f"< {most} (crashes less)", f"estimate {ratio(seen)}, ≥ {ratio(low)}"
+    if wide and (high < 1.0 or (low <= 1.0 and not from_below and high < math.inf)):  # as the row of the rate
+        apart = "crashes less" if high < 1.0 else "not told apart"
+        return f"< {most} ({apart})", f"estimate {ratio(seen)}, ≥ {ratio(low)}"
     if from_below and low > 1.0:
         return f"> {ratio(low)} (crashes more)", f"estimate {ratio(seen)}"
     apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"

@@ -194,12 +194,12 @@ def _written(
     """Write what is known of one scenario, and its page."""
     resolved = [each.run.resolved for each in of.runs]
     campaign, told = resolved[0].campaign, zip(SIDES, labels, resolved, strict=True)
-    content = {
+    content = finite_json({
         "format": 1, "method": campaign.testing.method, "seed": campaign.seed, "scenario": campaign.scenario,
         "campaigns": {side: {"label": label, "campaign_hash": own.content_hash} for side, label, own in told},
         **paired_estimate(of.pairs, campaign.stop.confidence), **ended, "asked": asked,
         "unseen": resolved[0].parameters.unseen,
-    }  # fmt: skip
+    })  # fmt: skip
     for side, each in zip(SIDES, of.results, strict=True):
         content[side] |= doubts_of(each.shown.campaign, each.estimates, each.shown.manifest)
     write_sealed(of.folder / COMPARISON, content)
