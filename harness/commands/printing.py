@@ -179,7 +179,7 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
             "estimator": name + (" *" if name == content["headline"] else ""),
             "crash rate per test": entry["crash_rate"],
             f"{share(content['confidence'])} interval": interval(entry.get("ci_low"), entry.get("ci_high")),
-            "RHW": half_width(entry.get("rhw")),
+            "RHW": "none, see below" if entry.get("cautions") else half_width(entry.get("rhw")),
             "effective crashes": entry.get("n_effective"),
             "largest weight share": share(entry.get("largest_weight_share")),
         }
