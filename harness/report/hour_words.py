@@ -9,6 +9,7 @@ from typing import Any
 from harness.estimators.answer import AssumedOfRate
 from harness.estimators.estimate import WIDE_RHW
 from harness.families import family_named
+from harness.families.words import EXCLUDED
 from harness.numbers import count, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, headed, wrapped
 from harness.report.rows import decided, looking_words, ratio_texts
@@ -108,6 +109,8 @@ def exposures(content: Mapping[str, Any]) -> str:
         given = found["low"] == found["high"] and found["source"] != "assumed"
         kind = "counted" if found["counted"] else "given" if given else "assumed"
         told.setdefault(kind, []).append(f"{called(name)} {plain(float(format(found['per_hour'], '.2g')))}")
+        if EXCLUDED in found["source"]:
+            told[kind][-1] += f" ({EXCLUDED})"
         if (left := of.get("assumed")) and (others := looking_words(moved := AssumedOfRate(**left))):
             told[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
     return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
