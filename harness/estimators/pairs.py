@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property
 from typing import Any, Literal, NamedTuple, Self
 
@@ -61,6 +61,10 @@ class PairDecision:
     n_milder: int = 0
     n_differing: int = 0
     ratio: tuple[float, float] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """What there is of it."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
     def doubted(self, n_milder: int, n_differing: int) -> PairDecision:
         """The same after what was seen besides the crashes that count."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -163,7 +163,7 @@ def compare_campaigns(
     if margin is not None:
         code = EXIT_OF[decision.verdict]
     ended = {
-        "decision": asdict(decision), "to_decide": _to_decide(a, rounds, pairs),
+        "decision": decision.to_json(), "to_decide": _to_decide(a, rounds, pairs),
         "ended": ended_by(a, rule, int(pairs.tests.sum())),
     }  # fmt: skip
     told = labels or (a.name, b.name), LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE
@@ -173,7 +173,7 @@ def compare_campaigns(
     for of in scenarios:
         own = PairRule(a, margin, rhw)
         own.observe(of.pairs)
-        each[of.name] = asdict(_decided(own, [of]))
+        each[of.name] = _decided(own, [of]).to_json()
         _written(of, {"decision": each[of.name], "to_decide": None, "ended": "sum"}, *told, code)
     return _sum_written(out, a, pairs, scenarios, ended, each, told[0], code)
 
