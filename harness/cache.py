@@ -12,6 +12,7 @@ import os
 import stat
 import sys
 import tempfile
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -134,21 +135,32 @@ def _make_room(kept: Path) -> None:
 
 
 @contextmanager
-def made_once(name: str, waits: Callable[[], object]) -> Iterator[None]:
-    """Keep other processes from making the same meanwhile; ``waits`` is called where one of them is at it already."""
+def made_once(name: str, waits: Callable[[str], object]) -> Iterator[None]:
+    """Keep other processes from making the same meanwhile; ``waits`` is told which of them is at it already."""
     with ExitStack() as held:
         # Without a lock is a cache that may only be read or does not exist yet, and a file system that has none.
         with suppress(OSError, StopIteration):
             path = next(places(name)).with_suffix(".lock")
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = held.enter_context(path.open("wb+"))  # a pipe would wait for who reads it
+            file = held.enter_context(path.open("ab+"))  # a pipe would wait for who reads it
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                waits()
+                waits(_holder(path))
                 fcntl.flock(file, fcntl.LOCK_EX)
             held.callback(path.unlink, missing_ok=True)
+            file.truncate(0)
+            file.write(str(os.getpid()).encode())
+            file.flush()
         yield
+
+
+def _holder(path: Path) -> str:
+    """Who has locked a file, and since when; which may be over by now."""
+    with suppress(OSError):
+        if pid := path.read_text():
+            return f"process {pid}, since {time.strftime('%H:%M:%S', time.localtime(path.stat().st_mtime))}"
+    return "a process that has just begun"
 
 
 def put(name: str, write: Callable[[Path], object]) -> Path:

@@ -7,6 +7,7 @@ import threading
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import wait
+from pathlib import Path
 from typing import ClassVar
 
 PRINTED = "printed.txt"
@@ -37,7 +38,8 @@ class Printed:
     """
 
     kept: ClassVar[Kept | None] = None
-    """By what begins meanwhile."""
+    folder: ClassVar[Path | None] = None
+    """By what begins meanwhile, and of which run folder that is."""
 
     def __init__(self) -> None:
         self._to_others = _to_stderr if self.kept is None else self.kept.add

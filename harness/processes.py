@@ -207,6 +207,7 @@ def _server() -> Iterator[None]:
     short = _in_short(temporary_folder())
     main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     before, tempfile.tempdir = tempfile.tempdir, short
+    masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # it would end with a traceback
     safe_path = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"  # a json.py of the current folder is not what the server imports
     try:
@@ -215,6 +216,7 @@ def _server() -> Iterator[None]:
         sys.modules["__main__"], tempfile.tempdir = main, before
         os.environ.pop(SAFE_PATH)
         os.environ |= {} if safe_path is None else {SAFE_PATH: safe_path}
+        signal.pthread_sigmask(signal.SIG_SETMASK, masked)
 
 
 @cache

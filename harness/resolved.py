@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from harness.campaign.campaign import Campaign, Command, Use, refusal
-from harness.controllers.find import require_controller, runs_script, source_of_own
+from harness.controllers.find import require_controller, script_step_s, source_of_own
 from harness.errors import CampaignError
 from harness.estimators.one_pass import accumulator
 from harness.estimators.own import headline_of
@@ -32,7 +32,7 @@ class Resolved:
     ``challenge`` says how they are; a function or surrogates of the user's own by the hashes of their files.
     ``content_hash`` is of all that changes an episode's bits, the environment's numbers included;
     ``controller_sha256`` of the source of the AV's controller, None where there is none, or nobody has looked;
-    ``script`` says whether it is a TraCI script.
+    ``script`` is how often one of TraCI is asked (s), else 0.
     """
 
     campaign: Campaign
@@ -43,7 +43,7 @@ class Resolved:
     challenge: str
     content_hash: str
     controller_sha256: str | None = None
-    script: bool = False
+    script: float = 0.0
 
     @property
     def family(self) -> Family:
@@ -84,7 +84,7 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
         from harness.worlds.program import require_private  # noqa: PLC0415 - imports traci
 
         require_private(campaign.av.traci)
-    script = runs_script(campaign.av)
+    script = script_step_s(campaign.av)
     resolved = replace(resolve(campaign, command), controller_sha256=controller_sha256, script=script)
     accumulator(headline_of(campaign))  # one of the user's own can be made
     if campaign.sampling.strata:

@@ -57,13 +57,14 @@ class Reference:
 class Assumed:
     """What data leave open of who cuts in closely, and by what it moves the probabilities of strata.
 
-    It is the share of those who do not look, stated up to ``highest``; or lane changes at the times to collision
+    It is the ``share`` of those who do not look, stated up to ``highest``; or lane changes at the times to collision
     ``where`` none was seen. ``times`` are the factors at both ends, (2, S); None where no strata are known.
     """
 
     where: str = ""
     highest: float | None = None
     times: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    share: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

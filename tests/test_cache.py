@@ -2,6 +2,7 @@
 
 import os
 import pwd
+import re
 import shutil
 import tempfile
 import time
@@ -168,7 +169,8 @@ def test_what_another_makes_is_waited_for(folder):
     waited, made = [], []
 
     def make(i):
-        with cache.made_once(NAME, lambda: waited.append(i)):
+        time.sleep(0.05 * i)
+        with cache.made_once(NAME, waited.append):
             if cache.read(NAME) is None:
                 time.sleep(0.2)
                 made.append(i)
@@ -177,8 +179,9 @@ def test_what_another_makes_is_waited_for(folder):
     with ThreadPoolExecutor(3) as threads:
         list(threads.map(make, range(3)))
     assert (len(made), len(waited)) == (1, 2)
+    assert all(re.fullmatch(rf"process {os.getpid()}, since \d\d:\d\d:\d\d", each) for each in waited)
     assert [path.name for path in (folder / "pools").iterdir()] == ["one"]
-    with cache.made_once(OTHER, lambda: waited.append(-1)):
+    with cache.made_once(OTHER, waited.append):
         pass
     assert len(waited) == 2
 
@@ -189,5 +192,5 @@ def test_where_no_lock_can_be_had_nobody_waits(folder, monkeypatch):
     os.mkfifo(piped.with_suffix(".lock"))
     for own in (folder, folder.with_name("piped"), None):  # or neither a home nor yet a folder in its place
         monkeypatch.setattr(cache, "own_folder", lambda own=own: own)
-        with cache.made_once(NAME, lambda: pytest.fail("waits")):
+        with cache.made_once(NAME, lambda _: pytest.fail("waits")):
             pass

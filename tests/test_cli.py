@@ -209,6 +209,23 @@ def test_what_a_signal_ends_has_its_exit_code_whatever_becomes_of_the_interrupti
     assert not Progress.cancelled
 
 
+@pytest.mark.parametrize(
+    ("n", "before", "told"),
+    [
+        (None, {}, "No test was finished: the same command begins anew."),
+        (0, {}, "No test was finished: the same command begins anew."),
+        (3, {}, "Finished tests are kept: the same command with --resume goes on."),
+        (0, {"shadow": {}}, "Finished tests are kept: the same command with --resume goes on."),
+    ],
+)
+def test_after_an_interruption_it_is_told_whether_anything_is_kept(raising, tmp_path, capsys, n, before, told):
+    if n is not None:
+        (tmp_path / "cut_in").mkdir()
+        (tmp_path / "cut_in" / "manifest.json").write_text(json.dumps({"n_episodes": n, "before": before}))
+    assert raising(KeyboardInterrupt(), "harness.runner.run.run_campaign", "run", SMOKE, "--out") == 130
+    assert f"Interrupted. {told}\n" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("defect", [OSError(errno.EBADF, "closed too early"), ZeroDivisionError()], ids=repr)
 def test_defects_are_not_hidden(raising, defect):
     with pytest.raises(type(defect)) as caught:

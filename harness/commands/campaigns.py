@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -226,7 +227,7 @@ def av_check(
     if as_json:
         print_json(found.to_json())
     else:
-        say(verdict(found))
+        say(*textwrap.wrap(verdict(found), 100, break_on_hyphens=False))
         print_table("Vehicle under test", rows(found))
     ctx.exit(found.exit_code)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -65,4 +66,5 @@ def fit(
     if as_json:
         print_json({"files": written, **found.facts})
     else:
-        say(*found.told, *written)
+        setting = shlex.quote(f"environment.parameters={out}")
+        say(*found.told, *written, f"next: harness run my_av.py:MyAV --set {setting}")

@@ -40,7 +40,7 @@ def prints_kept_in(folder: Path | None = None) -> Iterator[None]:
 
     Without a folder only how much it was is said.
     """
-    began, before, Printed.kept = time.time(), Printed.kept, (kept := Kept())
+    began, before, Printed.kept, Printed.folder = time.time(), Printed.kept, (kept := Kept()), folder
     try:
         yield
     finally:
@@ -86,8 +86,19 @@ _HOW_TO_GO_ON = {
 def show_interrupted(command: str, signal_name: str | None) -> None:
     """Say that the user or the system asked for the end, and that nothing finished is lost."""
     by = f" by {signal_name}" if signal_name not in (None, "SIGINT") else ""
+    how = _HOW_TO_GO_ON.get(command, "")
+    if how and not (Printed.folder and holds_tests(Printed.folder)):
+        how = " No test was finished: the same command begins anew."
     with suppress(OSError):  # after SIGHUP there may be no terminal left
-        click.echo(f"Interrupted{by}.{_HOW_TO_GO_ON.get(command, '')}", err=True)
+        click.echo(f"Interrupted{by}.{how}", err=True)
+
+
+def holds_tests(folder: Path) -> bool:
+    """Whether a run has finished something in a folder, or in one below it."""
+    with suppress(OSError, ValueError):
+        manifests = [json.loads(path.read_bytes()) for path in folder.rglob("manifest.json")]
+        return any(each["n_episodes"] or each["before"] for each in manifests)
+    return True  # what is there cannot be read
 
 
 _OF_THE_SYSTEM = (
@@ -168,7 +179,7 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
             "estimator": name + (" *" if name == content["headline"] else ""),
             "crash rate per test": entry["crash_rate"],
             f"{share(content['confidence'])} interval": interval(entry.get("ci_low"), entry.get("ci_high")),
-            "RHW": half_width(entry.get("rhw")),
+            "RHW": "none, see below" if entry.get("cautions") else half_width(entry.get("rhw")),
             "effective crashes": entry.get("n_effective"),
             "largest weight share": share(entry.get("largest_weight_share")),
         }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 import click
@@ -285,6 +286,7 @@ def replay(
     from harness.report.motion import writer_of
     from harness.report.sumo_files import gui_program, watch
     from harness.runner.stored import changed_since
+    from harness.worlds.sumo import sumo_program
 
     files = [*files, *([] if sumo_folder is None else [sumo_folder / "test.sumocfg"])]
     for file in files:  # can be written, before anything is simulated for them
@@ -306,6 +308,11 @@ def replay(
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
     if not stored and result.bit_equal is not False and (note := changed_since(manifest, campaign).code_words()):
         say(f"note: {note}", err=True)
+    if any(file.suffix == ".sumocfg" for file in written) and not which("sumo"):
+        try:
+            sumo_program("sumo", "--sumo")
+        except HarnessError as missing:  # what is written is of use elsewhere
+            say(f"note: {missing.found} on this machine to run it (extra 'sumo'). {missing.mend}", err=True)
     if program is not None:
         watch(result, program)
     if result.changed is not None:

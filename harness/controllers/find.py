@@ -12,6 +12,7 @@ from copy import deepcopy
 from functools import cache, partial
 from importlib.util import module_from_spec, spec_from_file_location
 from inspect import Parameter, Signature, isfunction, signature
+from operator import methodcaller
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar, get_type_hints
@@ -25,6 +26,7 @@ from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.files import real_path
 from harness.problems import did_you_mean
 from harness.processes import Child, WorkerDeath, first_to_answer, tell
+from harness.vehicles.kinematics import STEP_S
 
 _Answer = TypeVar("_Answer")
 
@@ -127,7 +129,10 @@ def build_host(
         raise CampaignError("av.controller", found, _A_CONTROLLER, mend) from error
     if is_batch:
         return BatchHost(*told, first, names=names)
-    return VehicleHost(*told, make, n_cells, first, names=names)
+    host = VehicleHost(*told, make, n_cells, first, names=names)
+    if is_script(str(av.controller)):
+        host.told_at = methodcaller("told_at")
+    return host
 
 
 def _script(av: AutomatedVehicle, guard: Guard) -> Callable[[], Any] | None:
@@ -280,12 +285,9 @@ def require_controller(av: AutomatedVehicle) -> str | None:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
 
 
-def runs_script(av: AutomatedVehicle) -> bool:
-    """Whether an AV's controller is a TraCI script; a note is made of one that SUMO may have asked less often."""
-    if av.controller is None or not is_script(av.controller):
-        return False
-    _note_step_length(_file_of_script(av.controller))
-    return True
+def script_step_s(av: AutomatedVehicle) -> float:
+    """How often a TraCI script is asked (s), as far as its text says; 0 of any other controller."""
+    return _step_length(_file_of_script(av.controller)) if av.controller and is_script(av.controller) else 0.0
 
 
 def _file_of_script(name: str) -> str:
@@ -294,13 +296,16 @@ def _file_of_script(name: str) -> str:
 
 
 @cache
-def _note_step_length(file: str) -> None:
-    """Say once that a script may be asked more often than by SUMO, for which it may have been written."""
+def _step_length(file: str) -> float:
+    """What a script or the .sumocfg that it names says (s); where neither does, a note: SUMO would ask less often."""
     script = real_path(file)
     named = filter(Path.is_file, map(Path, re.findall(r"[\w./-]+cfg\b", script.read_text("utf-8", errors="replace"))))
-    if not any("step-length" in file.read_text("utf-8", errors="replace") for file in (script, *named)):
+    text = "\n".join(each.read_text("utf-8", errors="replace") for each in (script, *named))
+    if "step-length" not in text:
         told = "names no --step-length, nor does a .sumocfg of its: it is asked every 0.1 s; SUMO's default is 1 s"
         sys.stderr.write(f"note: {script.name} {told}.\n")
+    found = re.search(r"step-length\W+(?:value\W+)?(\d*\.?\d+)", text)
+    return float(found[1]) if found else STEP_S
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:

@@ -260,11 +260,15 @@ class Host:
 
 @dataclass
 class VehicleHost(Host):
-    """One controller object per cell, made by ``make``; the ``first``, if there is one already, is that of cell 0."""
+    """One controller object per cell, made by ``make``; the ``first``, if there is one already, is that of cell 0.
+
+    ``told_at`` says of one where its user asks for what it answers.
+    """
 
     make: Callable[[], VehicleController]
     n_cells: int
     first: VehicleController | None = None
+    told_at: Callable[[Any], str] = lambda _: ""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -302,7 +306,8 @@ class VehicleHost(Host):
                     continue  # its episode has failed in this turn's start
                 value, wrong = call(_step, controller, seen, check=check)
                 if wrong is not None:
-                    failures[k] = f"{'step, warming up' if warms_up else 'step'}: {wrong}"
+                    place = "" if value is None else self.told_at(controller)  # of what is raised it is known
+                    failures[k] = f"{'step, warming up' if warms_up else 'step'}: {wrong}{place}"
                     self._drop(k)
                 elif not warms_up:
                     answer[i] = value

@@ -48,7 +48,8 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         expected, mend = "a script that commands one vehicle", "Name its vehicle: --set av.traci_style.ego=NAME."
         if wrong.startswith(FAILS):
             expected = "a script of calls that docs/controllers.md has (“How it differs from TraCI”)"
-            mend = "Fix the script in that line. If it asks for other vehicles, add --set av.traci_style.ego=NAME."
+            other = " If it asks for other vehicles, add --set av.traci_style.ego=NAME."
+            mend = f"Fix the script in that line.{other if 'is not known' in wrong else ''}"
         raise CampaignError("av.controller", found, expected, mend)
 
     def vehicle(set_speed_mps: float, lv_name: str, bv_name: str) -> ScriptVehicles:

@@ -374,6 +374,11 @@ class ScriptController:
         self._left -= 1
         return self._held
 
+    def told_at(self) -> str:
+        """`` (my_script.py:12)``: where the script gave its last command."""
+        file, line = self._traci.vehicle.told_at
+        return f" ({Path(file).name}:{line})"
+
     def _turn(self) -> None:
         assert self._run is not None
         RefusedError.last = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NoReturn
@@ -92,6 +93,8 @@ class VehicleDomain(Domain):
         """Accelerations (m/s²) of the coming steps; empty without a command."""
         self._command: Callable[[], Iterator[float]] | None = None
         """What begins the plan anew: nothing for a command that is over after a step."""
+        self.told_at = "", 0
+        """File and line of the last command."""
         self._told = math.nan
         """Speed (m/s) that the AV will have if it does what it is told."""
         self._accel = self._decel = math.inf
@@ -266,6 +269,8 @@ class VehicleDomain(Domain):
         self._begin(partial(self._approach, _finite(speed), duration), duration)
 
     def _begin(self, command: Callable[[], Iterator[float]] | None, duration: float) -> None:
+        caller = sys._getframe(2)
+        self.told_at = caller.f_code.co_filename, caller.f_lineno
         self._plan = iter(()) if command is None else command()
         self._command = command if duration > self.step_s + _ROUNDING else None
 

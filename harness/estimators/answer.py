@@ -38,6 +38,7 @@ class AssumedOfRate:
     where: str
     highest: float | None
     times: tuple[float, float] | None
+    share: float | None = None
 
     @property
     def most(self) -> float:
@@ -145,7 +146,7 @@ def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
         of_strata = p * np.vstack([np.ones_like(p), *map(np.array, assumed.times)])
         rates = of_strata @ share if best.n_crashes else weight_of_a_test(of_strata, n.astype(np.int64)).max(1)
         times = float(rates[1] / rates[0]), float(rates[2] / rates[0])
-    return AssumedOfRate(assumed.where, assumed.highest, times)
+    return AssumedOfRate(assumed.where, assumed.highest, times, assumed.share)
 
 
 def _per_1e6_km(estimate: Estimate, distance_per_test_km: float) -> dict[str, float]:

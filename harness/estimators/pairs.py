@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property
 from typing import Any, Literal, NamedTuple, Self
 
@@ -49,6 +49,7 @@ class PairDecision:
     """Whether B's rate is at most 1 + ``margin`` times A's: at no margin, who crashes less often.
 
     It holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
+    ``ratio`` are the ends of B/A by which a margin was decided, None without one.
     No margin is kept by a B with ``n_milder`` crashes that its rate leaves out, nor where ``n_differing`` tests of
     either were not the same when they ran twice.
     """
@@ -59,6 +60,11 @@ class PairDecision:
     given_the_library: bool
     n_milder: int = 0
     n_differing: int = 0
+    ratio: tuple[float, float] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """What there is of it."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
     def doubted(self, n_milder: int, n_differing: int) -> PairDecision:
         """The same after what was seen besides the crashes that count."""

@@ -355,6 +355,9 @@ class PairRule(Rule):
         """Whether to stop at the end of a round."""
         watched, level = pairs.within(self._statement), Level.two_sided(self._confidence)
         self.decision = replace(self.decision, verdict=self._verdict(watched))
+        if self.decision.margin and watched.n_crashes:
+            _, low, high = watched.ratio(self._level(watched))
+            self.decision = replace(self.decision, ratio=(1.0 / high, 1.0 / low if low > 0.0 else math.inf))
         pool = watched.rhw_from_pool(level)
         found, of = (watched.rhw(level), pairs.n_crashes), "rhw_of_difference"
         given_up = self._looked(*found, of=of, after_first_tests=True, pool=(pool, pool))
@@ -377,11 +380,13 @@ class PairRule(Rule):
                 return times
         return math.inf
 
-    def _verdict(self, watched: Pairs) -> PairVerdict:
-        level = Level.two_sided(self._confidence)
+    def _level(self, watched: Pairs) -> Level:
         if watched.n_crashes and not self.ends_at_rhw:
-            level = self.level_at(watched.expected(watched.larger_rate), self._confidence)
-        return watched.verdict(self.decision.margin, level)
+            return self.level_at(watched.expected(watched.larger_rate), self._confidence)
+        return Level.two_sided(self._confidence)
+
+    def _verdict(self, watched: Pairs) -> PairVerdict:
+        return watched.verdict(self.decision.margin, self._level(watched))
 
     def _both_below(self, watched: Pairs) -> bool:
         """Whether both are known to crash less than so many times as often as the reference driver does at least."""

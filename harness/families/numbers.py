@@ -126,12 +126,13 @@ class SpeedsAndGaps(Section):
 class LeftOpen(NamedTuple):
     """What data leave open of a traffic: numbers by name at the two ``ends`` of what they may be.
 
-    ``where`` says where nothing was seen, else it is empty and ``highest`` the end of a stated range.
+    ``where`` says where nothing was seen, else it is empty and ``highest`` the end of what is stated of a ``share``.
     """
 
     where: str
-    highest: float | None
     ends: tuple[Mapping[str, float], Mapping[str, float]]
+    share: float | None = None
+    highest: float | None = None
 
 
 class ParameterFile(Section):

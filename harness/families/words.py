@@ -9,6 +9,9 @@ import numpy as np
 
 from harness.vocabulary import FloatArray
 
+EXCLUDED = "the fitted data exclude it"
+"""In the note of an exposure that was kept although too few events were counted for one."""
+
 
 class Words(NamedTuple):
     """Nouns and phrases of pages and terminals.

@@ -71,7 +71,12 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
     if (cached := cached_pool(resolved, order)) is not None:
         return cached
     progress = progress or Progress()
-    with cache.made_once(pool_name(key), lambda: progress.stage("waiting for a pool that another run builds", None)):
+
+    def waits(who: str) -> None:
+        progress.stage(f"waiting for a pool that another run builds ({who})", None)
+        progress.tell()
+
+    with cache.made_once(pool_name(key), waits):
         if (cached := cached_pool(resolved, order)) is not None:
             return cached
         pool = build_pool(resolved, key, progress, order)

@@ -148,7 +148,7 @@ def assumed(
     paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)
     base, *moved = paths.of([traffic.environment, *filter(None, ends)])
     low, high = (tuple(ratio_of(each.p, base.p).tolist()) for each in moved)
-    return asdict(Assumed(left.where, left.highest, (low, high)))
+    return asdict(Assumed(left.where, left.highest, (low, high), left.share))
 
 
 def ratio_of(a: FloatArray, b: FloatArray) -> FloatArray:

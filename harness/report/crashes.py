@@ -60,10 +60,12 @@ def crash_gallery(
     """
     crashes, scenes, family = summary.crashes, Scenes(run.campaign, environment), family_named(run.campaign.scenario)
     facts = [each.of(crashes) for each in shown_of(family)]
+    told = list(zip(shown_of(family), facts, strict=True))[:2]
     episode = crashes["episode"]
     ends = _ends(run, scenes, episode, crashes["impact_speed_mps"])
     avoided = (ends < 0) & (ends != UNKNOWN)
-    rankings = _rankings(summary, avoided, avoided.any(axis=1) | (ends == UNKNOWN).any(axis=1))
+    stand_in = next(iter(family.stand_ins), "")
+    rankings = _rankings(summary, stand_in, avoided, avoided.any(axis=1) | (ends == UNKNOWN).any(axis=1))
     asked = {int(episode[place]) for ranked in rankings.values() for place in ranked}
     traces = run.traces(asked)
     traced = set() if traces is None else set(traces.column("episode").unique().to_pylist())
@@ -82,15 +84,20 @@ def crash_gallery(
         if traces is not None and number in traced:
             impact, scene = tenths(crash["impact_speed_mps"]), len(shown)
             row, trace = (each.filter(pc.equal(each["episode"], number)) for each in (stored, traces))
-            shown.append(scenes.scene(row, trace, why=f"impact at {impact} m/s ({', '.join(why)})"))
+            event = " and ".join(f"{each.words} {tenths(float(of[place]))} {each.unit}" for each, of in told)
+            kinds = ", ".join(each.rpartition(" no. ")[0] for each in why)
+            shown.append(scenes.scene(row, trace, why=f"{event}, impact at {impact} m/s ({kinds})"))
         share = crash["weight"] / total if total > 0.0 else math.nan
         shown_facts = [float(each[place]) for each in facts]
         rows.append(GalleryRow(number, crash, shown_facts, ", ".join(why), share, component, by, scene))
     return rows, shown
 
 
-def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> dict[str, list[int]]:
-    """Places of crashes by what they are shown for; who ``avoided`` (n, D) them, and if ``someone`` (n,) may have."""
+def _rankings(summary: RunSummary, stand_in: str, avoided: BoolArray, someone: BoolArray) -> dict[str, list[int]]:
+    """Places of crashes by what they are shown for; who ``avoided`` (n, D) them, the first of whom is the ``stand_in``.
+
+    ``someone`` (n,) may have.
+    """
     crashes, among = summary.crashes, someone if someone.any() else ~someone
     episode, impact, weight = (crashes[name] for name in ("episode", "impact_speed_mps", "weight"))
     known = someone.any() and (avoided.any(1) == someone).all()
@@ -100,7 +107,7 @@ def _rankings(summary: RunSummary, avoided: BoolArray, someone: BoolArray) -> di
         keys["outermost"] = crashes["component"]
     elif not summary.all_weights_one:
         keys["weight"] = weight
-    first = {"avoidable by r157-cc": worst_crashes(impact, episode, avoided[:, 0])} if avoided.size else {}
+    first = {f"avoidable by {stand_in}": worst_crashes(impact, episode, avoided[:, 0])} if avoided.size else {}
     return first | {name: worst_crashes(key, episode, among) for name, key in keys.items()}
 
 

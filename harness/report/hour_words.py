@@ -9,9 +9,10 @@ from typing import Any
 from harness.estimators.answer import AssumedOfRate
 from harness.estimators.estimate import WIDE_RHW
 from harness.families import family_named
-from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths
-from harness.report.lines import columns, wrapped
-from harness.report.rows import decided, ratio_texts
+from harness.families.words import EXCLUDED
+from harness.numbers import count, interval, number, plain, ratio, share, tenths
+from harness.report.lines import columns, headed, wrapped
+from harness.report.rows import decided, looking_words, ratio_texts
 from harness.report.words import GO_ON, doubt_words, early_words, ended_words, milder_words, scope_words, unseen_words
 
 
@@ -29,14 +30,14 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
     """The answer for a terminal, at most ten lines of 100 columns; with ``readings`` two more."""
     n, engine = count(content["n_episodes"]), "SUMO" if content["engine"] == "sumo" else "SUMO’s twin"
     scenarios = scenarios_words(content["families"])
-    took = [] if readings else [duration(content["wall_time_s"])]  # of the run, not of an answer given anew
-    head = [content["vehicle"], f"{n} tests in {engine}, {scenarios}", *took]
+    took_s = None if readings else content["wall_time_s"]  # of the run, not of an answer given anew
+    head = headed(content["vehicle"], content.get("parameters", ()), f"{n} tests in {engine}, {scenarios}", took_s)
     verdict = [] if content["decision"] is None else [decided(content["decision"]).texts]
     rows = [*verdict, *sum_rows(content), *(reading_rows(content) if readings else ())]
     ends = [] if report is None else [f"  report  {report}"]
     parts = columns([(row[1], row[2] + " of all" * (i == 0), *row[3:]) for i, row in enumerate(family_rows(content))])
     under = wrapped([*(f"! {text}" for text in warnings(content)), exposures(content), scope(content)])
-    return [" · ".join(head), *columns(rows), *parts, *under, *ends]
+    return [head, *columns(rows), *parts, *under, *ends]
 
 
 def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -108,6 +109,10 @@ def exposures(content: Mapping[str, Any]) -> str:
         given = found["low"] == found["high"] and found["source"] != "assumed"
         kind = "counted" if found["counted"] else "given" if given else "assumed"
         told.setdefault(kind, []).append(f"{called(name)} {plain(float(format(found['per_hour'], '.2g')))}")
+        if EXCLUDED in found["source"]:
+            told[kind][-1] += f" ({EXCLUDED})"
+        if (left := of.get("assumed")) and (others := looking_words(moved := AssumedOfRate(**left))):
+            told[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
     return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
 
 

@@ -27,13 +27,18 @@ def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None 
         warnings[MOST_WARNINGS - 1 :] = [f"! {count(len(warnings) - MOST_WARNINGS + 1)} more warnings: see the report"]
     ends = [answer.scope, *([] if report is None else [f"report  {report}"])]
     rows = answer.rows[: LINES - 1 - len(warnings) - len(ends)]
-    parameters = ", ".join(f"{name} {value}" for name, value in answer.parameters)
-    head = [answer.vehicle, answer.tests, *([] if took_s is None else [duration(took_s)])]
-    if parameters:
-        room = WIDTH - len(" · ".join(head)) - 3
-        head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
+    head = headed(answer.vehicle, answer.parameters, answer.tests, took_s)
     table = columns([row.texts for row in rows])
-    return [" · ".join(head), *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+    return [head, *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+
+
+def headed(vehicle: str, parameters: Iterable[Sequence[str]], tests: str, took_s: float | None) -> str:
+    """The first line: who was tested, with as many of its ``parameters`` as there is room for, and how often."""
+    head = [vehicle, tests, *([] if took_s is None else [duration(took_s)])]
+    if told := ", ".join(map(" ".join, parameters)):
+        room = WIDTH - len(" · ".join(head)) - 3
+        head[0] += f" ({textwrap.shorten(told, max(room, 8), placeholder=' …')})"
+    return " · ".join(head)
 
 
 def run_lines(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from harness.campaign.campaign import Campaign
-from harness.estimators.answer import Estimates
+from harness.estimators.answer import AssumedOfRate, Estimates
 from harness.estimators.estimate import Estimate
 from harness.estimators.severity import HARD_MPS, TOUCH_MPS, Severity
 from harness.estimators.traffic import TrafficError, Uncertain
@@ -74,16 +74,23 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) ->
     yield from reversed(rows) if unseen or (wide and beside and end(beside[0]["ratio_high"]) < 1.0) else rows
     if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "that driver never crashes here")
-    if assumed is not None and assumed.highest is not None and assumed.times is not None:
+    if assumed is not None and (others := looking_words(assumed)):
         ends = "" if from_below else f"up to {number(assumed.most * high)}"
-        value = f"up to {number(assumed.most, 2)} times"
-        yield Row("assumed", "in other traffic", value, ends, f"if {share(assumed.highest)} do not look behind")
+        yield Row("assumed", "in other traffic", f"up to {number(assumed.most, 2)} times", ends, others)
     if campaign.has_baseline_runs and best.n_crashes:
         yield from width_row(campaign, best, manifest.get("expected"))
     if told.severity is not None:
         yield from _severity(told.severity, so_far)
     if "within" in best.details and campaign.testing.shells.statement != ASSUMPTION_FREE:
         yield within(best.details["within"])
+
+
+def looking_words(of: AssumedOfRate) -> str:
+    """In which other traffic a rate moves most; empty where no range is stated of who does not look."""
+    if of.highest is None or of.times is None:
+        return ""
+    here = "" if of.share is None else f", not {plain(100.0 * of.share)} %,"
+    return f"{plain(100.0 * of.highest)} %{here} do not look behind"
 
 
 def width_row(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | None) -> Iterator[Row]:
@@ -156,8 +163,9 @@ def ratio_texts(found: Mapping[str, Any], *, wide: bool, from_below: bool) -> tu
     most = "no limit" if math.isinf(high) else ratio(high)
     if not seen:
         return f"< {most}", "no crash seen"
-    if wide and high < 1.0:
-        return f"< {most} (crashes less)", f"estimate {ratio(seen)}, ≥ {ratio(low)}"
+    if wide and (high < 1.0 or (low <= 1.0 and not from_below and high < math.inf)):  # as the row of the rate
+        apart = "crashes less" if high < 1.0 else "not told apart"
+        return f"< {most} ({apart})", f"estimate {ratio(seen)}, ≥ {ratio(low)}"
     if from_below and low > 1.0:
         return f"> {ratio(low)} (crashes more)", f"estimate {ratio(seen)}"
     apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"

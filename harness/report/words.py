@@ -23,6 +23,7 @@ from harness.report.notes import note_words
 from harness.report.rows import Row, end, held_back, rows_of, too_few, with_traffic
 from harness.sampling.milder import n_left_out
 from harness.strata import ASSUMPTION_FREE
+from harness.vehicles.kinematics import STEP_S
 
 CUT_OFF_SHARE = 0.2
 """Weight, relative to the rate, from which tests that were cut off are warned of, if the interval leaves them out."""
@@ -68,7 +69,7 @@ def answer_of(campaign: Campaign, manifest: Mapping[str, Any], content: Mapping[
 
 def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> ShortAnswer:
     """The answer by a campaign's own estimate, with what the ``manifest`` of the run says besides."""
-    vehicle, parameters = vehicle_words(campaign.av, script=bool(manifest.get("script")))
+    vehicle, parameters = vehicle_words(campaign.av, script=manifest.get("script"))
     engine = "SUMO" if campaign.world.engine == "sumo" else "SUMO’s twin"
     scenario = family_named(campaign.scenario).words.called
     return ShortAnswer(
@@ -85,8 +86,8 @@ def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimate
     )
 
 
-def vehicle_words(av: AutomatedVehicle, *, script: bool = False) -> tuple[str, list[tuple[str, str]]]:
-    """Who drives the vehicle, which may be a TraCI ``script``, and its parameters that are not defaults."""
+def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple[str, list[tuple[str, str]]]:
+    """Who drives the vehicle, and its parameters that are not defaults; a TraCI ``script`` is asked so often (s)."""
     given = dict[str, Any]()
     for section, key in ((av.parameters, ""), (av.reaction, "reaction")):
         if isinstance(section, BaseModel):
@@ -101,7 +102,8 @@ def vehicle_words(av: AutomatedVehicle, *, script: bool = False) -> tuple[str, l
         name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
     elif script:  # SUMO would know its vehicle's type
         style = av.traci_style
-        given["initial bounds"] = f"{plain(style.accel_mps2)} and −{plain(style.decel_mps2)} m/s²"
+        given |= {"accel": f"{plain(style.accel_mps2)} m/s²", "decel": f"{plain(style.decel_mps2)} m/s²"}
+        given |= {} if script in (True, STEP_S) else {"step": f"{plain(script)} s"}  # True: of an earlier version
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
     elif av.fmu is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -163,7 +163,7 @@ def compare_campaigns(
     if margin is not None:
         code = EXIT_OF[decision.verdict]
     ended = {
-        "decision": asdict(decision), "to_decide": _to_decide(a, rounds, pairs),
+        "decision": decision.to_json(), "to_decide": _to_decide(a, rounds, pairs),
         "ended": ended_by(a, rule, int(pairs.tests.sum())),
     }  # fmt: skip
     told = labels or (a.name, b.name), LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE
@@ -173,7 +173,7 @@ def compare_campaigns(
     for of in scenarios:
         own = PairRule(a, margin, rhw)
         own.observe(of.pairs)
-        each[of.name] = asdict(_decided(own, [of]))
+        each[of.name] = _decided(own, [of]).to_json()
         _written(of, {"decision": each[of.name], "to_decide": None, "ended": "sum"}, *told, code)
     return _sum_written(out, a, pairs, scenarios, ended, each, told[0], code)
 
@@ -194,12 +194,12 @@ def _written(
     """Write what is known of one scenario, and its page."""
     resolved = [each.run.resolved for each in of.runs]
     campaign, told = resolved[0].campaign, zip(SIDES, labels, resolved, strict=True)
-    content = {
+    content = finite_json({
         "format": 1, "method": campaign.testing.method, "seed": campaign.seed, "scenario": campaign.scenario,
         "campaigns": {side: {"label": label, "campaign_hash": own.content_hash} for side, label, own in told},
         **paired_estimate(of.pairs, campaign.stop.confidence), **ended, "asked": asked,
         "unseen": resolved[0].parameters.unseen,
-    }  # fmt: skip
+    })  # fmt: skip
     for side, each in zip(SIDES, of.results, strict=True):
         content[side] |= doubts_of(each.shown.campaign, each.estimates, each.shown.manifest)
     write_sealed(of.folder / COMPARISON, content)

@@ -7,6 +7,7 @@ loses no more than that. What the manifest lists is there, and nothing else coun
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 import zlib
@@ -51,6 +52,7 @@ from harness.sampling.protocol import ShardRequest, Source
 
 SMALLEST_FAILED_SAMPLE = 200
 """Episodes before the share of failures can end a campaign."""
+SHARE = "run.max_failed_share"
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
 _INTERVAL_S, _SHARE = 5.0, 0.05
 """Time between two writes, and the share of the time that they may take."""
@@ -274,10 +276,11 @@ def require_few_failed(
     """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
     if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in by_kind(causes).most_common(1))
-        mend = "Fix the AV (`harness av-check` looks at it in seconds), or raise the share to go on."
+        enough = min(math.ceil(1e3 * causes.total() / n) / 1e3, 1.0)
+        mend = f"Fix the AV (`harness av-check` looks at it in seconds), or go on with --set {SHARE}={enough:g}."
         found, expected = f"{causes.total()} of {n} {what} failed{cause}", f"a share of at most {most:g}"
         mend += f" All causes are in the column 'failure' of {where}."
-        raise TooManyFailedError("run.max_failed_share", found, expected, mend)
+        raise TooManyFailedError(SHARE, found, expected, mend)
 
 
 def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dict[str, Any]:
@@ -290,8 +293,9 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
     def refusal(found: str, expected: str, mend: str) -> RunFolderError:
         return RunFolderError(str(folder), found, expected, mend)
 
+    nothing: dict[str, Any] = {"n_episodes": 0, "parts": [], "before": {}}
     if not any(folder.iterdir()):
-        return {"n_episodes": 0, "parts": [], "before": {}}
+        return nothing
     elsewhere = "Choose another folder with --out."
     if not (folder / MANIFEST).exists():
         expected = "a new or empty folder, or one that a run has left"
@@ -301,6 +305,8 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         found = f"another campaign ({manifest.get('name')}, {manifest['campaign_hash']})"
         mend = "Choose another folder with --out, or run the campaign.yaml that it holds."
         raise refusal(found, f"a folder for this one ({resolved.content_hash})", mend)
+    if not (manifest["n_episodes"] or manifest["before"]):  # it was interrupted before anything was finished
+        return nothing
     if not resume:
         mend = "Continue it with --resume, or choose another folder with --out."
         raise refusal("this campaign, already begun", "a new or empty folder", mend)

@@ -145,12 +145,13 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     from harness.report.page import write_hours  # noqa: PLC0415 - draws
     from harness.report.words import vehicle_words  # noqa: PLC0415
 
+    vehicle, parameters = vehicle_words(campaign.av, script=next(iter(ready.values())).script)
     asked = {
         "format": 1, "name": campaign.name, "campaign_crc32": zlib.crc32(yaml),
         "seed": campaign.seed, "engine": campaign.world.engine,
         "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
         "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
-        "vehicle": vehicle_words(campaign.av)[0], "wall_time_s": round(time.monotonic() - began, 3),
+        "vehicle": vehicle, "parameters": parameters, "wall_time_s": round(time.monotonic() - began, 3),
     }  # fmt: skip
     content = finite_json({**asked, **answer})
     write_sealed(out / FAMILIES, content)
@@ -209,11 +210,13 @@ def hour_answer(
     follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
     speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
     found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
-    for name, (estimates, manifest) in told.items():
-        of = found["families"][name]
-        per_test = of["exposure"]["per_hour"] / of["p_event"]
+    for part, (name, (estimates, manifest)) in zip(hour.families, told.items(), strict=True):
+        of, p = found["families"][name], part.seen.design.p
         of["median_impact_mps"] = (estimates["severity"] or {}).get("median_mps")
-        of |= doubts_of(ready[name].campaign, estimates, manifest, per_test)
+        of |= doubts_of(ready[name].campaign, estimates, manifest, part.per_hour)
+        if (left := of["assumed"]) and left["times"]:  # per event, of which there are more per test in other traffic
+            moved = (p @ np.array(manifest["assumed"]["times"]).T / p.sum()).tolist()
+            of["assumed"] = {**left, "times": [a / b for a, b in zip(left["times"], moved, strict=True)]}
     return found
 
 

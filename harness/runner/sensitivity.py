@@ -18,15 +18,16 @@ from typing import Any, Literal
 import numpy as np
 
 from harness.arguments import checked
-from harness.errors import CampaignError
+from harness.errors import CampaignError, RunFolderError
 from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.families.protocol import Parameters
 from harness.progress import Progress
-from harness.records.folder import SENSITIVITY, require_place, write_sealed
+from harness.records.folder import MANIFEST, SENSITIVITY, require_place, write_sealed
 from harness.records.replicates import read_replicates
 from harness.runner.stored_shells import Nearby, StoredShells, require_shares
 from harness.strata import ShellDesign
+from harness.vocabulary import FAMILIES
 
 N_REPLICATES = 50
 CONFIDENCE, QUANTILE = 0.9, 1.645
@@ -62,6 +63,10 @@ def sensitivity(
     """
     folder, progress = Path(folder), progress or Progress()
     require_place(folder)
+    if (folder / FAMILIES).is_file():
+        each = ", ".join(f"`{_OPTION} {path.parent}`" for path in sorted(folder.glob(f"*/{MANIFEST}")))
+        mend = f"Ask each scenario: {each}; or other exposures of the sum: `harness estimate {folder} --exposure …`."
+        raise RunFolderError(str(folder), "a run of several scenarios", "the run folder of one", mend)
     tested = StoredShells.of(folder, progress, _OPTION)
     require_shares(tested)
     settings = tested.here.campaign.environment

@@ -12,7 +12,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.cli import main
-from harness.controllers.find import runs_script
+from harness.controllers.find import script_step_s
 from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
 from harness.resolved import resolve
@@ -148,6 +148,7 @@ def test_what_a_script_does_wrong_in_any_test_is_said_before_the_first(reason, t
     with pytest.raises(CampaignError) as caught:
         drive("av={controller: my.py}", "av.limits.construction_time_s=0.2")
     assert re.search(reason, caught.value.found if reason.endswith("$") else str(caught.value))
+    assert "traci_style.ego" not in caught.value.mend or "step-length" not in reason
 
 
 HELD = "av.traci_style.ego=ego"
@@ -161,7 +162,7 @@ IN_A_TEST = {
     r"step: RefusedError: traci.vehicle.changeLane is refused: the AV stays.*\(my.py:8\)": text(
         "if leader:\n        try: traci.vehicle.changeLane('ego', 1, 5.0)\n        except traci.TraCIException: pass"
     ),
-    r"step: asked for -\d+\.?\d* m/s2, outside of av.limits ": text(
+    r"step: asked for -\d+\.?\d* m/s2, outside of av.limits \(-15 to 10\) \(my.py:7\)": text(
         "if leader: traci.vehicle.setSpeedMode('ego', 0), traci.vehicle.setSpeed('ego', 0.0)"
     ),
 }
@@ -228,17 +229,17 @@ def test_one_that_names_none_is_told_so_once(tmp_path, capsys):
     for name, script in scripts.items():
         (folder / name).write_text(script, "utf-8")
         for _ in range(2):
-            assert runs_script(load_campaign(str(folder / name)).av)
+            assert script_step_s(load_campaign(str(folder / name)).av) == (0.2 if name == "cfg.py" else 0.1)
     (note,) = capsys.readouterr().err.splitlines()
     assert note.startswith("note: none.py names no --step-length")
 
 
 def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_path):
     file, asked = tmp_path / "my.py", ["world.engine=twin", *FORCED, "stop.episodes=40"]
-    file.write_text(text("", PER_SECOND.format(option='"--step-length=0.1"', step_s=0.1)), "utf-8")
+    file.write_text(text("", PER_SECOND.format(option='"--step-length=0.2"', step_s=0.2)), "utf-8")
     run_here(load_campaign(f"{file}", asked), tmp_path / "run")
     told = answer_in(tmp_path / "run")
-    assert [name for name, _ in told["parameters"]] == ["initial bounds"]
+    assert told["parameters"] == [["accel", "2.6 m/s²"], ["decel", "4.5 m/s²"], ["step", "0.2 s"]]
     assert "getLateralLanePosition shows it" in "".join(told["warnings"])
     file.write_bytes(b"\xff")
     assert answer_in(tmp_path / "run") == told

@@ -72,6 +72,8 @@ def test_the_pool_knows_the_rate_and_a_run_of_shells_finds_it(engine, tmp_path):
     assert found["shells"]["crash_rate"] == pytest.approx(RATE, rel=0.1)
     crashed = run.episodes().query("outcome == 'crash'")
     assert set(crashed["gap_m"]) == {8.0}
+    page = harness.write_report(tmp_path / "run").read_text()
+    assert ("<caption>The hardest impacts, the most typical" in page, "r157-cc</code> avoids" in page) == (True, False)
     again = harness.replay(tmp_path / "run", int(crashed["episode"].iloc[0]))
     assert again.row["outcome"] == "crash"
 

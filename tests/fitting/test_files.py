@@ -43,7 +43,9 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
     assert all(each.se > abs(each.value) for each in numbers)
     assert len(grey) < len(re.findall(r'<tr><th scope="row"><code>', page))
     assert main(["fit", "rows.parquet", "--out", "again/a #1: b.yaml", "--replicates", "5", "--quiet"]) == 0
-    assert "! only 5 replicates (a 90 % interval needs at least 20)" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "! only 5 replicates (a 90 % interval needs at least 20)" in out
+    assert out.endswith("next: harness run my_av.py:MyAV --set 'environment.parameters=again/a #1: b.yaml'\n")
     again = list((tmp_path / "again").iterdir())
     assert len(again) >= 3
     for file in again:

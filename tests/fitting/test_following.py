@@ -1,6 +1,8 @@
 """Brakings and cut-outs counted in trajectories of known laws, and what is no event."""
 
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -12,7 +14,8 @@ from harness.estimators.limits import garwood
 from harness.families import family_named
 from harness.families.cut_out.fitting import CutOutFitter, time_law
 from harness.families.following.fitting import TAIL, Seen
-from harness.families.lead_brakes.fitting import MOST_NOISE_MPS2, BrakingFitter, tail_scale
+from harness.families.lead_brakes.fitting import EVENT, MOST_NOISE_MPS2, BrakingFitter, tail_scale
+from harness.families.words import EXCLUDED
 from harness.fitting.tracks import noise_of
 from tests.fitting.following import LANE_M, RATE_HZ, braked, braking, leaving, led, positions, recording, table
 from tests.fitting.trajectories import overtaking
@@ -145,6 +148,22 @@ def test_a_cut_out_that_reveals_nobody_slower_is_none():
         assert CutOutFitter().seen(recording(rows)).events.size == events
     alone = pd.concat([table(1, positions(v, 50.0), v, lane, lateral), other, ahead])
     assert not CutOutFitter().seen(recording(alone)).events.size  # nobody follows
+
+
+@pytest.mark.parametrize(("hours", "excluded"), [(200.0, True), (5.0, False)])
+def test_that_data_exclude_an_exposure_that_is_kept_stands_in_the_file(hours, excluded, tmp_path, monkeypatch):
+    """Of no braking in so many hours; the answer of a campaign says it again."""
+    monkeypatch.chdir(tmp_path)
+    fitter, family = BrakingFitter(), family_named("lead_brakes")
+    fitter._seen = [Seen(hours, np.empty(0, EVENT))]
+    found = fitter.fitted(SimpleNamespace(out=Path("mine.yaml"), provenance=list), {})
+    assert ("which these data exclude" in found.told[0]) == excluded
+    ((file, content),) = found.files.items()
+    file.write_bytes(content)
+    parameters = family.parameters(EnvironmentSettings(parameters=f"./{file}"))
+    exposure = family.exposure(family.traffic(EnvironmentSettings(), parameters), parameters)
+    assert (exposure.per_hour, exposure.counted) == (pytest.approx(0.1), None)
+    assert (f"; {EXCLUDED}: 0 in 200 h" in exposure.source) == excluded
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Episodes for other tools: what they hold is the trace, and a checker of the format has no complaint."""
 
 import csv
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -161,12 +162,16 @@ def test_without_its_extra_or_a_screen_the_gui_is_refused_in_words(stored_run, m
             CampaignError, match=r"found no sumo-gui; .* the extra .* -c requirements.lock -e '\.\[sumo\]'"
         ):
             gui_program()
+        folder = str(stored_run("shells-twin"))
+        assert main(["replay", folder, "3", "--sumo", str(tmp_path / "sumo")]) == 0
+        told = r"note: no sumo on this machine to run it \(extra 'sumo'\)\. .* -e '\.\[sumo\]'"
+        assert re.search(told, capsys.readouterr().err)
         own = tmp_path / "sumo-gui"
         own.write_text("#!/bin/sh\nexit 3\n")
         own.chmod(0o755)
         patch.setenv("DISPLAY", ":none")
         assert gui_program() == own
-        assert main(["replay", str(stored_run("shells-twin")), "3", "--gui"]) == 2
+        assert main(["replay", folder, "3", "--gui"]) == 2
         assert "a sumo-gui that ends with 3" in capsys.readouterr().err
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)

@@ -14,6 +14,7 @@ import pytest
 from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.pairs import PairDecision
+from harness.numbers import ratio
 from harness.report.pair_words import deciding_words, pair_warnings, pair_words
 from harness.runner.compare import _decided, compare_campaigns
 from harness.runner.tables import read
@@ -143,7 +144,10 @@ def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_c
     a, b = reversed(campaigns) if swapped else campaigns
     found = compare_campaigns(a, b, tmp_path, workers=1, margin=0.1)
     assert (found.content["decision"]["verdict"], found.exit_code) == (verdict, exit_code)
-    assert "10 %" in pair_words(found.content["decision"])
+    low, high = found.content["decision"]["ratio"]
+    end = f"≥ {ratio(low)}" if swapped else f"≤ {ratio(high)}"
+    assert pair_words(found.content["decision"]).endswith(f"10 % worse than A (B / A {end})")
+    assert low > 1.1 if swapped else high <= 1.1
     assert manifest(tmp_path / "a")["unmet"] == [{"key": "margin", "numbers": {"margin": 0.1}}]
 
 

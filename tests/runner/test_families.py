@@ -14,6 +14,7 @@ from harness.campaign.sections import EXPOSURES
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.stopping import Decision
+from harness.families.words import EXCLUDED
 from harness.numbers import number, plain
 from harness.pool import moved
 from harness.printed import PRINTED
@@ -207,6 +208,23 @@ def test_where_few_tests_reject_only_the_lower_ends_are_told(run, rhw, low, show
     told = "\n".join(hour_lines({**content, "beside": beside | {"ratio_low": 2.5, "ratio_high": 900.0}}))
     ratio = "> 2.50 (crashes more)" in told
     assert ("crashes so far      > 1.00 × 10⁻³ per hour" in told, ratio, "to 900" in told) == (shown, shown, not shown)
+
+
+def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
+    """As in the answer of that scenario alone, but at as many events: there are 1.31 times as many per test, too."""
+    content = run.content
+    told = " ".join(" ".join(hour_lines(content)).split())
+    said = "cut-in 0.048 (crashes × 19 if 25 %, not 1 %, do not look behind); assumed: lead brakes 0.1"
+    assert told.count(said) == 1
+    assert "25 %, not 1 %, do not look behind" in repr(run.runs["cut_in"])
+    assert (run.folder / "report.html").read_text().count("× 19 if 25 %, not 1 %") == 1
+    brakes = content["families"]["lead_brakes"]
+    kept = {**brakes, "exposure": {**brakes["exposure"], "source": f"assumed; {EXCLUDED}: 0 in 200 h of following"}}
+    fitted = " ".join(hour_lines({**content, "families": {**content["families"], "lead_brakes": kept}}))
+    assert f"lead brakes 0.1 ({EXCLUDED})" in " ".join(fitted.split())
+    verdict = Decision(1.0, "assumption_free", 0.95, 2.5, 40.0, driver="r157-cc").to_json()
+    report = run.folder / "report.html"
+    assert (len(hour_lines(content, report)), len(hour_lines({**content, "decision": verdict}, report))) == (10, 11)
 
 
 @pytest.mark.parametrize(("times", "warned"), [([0.2, 4.0], True), ([0.99, 1.01], False), (None, False)])

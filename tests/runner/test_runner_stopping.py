@@ -52,6 +52,24 @@ def test_a_run_resumed_to_a_smaller_rhw_extends_the_same_records(runs, run_here,
     assert unlike_columns(runs / "tight", out) == []
 
 
+class Interrupted(Progress):
+    """As soon as a test would be driven."""
+
+    def stage(self, name, _total, **_done):
+        if name == "tests":
+            raise KeyboardInterrupt
+
+
+def test_what_was_interrupted_before_any_test_begins_anew(run_here, campaign, tmp_path):
+    asked = campaign(*COMMON, "stop.rhw=null", "stop.episodes=50")
+    with pytest.raises(KeyboardInterrupt):
+        run_here(asked, tmp_path / "run", progress=Interrupted())
+    assert manifest(tmp_path / "run")["n_episodes"] == 0
+    run_here(asked, tmp_path / "run")
+    with pytest.raises(RunFolderError, match="already begun"):
+        run_here(asked, tmp_path / "run")
+
+
 def files(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 

@@ -98,10 +98,10 @@ class EnvironmentParameters(ParameterFile):
         share, steps = self.cut_in.ignore_share, self.acceptance_steps
         if share is not None and share.range is not None:
             low, high = share.range
-            return LeftOpen("", high, ({NOT_LOOKING: low}, {NOT_LOOKING: high}))
+            return LeftOpen("", ({NOT_LOOKING: low}, {NOT_LOOKING: high}), share.value, high)
         if steps is not None and steps.without_events:
             least = {f"{STEP}{step}": SMALLEST_SHARE for step in steps.without_events}
-            return LeftOpen(self.unseen, None, (least, steps.as_if_unseen({})))
+            return LeftOpen(self.unseen, (least, steps.as_if_unseen({})))
         return None
 
     def values(self) -> dict[str, float]:

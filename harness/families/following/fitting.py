@@ -18,6 +18,7 @@ import numpy as np
 from harness.campaign.sections import EnvironmentSettings
 from harness.estimators.limits import garwood
 from harness.families.following.family import FollowingFamily
+from harness.families.words import EXCLUDED
 from harness.fitting.files import OF_YAML, environment_text
 from harness.fitting.protocol import Asked, Fitted
 from harness.fitting.recording import Recording
@@ -102,7 +103,7 @@ class FollowingFitter:
             content |= law
             of = [(name, each) for own in law.values() for name, each in own.items()]
             told += "; " + ", ".join(f"{name} {number(each['value'])} ± {number(each['se'], 2)}" for name, each in of)
-        elif content:
+        elif events.size >= FEWEST_COUNTED:
             told += f"; a law takes {FEWEST_OF_LAW}: kept is that of {base}"
         silent, n = [each.why for each in self._seen if each.why], len(self._seen)
         more = [f"! {self.family.name}: {len(silent)} of {n} recordings are not counted: {silent[0]}"] if silent else []
@@ -124,6 +125,9 @@ class FollowingFitter:
             counted = {"exposure": {"per_hour": rate, "events": n, "hours": round(hours, 6)}}
             return counted, f"{told}, {number(n / hours)} per hour ({limits})"
         needed = f", some {number(hours * FEWEST_COUNTED / n, 2)} h" if n else ""
-        excluded = "" if low <= kept.value <= high else ", which these data exclude"
+        outside = not low <= kept.value <= high
+        seen = {"note": f"{kept.note or kept.source}; {EXCLUDED}: {n} in {hours:.4g} h of following"}
+        content: Numbers = {"exposure": {"per_hour": kept.model_dump(exclude_none=True) | seen}} if outside else {}
+        excluded = ", which these data exclude" if outside else ""
         told += f" ({limits} per hour); at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)}"
-        return {}, f"{told} per hour [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
+        return content, f"{told} per hour [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
