@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -121,7 +122,9 @@ class EpisodeLoop:
         kernel, given, ended = self._kernel_state(shard), 0, 0
         traffic.begin(self._world.n_cells)
         try:
-            while True:
+            for turn in count(1):
+                if self._av is not None and turn % self._scenario.max_steps == 0:
+                    self._av.require_untouched()  # a test may not end any more
                 placed = refill(kernel, given)
                 traffic.move(kernel, placed)
                 if self._av is not None:
@@ -133,6 +136,7 @@ class EpisodeLoop:
                     return shard
                 ended += self._step_and_judge(kernel, shard, placed)
                 given += placed
+            raise AssertionError  # for mypy: it counts on
         finally:
             if self._av is not None:
                 self._av.require_untouched()

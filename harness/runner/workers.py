@@ -40,7 +40,7 @@ ATTEMPTS = 3
 SURELY_TOO_MANY = 1e-4
 """Probability of so many deaths under the allowed share, below which a controller is refused: with the default share
 its third at the earliest, its seventh if it dies in all of 96 cells, some ten seconds into the run."""
-SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, None)
+SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGSTOP, None)
 """Ends that an operator or a shortage of memory brings: a controller is blamed only when its test is hit again."""
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""

@@ -95,6 +95,7 @@ FAULTS = {
     "ends_the_process": lambda: os._exit(7),
     "crashes": lambda: os.kill(os.getpid(), signal.SIGSEGV),
     "is_killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
+    "stops": lambda: os.kill(os.getpid(), signal.SIGSTOP),
 }
 
 
@@ -193,7 +194,7 @@ class Global(IDM):
 
 
 class Replaces(IDM):
-    """Puts nothing in the place of another module, or of a function in it."""
+    """Puts nothing in the place of another module, or of a function in it; of the judge one that ends no test."""
 
     def __init__(self, what, at):
         super().__init__()
@@ -202,7 +203,7 @@ class Replaces(IDM):
 
     def replace(self, at):
         if at == self.at and self.module:
-            setattr(sys.modules[self.module], self.name, None)
+            setattr(sys.modules[self.module], self.name, (lambda *_: 0) if self.name == "judge" else None)
         elif at == self.at:
             sys.modules[self.name] = None
 

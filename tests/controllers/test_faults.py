@@ -110,6 +110,7 @@ OF_THE_PROCESS = {
     "closes_descriptors": f"start: {CLOSED}",
     "crashes": "start: the controller ended the worker process (exit code -11)",
     "is_killed": "start: the controller ended the worker process (exit code -9)",
+    "stops": "start: the controller stopped its process (SIGSTOP)",
     "hangs_for_good": f"start: {LATE}, and the call could not be interrupted",
 }
 
@@ -215,6 +216,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "numpy",
         "harness",
         "harness.controllers.hosts.Guard",
+        "harness.loop.loop.judge",
         "sys.excepthook",
         "sys.meta_path",
     ],
