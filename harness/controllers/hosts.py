@@ -356,6 +356,8 @@ class BatchHost(Host):
         failures = {k: f"start: {cause}" for k, cause in zip(cells.tolist(), causes, strict=True) if cause is not None}
         sound = np.array([cause is None for cause in causes])
         cells, announced = cells[sound], announced[sound]
+        if not cells.size:
+            return failures
         random = [controller_random(self.seed, index) for index in announced.tolist()]
         with self.guard:
             begin = optional("start_batch", read_only(cells), read_only(announced), random)

@@ -249,7 +249,7 @@ class Workers:
         """Say whose doing the death of a worker was: a test's that is run no more, or nobody's knows."""
         exit_code, episode = death
         again = episode is not None and episode == job.suspected
-        if episode is not None and (again or exit_code not in SENT_FROM_OUTSIDE):
+        if episode is not None and episode not in job.fatal and (again or exit_code not in SENT_FROM_OUTSIDE):
             job.fatal[episode] = death_cause(exit_code, self._campaign.av.limits)
             job.n_deaths = 0
             self._require_few_deaths(job)

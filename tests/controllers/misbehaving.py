@@ -163,6 +163,17 @@ class OnlyStepBatch:
         return [idm_acceleration(*map(float, row)) for row in columns]
 
 
+class EndsAtTheStart(OnlyStepBatch):
+    def start_batch(self, cells, episodes, random):
+        os._exit(7)
+
+
+class ClosesSumo(IDM):
+    def step(self, seen):
+        __import__("libsumo").close()
+        return super().step(seen)
+
+
 def says_nothing():
     Path("called").touch()
 
