@@ -147,23 +147,29 @@ class Child:
         self._process.join(seconds)
         self.kill()
 
+    def is_stopped(self) -> bool:
+        """Whether it has been told to do nothing until it is continued, which nobody will."""
+        with suppress(OSError):
+            return _stat(self._process.pid)[0] == "T"
+        return False
+
     def _died(self) -> int | None:
-        """Exit code of one that has ended its pipe; if it lives on without it, it is ended."""
+        """Exit code of one that has ended its pipe; if it lives on without it, or is stopped, it is ended."""
         self._process.join(_DYING_S)
-        lives = self._process.is_alive()
+        lives, stopped = self._process.is_alive(), self.is_stopped()
         exit_code = self.kill()
-        return CLOSED_PIPE_EXIT_CODE if lives else exit_code
+        return -signal.SIGSTOP if stopped else CLOSED_PIPE_EXIT_CODE if lives else exit_code
 
 
 _Child = TypeVar("_Child", bound=Child)
 
 
 def first_to_answer(children: Sequence[_Child]) -> _Child:
-    """Wait for one that has an answer, or has died."""
+    """Wait for one that has an answer, has died, or was stopped."""
     while True:
-        ready = wait([handle for child in children for handle in child.handles])
+        ready = wait([handle for child in children for handle in child.handles], _LOOK_S)
         for child in children:
-            if not set(child.handles).isdisjoint(ready) and child.hears():
+            if (not set(child.handles).isdisjoint(ready) or (not ready and child.is_stopped())) and child.hears():
                 return child
 
 
@@ -208,14 +214,14 @@ def _server() -> Iterator[None]:
     main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     before, tempfile.tempdir = tempfile.tempdir, short
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # it would end with a traceback
-    safe_path = os.environ.get(SAFE_PATH)
+    kept = {name: os.environ.pop(name) for name in (SAFE_PATH, "PYTHONHASHSEED") if name in os.environ}
     os.environ[SAFE_PATH] = "1"  # a json.py of the current folder is not what the server imports
     try:
         yield
     finally:
         sys.modules["__main__"], tempfile.tempdir = main, before
         os.environ.pop(SAFE_PATH)
-        os.environ |= {} if safe_path is None else {SAFE_PATH: safe_path}
+        os.environ |= kept
         signal.pthread_sigmask(signal.SIG_SETMASK, masked)
 
 
@@ -276,10 +282,15 @@ def _end_started_by(leader: int | None) -> None:
     found = {leader}
     for pid in sorted(int(each.name) for each in Path("/proc").glob("[0-9]*")):  # parents first
         with suppress(OSError):
-            fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+            fields = _stat(pid)
             if found & {int(fields[1]), int(fields[3])} and pid != leader:
                 found.add(pid)
                 os.kill(pid, signal.SIGKILL)
+
+
+def _stat(pid: int | None) -> list[str]:
+    """Of a process: its state, its parent, its group, its session and more."""
+    return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
 
 
 def end(process: subprocess.Popen[bytes]) -> int:

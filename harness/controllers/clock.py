@@ -2,13 +2,15 @@
 
 A test must not depend on when it runs, or on how fast. A vehicle that asks a clock does, yet does the same again if
 that is a moment later: a controller that computes nothing within 10 ms of its last answer keeps its first answer in
-every test. So tests are repeated by a clock that is an hour later at every call. Modules may have kept Python's own
+every test. So tests are repeated by a clock that is a day later at every call. Modules may have kept Python's own
 functions (``from time import monotonic``): the clock is there before the vehicle's are imported, in a fresh process.
 """
 
 from __future__ import annotations
 
 import datetime
+import os
+import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,7 +22,8 @@ from typing import Any, Self, TypeAlias
 
 from harness.controllers.hosts import NOT_THE_USERS, Guard
 
-HOUR_S = 3600.0
+LATER_S = 90061.001001
+"""A day and one each of its parts, down to a microsecond: all that a time is shown by changes, also its parity."""
 HELD_S, LOOK_S = 1e9, 1e-6
 _TRUE_DATETIME: TypeAlias = datetime.datetime
 _READ = ("time", "monotonic", "perf_counter", "process_time", "thread_time")
@@ -30,7 +33,7 @@ _LOADS = ("create_module", "exec_module")
 
 
 class Clock:
-    """An hour later at every call of a controller; or ``held``, but for 1 µs at each look: two runs see the same.
+    """Later by `LATER_S` at every call of a controller; or ``held``, but for 1 µs at each look: two runs see the same.
 
     ``read_at`` says where the user's code has looked at it.
     """
@@ -40,13 +43,13 @@ class Clock:
         self.read_at: list[str] = []
 
     def function(self, name: str, read: Callable[[], float]) -> Callable[[], float]:
-        """What stands for ``time.name``, which is ``read``."""
+        """What stands for the function of this name, which is ``read``."""
 
         def now() -> float:
-            self._note(f"time.{name}")
+            self._note(name)
             if self._held:
                 return HELD_S + LOOK_S * self._n_looks
-            return read() + HOUR_S * (Guard.n_calls - self._n_calls)
+            return read() + LATER_S * (Guard.n_calls - self._n_calls)
 
         return now
 
@@ -67,7 +70,8 @@ class Clock:
         kept |= {(time, f"{name}_ns"): getattr(time, f"{name}_ns") for name in _READ}
         kept[datetime, "datetime"] = datetime.datetime
         kept |= {(ExtensionFileLoader, name): getattr(ExtensionFileLoader, name) for name in _LOADS}
-        now = {name: self.function(name, kept[time, name]) for name in _READ}
+        kept |= {(os, "times"): os.times, (resource, "getrusage"): resource.getrusage}
+        now = {name: self.function(f"time.{name}", kept[time, name]) for name in _READ}
         for name, function in now.items():
             setattr(time, name, function)
             setattr(time, f"{name}_ns", lambda function=function: round(1e9 * function()))
@@ -75,10 +79,15 @@ class Clock:
             show = kept[time, name]
             setattr(time, name, lambda secs=None, show=show: show(now["time"]() if secs is None else secs))
         gettime, strftime, asctime = kept[time, "clock_gettime"], kept[time, "strftime"], kept[time, "asctime"]
-        time.clock_gettime = lambda clock: self.function("clock_gettime", lambda: gettime(clock))()
+        time.clock_gettime = lambda clock: self.function("time.clock_gettime", lambda: gettime(clock))()
         time.clock_gettime_ns = lambda clock: round(1e9 * time.clock_gettime(clock))
         time.strftime = lambda form, shown=None: strftime(form, time.localtime() if shown is None else shown)
         time.asctime = lambda shown=None: asctime(time.localtime() if shown is None else shown)
+        times, usage = kept[os, "times"], kept[resource, "getrusage"]
+        os.times = lambda: os.times_result(self.function("os.times", each.__float__)() for each in times())
+        resource.getrusage = lambda who: resource.struct_rusage(
+            [*(self.function("resource.getrusage", each.__float__)() for each in usage(who)[:2]), *usage(who)[2:]]
+        )
         datetime.datetime = _datetime(now["time"])  # type: ignore[misc]
         for name in _LOADS:
             setattr(ExtensionFileLoader, name, _by_true_datetime(kept[ExtensionFileLoader, name]))

@@ -64,6 +64,8 @@ def death_cause(exit_code: int | None, limits: Limits) -> str:
         return f"{late}, and the call could not be interrupted"
     if exit_code == CLOSED_PIPE_EXIT_CODE:
         return "the controller closed file descriptors that are not its own (os.close, os.closerange)"
+    if exit_code == -signal.SIGSTOP:
+        return "the controller stopped its process (SIGSTOP)"
     return f"the controller ended the worker process (exit code {exit_code})"
 
 
@@ -359,6 +361,8 @@ class BatchHost(Host):
         failures = {k: f"start: {cause}" for k, cause in zip(cells.tolist(), causes, strict=True) if cause is not None}
         sound = np.array([cause is None for cause in causes])
         cells, announced = cells[sound], announced[sound]
+        if not cells.size:
+            return failures
         random = [controller_random(self.seed, index) for index in announced.tolist()]
         with self.guard:
             begin = optional("start_batch", read_only(cells), read_only(announced), random)

@@ -28,6 +28,8 @@ class Fingerprint(NamedTuple):
     motions: IntArray
     """Of 6 s in which a speed changes: length, speeds and ways to the next vehicle on the lane, in cells. All rows
     count, so it does not matter when the clock ticks."""
+    recurring: dict[str, float]
+    """Shares of both that another vehicle of the recording has, too: so many another recording has by chance."""
 
 
 def fingerprint(track: Recording) -> Fingerprint:
@@ -43,7 +45,17 @@ def fingerprint(track: Recording) -> Fingerprint:
     changes = np.ptp(np.rint(speeds), axis=0) > 0
     changes &= track.piece[:n] == track.piece[track.v.size - n :]
     motions = _hashes(*speeds, *ways, track.length[:n] / LENGTH_M)[changes]
-    return Fingerprint(track.place, np.unique(of_row[of_row % ONE_OF == 0]), np.unique(motions))
+    kept = of_row % ONE_OF == 0
+    rows, of_rows = _recurring(of_row[kept], track.piece[kept])
+    motions, of_motions = _recurring(motions, track.piece[:n][changes])
+    return Fingerprint(track.place, rows, motions, {"rows": of_rows, "motions": of_motions})
+
+
+def _recurring(hashes: IntArray, piece: IntArray) -> tuple[IntArray, float]:
+    """Each hash once, and the share of those of a piece that are in others, too."""
+    of_pieces = pd.DataFrame({"hash": hashes, "piece": piece}).drop_duplicates()["hash"]
+    marks, n = np.unique(of_pieces, return_counts=True)
+    return marks, float(n[n > 1].sum() / max(n.sum(), 1))
 
 
 def _hashes(*columns: np.ndarray) -> IntArray:
@@ -51,8 +63,8 @@ def _hashes(*columns: np.ndarray) -> IntArray:
     return pd.util.hash_pandas_object(pd.DataFrame(cells), index=False).to_numpy().astype(np.int64)
 
 
-# Largest shares that recordings may have in common by chance, and fewest hashes that can tell [assumed]. Of simulated
-# recordings that are all different 0.46 of the motions were, by laws without noise; of copies rounded to 0.1 0.6.
+# Largest shares that recordings may have in common beyond chance, and fewest hashes that can tell [assumed]. Of small
+# recordings of one law without noise 0.45 of the motions were; of copies rounded to 0.1 0.6.
 KINDS = (
     ("rows", "rows", "positions, speeds and lengths are the same", 0.1, 1),
     ("motions", "motion", "speeds, gaps and lengths are the same over 6 s, but for rounding", 0.5, 40),
@@ -70,7 +82,9 @@ def require_distinct(found: Sequence[Fingerprint]) -> None:
         again = np.flatnonzero(marks[1:] == marks[:-1])
         pairs, counts = np.unique(np.column_stack([of[again], of[again + 1]]), axis=0, return_counts=True)
         for (first, second), n in zip(pairs.tolist(), counts.tolist(), strict=True):
-            if (smaller := min(sizes[first], sizes[second])) >= fewest and n > most * smaller:
-                words = f"{n / smaller:.0%} of its {what} also in {found[first].place}: {why}"
+            smaller, larger = sorted((first, second), key=sizes.__getitem__)
+            chance = found[larger].recurring[kind]
+            if (size := sizes[smaller]) >= fewest and n / size > chance + most * (1.0 - chance):
+                words = f"{n / size:.0%} of its {what} also in {found[first].place}: {why}"
                 mend = "Leave one of them out: what comes twice would count twice."
                 raise TrajectoryError(found[second].place, words, "other vehicles, or other times", mend)

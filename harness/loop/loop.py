@@ -11,7 +11,7 @@ import numpy as np
 from harness.compiled import unboxed
 from harness.controllers.hosts import ControllerHost
 from harness.controllers.protocol import BatchObservation
-from harness.errors import WorldDisagreementError
+from harness.errors import CampaignError, WorldDisagreementError
 from harness.loop.cells import EPISODE_DTYPE, KernelState, PrescribedEvents, idle_cells
 from harness.loop.drive import Past, command, drive, empty_observation, first, hold_cruising, observe
 from harness.loop.judge import fail, judge
@@ -112,16 +112,19 @@ class EpisodeLoop:
         """Run tests ``first_episode … first_episode + n − 1`` of the campaign, in which the others do so.
 
         Raises `WorldDisagreementError`: the world did something else than it was told. Raises `CampaignError`: the
-        vehicle has replaced what the harness calls, whatever came of that.
+        vehicle has replaced what the harness calls, or changed the simulation, whatever came of that.
         """
         n = len(traffic)
         traced = hash_of_index(self._scenario.seed, first_episode + np.arange(n)) < self._keep.trace_share
         shard = Shard(first_episode, self._scenario, traffic, np.zeros(n, EPISODE_DTYPE), traced)
         self._cells.cell["row"] = -1
-        kernel, given, ended = self._kernel_state(shard), 0, 0
+        kernel, given, ended, turn = self._kernel_state(shard), 0, 0, 0
         traffic.begin(self._world.n_cells)
         try:
             while True:
+                turn += 1
+                if self._av is not None and turn % self._scenario.max_steps == 0:
+                    self._av.require_untouched()  # a test may not end any more
                 placed = refill(kernel, given)
                 traffic.move(kernel, placed)
                 if self._av is not None:
@@ -133,6 +136,12 @@ class EpisodeLoop:
                     return shard
                 ended += self._step_and_judge(kernel, shard, placed)
                 given += placed
+        except Exception as error:
+            if self._av is None or type(error).__module__ != "libsumo.libsumo":
+                raise
+            found = f"a vehicle that has changed the simulation that it is tested in ({error})"
+            mend = "Use the traci that is handed in (docs/controllers.md), not the module."
+            raise CampaignError("av.controller", found, "libsumo left as it is", mend) from error
         finally:
             if self._av is not None:
                 self._av.require_untouched()

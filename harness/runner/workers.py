@@ -40,7 +40,7 @@ ATTEMPTS = 3
 SURELY_TOO_MANY = 1e-4
 """Probability of so many deaths under the allowed share, below which a controller is refused: with the default share
 its third at the earliest, its seventh if it dies in all of 96 cells, some ten seconds into the run."""
-SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, None)
+SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGSTOP, None)
 """Ends that an operator or a shortage of memory brings: a controller is blamed only when its test is hit again."""
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
@@ -244,7 +244,7 @@ class Workers:
         """Say whose doing the death of a worker was: a test's that is run no more, or nobody's knows."""
         exit_code, episode = death
         again = episode is not None and episode == job.suspected
-        if episode is not None and (again or exit_code not in SENT_FROM_OUTSIDE):
+        if episode is not None and episode not in job.fatal and (again or exit_code not in SENT_FROM_OUTSIDE):
             job.fatal[episode] = death_cause(exit_code, self._campaign.av.limits)
             job.n_deaths = 0
             self._require_few_deaths(job)

@@ -111,6 +111,7 @@ OF_THE_PROCESS = {
     "closes_descriptors": f"start: {CLOSED}",
     "crashes": "start: the controller ended the worker process (exit code -11)",
     "is_killed": "start: the controller ended the worker process (exit code -9)",
+    "stops": "start: the controller stopped its process (SIGSTOP)",
     "hangs_for_good": f"start: {LATE}, and the call could not be interrupted",
 }
 
@@ -216,6 +217,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "numpy",
         "harness",
         "harness.controllers.hosts.Guard",
+        "harness.loop.loop.judge",
         "sys.excepthook",
         "sys.meta_path",
     ],
@@ -226,6 +228,12 @@ def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, c
     assert err.startswith("error: av.controller\n")
     assert f"a vehicle that has replaced {what}, which the harness calls, too" in err
     assert (tmp_path / "run").exists() == (at == "step")
+
+
+@pytest.mark.slow
+def test_one_that_ends_the_simulation_that_it_is_tested_in_is_named(tmp_path, capsys):
+    assert _run(tmp_path, _of("ClosesSumo"), "world.engine=sumo") == EXIT_BAD_INPUT
+    assert "a vehicle that has changed the simulation that it is tested in" in capsys.readouterr().err
 
 
 def test_what_the_process_itself_is_told_is_as_it_was():
@@ -293,10 +301,11 @@ def test_a_batch_controllers_fault_is_laid_at_one_cell_or_else_fails_all_that_we
     assert all(f"step_batch: returned {words}" in cause for cause in failed.values())
 
 
-def test_one_that_always_ends_its_process_is_named_after_a_few_workers(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("av", quick(1, [_of("Always", where="step"), _of("EndsAtTheStart")]), ids=["step", "batch"])
+def test_one_that_always_ends_its_process_is_named_after_a_few_workers(av, tmp_path, capsys, monkeypatch):
     started, start = [], LocalWorkers.new_worker
     monkeypatch.setattr(LocalWorkers, "new_worker", lambda self: (started.append(self), start(self))[1])
-    assert _run(tmp_path, _of("Always", where="step"), "run.max_failed_share=0.01") == EXIT_TOO_MANY_FAILED
+    assert _run(tmp_path, av, "run.max_failed_share=0.01") == EXIT_TOO_MANY_FAILED
     err = capsys.readouterr().err
     assert "ended the worker process" in err
     assert 2 <= len(started) <= 7

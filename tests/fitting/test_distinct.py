@@ -69,6 +69,31 @@ def test_drivers_of_one_speed_and_headway_are_no_copies():
     require_distinct([each._replace(rows=each.rows[:0]) for each in found])
 
 
+def free_traffic(seed: int) -> pd.DataFrame:
+    """A thousand vehicles through one site of 420 m, nobody near ahead, of one length, rounded to 0.1."""
+    rng, rows = np.random.default_rng(seed), []
+    for k in range(1000):
+        speed, swing, per_s, phase = rng.normal(30.0, 3.0), *rng.uniform((0.0, 0.02, 0.0), (1.0, 0.1, 6.3))
+        time_s = np.arange(0.0, 440.0 / speed, 0.1)
+        speed_mps = speed + swing * np.sin(2.0 * np.pi * per_s * time_s + phase)
+        s_m = np.cumsum(0.1 * speed_mps) + rng.uniform(0.0, 3.0)
+        own = {"recording_id": seed, "vehicle_id": k, "lane": k % 20, "lateral_m": 3.75 * (k % 20), "length_m": 4.5}
+        moves = {"time_s": time_s + k, "s_m": s_m.round(1), "speed_mps": speed_mps.round(1)}
+        rows.append(pd.DataFrame({**moves, **own}))
+    return pd.concat(rows)
+
+
+def test_what_any_traffic_of_a_site_has_in_common_is_no_copy():
+    """A quarter of the rounded rows are by chance those of others, also within one recording; a copy has them all."""
+    one, other = (fingerprint(recording(free_traffic(seed))) for seed in (1, 2))
+    assert np.isin(other.rows, one.rows).mean() > 0.2
+    assert np.isin(other.motions, one.motions).mean() > 0.5
+    require_distinct([one, other])
+    for again in (one._replace(rows=one.rows[:0]), one._replace(motions=one.motions[:0])):
+        with pytest.raises(TrajectoryError, match="100% of its"):
+            require_distinct([one, again])
+
+
 def test_a_recording_too_short_to_tell_is_none():
     rows = ROWS[ROWS.time_s < 3.0].query("recording_id == 0")
     assert fingerprint(recording(rows)).motions.size == 0

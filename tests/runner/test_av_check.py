@@ -6,6 +6,9 @@ import datetime
 import math
 import os
 import re
+import resource
+import subprocess
+import sys
 import time
 
 import pytest
@@ -17,7 +20,7 @@ from harness.records.folder import read_manifest
 from harness.report.av_check import cause, rows, verdict
 from harness.runner.look import check_av
 from harness.runner.stored import changed_since, replay_episode
-from tests.stored_runs import answer_in, copy_of, edit
+from tests.stored_runs import answer_in, copy_of, edit, sets
 from tests.worlds.running import ROOT
 
 MIXTURE_FILE, FORCED = (str(ROOT / f"scenarios/overtaking_{name}.yaml") for name in ("mixture", "forced"))
@@ -102,6 +105,16 @@ class KeepsItByClockGettime(KeepsItsAnswer):
         return time.clock_gettime_ns(time.CLOCK_MONOTONIC) / 1e9
 
 
+class KeepsItByTheMinute(KeepsItsAnswer):
+    def now(self):
+        return datetime.datetime.now().minute / 60.0
+
+
+class KeepsItByItsOwnTime(KeepsItsAnswer):
+    def now(self):
+        return os.times().user + resource.getrusage(resource.RUSAGE_SELF).ru_utime
+
+
 class LooksAtTheClock(Steady):
     """It does nothing with it, but for a library whose compiled modules know how a datetime lies in memory."""
 
@@ -175,6 +188,8 @@ def test_the_built_in_idm_is_fine():
         pytest.param("KeepsItsAnswer", "on the clock (time.monotonic, test_av_check.py:", marks=pytest.mark.slow),
         pytest.param("KeepsItForAnHour", "on the clock (time.time, test_av_check.py:", marks=pytest.mark.slow),
         pytest.param("KeepsItByClockGettime", "on the clock (time.clock_gettime, test_a", marks=pytest.mark.slow),
+        pytest.param("KeepsItByTheMinute", "on the clock (time.time, test_av_check.py:", marks=pytest.mark.slow),
+        pytest.param("KeepsItByItsOwnTime", "on the clock (os.times, test_av_check.py:", marks=pytest.mark.slow),
         pytest.param("OfItsProcess", "It differs from process to process: ", marks=pytest.mark.slow),
         pytest.param("HashesAText", "It differs from process to process: ", marks=pytest.mark.slow),
     ],
@@ -187,6 +202,16 @@ def test_a_controller_that_is_not_reproduced_is_found_out(name, why):
         did = found.behaviour
         assert did.mean_acceleration_mps2 == did.min_acceleration_mps2 == did.max_acceleration_mps2 == -1.5
         assert (did.reaction_s, did.braking_share, did.share_at_min) == (0.0, 1.0, 0.0)
+
+
+@pytest.mark.slow
+def test_a_seed_that_python_is_given_for_hashes_hides_none():
+    command = [sys.executable, "-m", "harness", "av-check", f"{__file__}:HashesAText", "--tests", "6"]
+    variables = {**os.environ, "PYTHONHASHSEED": "0"}
+    done = subprocess.run(
+        [*command, *sets("world.engine=twin")], env=variables, cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, "It differs from process to process" in " ".join(done.stdout.split())) == (3, True)
 
 
 @pytest.mark.slow
