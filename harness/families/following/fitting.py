@@ -126,8 +126,9 @@ class FollowingFitter:
             return counted, f"{told}, {number(n / hours)} per hour ({limits})"
         needed = f", some {number(hours * FEWEST_COUNTED / n, 2)} h" if n else ""
         outside = not low <= kept.value <= high
-        note = {"note": f"{kept.note or kept.source}; {EXCLUDED}: {n} in {hours:.4g} h of following"}
-        content: Numbers = {"exposure": {"per_hour": kept.model_dump(exclude_none=True) | note}} if outside else {}
+        told_of_it = {"note": f"{kept.note or kept.source}; {EXCLUDED}: {n} in {hours:.4g} h of following"}
+        per_hour = kept.model_dump(exclude_none=True) | told_of_it
+        content: Numbers = {"exposure": {"per_hour": per_hour}} if outside else {}
         excluded = ", which these data exclude" if outside else ""
         told += f" ({limits} per hour); at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)}"
         return content, f"{told} per hour [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
