@@ -23,14 +23,13 @@ def pair_words(decision: Mapping[str, Any]) -> str:
         told = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
         return told.get(verdict, "Not told apart")
     most = share(margin)
-    low, high = (None if end is None else ratio(end) for end in decision.get("ratio") or (None, None))
-    ends = {
-        "proven": (f"B is at most {most} worse than A", high and f" (B / A ≤ {high})"),
-        "refuted": (f"B is more than {most} worse than A", low and f" (B / A ≥ {low})"),
-    }
-    between = low and f" (B / A {f'{low} to {high}' if high else f'≥ {low}'})"
-    verdict_words, bound = ends.get(verdict, (f"Open whether B is more than {most} worse than A", between))
-    return verdict_words + (bound or "")
+    low, high = ("" if end is None else ratio(end) for end in decision.get("ratio") or (None, None))
+    if verdict == "proven":
+        return f"B is at most {most} worse than A" + f" (B / A ≤ {high})" * bool(high)
+    if verdict == "refuted":
+        return f"B is more than {most} worse than A" + f" (B / A ≥ {low})" * bool(low)
+    between = f"{low} to {high}" if high else f"≥ {low}"
+    return f"Open whether B is more than {most} worse than A" + f" (B / A {between})" * bool(low)
 
 
 def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
