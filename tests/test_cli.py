@@ -163,7 +163,7 @@ WRONG = "episodes/0.parquet", "half a file", "a whole one", "Delete it."
     [
         (RunFolderError(*WRONG), 2, "\n  found:    half a file\n  expected: a whole one\n  fix:      Delete it.\n"),
         (TooManyFailedError(*WRONG), 3, "half a file"),
-        (KeyboardInterrupt(), 130, "--resume"),
+        (KeyboardInterrupt(), 130, "No test was finished"),
         (errno.ENOSPC, 2, "Free some space"),
         (errno.EDQUOT, 2, "--resume"),
         (errno.EACCES, 2, "permissions"),
