@@ -15,7 +15,7 @@ from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import HourRule
 from harness.estimators.tally import Tally
 from harness.families.protocol import Exposure
-from harness.sampling.hours import HourRounds
+from harness.sampling.shells import HourRounds
 from harness.strata import Reference, ShellDesign
 
 LEVEL = Level.two_sided(0.9)
