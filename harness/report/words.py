@@ -103,7 +103,7 @@ def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple
     elif script:  # SUMO would know its vehicle's type
         style = av.traci_style
         given |= {"accel": f"{plain(style.accel_mps2)} m/s²", "decel": f"{plain(style.decel_mps2)} m/s²"}
-        given |= {} if script in (True, STEP_S) else {"step": f"{plain(script)} s"}  # True: of an earlier version
+        given |= {} if script == STEP_S else {"step": f"{plain(script)} s"}
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
     elif av.fmu is not None:

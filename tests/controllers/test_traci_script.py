@@ -236,10 +236,10 @@ def test_one_that_names_none_is_told_so_once(tmp_path, capsys):
 
 def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_path):
     file, asked = tmp_path / "my.py", ["world.engine=twin", *FORCED, "stop.episodes=40"]
-    file.write_text(text("", PER_SECOND.format(option='"--step-length=0.2"', step_s=0.2)), "utf-8")
+    file.write_text(text("", PER_SECOND.format(option='"--step-length=1"', step_s=1.0)), "utf-8")
     run_here(load_campaign(f"{file}", asked), tmp_path / "run")
     told = answer_in(tmp_path / "run")
-    assert told["parameters"] == [["accel", "2.6 m/s²"], ["decel", "4.5 m/s²"], ["step", "0.2 s"]]
+    assert told["parameters"] == [["accel", "2.6 m/s²"], ["decel", "4.5 m/s²"], ["step", "1 s"]]
     assert "getLateralLanePosition shows it" in "".join(told["warnings"])
     file.write_bytes(b"\xff")
     assert answer_in(tmp_path / "run") == told
