@@ -22,6 +22,12 @@ from tests.runner import bad_workers
 from tests.stored_runs import ROOT, golden, manifest, part_files, sets, unlike_columns
 
 PATIENCE_S, POLL_S = 300.0, 0.01
+WRITES_OFTEN = """
+import runpy
+from harness.runner import kept
+kept._INTERVAL_S = 0.5
+runpy.run_module("harness", run_name="__main__", alter_sys=True)
+"""
 
 
 @pytest.mark.parametrize("name", quick(IN_BOTH_WORLDS))
@@ -83,7 +89,7 @@ def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in
     settings = ("world.engine=twin", "stop.episodes=1000000000", "stop.rhw=null", "run.shard_size=500")
     asked = ["run", "scenarios/overtaking_forced.yaml", "--out", out, "--workers", "2", *sets(*settings)]
     process = subprocess.Popen(
-        [sys.executable, "-m", "harness", *asked],
+        [sys.executable, "-c", WRITES_OFTEN, *asked],
         cwd=ROOT,
         env={**os.environ, "TMPDIR": str(temporary)},
         start_new_session=True,

@@ -7,7 +7,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from elftools.elf.elffile import ELFFile
 
 from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT
@@ -29,6 +28,8 @@ MANAGERS = {
 
 def _needed_of_the_system(package):
     """Sonames that the shared libraries and programs of an installed package need and do not bring along."""
+    from elftools.elf.elffile import ELFFile
+
     needed, brought = set(), set()
     for path in (Path(str(file.locate())) for file in metadata.files(package) or []):
         if not path.is_file():
@@ -70,6 +71,7 @@ def programs(monkeypatch, tmp_path):
     return add
 
 
+@pytest.mark.slow  # the versions are pinned
 def test_the_list_is_what_the_wheels_need():
     known = {library.soname for library in LIBRARIES}
     needed = _needed_of_the_system("libsumo") | _needed_of_the_system("eclipse-sumo")
