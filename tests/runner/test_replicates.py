@@ -164,7 +164,7 @@ def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
     assert (found["where"], found["share"], found["highest"]) == ("", 0.01, 0.08)
     content = estimate_blocks(tested.blocks, there.campaign, {**tested.manifest, "assumed": found})
     (row,) = [row for row in told(content)["rows"] if row["key"] == "assumed"]
-    assert (row["value"], row["remark"]) == ("up to 8.0 times", "8 %, not 1 %, do not look behind")
+    assert (row["value"], row["remark"]) == ("up to 8.0 times", "if 8 %, not 1 %, do not look behind")
     assert content["assumed"]["times"] == pytest.approx([0.5, 8.0], rel=0.005)
     assert assumed(tested.here, tested.pool, tested.design, Progress()) is None
 
