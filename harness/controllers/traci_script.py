@@ -36,8 +36,6 @@ _PATIENCE = 100
 """Steps that a script may ask for when its simulation has ended; a loop that no error ends is left where it is."""
 _LEFT = list[greenlet]()
 _VERSION = 22, "SUMO 1.28.0"
-
-
 _OF_SIMULATION = {
     0x66: "getTime", 0x71: "getLoadedNumber", 0x72: "getLoadedIDList", 0x73: "getDepartedNumber",
     0x74: "getDepartedIDList", 0x79: "getArrivedNumber", 0x7A: "getArrivedIDList", 0x7B: "getDeltaT",
@@ -84,15 +82,13 @@ class _Simulation(SimulationDomain):
     def getMinExpectedNumber(self) -> int:
         return self._vehicles.getIDCount()
 
-    getLoadedIDList = getDepartedIDList
-
     def getDepartedNumber(self) -> int:
         return len(self.getDepartedIDList())
 
     def getArrivedNumber(self) -> int:
         return len(self.arrived)
 
-    getLoadedNumber = getDepartedNumber
+    getLoadedIDList, getLoadedNumber = getDepartedIDList, getDepartedNumber
 
 
 class ScriptVehicles(VehicleDomain):

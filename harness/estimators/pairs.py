@@ -25,13 +25,13 @@ from harness.estimators.tally import Tally, mean_square
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vocabulary import FloatArray, IntArray
 
-NO_CRASH, CRASH, FAILED = range(3)
+NO_CRASH, CRASH, FAILED = range(N_ENDS := 3)
 """How a test of a pair ended."""
-N_ENDS = 3
 A_CRASHES, B_CRASHES = np.array([1.0, 1.0, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0])
 """Of the outcomes: both crash, only A, only B, neither."""
 ONLY_A, ONLY_B = np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0, 0.0])
 DIFFERENCE = A_CRASHES - B_CRASHES
+PairVerdict = Literal["proven", "refuted", "open"]
 
 
 @cache
@@ -39,9 +39,6 @@ def _kinds(worse: float) -> IntArray:
     """Of the four outcomes, which ends of A and B belong to each, shape (3, 3, 4); ``worse`` see `PairCounts`."""
     a, b = np.meshgrid([False, True, worse > 0.0], [False, True, worse < 0.0], indexing="ij")
     return np.stack((a & b, a & ~b, ~a & b, ~a & ~b), axis=2).astype(np.int64)
-
-
-PairVerdict = Literal["proven", "refuted", "open"]
 
 
 @dataclass(frozen=True)
@@ -68,9 +65,8 @@ class PairDecision:
 
     def doubted(self, n_milder: int, n_differing: int) -> PairDecision:
         """The same after what was seen besides the crashes that count."""
-        kept = self.margin and self.verdict == "proven"
-        verdict: PairVerdict = "open" if kept and (n_milder or n_differing) else self.verdict
-        return replace(self, verdict=verdict, n_milder=n_milder, n_differing=n_differing)
+        lost = self.margin and self.verdict == "proven" and (n_milder or n_differing)
+        return replace(self, verdict="open" if lost else self.verdict, n_milder=n_milder, n_differing=n_differing)
 
 
 class Interval(NamedTuple):
