@@ -140,7 +140,8 @@ def made_once(name: str, waits: Callable[[str], object]) -> Iterator[None]:
     with ExitStack() as held:
         # Without a lock is a cache that may only be read or does not exist yet, and a file system that has none.
         with suppress(OSError, StopIteration):
-            path = next(places(name)).with_suffix(".lock")
+            path = next(places(name))
+            path = path.with_name(f".{path.name}.lock")
             path.parent.mkdir(parents=True, exist_ok=True)
             file = held.enter_context(path.open("ab+"))  # a pipe would wait for who reads it
             try:

@@ -20,6 +20,7 @@ import pickle
 import struct
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -96,6 +97,7 @@ class _KernelCache(caching.NullCache):
         file = Path(function.__code__.co_filename)
         # What comes from outside of the package is not among the sources that the folder is named after.
         self._outside = b"" if file.is_relative_to(_PACKAGE) else file.read_bytes()
+        self._compiling = ExitStack()
 
     def _name_for(self, signature: Any, codegen: Any) -> str:
         kinds = [(str(kind), repr(kind.key)) for kind in signature]
@@ -103,16 +105,23 @@ class _KernelCache(caching.NullCache):
         return self._name + hashlib.sha256(content).hexdigest()[:24]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """What has been compiled for these types and this processor; None if nothing has."""
+        """What has been compiled for these types and this processor; None if nothing has: others wait for it then."""
         target_context.refresh()
-        if (kept := cache.read(self._name_for(sig, target_context.codegen()))) is None:
-            return None
+        self._compiling.close()  # of one that was not compiled in the end
+        name = self._name_for(sig, target_context.codegen())
+        if (kept := cache.read(name)) is None:
+            self._compiling.enter_context(cache.made_once(name, lambda _: None))
+            if (kept := cache.read(name)) is None:
+                return None
+            self._compiling.close()
         return compiler.CompileResult._rebuild(target_context, *pickle.loads(kept))  # type: ignore[no-untyped-call] # noqa: S301 - sound, and our own
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep what has been compiled, unless it holds addresses."""
-        if not data.library.has_dynamic_globals:
-            cache.keep(self._name_for(sig, data.codegen), serialize.dumps(data._reduce()))  # type: ignore[no-untyped-call]
+        with self._compiling:
+            if not data.library.has_dynamic_globals:
+                name = self._name_for(sig, data.codegen)
+                cache.keep(name, serialize.dumps(data._reduce()))  # type: ignore[no-untyped-call]
 
     @property
     def is_filled(self) -> bool:

@@ -8,8 +8,6 @@ import fcntl
 import os
 import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -29,17 +27,11 @@ settings.load_profile("harness")
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile kernels before workers of xdist would, each of them all."""
-    if not getattr(session.config.option, "numprocesses", None):
-        return
-    from harness import cache
-    from harness.compiled import KERNELS
+    """Compile kernels, as ``harness setup`` does, before workers of xdist wait for each other's."""
+    if getattr(session.config.option, "numprocesses", None):
+        from harness.runner.setup import compile_kernels
 
-    if cache.has(mark := f"{KERNELS}/compiled-for-tests"):
-        return
-    compiling = [subprocess.Popen([sys.executable, "-m", "tests.compiling", half]) for half in "01"]
-    if not any([process.wait() for process in compiling]):  # noqa: C419 - wait for all
-        cache.keep(mark, b"done")
+        compile_kernels()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

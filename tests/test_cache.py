@@ -189,7 +189,7 @@ def test_what_another_makes_is_waited_for(folder):
 def test_where_no_lock_can_be_had_nobody_waits(folder, monkeypatch):
     folder.write_text("no folder")
     (piped := folder.with_name("piped") / NAME).parent.mkdir(parents=True)
-    os.mkfifo(piped.with_suffix(".lock"))
+    os.mkfifo(piped.with_name(f".{piped.name}.lock"))
     for own in (folder, folder.with_name("piped"), None):  # or neither a home nor yet a folder in its place
         monkeypatch.setattr(cache, "own_folder", lambda own=own: own)
         with cache.made_once(NAME, lambda _: pytest.fail("waits")):

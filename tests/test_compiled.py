@@ -130,6 +130,16 @@ def test_a_copy_of_the_package_finds_what_another_has_compiled_unless_it_is_dama
     assert hits == [["0", "0", "False"], ["1", "1", "True"], ["0", "1", "True"], ["1", "1", "True"]]
 
 
+def test_processes_side_by_side_compile_a_kernel_once(tmp_path):
+    script = (
+        "from harness import random_stream; random_stream.uniforms(1, 0, 1, 0, 1);"
+        "print(sum(random_stream._fill_uniforms.stats.cache_hits.values()))"
+    )
+    variables = {**os.environ, cache.FOLDER: str(tmp_path)}
+    both = [subprocess.Popen([sys.executable, "-c", script], env=variables, stdout=subprocess.PIPE) for _ in range(2)]
+    assert sorted(process.communicate()[0] for process in both) == [b"0\n", b"1\n"]
+
+
 # -- named tuples that kernels are given as one pointer: what compiled code reads is the tuple's own --
 
 
@@ -201,12 +211,17 @@ def test_a_first_run_compiles_nothing(tmp_path):
     harness("setup")
     before = kernels()
     assert len(before) > 5
-    for av in ("idm", "my_av.py:MyAV"):
-        harness("run", av, "--set", "stop.episodes=300", "--set", "stop.rhw=null", "--out", av[:3])
+    nade = "testing.method=step_mixture", "environment.parameters=ndd-overtaking-1"
+    for i, (av, *sets) in enumerate(
+        [("idm",), ("my_av.py:MyAV",), ("idm", *nade), ("my_av.py:MyAV", "scenario=cut_out")]
+    ):
+        sets += ["stop.episodes=300", "stop.rhw=null"]
+        harness("run", av, *(word for each in sets for word in ("--set", each)), "--out", str(i))
     assert kernels() == before
 
 
 def test_what_was_compiled_is_not_compiled_again(tmp_path, monkeypatch):
     monkeypatch.setenv(cache.FOLDER, str(tmp_path))
     monkeypatch.setattr("harness.runner.setup.run_campaign", lambda *_, **__: None)
+    monkeypatch.setattr("harness.runner.setup._OTHERS", [])
     assert [compile_kernels(), compile_kernels()] == [True, False]

@@ -1,13 +1,17 @@
-"""Compile what a first campaign needs, by running two small ones in the twin: once per version of the harness."""
+"""Compile kernels by running small campaigns in the twin, once per version of the harness."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness import cache
 from harness.campaign.files import load_campaign
 from harness.compiled import KERNELS
+from harness.families import R157
+from harness.processes import Child, first_to_answer, tell
 from harness.progress import Progress
 from harness.runner.run import run_campaign
 
@@ -18,23 +22,38 @@ _CONTROLLER = """class Holds:
     def step(self, seen):
         return 0.0
 """
+_OTHERS = [
+    ("idm", "testing.method=step_mixture", "environment.parameters=ndd-overtaking-1"),
+    *(("idm", f"scenario={name}", "testing.method=forced") for name in R157[1:]),
+]
 
 
 def compile_kernels(progress: Progress | None = None) -> bool:
-    """Compile all kernels of the default method, for built-in vehicles and for controllers; False where it was done.
+    """Compile what campaigns of all methods and scenarios need, on two cores; False where it was done.
 
     The cache keeps them. Where it cannot be written this says nothing: the first run compiles them again.
     """
     done = f"{KERNELS}/all"
     if cache.has(done):
         return False
+    progress = progress or Progress()
     with TemporaryDirectory() as folder:
         controller = Path(folder) / "holds.py"
         controller.write_text(_CONTROLLER)
-        vehicles, progress = ("idm", f"{controller}:Holds"), progress or Progress()
-        progress.stage("compiling", len(vehicles))
-        for number, vehicle in enumerate(vehicles):
-            run_campaign(load_campaign(vehicle, _SMALL), Path(folder) / str(number), workers=1)
+        campaigns = [("idm",), (f"{controller}:Holds",)]
+        progress.stage("compiling", len(campaigns) + 1)
+        beside = Child(tell, partial(_run_all, _OTHERS, Path(folder) / "others"))
+        try:
+            _run_all(campaigns, Path(folder), progress)
+            first_to_answer([beside]).answer()
             progress.advance(1)
+        finally:
+            beside.kill()
     cache.keep(done, b"")
     return True
+
+
+def _run_all(campaigns: Sequence[tuple[str, ...]], folder: Path, progress: Progress | None = None) -> None:
+    for number, (vehicle, *settings) in enumerate(campaigns):
+        run_campaign(load_campaign(vehicle, [*_SMALL, *settings]), folder / str(number), workers=1)
+        (progress or Progress()).advance(1)
