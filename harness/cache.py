@@ -8,6 +8,7 @@ that a folder that may only be read is a cache, too, and a user without a home h
 from __future__ import annotations
 
 import fcntl
+import math
 import os
 import stat
 import sys
@@ -29,6 +30,8 @@ SAID = "HARNESS_CACHE_SAID"
 """Environment variable that keeps a process from saying what another of the same command has said, or will say."""
 MOST_BYTES = 4 << 30
 """That files of one kind may take up [assumed]: tables of a challenge are 110 MB for each traffic."""
+_LOOK_S = 0.1
+"""Time between two looks at whether another process has done what is waited for."""
 _SEAL_BYTES, _SEALED = 4, 0x2144DF1C
 """The CRC-32 of whatever ends with its own is always this."""
 
@@ -135,8 +138,11 @@ def _make_room(kept: Path) -> None:
 
 
 @contextmanager
-def made_once(name: str, waits: Callable[[str], object]) -> Iterator[None]:
-    """Keep other processes from making the same meanwhile; ``waits`` is told which of them is at it already."""
+def made_once(name: str, waits: Callable[[str], object], most_s: float = math.inf) -> Iterator[None]:
+    """Keep other processes from making the same meanwhile; ``waits`` is told which of them is at it already.
+
+    One that takes longer than ``most_s``, as it may have been stopped, is not waited for.
+    """
     with ExitStack() as held:
         # Without a lock is a cache that may only be read or does not exist yet, and a file system that has none.
         with suppress(OSError, StopIteration):
@@ -144,11 +150,18 @@ def made_once(name: str, waits: Callable[[str], object]) -> Iterator[None]:
             path = path.with_name(f".{path.name}.lock")
             path.parent.mkdir(parents=True, exist_ok=True)
             file = held.enter_context(path.open("ab+"))  # a pipe would wait for who reads it
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                waits(_holder(path))
-                fcntl.flock(file, fcntl.LOCK_EX)
+            until = None
+            while True:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if until is None:
+                        waits(_holder(path))
+                        until = time.monotonic() + most_s
+                    if time.monotonic() >= until:
+                        raise
+                    time.sleep(_LOOK_S)
             held.callback(path.unlink, missing_ok=True)
             file.truncate(0)
             file.write(str(os.getpid()).encode())

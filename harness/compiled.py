@@ -89,6 +89,10 @@ KERNELS = f"kernels-{source_hash()}-{sys.implementation.cache_tag}-numba-{versio
 """What the cache keeps kernels under."""
 
 
+_COMPILES_S = 60.0
+"""Longer than any kernel takes [assumed]: what another process has not compiled by then is compiled here, too."""
+
+
 class _KernelCache(caching.NullCache):
     """Where numba finds what has been compiled of a kernel, and leaves what has not."""
 
@@ -110,7 +114,7 @@ class _KernelCache(caching.NullCache):
         self._compiling.close()  # of one that was not compiled in the end
         name = self._name_for(sig, target_context.codegen())
         if (kept := cache.read(name)) is None:
-            self._compiling.enter_context(cache.made_once(name, lambda _: None))
+            self._compiling.enter_context(cache.made_once(name, lambda _: None, most_s=_COMPILES_S))
             if (kept := cache.read(name)) is None:
                 return None
             self._compiling.close()

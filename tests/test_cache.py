@@ -186,6 +186,13 @@ def test_what_another_makes_is_waited_for(folder):
     assert len(waited) == 2
 
 
+def test_who_does_not_get_on_is_not_waited_for_longer_than_that(folder):
+    waited = []
+    with cache.made_once(NAME, waited.append), cache.made_once(NAME, waited.append, most_s=0.2):
+        assert len(waited) == 1
+    assert not list((folder / "pools").iterdir())
+
+
 def test_where_no_lock_can_be_had_nobody_waits(folder, monkeypatch):
     folder.write_text("no folder")
     (piped := folder.with_name("piped") / NAME).parent.mkdir(parents=True)
