@@ -195,8 +195,23 @@ class _Unboxed:
     def __init__(self, bundle: tuple[Any, ...]) -> None:
         self._bundle, self._records = bundle, list[np.ndarray]()
         self._memory = np.array(list(_words(bundle, self._records)), np.int64)
-        self._numba_type_ = _UnboxedType(_numba.typeof(bundle))
+        if (kind := _kind(bundle)) not in _TYPES:
+            _TYPES[kind] = _UnboxedType(_numba.typeof(bundle))
+        self._numba_type_ = _TYPES[kind]
         self.address: int = self._memory.ctypes.data
+
+
+_TYPES: dict[Any, _UnboxedType] = {}
+"""Numba's types by `_kind`: it takes milliseconds to find the type of a record of many fields."""
+
+
+def _kind(value: Any) -> Any:
+    """What numba's type of a value follows from."""
+    if isinstance(value, tuple):
+        return type(value), *map(_kind, value)
+    if isinstance(value, np.ndarray):
+        return value.dtype, value.ndim, value.flags.num
+    return value.dtype if isinstance(value, np.void) else type(value)
 
 
 def _words(value: Any, records: list[np.ndarray]) -> Iterator[int]:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +95,13 @@ def read_text(path: Path) -> str:
 
 def _load(text: str, name: str) -> tuple[Any, Lines]:
     """Value of a text, and the line of each of its parts by path; there are none when it is empty."""
+    value, lines = _parsed(text, name)
+    return deepcopy(value), lines
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str, name: str) -> tuple[Any, Lines]:
+    """The same, shared with whoever asks: scenarios and comparisons read the same traffic again and again."""
     where, mend = name, "Correct or delete it."
     try:
         loader = StrictLoader(text)
