@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import parent_process
+from numbers import Real
 from pathlib import Path
 from sysconfig import get_path
 from time import monotonic, sleep
@@ -296,7 +297,8 @@ class VehicleHost(Host):
     def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:
         """Accelerations (m/s²), shape (n,), and the cells whose controller failed (their value is not used).
 
-        One that ``warms_up`` is shown what was: what it answers is neither used nor judged, what it raises counts.
+        One that ``warms_up`` is shown what was: what it answers is neither used nor judged, and 0 if it is no number;
+        what it raises counts.
         """
         answer = np.zeros(observation.cell.size)
         failures = {}
@@ -311,7 +313,7 @@ class VehicleHost(Host):
                     place = "" if value is None else self.told_at(controller)  # of what is raised it is known
                     failures[k] = f"{'step, warming up' if warms_up else 'step'}: {wrong}{place}"
                     self._drop(k)
-                elif not warms_up:
+                elif not warms_up or isinstance(value, Real):
                     answer[i] = value
         return answer, failures
 
@@ -375,13 +377,16 @@ class BatchHost(Host):
 
         def ask() -> Any:
             answer = self.controller.step_batch(observation)
-            return np.zeros(n) if warms_up else answer
+            is_no_answer = warms_up and _numbers(n, answer)[1] is not None
+            return np.zeros(n) if is_no_answer else answer
 
         with self.guard:
             answer, wrong = self.guard.call(ask, check=partial(_numbers, n))
         if wrong is not None:
             call = "step_batch, warming up" if warms_up else "step_batch"
             return np.zeros(n), dict.fromkeys(cells.tolist(), f"{call}: {wrong}")
+        if warms_up:
+            return answer, {}
         outside = self.guard.outside(answer).tolist()
         return answer, {int(cells[i]): f"step_batch: {self.guard.acceleration(answer[i])[1]}" for i in outside}
 

@@ -37,8 +37,8 @@ SPACING = 1.01
 FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
 """Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
 UNKNOWN_MEAN = {"mean": math.nan, "std_error": math.inf}
-BEFORE_OVERLAP = ("took_over_early", "asked_to_speed_up")
-"""What AVs do, or ask for in vain, while BV comes over; columns of blocks."""
+BEFORE_OVERLAP = ("took_over_early", "asked_to_speed_up", "braked_before")
+"""What AVs do, or ask for in vain, before BV is on their lane; columns of blocks."""
 
 
 class Diagnostics:

@@ -26,6 +26,9 @@ STRAYED = (
 )
 """Cause of a test that failed because its weight would have been wrong."""
 
+BRAKES_MPS2 = -0.1
+"""Who asks for less while nobody is ahead slows down of its own accord [assumed]: rounding asks for less than that."""
+
 
 class Scenario(NamedTuple):
     """What tests of a campaign have in common.
@@ -194,20 +197,22 @@ class EpisodeLoop:
         if n := observe(kernel):
             seen = first(self._observation, n)
             if av.warm_up_steps:
-                failures = {**self._warm_up(av, seen), **failures}
+                failures = {**self._warm_up(av, seen, shard), **failures}
             cells.acceleration[seen.cell], failed = av.act(seen)
             hold_cruising(kernel, n)
             failures = {**failed, **failures}
         self._past.note(self._world.x, self._world.v)
         return self._fail(failures, kernel, shard)
 
-    def _warm_up(self, av: ControllerHost, seen: BatchObservation) -> dict[int, str]:
+    def _warm_up(self, av: ControllerHost, seen: BatchObservation, shard: Shard) -> dict[int, str]:
         """Show controllers that are asked for the first time in their episode what was before; returns who failed."""
         cell, failures = self._cells.cell[seen.cell], dict[int, str]()
         new = (cell["step"] == cell["acts_from"]) & (cell["acts_from"] > 0)  # who follows has had its warm-up
         if new.any():
             for before in self._past.before(BatchObservation._make(column[new] for column in seen)):
-                failures = {**av.act(before, warms_up=True)[1], **failures}
+                asked, failed = av.act(before, warms_up=True)
+                failures = {**failed, **failures}
+            shard.episode["braked_before"][cell["row"][new]] = asked < BRAKES_MPS2
         return failures
 
     def _step_and_judge(self, kernel: KernelState, shard: Shard, placed: int) -> int:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
-from harness.report.words import late_words
+from harness.report.words import brakes_before_words, late_words
 from harness.shown import ShownInPython
 
 SLOW_S = 0.1
@@ -54,7 +54,7 @@ class Behaviour:
 
     ``reaction_s`` is the median time from the onset of the cut-in to the first braking beyond 0.1 m/s², over the
     episodes that braked at all; their share is ``braking_share``. ``n_took_over_early`` did something before the
-    overlap.
+    overlap, ``n_braked_before`` asked to brake before the onset.
     """
 
     mean_acceleration_mps2: float
@@ -67,6 +67,7 @@ class Behaviour:
     n_events: int
     n_crashes: int
     n_took_over_early: int
+    n_braked_before: int
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,8 @@ def verdict(found: AvCheck) -> str:
         )
     if found.shows and found.source == "controller" and not seen.n_took_over_early:
         advice += f" But {late_words(script=found.script)}."
+    if found.shows and seen.n_braked_before:
+        advice += f" But {brakes_before_words(seen.n_braked_before, script=found.script)}."
     return (
         f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
         f"{found.events}, {seen.reaction_s:.1f} s after they began (median; some leave time to wait); "

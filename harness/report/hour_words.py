@@ -13,7 +13,16 @@ from harness.families.words import EXCLUDED
 from harness.numbers import count, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, headed, wrapped
 from harness.report.rows import decided, looking_words, ratio_texts
-from harness.report.words import GO_ON, doubt_words, early_words, ended_words, milder_words, scope_words, unseen_words
+from harness.report.words import (
+    GO_ON,
+    doubt_words,
+    early_words,
+    ended_words,
+    milder_words,
+    overlap_words,
+    scope_words,
+    unseen_words,
+)
 
 
 def called(family: str) -> str:
@@ -98,7 +107,8 @@ def warnings(content: Mapping[str, Any]) -> Iterator[str]:
             most = found.most * (of["ci_high"] if of["n_crashes"] else of["upper_bound"])
             yield f"{called(name)}: {unseen_words(found.where)}, here {number(most)} per hour"
         doubts = doubt_words({**of, "rate": of["rate_per_hour"]}, " per hour")
-        yield from (f"{called(name)}: {text}" for text in (*early_words(of["n_crashes_before_event"]), *doubts))
+        early = *early_words(of["n_crashes_before_event"]), *overlap_words(of.get("before_overlap"))
+        yield from (f"{called(name)}: {text}" for text in (*early, *doubts))
 
 
 def exposures(content: Mapping[str, Any]) -> str:

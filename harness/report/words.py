@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.estimators.answer import STORED_ESTIMATES, Elsewhere, Estimates
+from harness.estimators.answer import STORED_ESTIMATES, Elsewhere, Estimates, before_overlap
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.numbers import WIDEST_RHW, count, leaves, number, plain, share, words
@@ -79,7 +79,7 @@ def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimate
         rows=tuple(with_traffic(list(rows_of(campaign, manifest, told)), told.traffic)),
         warnings=(
             *_warnings(campaign, manifest, told),
-            *_before_overlap(campaign, manifest, told.diagnostics),
+            *overlap_words(before_overlap(campaign, manifest, told.diagnostics)),
             *(() if told.traffic is None else too_few(told.traffic.n_replicates, told.traffic.confidence)),
         ),
         scope=_scope(campaign, manifest, told),
@@ -186,15 +186,23 @@ def late_words(*, script: bool) -> str:
     return f"it did nothing before the other car (BV) was in its lane; {what} shows it some 2 s earlier"
 
 
-def _before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> Iterator[str]:
-    """What the vehicle did while BV came over, a line each."""
-    if not manifest.get("events_show") or campaign.av.acts_before_event:
+def brakes_before_words(n: int, *, script: bool) -> str:
+    """That a vehicle slows down before anything happens, as one does whose own set speed is below that of the test."""
+    speed = "getAllowedSpeed" if script else "set_speed_mps"
+    return f"in {count(n)} tests it braked with nobody ahead, which makes cut-ins milder: let it cruise at {speed}"
+
+
+def overlap_words(of: Mapping[str, Any] | None) -> Iterator[str]:
+    """What the vehicle did before BV was on its lane (`before_overlap`), a line each."""
+    if of is None:
         return
-    if campaign.av.source in ("sumo", "traci"):
+    if of["source"] in ("sumo", "traci"):
         yield "SUMO changes lanes in one step: this vehicle cannot see the other car (BV) coming over, as drivers can"
-    elif counts.get("n_events") and not counts.get("n_took_over_early"):
-        yield late_words(script=bool(manifest.get("script")))
-    if (n := counts.get("n_asked_to_speed_up")) and campaign.av.model is None:  # of our own it is known
+    elif of["n_events"] and not of["n_took_over_early"]:
+        yield late_words(script=of["script"])
+    if n := of["n_braked_before"]:
+        yield brakes_before_words(n, script=of["script"])
+    if (n := of["n_asked_to_speed_up"]) and not of["built_in"]:  # of our own it is known
         yield f"in {count(n)} tests it asked to speed up before BV was in its lane; its speed was held (av.takes_over)"
 
 

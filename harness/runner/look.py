@@ -246,4 +246,5 @@ def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Beh
         braking_share=float(braked.mean()) if reaction.size else np.nan,
         n_events=len(reactions), n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
         n_took_over_early=int(np.count_nonzero((took_over >= 0) & (took_over <= episode["event_step"]))),
+        n_braked_before=int(np.count_nonzero(episode["braked_before"])),
     )  # fmt: skip

@@ -89,6 +89,39 @@ def test_one_that_sees_nobody_keeps_its_speed_until_bv_is_on_its_lane_however_it
     assert (at_once["outcome"] == CRASH).sum() > 1.2 * (episode["outcome"] == CRASH).sum()
 
 
+class Slows:
+    """A cruise control that brakes for nobody: to a set speed of its own, or to that of the test."""
+
+    def __init__(self, own_mps=math.nan):
+        self.own_mps = own_mps
+
+    def start(self, episode):
+        self.target = episode.set_speed_mps if math.isnan(self.own_mps) else self.own_mps
+
+    def step(self, seen):
+        return max(self.target - seen.speed_mps, -2.0)
+
+
+class SlowsBatch:
+    def step_batch(self, seen):
+        return np.maximum(20.0 - seen.speed_mps, -2.0)
+
+
+class SlowsScript(TraciStyleController):
+    def on_step(self, traci, veh_id, time):
+        traci.vehicle.setAcceleration(veh_id, max(20.0 - traci.vehicle.getSpeed(veh_id), -2.0), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("form", "n"), [("Slows, parameters: {own_mps: 20}", 40), ("SlowsBatch", 40), ("SlowsScript", 40), ("Slows", 0)]
+)
+def test_one_that_brakes_while_nobody_is_ahead_is_seen_however_it_is_written(form, n):
+    """Its own set speed makes it slow before BV comes, and cut-ins milder than they are for who cruises."""
+    name, *more = form.split(", ")
+    av = ", ".join([f"controller: 'tests.controllers.test_forms:{name}'", *more])
+    assert drive(LATERAL, f"av={{{av}}}", n=40).episode["braked_before"].sum() == n
+
+
 EAGER = "parameters: {desired_speed_mps: 60.0, time_headway_s: 0.2}"
 
 

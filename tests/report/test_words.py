@@ -75,10 +75,12 @@ def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
 )
 def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(name, shows, blind, held, stored_run):
     run = read_run_folder(stored_run(name))
-    asked = {**run.estimates.diagnostics, "n_asked_to_speed_up": 1234 * (name != "forced-krauss")}
+    counts = dict.fromkeys(("n_asked_to_speed_up", "n_braked_before"), 1234 * (name != "forced-krauss"))
+    asked = {**run.estimates.diagnostics, **counts}
     warnings = "".join(said(run, manifest={"events_show": shows}, diagnostics=asked).warnings)
     assert ("cannot see the other car (BV)" in warnings) == blind
     assert ("1,234 tests it asked to speed up" in warnings) == held
+    assert ("1,234 tests it braked with nobody ahead" in warnings) == (name != "forced-krauss")
 
 
 @pytest.mark.parametrize(

@@ -227,6 +227,19 @@ def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
     assert (len(hour_lines(content, report)), len(hour_lines({**content, "decision": verdict}, report))) == (10, 11)
 
 
+def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_scenario(run):
+    of = run.content["families"]
+    assert of["cut_in"]["before_overlap"]["built_in"]
+    acted = {**of["cut_in"]["before_overlap"], "n_braked_before": 1234, "n_took_over_early": 0}
+    content = {**run.content, "families": {**of, "cut_in": {**of["cut_in"], "before_overlap": acted}}}
+    told = " ".join(" ".join(hour_lines(content)).split())
+    for said in (
+        "! cut-in: in 1,234 tests it braked with nobody ahead",
+        "! cut-in: it did nothing before the other car",
+    ):
+        assert said in told
+
+
 @pytest.mark.parametrize(("times", "warned"), [([0.2, 4.0], True), ([0.99, 1.01], False), (None, False)])
 def test_a_rate_that_traffic_leaves_open_has_only_an_upper_limit_in_the_sum_too(run, times, warned):
     """Where no lane change was seen that a notable part of it comes from."""
