@@ -221,6 +221,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         ended += f"{reached} (asked: ± {share(target)}){more}"
     elif stopped_by == "episodes":
         ended = "all tests done" if campaign.accept is None else ended + GO_ON
+    elif stopped_by in ("rhw", "below_reference") and (given := campaign.testing.shells.statement) != ASSUMPTION_FREE:
+        ended += f", given the {given}"
     return scope_words(best.confidence, ended)
 
 

@@ -64,6 +64,12 @@ def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     assert rows["rate"].remark.startswith("< ")
 
 
+@pytest.mark.parametrize(("name", "given"), [("shells-inside", True), ("shells-stops", False)])
+def test_what_ended_a_run_is_said_with_what_it_rests_on(name, given, stored_run):
+    """The row above it may be of another statement."""
+    assert said(read_run_folder(stored_run(name))).scope.endswith("given the library" if given else "precise enough")
+
+
 @pytest.mark.parametrize(
     ("name", "shows", "blind", "held"),
     [
