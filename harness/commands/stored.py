@@ -189,7 +189,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
 
     Fitted numbers move by their standard errors, or together by replicates; assumed ones over their ranges. Nothing is
     simulated in SUMO: each move takes a second, once. The result is kept in DIR/sensitivity.json and shown on the page.
-    Of several scenarios DIR is the folder of one, such as runs/all/cut_in.
+    Of several scenarios it is the sum that moves: with the numbers of each, and with how often its events are met.
     """
     with progress_bar() as bar:
         content = harness.sensitivity(folder, ranges=ranges, progress=bar)

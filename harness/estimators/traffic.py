@@ -119,7 +119,7 @@ class Bar:
     """
 
     what: str
-    known: Literal["fitted", "assumed"]
+    known: Literal["fitted", "assumed", "counted"]
     values: tuple[float, float] | None
     rate: tuple[Number, Number]
     ratio: tuple[Number, Number]

@@ -54,6 +54,7 @@ def write_hours(folder: Path, content: dict[str, Any]) -> Path:
         verdict=None if decision is None else decided(decision).texts,
         rows=[(row, content["families"][row[0]]) for row in family_rows(content)],
         warnings=list(warnings(content)), exposures=exposures(content), scope=scope(content), called=called,
+        moved=_sensitivity(folder, str(content.get("crc32")), str(folder)),
     )  # fmt: skip
 
 
@@ -74,18 +75,18 @@ def _plots(run: RunFolder, summary: RunSummary) -> list[Plot]:
         severity_plot(run.estimates),
         where_plot_of(run, summary),
         None if run.shells is None else shells_plot(run.shells),
-        sensitivity_plot(found) if (found := _sensitivity(run)) is not None and found.shown else None,
+        _sensitivity(run.path, run.manifest["campaign_hash"], run.typed),
         convergence_plot(run),
     ]
     return [plot for plot in plots if plot is not None]
 
 
-def _sensitivity(run: RunFolder) -> Sensitivity | None:
+def _sensitivity(folder: Path, known_by: str, typed: str) -> Plot | None:
     """What `harness sensitivity` has found of these tests; None where it has not, or of others."""
-    if not (file := run.path / SENSITIVITY).is_file():
+    if not (file := folder / SENSITIVITY).is_file():
         return None
-    found = read_as(Sensitivity, file, mend=f"Make it again with `harness sensitivity {run.typed}`.")
-    return found if found.campaign_hash == run.manifest["campaign_hash"] else None
+    found = read_as(Sensitivity, file, mend=f"Make it again with `harness sensitivity {typed}`.")
+    return sensitivity_plot(found) if found.campaign_hash == known_by and found.shown else None
 
 
 def _style() -> str:

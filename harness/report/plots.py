@@ -170,7 +170,7 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
     ends = np.array([[np.nanmin([*of, 1.0]), np.nanmax([*of, 1.0])] for bar in shown for of in (bar.rate, bar.ratio)])
     rate, ratio = ends[0::2].T, ends[1::2].T
     low, high = 0.9 * float(max(ends[:, 0].min(), 1e-3)), 1.1 * float(ends[:, 1].max())
-    rows, fitted = np.arange(len(names)), np.array([bar.known == "fitted" for bar in shown])
+    rows, fitted = np.arange(len(names)), np.array([bar.known != "assumed" for bar in shown])
     y = PlotAxis("", len(names) - 0.4, -0.6, names=names)
     panel = PlotPanel(
         "What moves the answer", PlotAxis("times", low, high, log=True), y, height=76.0 + 22.0 * len(names)

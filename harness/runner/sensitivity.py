@@ -10,21 +10,25 @@ drivers show: by how much their rates, which are known there, would come out wro
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from harness.arguments import checked
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import CampaignError
 from harness.estimators.estimate import finite_json
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.families.protocol import Parameters
 from harness.progress import Progress
-from harness.records.folder import MANIFEST, SENSITIVITY, require_place, write_sealed
+from harness.records.folder import SENSITIVITY, read_manifest, require_place, write_sealed
+from harness.records.reader import read_campaign
 from harness.records.replicates import read_replicates
+from harness.resolved import resolve
+from harness.runner.stored import read_families
 from harness.runner.stored_shells import Nearby, StoredShells, require_shares
 from harness.strata import ShellDesign
 from harness.vocabulary import FAMILIES
@@ -53,7 +57,7 @@ def sensitivity(
     Parameters
     ----------
     folder : str or Path
-        Run folder.
+        Run folder, or the folder of several scenarios: each is asked, and by its share the sum.
     ranges : mapping, optional
         Lowest and highest value of numbers, by ``section.name``, besides those that the environment states.
     progress : Progress, optional
@@ -63,15 +67,17 @@ def sensitivity(
     """
     folder, progress = Path(folder), progress or Progress()
     require_place(folder)
-    if (folder / FAMILIES).is_file():
-        each = ", ".join(f"`{_OPTION} {path.parent}`" for path in sorted(folder.glob(f"*/{MANIFEST}")))
-        mend = f"Ask each scenario: {each}; or other exposures of the sum: `harness estimate {folder} --exposure …`."
-        raise RunFolderError(str(folder), "a run of several scenarios", "the run folder of one", mend)
+    found = (_of_sum if (folder / FAMILIES).is_file() else _of_one)(folder, ranges or {}, progress)
+    content = finite_json(found)
+    write_sealed(folder / SENSITIVITY, content)
+    return content
+
+
+def _of_one(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: Progress) -> Sensitivity:
     tested = StoredShells.of(folder, progress, _OPTION)
     require_shares(tested)
-    settings = tested.here.campaign.environment
-    parameters = tested.here.parameters
-    asked = list(moves(settings.parameters, parameters, tested.here.family.shipped, ranges or {}))
+    settings, parameters = tested.here.campaign.environment, tested.here.parameters
+    asked = list(moves(settings.parameters, parameters, tested.here.family.shipped, ranges))
     if not asked:
         found = f"{settings.parameters}, of which no number has a standard error (se) or a range"
         number = next(reversed(parameters.numbers()), "section__name").replace("__", ".")
@@ -81,10 +87,48 @@ def sensitivity(
     bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
     driver = next((each.name for each in tested.design.references), "")
     bars += bar_of_readings(tested.design)
-    ordered, traffic = tuple(sorted(bars, key=lambda bar: -bar.span)), Path(settings.parameters).stem
-    content = finite_json(Sensitivity(tested.manifest["campaign_hash"], traffic, driver, ordered))
-    write_sealed(folder / SENSITIVITY, content)
-    return content
+    return Sensitivity(tested.manifest["campaign_hash"], Path(settings.parameters).stem, driver, _longest_first(bars))
+
+
+def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: Progress) -> Sensitivity:
+    """Bars of each scenario, by its share of the sum's rates, and of the exposures; one that refuses is left out."""
+    stored, bars, of_numbers = read_families(folder), list[Bar](), dict[str, Mapping[str, tuple[float, float]]]()
+    for name in stored["families"]:
+        campaign = read_campaign(folder / name, read_manifest(folder / name), check_files=True)
+        of_file = {each.replace("__", ".") for each in resolve(campaign).parameters.numbers()}
+        of_numbers[name] = {key: ends for key, ends in ranges.items() if key in of_file}
+    if unknown := sorted(set(ranges).difference(*of_numbers.values())):
+        mend = f"Ask {folder / next(iter(of_numbers))} alone, say: its table names its numbers."
+        raise CampaignError("--range", unknown[0], "a number of one of these scenarios", mend)
+    hour = stored["beside"]["rate_per_hour"] or math.nan
+    for name, of in stored["families"].items():
+        shares, exposure = (of["share"] or 0.0, of["reference_rate_per_hour"] / hour), of["exposure"]
+        ends = float(f"{exposure['low']:.4g}"), float(f"{exposure['high']:.4g}")
+        if ends[0] < ends[1]:
+            low, high = (end / exposure["per_hour"] for end in ends)
+            known: Literal["counted", "assumed"] = "counted" if exposure["counted"] else "assumed"
+            bars.append(_part(Bar(f"exposure {name}", known, ends, (low, high), (1.0, 1.0), (0.0, 0.0)), *shares))
+        try:
+            found = _of_one(folder / name, of_numbers[name], progress)
+        except CampaignError as refused:
+            sys.stderr.write(f"note: {name} alone moves by nothing here: {refused.found}\n")
+        else:
+            bars += [_part(replace(bar, what=f"{name} {bar.what}"), *shares) for bar in found.bars]
+    return Sensitivity(str(stored["crc32"]), "crashes per hour", stored["beside"]["reference"], _longest_first(bars))
+
+
+def _part(bar: Bar, share: float, of_driver: float) -> Bar:
+    """What a scenario's bar is of the sum, of whose rate the scenario has a ``share``, and of the driver's another."""
+    rate, ratio = np.array(bar.rate), np.array(bar.ratio)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        moved = 1.0 + share * (rate - 1.0)
+        beside = moved / (1.0 + of_driver * (rate / ratio - 1.0))
+    (low, high), (lower, upper) = moved.tolist(), beside.tolist()
+    return replace(bar, rate=(low, high), ratio=(lower, upper), off=(share * bar.off[0], share * bar.off[1]))
+
+
+def _longest_first(bars: Sequence[Bar]) -> tuple[Bar, ...]:
+    return tuple(sorted(bars, key=lambda bar: -bar.span))
 
 
 def moves(

@@ -96,16 +96,6 @@ def test_what_is_not_said_to_be_uncertain_is_refused(folder, capsys, option, fou
     assert not (folder / "sensitivity.json").exists()
 
 
-def test_of_several_scenarios_it_says_what_to_ask(tmp_path, capsys):
-    for name in ("cut_in", "lead_brakes"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "manifest.json").touch()
-    (tmp_path / "families.json").touch()
-    assert main(["sensitivity", str(tmp_path)]) == 2
-    each = f"'harness sensitivity {tmp_path}/cut_in', 'harness sensitivity {tmp_path}/lead_brakes'"
-    assert f"Ask each scenario: {each}; or other exposures of the sum:" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(("n", "ends", "off"), [(1, [0.55, 1.45], [0.05, 0.15]), (3, [None, None], [None, None])])
 def test_a_block_shows_what_is_answered_and_how_much_is_not(n, ends, off):
     """Of five replicates, n in which the reference driver comes out wrong by a factor of 3."""
