@@ -140,8 +140,7 @@ class EpisodeLoop:
             lent = sorted(self._world.lent) if isinstance(error, WorldDisagreementError | RuntimeError) else []
             if self._av is None or not (lent or type(error).__module__ == "libsumo.libsumo"):
                 raise
-            by = ", ".join(f"libsumo.{name}" for name in lent) or error
-            found = f"a vehicle that has changed the simulation that it is tested in ({by})"
+            found = f"a vehicle that has changed the simulation that it is tested in ({', '.join(lent) or error})"
             mend = "Use the traci that is handed in (docs/controllers.md), not the module."
             raise CampaignError("av.controller", found, "libsumo left as it is", mend) from error
         finally:

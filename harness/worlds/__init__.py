@@ -27,8 +27,7 @@ class World:
     """
 
     drives_av = acts_before_event = False
-    lent: Collection[str] = ()
-    """What of the simulation's own interface others have used in this process."""
+    lent: Collection[str] = ()  # what others in this process have used of the simulation's own interface
 
     def __init__(self, n_cells: int, vehicles: Sequence[str] = VEHICLES) -> None:
         self.vehicles = tuple(vehicles)
