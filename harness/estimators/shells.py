@@ -265,7 +265,7 @@ class SeenShells:
         """Of the first strata; anything is possible where crashes lie on too few paths."""
         if (n_strata, level) not in self._known:
             p, tally = self.design.p[:n_strata], self.tally.part(slice(0, n_strata))
-            found = RateLimits(float(p @ tally.share), 0.0, 1.0, math.inf, math.inf)
+            found = RateLimits(tally.rate(p), 0.0, 1.0, math.inf, math.inf)
             if not (few := paths_that_count(p, tally) < FEWEST_PATHS):
                 found = combined(p, tally, self.design.n_independent, level)
             testable = np.resize(self.design.available[:n_strata] or 1, p.size) > 0
@@ -296,7 +296,7 @@ class SeenShells:
             boundary=design.boundary, n_shells=n, crash_rate=limits.rate, ci_low=limits.low, ci_high=limits.high,
             rhw=limits.rhw, rhw_from_pool=limits.from_pool_relative()[0],
             rhw_from_pool_at_least=limits.from_pool_relative()[1],
-            crash_rate_if_failed_had_crashed=float(design.p[:n] @ inside.failed_as_crashes().share),
+            crash_rate_if_failed_had_crashed=inside.failed_as_crashes().rate(design.p[:n]),
             refuted=outside.totals[1] > 0, refuted_by=tuple(crashed[:MOST_NAMED]),
             upper_bound_outside=combined(design.p[n:], outside, design.n_independent, level).high, **counts,
         )  # fmt: skip

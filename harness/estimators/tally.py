@@ -110,6 +110,10 @@ class Tally(NamedTuple):
         """Share of tests that crashed, shape (S,)."""
         return weight_of_a_test(np.asarray(self.crashes, np.float64), self.tests)
 
+    def rate(self, p: FloatArray) -> float:
+        """Crashes per test: Σ p_s c_s, and no more than 1, as probabilities (S,) that the pool estimates may sum to."""
+        return min(float(p @ self.share), 1.0)
+
 
 def empty_tally(n_strata: int) -> Tally:
     """That of no tests."""
@@ -251,4 +255,4 @@ def combined(p: FloatArray, tally: Tally, n_paths: float, level: Level) -> RateL
     least = np.divide(least, tally.share, out=np.zeros_like(least), where=tally.crashes > 0)
     from_pool = level.z * math.sqrt(variance)
     at_least = level.z * math.sqrt(pool_variance(p, tally, n_paths, least, -ROOM))
-    return RateLimits(float(p @ tally.share), max(low, 0.0), min(high, 1.0), from_pool, at_least)
+    return RateLimits(tally.rate(p), min(max(low, 0.0), 1.0), min(high, 1.0), from_pool, at_least)

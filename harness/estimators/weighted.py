@@ -206,7 +206,7 @@ class Nade:
         cap, origin = self.cap()
         hoeffding = capped_mean_upper(self.y.mean(self.n), cap, self.n, confidence)
         below, above = skewed_distances(std_error, third_moment or 0.0, (1.0 - confidence) / 2.0)
-        low, high, half = max(0.0, rate - below), min(1.0, rate + above), (below + above) / 2.0
+        low, high, half = min(max(0.0, rate - below), 1.0), min(1.0, rate + above), (below + above) / 2.0
         if self.n_crashes == 0:
             low, high = 0.0, capped_mean_upper(0.0, cap, self.n, (1.0 + confidence) / 2.0)
         upper, settled = hoeffding, self.is_settled()
@@ -215,9 +215,9 @@ class Nade:
         negative = () if rate >= 0.0 else (note("negative"),)
         cautions = (*cautions, *negative, *self.cautions())
         return Estimate(
-            crash_rate=rate, std_error=std_error, ci_low=low, ci_high=high, upper_bound=upper, confidence=confidence,
+            crash_rate=min(rate, 1.0), std_error=std_error, ci_low=low, ci_high=high, upper_bound=upper,
             rhw=half / rate if rate > 0.0 else math.inf, n_episodes=self.n, n_crashes=self.n_crashes,
-            n_effective=self.y.n_effective, largest_weight_share=self.largest_share(),
+            confidence=confidence, n_effective=self.y.n_effective, largest_weight_share=self.largest_share(),
             interval="normal" if third_moment is None else "skewed", bound="one_sided" if settled else "hoeffding",
             cap=origin, weight_cap=self.known_cap(), cautions=cautions,
             warnings=(*cautions, *self.warnings(half), *warnings),

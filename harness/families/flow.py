@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from harness.vocabulary import FloatArray, Record
+from harness.errors import CampaignError
+from harness.vocabulary import BoolArray, FloatArray, Record
 
 _SPEED_POINTS = 8001
+PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])
+"""Where quantiles are evaluated: the ends are the smallest and the largest uniform that is drawn, but zero."""
 
 
 class Flow:
@@ -22,7 +25,8 @@ class Flow:
         shape, location, scale = (float(n[f"initial_state__v_{k}"]) for k in ("shape", "location_mps", "scale_mps"))
         z = (self._speeds - location) / scale
         cdf = special.ndtr(z) - 2.0 * special.owens_t(z, shape)  # of the skew normal distribution
-        self.speed_cdf: FloatArray = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
+        with np.errstate(invalid="ignore"):  # see `require_sound`
+            self.speed_cdf: FloatArray = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
 
     def u_of(self, v: FloatArray) -> FloatArray:
         """Speeds (m/s) as fits have them."""
@@ -39,7 +43,29 @@ class Flow:
         shift = n["initial_state__r1_shift_m"] + n["initial_state__r1_shift_u_m"] * u
         mean = n["initial_state__r1_log_mean"] + n["initial_state__r1_log_mean_u"] * u
         sd = np.exp(n["initial_state__r1_log_sd"] + n["initial_state__r1_log_sd_u"] * u)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             below = special.ndtr((np.log(np.maximum(n["fit_range__r1_min_m"] - shift, 0.0)) - mean) / sd)
             upto = special.ndtr((np.log(n["fit_range__r1_max_m"] - shift) - mean) / sd)
         return np.asarray(shift + np.exp(mean + sd * special.ndtri(below + probability * (upto - below))))
+
+    def require_sound(self, file: str) -> None:
+        """Refuse laws (`CampaignError`, naming a parameter ``file``) of which nothing is left in the fit range."""
+        reaches = np.diff(self.speed_cdf) >= -1e-9  # rounding shows where next to nothing of the distribution is left
+        where = f"initial_state.v_location_mps, v_scale_mps and v_shape ({file})"
+        require(reaches, where, "no speed within the fit range", (), "a distribution of v_BV that reaches into it")
+        least, most = self._n["fit_range__r1_min_m"], self._n["fit_range__r1_max_m"]
+        for speed in np.linspace(self._speeds[0], self._speeds[-1], 9):
+            r1 = self.gaps(PROBABILITIES, np.full(PROBABILITIES.size, speed))
+            inside = (r1 >= least - 1e-6) & (r1 <= most + 1e-6)
+            rises = np.append(r1[2:] > r1[:-2], [True, True])  # pairs, because the outermost two may agree
+            found = f"R1 = {{:.3g}} m in the {{:.6g}} quantile at v = {speed:g} m/s"
+            expected = f"gaps spread within the fit range, {least:g} to {most:g} m"
+            require(inside & rises, f"initial_state.r1_* ({file})", found, (r1, PROBABILITIES), expected)
+
+
+def require(sound: BoolArray, where: str, found: str, values: tuple[FloatArray, ...], expected: str) -> None:
+    """Refuse a law that is not sound (n,) everywhere; ``found`` formats the ``values`` (n,) where it first fails."""
+    if not sound.all():
+        first = int(np.argmin(sound))
+        mend = "The numbers are allowed one by one, but not together: correct those of this law."
+        raise CampaignError(where, found.format(*(value[first] for value in values)), expected, mend)

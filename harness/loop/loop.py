@@ -140,9 +140,10 @@ class EpisodeLoop:
                 ended += self._step_and_judge(kernel, shard, placed)
                 given += placed
         except Exception as error:
-            if self._av is None or type(error).__module__ != "libsumo.libsumo":
+            lent = sorted(self._world.lent) if isinstance(error, WorldDisagreementError | RuntimeError) else []
+            if self._av is None or not (lent or type(error).__module__ == "libsumo.libsumo"):
                 raise
-            found = f"a vehicle that has changed the simulation that it is tested in ({error})"
+            found = f"a vehicle that has changed the simulation that it is tested in ({', '.join(lent) or error})"
             mend = "Use the traci that is handed in (docs/controllers.md), not the module."
             raise CampaignError("av.controller", found, "libsumo left as it is", mend) from error
         finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,7 @@ class World:
     """
 
     drives_av = acts_before_event = False
+    lent: Collection[str] = ()  # what others in this process have used of the simulation's own interface
 
     def __init__(self, n_cells: int, vehicles: Sequence[str] = VEHICLES) -> None:
         self.vehicles = tuple(vehicles)

@@ -168,9 +168,13 @@ class EndsAtTheStart(OnlyStepBatch):
         os._exit(7)
 
 
-class ClosesSumo(IDM):
+class CallsSumo(IDM):
+    def __init__(self, call):
+        super().__init__()
+        self.call = call
+
     def step(self, seen):
-        __import__("libsumo").close()
+        eval(self.call, {"libsumo": __import__("libsumo")})
         return super().step(seen)
 
 

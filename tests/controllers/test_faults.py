@@ -231,8 +231,11 @@ def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, c
 
 
 @pytest.mark.slow
-def test_one_that_ends_the_simulation_that_it_is_tested_in_is_named(tmp_path, capsys):
-    assert _run(tmp_path, _of("ClosesSumo"), "world.engine=sumo") == EXIT_BAD_INPUT
+@pytest.mark.parametrize(
+    "call", ["close()", "simulationStep()", "vehicle.setSpeed('AV0', 3.0)", "vehicle.remove('LV0')"]
+)
+def test_one_that_changes_the_simulation_that_it_is_tested_in_is_named(call, tmp_path, capsys):
+    assert _run(tmp_path, _of("CallsSumo", call=f"libsumo.{call}"), "world.engine=sumo") == EXIT_BAD_INPUT
     assert "a vehicle that has changed the simulation that it is tested in" in capsys.readouterr().err
 
 

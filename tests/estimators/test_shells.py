@@ -62,6 +62,12 @@ def test_limits_are_those_of_the_likelihood_ratio_and_wider_where_the_pool_errs(
     assert rough.high - rough.rate > 1.3 * (exact.high - exact.rate)
 
 
+def test_no_rate_is_above_1_where_probabilities_that_the_pool_estimates_sum_to_more():
+    every = ((0, 40, 0, 0), (1, 40, 0, 0), (2, 40, 0, 0))
+    estimate = shells_estimate(*every, shells=replace(SHELLS, cell_p=SHELLS.cell_p * (1.004 / SHELLS.p.sum())))
+    assert 0.0 < estimate.ci_low <= estimate.crash_rate <= estimate.ci_high == 1.0
+
+
 def test_a_reference_that_crashes_nowhere_in_the_pool_is_nothing_to_compare_with():
     """As beside a vehicle that keeps its distance all along: every other reference is still there."""
     who = Reference("r157-cc", "a driver"), Reference("r157-fsm", "another")

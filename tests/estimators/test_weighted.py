@@ -24,7 +24,9 @@ def nade(*blocks) -> Nade:
 def test_is_the_mean_with_its_standard_error(rows):
     estimate = nade(block([crash for crash, _ in rows], [weight for _, weight in rows])).result(0.9)
     y = np.array([math.exp(weight) if crash else 0.0 for crash, weight in rows])
-    assert estimate.crash_rate == pytest.approx(y.mean(), rel=1e-12)
+    assert estimate.crash_rate == pytest.approx(min(y.mean(), 1.0), rel=1e-12)
+    assert estimate.ci_low <= estimate.crash_rate * (1.0 + 1e-12)
+    assert estimate.crash_rate <= estimate.ci_high or not y.any()
     if len(y) > 1 and y.any():
         assert estimate.std_error == pytest.approx(y.std(ddof=1) / math.sqrt(len(y)), rel=1e-6, abs=1e-9 * y.mean())
         assert estimate.n_effective == pytest.approx(y.sum() ** 2 / (y**2).sum(), rel=1e-9)

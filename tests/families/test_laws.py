@@ -119,10 +119,12 @@ WRONG = [
     (LEAD, assumed("approach", duration_s=40.0), "approach.*the road is 4 km long"),
     (LEAD, assumed("exposure", per_hour=0.0), r"exposure\.per_hour"),
     (LEAD, assumed("free_driving", lowest_mps2=1.5), r"free_driving\.lowest_mps2"),
+    (LEAD, assumed("fit_range", r1_max_m=11.5), r"initial_state\.r1_\*.*nan m.*at v = 35 m/s"),
     (LEAD, {"like": "cut-out-1"}, "like.*lead-brakes-1"),
     (OUT, assumed("leaving", careless_least_s=2.5), r"leaving\.careless_least_s"),
     (OUT, assumed("leaving", careless_least_s=12.0, careless_most_s=20.0), "leaving.*careless"),
     (OUT, assumed("leaving", lateral_median_mps=0.05), "leaving.*lateral"),
+    (OUT, assumed("initial_state", v_location_mps=900.0), r"initial_state\.v_location_mps.*no speed"),
     (OUT, {"leaving": {"drop_mean": {"value": 0.1, "source": "assumed", "range": [0.2, 0.3]}}}, r"leaving\.drop_mean"),
 ]
 

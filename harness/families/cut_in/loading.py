@@ -16,15 +16,13 @@ import numpy as np
 from harness.campaign.models import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import compiled_threads, unboxed
-from harness.errors import CampaignError
 from harness.families.cut_in import laws
 from harness.families.cut_in.lateral import constant_lead
 from harness.families.cut_in.laws import Environment, InitialStates, Wish, build_environment
 from harness.families.cut_in.parameters import DEFAULT, SHIPPED_FOLDER, EnvironmentParameters, parameter_record
-from harness.vocabulary import N_ACCELERATIONS, BoolArray, FloatArray, State
+from harness.families.flow import PROBABILITIES, require
+from harness.vocabulary import N_ACCELERATIONS, FloatArray, State
 
-PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])
-"""Where quantiles are evaluated: the ends are the smallest and the largest uniform that is drawn, but zero."""
 RARE = PROBABILITIES.size - 2
 FASTEST_LV_MPS = 100.0
 """Speed limit of SUMO's lanes; LV may exceed it in one of a million tests."""
@@ -79,44 +77,27 @@ def require_sound_laws(environment: Environment, file: str) -> None:
         where, total = f"{section} ({file})", pmf[law].sum(axis=1)
         limits = "a scale from {:g} to {:g} m/s²".format(*SCALES_MPS2)
         inside = (scale[law] >= SCALES_MPS2[0]) & (scale[law] <= SCALES_MPS2[1])
-        _require(inside, where, "noise of scale {:.3g} m/s²" + _IN_STATE, (scale[law], *states.T), limits)
+        require(inside, where, "noise of scale {:.3g} m/s²" + _IN_STATE, (scale[law], *states.T), limits)
         whole = (pmf[law] >= 0.0).all(axis=1) & (np.abs(total - 1.0) < 1e-9)
-        _require(whole, where, "probabilities that sum to {:.12g}" + _IN_STATE, (total, *states.T), "a sum of 1")
+        require(whole, where, "probabilities that sum to {:.12g}" + _IN_STATE, (total, *states.T), "a sum of 1")
     is_share, where = (accepted > 0.0) & (accepted <= 1.0), f"cut_in.accept_scale_s and cut_in.ignore_share ({file})"
     found = "a share of {:.3g} accepted at R2 = {:g} m, R2dot = {:g} m/s"
-    _require(is_share, where, found, (accepted, *approaches.T), "a share above 0 and at most 1")
+    require(is_share, where, found, (accepted, *approaches.T), "a share above 0 and at most 1")
     possible = np.isfinite(chance) & (chance * accepted.min() > SMALLEST_CHANCE)
     wish = "a wish to change lanes of {:.3g}" + _IN_STATE
-    _require(possible, f"cut_in ({file})", wish, (chance, *states.T), "a finite number above 0")
+    require(possible, f"cut_in ({file})", wish, (chance, *states.T), "a finite number above 0")
 
 
 def _require_initial_states(environment: Environment, speeds: FloatArray, file: str) -> None:
-    n, initial = environment.numbers, InitialStates(environment.numbers)
-    reaches = np.diff(initial.speed_cdf) >= -1e-9  # rounding shows where next to nothing of the distribution is left
-    where = f"initial_state.v_location_mps, v_scale_mps and v_shape ({file})"
-    _require(reaches, where, "no speed within the fit range", (), "a distribution of v_BV that reaches into it")
-    least, most = n["fit_range__r1_min_m"], n["fit_range__r1_max_m"]
+    (initial := InitialStates(environment.numbers)).require_sound(file)
     for speed in speeds:
         states = initial.given_speed(speed, *(u.ravel() for u in np.meshgrid(PROBABILITIES, PROBABILITIES)))
         r1 = states["r1_m"][: PROBABILITIES.size]
         rate = states["r1dot_mps"].reshape(PROBABILITIES.size, -1)
-        inside = (r1 >= least - 1e-6) & (r1 <= most + 1e-6)
-        rises = np.append(r1[2:] > r1[:-2], [True, True])  # pairs, because the outermost two may agree
-        found = f"R1 = {{:.3g}} m in the {{:.6g}} quantile at v = {speed:g} m/s"
-        expected = f"gaps spread within the fit range, {least:g} to {most:g} m"
-        _require(inside & rises, f"initial_state.r1_* ({file})", found, (r1, PROBABILITIES), expected)
         fast = np.where(np.isfinite(rate).all(axis=0), speed + rate[RARE], np.inf)
         found = f"LV at {{:.3g}} m/s in one of a million tests, at v = {speed:g} m/s, R1 = {{:.3g}} m"
         expected = f"rates that are finite, and an LV of at most {FASTEST_LV_MPS:g} m/s in all but one of a million"
-        _require(fast <= FASTEST_LV_MPS, f"initial_state.r1dot_* ({file})", found, (fast, r1), expected)
-
-
-def _require(sound: BoolArray, where: str, found: str, values: tuple[FloatArray, ...], expected: str) -> None:
-    """Refuse a law that is not sound (n,) everywhere; ``found`` formats the ``values`` (n,) where it first fails."""
-    if not sound.all():
-        first = int(np.argmin(sound))
-        mend = "The numbers are allowed one by one, but not together: correct those of this law."
-        raise CampaignError(where, found.format(*(value[first] for value in values)), expected, mend)
+        require(fast <= FASTEST_LV_MPS, f"initial_state.r1dot_* ({file})", found, (fast, r1), expected)
 
 
 class LawValues(NamedTuple):

@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
+from harness.families.flow import Flow
 from harness.families.following.approach import (
     AV_START_M,
     START_DTYPE,
@@ -61,6 +62,7 @@ class FollowingFamily(Family):
         known = {name: value for name, value in values.items() if name.startswith(kernel)} | clear | scope
         dtype = [*((name, "f8") for name in known), *((name, "i8") for name in steps)]
         numbers = np.array([(*known.values(), *steps.values())], dtype)[0]
+        Flow(numbers).require_sound(settings.parameters)
         return FollowingTraffic(numbers, *given.grid())
 
     def max_steps(self, traffic: FollowingTraffic) -> int:
