@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -132,6 +132,11 @@ class Bar:
     def span(self) -> float:
         """How far the rate moves, on a logarithmic scale; below 0 where the tests do not say it."""
         return max((abs(math.log(end)) for end in self.rate if end > 0.0), default=-1.0)
+
+
+def tests_of_sum(content: Mapping[str, Any]) -> str:
+    """What the tests of several scenarios are known by, in the place of a campaign's hash."""
+    return f"{content.get('campaign_crc32')}-{content['n_episodes']}"
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.campaign.files import dump_campaign
-from harness.estimators.traffic import Sensitivity
+from harness.estimators.traffic import Sensitivity, tests_of_sum
 from harness.families import family_named
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
@@ -54,7 +54,7 @@ def write_hours(folder: Path, content: dict[str, Any]) -> Path:
         verdict=None if decision is None else decided(decision).texts,
         rows=[(row, content["families"][row[0]]) for row in family_rows(content)],
         warnings=list(warnings(content)), exposures=exposures(content), scope=scope(content), called=called,
-        moved=_sensitivity(folder, str(content.get("crc32")), str(folder)),
+        moved=_sensitivity(folder, tests_of_sum(content), str(folder)),
     )  # fmt: skip
 
 

@@ -30,7 +30,7 @@ from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
 from harness.printed import PRINTED
 from harness.progress import Progress
-from harness.records.folder import CAMPAIGN, sole_use, write_bytes, write_sealed
+from harness.records.folder import CAMPAIGN, SENSITIVITY, sole_use, write_bytes, write_sealed
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import require_no_fewer, require_own_folder
 from harness.runner.underway import EXIT_OF, RunResult, Underway, begun, doubted
@@ -257,7 +257,7 @@ def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> No
 
 def require_no_other(out: Path, names: Sequence[str]) -> None:
     """Refuse (`RunFolderError`) a folder that holds something else than what is so called, or written beside it."""
-    known = {*names, PRINTED, "report.html"}
+    known = {*names, PRINTED, SENSITIVITY, "report.html"}
     if other := sorted(each.name for each in out.iterdir() if each.name[0] != "." and each.name not in known):
         expected = "a new or empty folder, or one of the same scenarios"
         raise RunFolderError(str(out), f"a folder with {other[0]}", expected, "Choose another folder with --out.")

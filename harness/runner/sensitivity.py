@@ -21,7 +21,7 @@ import numpy as np
 from harness.arguments import checked
 from harness.errors import CampaignError
 from harness.estimators.estimate import finite_json
-from harness.estimators.traffic import Bar, Sensitivity
+from harness.estimators.traffic import Bar, Sensitivity, tests_of_sum
 from harness.families.protocol import Parameters
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, read_manifest, require_place, write_sealed
@@ -114,7 +114,7 @@ def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: P
             sys.stderr.write(f"note: {name} alone moves by nothing here: {refused.found}\n")
         else:
             bars += [_part(replace(bar, what=f"{name} {bar.what}"), *shares) for bar in found.bars]
-    return Sensitivity(str(stored["crc32"]), "crashes per hour", stored["beside"]["reference"], _longest_first(bars))
+    return Sensitivity(tests_of_sum(stored), "crashes per hour", stored["beside"]["reference"], _longest_first(bars))
 
 
 def _part(bar: Bar, share: float, of_driver: float) -> Bar:

@@ -14,6 +14,7 @@ from harness.campaign.sections import EXPOSURES
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.stopping import Decision
+from harness.estimators.traffic import Bar, Sensitivity
 from harness.families.words import EXCLUDED
 from harness.numbers import number, plain
 from harness.pool import moved
@@ -23,6 +24,7 @@ from harness.report.hour_words import hour_lines
 from harness.resolved import resolve
 from harness.runner.stored import estimate_families
 from tests.in_process import one_process
+from tests.stored_runs import copy_of
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
 QUICK = [
@@ -225,6 +227,41 @@ def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
     verdict = Decision(1.0, "assumption_free", 0.95, 2.5, 40.0, driver="r157-cc").to_json()
     report = run.folder / "report.html"
     assert (len(hour_lines(content, report)), len(hour_lines({**content, "decision": verdict}, report))) == (10, 11)
+
+
+def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monkeypatch, capsys):
+    """And an exposure as an answer with that exposure; a scenario that says nothing of its own is named."""
+    told, folder = run.content, copy_of(run.folder, tmp_path / "run")
+
+    def of_one(where, ranges, _):
+        if where.name == "cut_out":
+            raise CampaignError("harness sensitivity", "no number", "one", "Look for one.")
+        assert ranges == ({"braking.stop_share": (0.0, 0.1)} if where.name == "lead_brakes" else {})
+        return Sensitivity("", "", "r157-cc", (Bar("twice", "assumed", None, (2.0, 1.0), (4.0, 1.0), (0.1, 0.0)),))
+
+    monkeypatch.setattr("harness.runner.sensitivity._of_one", of_one)
+    assert main(["sensitivity", str(folder), "--range", "braking.stop_share=0:0.1"]) == 0
+    assert "note: cut_out alone moves by nothing here: no number" in capsys.readouterr().err
+    bars = {bar["what"]: bar for bar in json.loads((folder / "sensitivity.json").read_text())["bars"]}
+    assert len(bars) == 3 + 2
+    for name, of in told["families"].items():
+        rate, driver = told["per_hour"]["rate"], told["beside"]["rate_per_hour"]
+        low, high = (estimate_families(folder, {name: of["exposure"][end]}) for end in ("low", "high"))
+        bar = bars[f"exposure {name}"]
+        assert bar["rate"] == pytest.approx([each["per_hour"]["rate"] / rate for each in (low, high)], rel=1e-3)
+        assert bar["ratio"] == pytest.approx(
+            [each["beside"]["ratio"] / told["beside"]["ratio"] for each in (low, high)], rel=1e-3
+        )
+        if name != "cut_out":
+            more, half = of["rate_per_hour"] / rate, 0.5 * of["reference_rate_per_hour"] / driver
+            assert bars[f"{name} twice"]["rate"] == pytest.approx([1.0 + more, 1.0])
+            assert bars[f"{name} twice"]["ratio"] == pytest.approx([(1.0 + more) / (1.0 - half), 1.0])
+    again = harness.run(campaign(), folder, workers=1, resume=True)  # it hinders nothing
+    assert again.content["per_hour"] == told["per_hour"]
+    assert main(["report", str(folder)]) == 0
+    assert 'id="plot-sensitivity"' in (folder / "report.html").read_text()
+    assert main(["sensitivity", str(folder), "--range", "braking.stop_shar=0:0.1"]) == 2
+    assert "found:    braking.stop_shar" in capsys.readouterr().err
 
 
 def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_scenario(run):
