@@ -24,7 +24,7 @@ from harness.report.words import answer_of
 from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
-from tests.stored_runs import SCENARIOS, copy_of, estimates, golden, manifest, sets
+from tests.stored_runs import ROOT, SCENARIOS, copy_of, estimates, golden, manifest, sets
 
 SMOKE = str(SCENARIOS / "smoke.yaml")
 
@@ -323,6 +323,34 @@ def test_a_run_resumes_the_last_of_its_scenarios(tmp_path, monkeypatch):
     )
     for scenarios, resumed in asked:
         assert run_folder("mine", scenarios, resume=True) == Path("runs", resumed)
+
+
+@pytest.mark.parametrize(("more", "noted"), [([], True), (["--quiet"], False), (["--out", "x"], False)])
+def test_a_second_run_says_where_it_goes(more, noted, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("runs/idm").mkdir(parents=True)
+    monkeypatch.setattr("harness.run", Mock(side_effect=ZeroDivisionError))
+    with pytest.raises(ZeroDivisionError):
+        main(["run", "idm", *more])
+    assert ("runs/idm is there already: this run goes to runs/idm-2" in capsys.readouterr().err) == noted
+
+
+@pytest.mark.parametrize(
+    ("asked", "labels", "out"),
+    [
+        (["examples/idm.py:IDM", "sumo:ACC"], ("idm.py:IDM", "SUMO’s ACC"), "idm-IDM-sumo-ACC"),
+        (["examples/idm.py:IDM", "--against", "name=x"], ("idm.py:IDM", "idm.py:IDM, name=x"), "idm-IDM-name-x"),
+        (["idm", "late-600ms"], ("idm", "late-600ms"), "idm-late-600ms"),
+    ],
+)
+def test_a_comparison_names_vehicles_as_their_runs_do(asked, labels, out, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    compare = Mock(side_effect=ZeroDivisionError)
+    monkeypatch.setattr("harness.compare", compare)
+    with pytest.raises(ZeroDivisionError):
+        main(["compare", *asked])
+    assert compare.call_args.kwargs["labels"] == labels
+    assert str(compare.call_args.args[2]).startswith(f"runs/{out}")
 
 
 @pytest.mark.parametrize(("asked", "at_most"), [("r157-cc", 1.0), ("0.5*r157-cc", 0.5)])

@@ -144,6 +144,8 @@ def run(
     )
     if resume:
         _note_other_stop(folder, campaign)
+    elif chosen and folder.name != campaign.name and not ctx.meta.get("quiet"):
+        say(f"note: {options.RUNS / campaign.name} is there already: this run goes to {folder}", err=True)
     if campaign.run.executor == "local":
         start_server()
     with _told_as_typed(accept), named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
@@ -285,7 +287,7 @@ def schema() -> None:
 )
 @click.option("--dry-run", is_flag=True, help="Print the commands that would be run, and run none.")
 def setup(*, dry_run: bool) -> None:
-    """Install the system libraries that SUMO needs, if any are missing, and compile what a first run needs.
+    """Install the system libraries that SUMO needs, if any are missing, and compile what runs need (some 40 s).
 
     pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get, dnf or apk, as root or
     with sudo, which may ask for your password at a terminal. A campaign with world.engine twin needs none.

@@ -75,6 +75,7 @@ def compare(
         raise click.UsageError("Name a second campaign, or say with --against or --against-av how B differs.")
     from harness.campaign.files import names_a_campaign
     from harness.campaign.models import parse_override
+    from harness.report.words import vehicle_words
 
     stored = source_a if source_a.is_dir() else None
     file_a = source_a if stored is None else stored / "campaign.yaml"
@@ -88,12 +89,15 @@ def compare(
         b = harness.load_campaign(of_b, [*overrides, *against], av=against_av or av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
-    label_b = ", ".join([b.name, *filter(None, [against_av]), *against]) if file_b is None else b.name
-    labels = (a.name, label_b) if a.name != label_b else (str(source_a), str(file_b))
+    vehicles = vehicle_words(a.av)[0], vehicle_words(b.av)[0]
+    name_b = ", ".join([*filter(None, [against_av]), *against]) if file_b is None else b.name
+    labels = (a.name, b.name) if a.name != b.name else (str(source_a), str(file_b))
+    if vehicles[0] != vehicles[1] or file_b is None:
+        labels = vehicles if vehicles[0] != vehicles[1] else (vehicles[0], f"{vehicles[0]}, {name_b}")
     if junit is not None and margin is None:
         say("note: without --margin the JUnit file says only whether it came to an end, whichever is worse", err=True)
     if chosen := folder is None:
-        folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', label_b.removeprefix(f'{a.name}, '))}"
+        folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', name_b)}"
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
     with named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
         found = harness.compare(

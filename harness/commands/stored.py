@@ -200,10 +200,13 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     bars = list(map(_bar, content["bars"]))
     if not any(bar["remark"] for bar in bars):
         bars = [{key: value for key, value in bar.items() if key != "remark"} for bar in bars]
-    print_table(f"What moves the answer: {content['environment']}", bars)
+    from harness.families.cut_in.parameters import DEFAULT
+
+    traffic = content["environment"]
+    print_table(f"What moves the answer: {'the default traffic, ' * (traffic == DEFAULT)}{traffic}", bars)
     say(
-        "With a number at the one or the other end of what is known of it, the rate, and the ratio to the competent "
-        "driver, are so many times as high.",
+        "Under 'rate' and 'ratio' (to the competent driver) the left value is by how much they are multiplied with the "
+        "number at its lower end, the right one at its upper end.",
         "This assumes that the same share of each shell's events end in a crash; 'error' is by how much that is wrong "
         "for a reference driver.",
         f"report  {page}",

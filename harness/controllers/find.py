@@ -161,9 +161,10 @@ def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
         takes = [each for each in {**loads, **_signature(found).parameters} if each not in handed]
         wrong = next((each for each in parameters if each not in takes), "")
         what = f"{', '.join(parameters) or 'none'}, with which {name} cannot be made ({error})"
-        mend = did_you_mean(wrong, takes) or "Give what it needs: --set av.parameters.NAME=…; or correct its code."
+        mend = "Give what it needs: --set av.parameters.NAME=…; or correct its code."
+        mend = f"Leave out av.parameters.{wrong}." if "unexpected" in str(error) else mend
         expected = f"keyword arguments of the controller: {', '.join(takes) or 'it has none'}"
-        raise CampaignError("av.parameters", what, expected, mend) from error
+        raise CampaignError("av.parameters", what, expected, did_you_mean(wrong, takes) or mend) from error
     return lambda: make(**deepcopy(parameters))
 
 

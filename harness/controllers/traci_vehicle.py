@@ -17,7 +17,7 @@ ROAD = "cell0"
 LANE_CENTRES_M = (-1.6, 1.6)
 MAX_SPEED_MPS = 100.0
 _ROUNDING = 1e-9
-_SAFE_SPEED, _ACCEL, _DECEL = 1, 2, 4
+_SAFE_SPEED, _ACCEL, DECEL = 1, 2, 4
 """Bits of a speed mode."""
 _SUMOS_OWN = 31
 """The speed mode of a script that sets none."""
@@ -93,12 +93,12 @@ class VehicleDomain(Domain):
         """Accelerations (m/s²) of the coming steps; empty without a command."""
         self._command: Callable[[], Iterator[float]] | None = None
         """What begins the plan anew: nothing for a command that is over after a step."""
-        self.told_at = "", 0
-        """File and line of the last command."""
+        self.told_at = "", 0, DECEL
+        """File and line of the last command, and the speed mode then."""
         self._told = math.nan
         """Speed (m/s) that the AV will have if it does what it is told."""
         self._accel = self._decel = math.inf
-        self._speed_mode = _ACCEL | _DECEL
+        self._speed_mode = _ACCEL | DECEL
         self._subscribed: dict[str, tuple[int, ...]] = {}
         self._around: dict[str, tuple[float, tuple[int, ...]]] = {}
         """Range (m) and variables of what has been subscribed to around a vehicle."""
@@ -145,7 +145,7 @@ class VehicleDomain(Domain):
         """What the AV is told for the coming step (m/s²); without a command it keeps its speed."""
         if (acceleration := next(self._plan, None)) is None:
             self._command, acceleration = None, 0.0
-        elif self._speed_mode & _DECEL:
+        elif self._speed_mode & DECEL:
             acceleration = max(acceleration, -self._decel)
         if self._speed_mode & _ACCEL:
             acceleration = min(acceleration, self._accel)
@@ -270,7 +270,7 @@ class VehicleDomain(Domain):
 
     def _begin(self, command: Callable[[], Iterator[float]] | None, duration: float) -> None:
         caller = sys._getframe(2)
-        self.told_at = caller.f_code.co_filename, caller.f_lineno
+        self.told_at = caller.f_code.co_filename, caller.f_lineno, self._speed_mode
         self._plan = iter(()) if command is None else command()
         self._command = command if duration > self.step_s + _ROUNDING else None
 

@@ -159,9 +159,11 @@ def verdict(found: AvCheck) -> str:
             "State winds up while its answers are not used, as an integral does: limit it (anti-windup), or begin "
             "it when BV comes; then av.warm_up_s need be no longer than its filters."
         )
-    slower, speed, advice = found.speed.us_per_step / found.idm_speed.us_per_step, found.speed, ""
+    slower, speed, advice = found.speed.us_per_step / found.idm_speed.us_per_step, found.speed, "."
+    if speed.us_per_step > 100.0:  # which slows a run; in Python it is some 15
+        advice = f", {slower:.0f} times as long as IDM’s."
     if speed.construction_s > SLOW_S and speed.constructions > 1:
-        advice = (
+        advice += (
             f" Its constructor takes {speed.construction_s:.1f} s, and each worker of a run calls it "
             f"{speed.constructions} times: what all may share, load once (`load`, see docs/controllers.md)."
         )
@@ -172,7 +174,7 @@ def verdict(found: AvCheck) -> str:
     return (
         f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
         f"{found.events}, {seen.reaction_s:.1f} s after they began (median; some leave time to wait); "
-        f"a step takes {slower:.1f} times as long as IDM’s.{advice}"
+        f"it takes {speed.us_per_step:.1f} µs a step{advice}"
     )
 
 

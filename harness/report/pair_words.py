@@ -23,13 +23,14 @@ def pair_words(decision: Mapping[str, Any]) -> str:
         told = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
         return told.get(verdict, "Not told apart")
     most = share(margin)
-    low, high = ("" if end is None else ratio(end) for end in decision.get("ratio") or (None, None))
+    # Of B / A; told as all else, of A / B.
+    high, low = ("" if not end else ratio(1.0 / end) for end in decision.get("ratio") or (None, None))
     if verdict == "proven":
-        return f"B is at most {most} worse than A" + f" (B / A ≤ {high})" * bool(high)
+        return f"B is at most {most} worse than A" + f" (A / B ≥ {low})" * bool(low)
     if verdict == "refuted":
-        return f"B is more than {most} worse than A" + f" (B / A ≥ {low})" * bool(low)
-    between = f"{low} to {high}" if high else f"≥ {low}"
-    return f"Open whether B is more than {most} worse than A" + f" (B / A {between})" * bool(low)
+        return f"B is more than {most} worse than A" + f" (A / B ≤ {high})" * bool(high)
+    between = f"{low} to {high}" if low and high else f"≥ {low}" if low else f"≤ {high}"
+    return f"Open whether B is more than {most} worse than A" + f" (A / B {between})" * bool(low or high)
 
 
 def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
@@ -106,11 +107,10 @@ def pair_lines(
             rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
         label = label if len(label) <= LABEL else f"{label[: LABEL - 2]} …"
         rows.append((f"{name} {label}", rate, ends, f"{count(of['n_crashes'])} crashes"))
-    if asked["ratio"] is not None:
-        rows.append(("A / B", *ratio_words(asked), ""))
-    apart = asked["difference"]
-    ends = interval(asked["ci_low"], asked["ci_high"], beside=apart)
-    rows.append(("A − B", number(apart), ends, alone_words(asked)))
+    looks = f"verdict: confidence {plain(content['decision']['confidence'])} over all looks"
+    rows.append(("A / B", *ratio_words(asked), looks * (content["decision"]["verdict"] != "open")))
+    ends = interval(asked["ci_low"], asked["ci_high"], beside=asked["difference"])
+    rows.append(("A − B", number(asked["difference"]), ends, alone_words(asked)))
     families = content.get("families", {})
     parts = columns(
         [(called(name), f"A / B {' '.join(ratio_words(of))}", alone_words(of)) for name, of in families.items()]
@@ -120,8 +120,7 @@ def pair_lines(
         given = f"A / B and A − B assume that both crash only where {asked['boundary']} of the library does"
         remarks.insert(0, given)
     scope = scope_words(content["confidence"], ENDED.get(content.get("ended", ""), "interrupted"))
-    above = campaign.crash.counts_above_mps
-    counted = f" above {plain(above)} m/s" if above else ""
+    counted = f" above {plain(above)} m/s" if (above := campaign.crash.counts_above_mps) else ""
     scenarios, unit = (scenarios_words(families), "hour") if families else (called(campaign.scenario), "test")
     pairs = f"{count(content['n_pairs'])} pairs of tests, {scenarios}"
     head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per {unit}"

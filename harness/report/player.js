@@ -104,7 +104,7 @@
       scale = width / clamp(front + behind + 2 * LENGTH + 8, 40, clamp(width / 4.6, 40, 100));
       anchor = Math.min((behind + LENGTH + 3) * scale, width * (width < 640 ? 0.36 : 0.5));
       const [lane, w, l] = [LANE, WIDTH, LENGTH].map((each) => each * scale);
-      const top = 18, low = top + 2 * lane, height = low + 36;
+      const top = 18, low = top + 2 * lane, height = low + 22 + 14 * Math.max(others.length, 1);
       view.replaceChildren();
       set(view, { viewBox: `0 0 ${width} ${height}`, height });
       add(view, "rect", { class: "asphalt", y: top, width, height: 2 * lane });
@@ -204,6 +204,7 @@
         const aside = beyond && ghost < 0, edge = aside ? ends : width - 6, from = beyond ? edge : clamp(rear, 4, width - 130);
         const height = ghost >= 0 ? low + 18 + 14 * ghost : y + 4;
         if (aside && seen) ends -= 9 * label.textContent.length;
+        else if (seen && !beyond && x > ends - 100) ends = Math.min(ends, rear - 6);  // beside it, not over it
         set(label, { x: from, y: height, "text-anchor": beyond ? "end" : "start" });
       }
       const hit = `${(at(tracks.AV, t).x - eye) * scale} ${top + 1.5 * lane}`;

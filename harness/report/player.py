@@ -24,6 +24,7 @@ from harness.pool.kept import onset_steps
 from harness.records.schemas import chosen_from
 from harness.report.summary import floats
 from harness.report.templates import write_page
+from harness.report.words import vehicle_words
 from harness.shown import ShownInPython
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 from harness.vehicles.library import library_records
@@ -101,7 +102,7 @@ class Scenes:
     """
 
     def __init__(self, campaign: Campaign, environment: Environment | None) -> None:
-        self._name, self._acts = campaign.name, campaign.av.acts_before_event
+        self._vehicle, self._acts = vehicle_words(campaign.av)[0], campaign.av.acts_before_event
         self._family, self._environment = family_named(campaign.scenario), environment
 
     @property
@@ -168,7 +169,7 @@ class Scenes:
         moments = [(cut, " ".join(words.happens)), (av["brakes"], "AV brakes"), (av["crash"], "crash")]
         moments += [*seen, (onset, " ".join(words.shows))] if onset != cut else seen
         scene = {
-            "campaign": self._name, "scenario": self._family.name, "episode": episode,
+            "vehicle": self._vehicle, "scenario": self._family.name, "episode": episode,
             "title": f"Test {episode:,}: {why or outcome}",
             "first": first, "onset": onset, "event": cut, "principal": bv["name"],
             "apart": None if onset is None else first if self._family.follows else onset + 1,

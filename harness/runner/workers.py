@@ -270,7 +270,7 @@ class Workers:
         if float(bdtrc(len(fatal) - 1, n_begun, share)) < SURELY_TOO_MANY:
             found = f"{len(fatal)} of the first {n_begun} tests of shard {job.request.index} ended their worker process"
             found += f", the last of them test {episode}: {cause}"
-            mend = "Fix the controller (`harness av-check` looks at it in seconds), or go on with a larger share."
+            mend = "Fix the controller (`harness av-check` looks at it in seconds)."
             raise TooManyFailedError("run.max_failed_share", found, f"a share of at most {share:g}", mend)
 
 

@@ -4,6 +4,7 @@ import json
 import re
 import signal
 import sys
+from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -11,12 +12,14 @@ import numpy as np
 import pytest
 
 from benchmarks.kills import orphans
+from harness.campaign.campaign import Campaign
 from harness.cli import main
 from harness.controllers.find import build_host
 from harness.controllers.hosts import _numbers
 from harness.controllers.process_state import OtherModules
-from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED, TooManyFailedError
 from harness.printed import PRINTED
+from harness.runner.kept import require_few_failed
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
 from tests.in_process import controllers_here, one_process
@@ -168,6 +171,13 @@ def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
     assert not (tmp_path / "run/estimates.json").exists()
 
 
+@pytest.mark.parametrize(("n", "offered"), [(100, True), (10, False)])
+def test_to_go_on_is_offered_where_few_tests_failed(n, offered):
+    with pytest.raises(TooManyFailedError) as caught:
+        require_few_failed(Counter({"step: raises": 5}), n, Campaign(name="x"))
+    assert ("--set run.max_failed_share=" in caught.value.mend) == offered
+
+
 SHORT_MADE = ", limits: {construction_time_s: 0.2}"
 POPEN = "{controller: 'subprocess:Popen', parameters: {args: touch called, shell: true}}"
 IN_CONSTRUCTOR = {
@@ -180,6 +190,7 @@ REFUSED = [
     ("{controller: 'misbehavin:X'}", "av.controller", "Name its file"),
     (_of("OnlyStepp"), "av.controller", "Did you mean 'OnlyStep'?"),
     (_of("Misbehaving", badd="x"), "av.parameters", "Did you mean 'bad'?"),
+    (_of("OnlyStep", ttc=3), "av.parameters", "fix:      Leave out av.parameters.ttc.\n"),
     (_of("only_a_function"), "av.parameters", "min_acceleration_mps2"),
     *(
         (_of("Always", SHORT_MADE, where="constructor", how=how), "av.controller", words)

@@ -30,7 +30,14 @@ class Agent:
         return np.array([-1.0 if 4.0 * (speed - lead_speed) > gap else 0.0], dtype=np.float32)
 
 
-def make(package, file):
+class Pair(Agent):
+    """Answers as stable-baselines3 does."""
+
+    def predict(self, vector):
+        return super().predict(vector), None
+
+
+def make(package, file, agent):
     """Write the agent as a file of the package's own: of a policy that has to be trained, an untrained one."""
     if package == "torch":
         torch, network = importlib.import_module("torch"), importlib.import_module("network").Network()
@@ -61,11 +68,11 @@ def make(package, file):
 
         sb3.PPO("MlpPolicy", Road(), seed=1, device="cpu").save(file)
     else:
-        file.write_bytes(pickle.dumps(Agent()))
+        file.write_bytes(pickle.dumps(agent()))
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_a_recipe_is_the_same_vehicle_in_whatever_package(name, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("name", "agent"), [*((name, Agent) for name in RECIPES), ("my_agent", Pair)])
+def test_a_recipe_is_the_same_vehicle_in_whatever_package(name, agent, tmp_path, monkeypatch, capsys):
     package, file = RECIPES[name], tmp_path / "policy.zip"
     for each, text in BLOCKS.items():
         (tmp_path / each).write_text(text, "utf-8")
@@ -74,7 +81,7 @@ def test_a_recipe_is_the_same_vehicle_in_whatever_package(name, tmp_path, monkey
         monkeypatch.delitem(sys.modules, stale, raising=False)
     if package:
         pytest.importorskip(package)
-    make(package, file)
+    make(package, file, agent)
     av = f"av={{controller: '{name}:Policy', parameters: {{file: '{file}'}}}}"
     if package == "stable_baselines3":  # untrained: it does something, the same in any cell
         assert drive(av, n=40).failures == {}

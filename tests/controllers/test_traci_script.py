@@ -162,7 +162,7 @@ IN_A_TEST = {
     r"step: RefusedError: traci.vehicle.changeLane is refused: the AV stays.*\(my.py:8\)": text(
         "if leader:\n        try: traci.vehicle.changeLane('ego', 1, 5.0)\n        except traci.TraCIException: pass"
     ),
-    r"step: asked for -\d+\.?\d* m/s2, outside of av.limits \(-15 to 10\) \(my.py:7\)": text(
+    r"step: asked for -\d+\.?\d* m/s2, outside of av.limits \(-15 to 10\) \(my.py:7\): .* mode 0, .* use mode 31": text(
         "if leader: traci.vehicle.setSpeedMode('ego', 0), traci.vehicle.setSpeed('ego', 0.0)"
     ),
 }

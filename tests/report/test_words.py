@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from harness.estimators.answer import estimate_blocks
+from harness.estimators.answer import AssumedOfRate, estimate_blocks
 from harness.numbers import number, plain
 from harness.records.folder import read_manifest
 from harness.report.lines import LINES, WIDTH, columns, lines
@@ -135,10 +135,12 @@ def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     best = replace(run.estimates.best, **rate, details={**details, "references": [beside], "shells": shells})
     limits = {"limits_above_5_mps": (0.0, 1.0), "limits_below_1_mps": (0.001, 0.41)}
     severity = replace(run.estimates.severity, **limits, share_below_1_mps=0.0)
-    rows = said(run, best, severity=severity, decision=decision).rows
+    others = AssumedOfRate("", 0.25, (0.1, 25.0), 0.01)
+    rows = said(run, best, severity=severity, decision=decision, assumed=others).rows
     found = {row.key: row.texts[1:] for row in rows}
     assert found["rate"][:2] == ("> 1.00 × 10⁻⁷ per test", "estimate 2.00 × 10⁻⁷")
     assert found["ratio"][:2] == ("> 2.00 (crashes more)", "estimate 3.98")
+    assert found["assumed"][:2] == ("up to 25 times", "–")  # no gap in the column
     assert found["impact"][1:] == ("", "0 % (0–41 %) below 1 m/s")
 
 

@@ -253,6 +253,7 @@ def test_the_command_line(capfd):
     out = capfd.readouterr().out
     assert re.search(r"built-in IDM +[│┃]\n", out)
     assert re.match(r"READY: 6 tests twice, the same bits; it braked after \d+% of \d+ cut-ins", out)
+    assert re.search(r"it takes \d+(\.\d+)? µs a step\.", " ".join(out.split()))
     (mean,) = re.findall(r"mean acceleration, m/s² +│ +(\S+) +│ +(\S+) +│", out)
     assert mean[0] == mean[1]  # it is the built-in IDM
     assert "failed: none" in out

@@ -145,8 +145,9 @@ def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_c
     found = compare_campaigns(a, b, tmp_path, workers=1, margin=0.1)
     assert (found.content["decision"]["verdict"], found.exit_code) == (verdict, exit_code)
     low, high = found.content["decision"]["ratio"]
-    end = f"≥ {ratio(low)}" if swapped else f"≤ {ratio(high)}"
-    assert pair_words(found.content["decision"]).endswith(f"10 % worse than A (B / A {end})")
+    end = f"≤ {ratio(1.0 / low)}" if swapped else f"≥ {ratio(1.0 / high)}"  # in the direction of the row A / B
+    assert pair_words(found.content["decision"]).endswith(f"10 % worse than A (A / B {end})")
+    assert "verdict: confidence 0.95 over all looks" in " ".join(repr(found).split())
     assert low > 1.1 if swapped else high <= 1.1
     assert manifest(tmp_path / "a")["unmet"] == [{"key": "margin", "numbers": {"margin": 0.1}}]
 
