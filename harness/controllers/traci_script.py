@@ -27,7 +27,7 @@ from harness.controllers.from_source import FromSource
 from harness.controllers.protocol import EpisodeStart, Observation
 from harness.controllers.traci_refused import Domain, FatalTraCIError, RefusedError
 from harness.controllers.traci_style import SimulationDomain, Traci
-from harness.controllers.traci_vehicle import DECEL, VehicleDomain
+from harness.controllers.traci_vehicle import DECEL, LOOSE, VehicleDomain
 from harness.files import real_path
 from harness.vehicles.kinematics import STEP_S
 
@@ -36,7 +36,6 @@ _PATIENCE = 100
 """Steps that a script may ask for when its simulation has ended; a loop that no error ends is left where it is."""
 _LEFT = list[greenlet]()
 _VERSION = 22, "SUMO 1.28.0"
-_LOOSE = ": the script has set speed mode {}, in which decel does not bound setSpeed; use mode 31, or bound it yourself"
 _OF_SIMULATION = {
     0x66: "getTime", 0x71: "getLoadedNumber", 0x72: "getLoadedIDList", 0x73: "getDepartedNumber",
     0x74: "getDepartedIDList", 0x79: "getArrivedNumber", 0x7A: "getArrivedIDList", 0x7B: "getDeltaT",
@@ -374,7 +373,7 @@ class ScriptController:
     def told_at(self) -> str:
         """`` (my_script.py:12)``: where the script gave its last command; and if ``decel`` did not bound it, why."""
         file, line, mode = self._traci.vehicle.told_at
-        return f" ({Path(file).name}:{line}){'' if mode & DECEL else _LOOSE.format(mode)}"
+        return f" ({Path(file).name}:{line}){'' if mode & DECEL else LOOSE.format(mode)}"
 
     def _turn(self) -> None:
         assert self._run is not None

@@ -19,6 +19,7 @@ MAX_SPEED_MPS = 100.0
 _ROUNDING = 1e-9
 _SAFE_SPEED, _ACCEL, DECEL = 1, 2, 4
 """Bits of a speed mode."""
+LOOSE = ": the script has set speed mode {}, in which decel does not bound setSpeed; use mode 31, or bound it yourself"
 _SUMOS_OWN = 31
 """The speed mode of a script that sets none."""
 _CHANGES_LANE = 0b1100_1111_1111
