@@ -19,6 +19,8 @@ from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 
 LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_ttc_s", "contact")
 """What a replay tells of a cut-in that takes time."""
+LEAST_MOVE = 0.01
+"""Of a rate or ratio that a line is worth."""
 
 
 @click.command(
@@ -197,20 +199,27 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     if as_json:
         print_json(content)
         return
-    bars = list(map(_bar, content["bars"]))
+    bars = [_bar(bar) for bar in content["bars"] if any(map(_tells, (*bar["rate"], *bar["ratio"])))]
+    n_still = len(content["bars"]) - len(bars)
     if not any(bar["remark"] for bar in bars):
         bars = [{key: value for key, value in bar.items() if key != "remark"} for bar in bars]
-    from harness.families.cut_in.parameters import DEFAULT
+    from harness.families import families
 
     traffic = content["environment"]
-    print_table(f"What moves the answer: {'the default traffic, ' * (traffic == DEFAULT)}{traffic}", bars)
+    usual = "the default traffic, " * (traffic in [family.default_parameters for family in families().values()])
+    print_table(f"What moves the answer: {usual}{traffic}", bars)
     say(
+        *([f"{n_still} more numbers move neither by {share(LEAST_MOVE)}."] if n_still else ()),
         "Under 'rate' and 'ratio' (to the competent driver) the left value is by how much they are multiplied with the "
         "number at its lower end, the right one at its upper end.",
         "This assumes that the same share of each shell's events end in a crash; 'error' is by how much that is wrong "
         "for a reference driver.",
         f"report  {page}",
     )
+
+
+def _tells(times: float | None) -> bool:
+    return times is None or abs(times - 1.0) >= LEAST_MOVE
 
 
 def _bar(bar: dict[str, Any]) -> dict[str, str]:

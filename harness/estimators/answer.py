@@ -15,7 +15,7 @@ from harness.campaign.sections import LEAST_POOL_ERROR, MOST_EVENTS
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Note, Number, Point, Unavailable, finite_json
 from harness.estimators.likelihood import Level
-from harness.estimators.one_pass import BEFORE_OVERLAP, one_pass
+from harness.estimators.one_pass import BEFORE_EVENT, one_pass
 from harness.estimators.own import Asked, headline_of
 from harness.estimators.severity import Severity
 from harness.estimators.stopping import RoundRule, Rule
@@ -154,13 +154,12 @@ def _per_1e6_km(estimate: Estimate, distance_per_test_km: float) -> dict[str, fl
     return {"rate": estimate.crash_rate * scale, "ci_low": estimate.ci_low * scale, "ci_high": estimate.ci_high * scale}
 
 
-def before_overlap(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> dict[str, Any] | None:
-    """What a vehicle did before BV was on its lane, by number of tests; None where it could do nothing."""
-    if not manifest.get("events_show") or campaign.av.acts_before_event:
-        return None
-    counted = {name: counts.get(name, 0) for name in ("n_events", *(f"n_{each}" for each in BEFORE_OVERLAP))}
+def before_event(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> dict[str, Any]:
+    """What a vehicle did before the event, by number of tests; ``waits`` where it holds its speed while BV comes."""
+    waits = bool(manifest.get("events_show")) and not campaign.av.acts_before_event
+    counted = {name: counts.get(name, 0) for name in ("n_events", *(f"n_{each}" for each in BEFORE_EVENT))}
     built_in, script = campaign.av.model is not None, bool(manifest.get("script"))
-    return {"source": campaign.av.source, "built_in": built_in, "script": script, **counted}
+    return {"source": campaign.av.source, "built_in": built_in, "script": script, "waits": waits, **counted}
 
 
 def ended_by(campaign: Campaign, rule: Rule, n_episodes: int) -> StoppedBy:

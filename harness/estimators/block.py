@@ -37,7 +37,7 @@ MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
 EPISODE_COLUMNS = (
     "episode", "outcome", "event_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_event",
-    "n_steps", "end_ttc_s", "took_over_step", "asked_to_speed_up", "braked_before",
+    "n_steps", "end_ttc_s", "took_over_step", "asked_to_speed_up", "braked_before", "fell_behind",
 )  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass")
 BASELINE_COLUMNS = ("shadow", "event_mass")
@@ -90,7 +90,7 @@ class Block:
     ``log_weight`` (n,) is log p(x_c) - log q_sampled(x_c), exactly 0 without control. ``columns``, also as attributes,
     are what else the method records, a row for each episode: bool (n,) ``happened``, ``cut_off`` (`DANGER_TTC_S`),
     ``took_over_early`` (the AV did something before BV was on its lane), ``asked_to_speed_up`` (or that in vain) and
-    ``braked_before`` (it asked to brake before anything happened);
+    ``braked_before`` (it asked to brake before anything happened), ``fell_behind`` (it did not keep up till then);
     ``impact_mps`` (n,), closing speed at contact, NaN without a crash; ``n_control_steps`` (n,). ``log_q`` (n, M) is,
     per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode;
     ``martingale`` (n, J) the D_j of `harness.estimators.doubly_robust`;
@@ -227,7 +227,7 @@ def block_from_tables(
         "impact_mps": np.asarray(episodes["impact_speed_mps"].to_numpy(), dtype=np.float64),
         "cut_off": (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy(),
         "took_over_early": pc.fill_null(early, fill_value=False).to_numpy(),
-        **{name: episodes[name].to_numpy() for name in ("asked_to_speed_up", "braked_before")},
+        **{name: episodes[name].to_numpy() for name in ("asked_to_speed_up", "braked_before", "fell_behind")},
     }
     if sampling.mixes:
         columns["log_q"] = _nested(episodes, "log_q", len(alpha))

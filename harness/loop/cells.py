@@ -39,13 +39,16 @@ _STEPS = "n_steps", "event_step", "lead_steps", "onset_step", "took_over_step", 
 _AT_EVENT = "event_gap_m", "event_rate_mps", "onset_gap_m", "onset_rate_mps"
 _AT_END = "crash_time_s", "impact_speed_mps", "min_ttc_s", "end_ttc_s", "av_distance_m", "log_weight", "log_p_event"
 EPISODE_DTYPE = np.dtype(
-    [(name, np.int8) for name in ("outcome", "component", "asked_to_speed_up", "braked_before")]
+    [(name, np.int8) for name in ("outcome", "component", "asked_to_speed_up", "braked_before", "fell_behind")]
     + [(name, np.int16) for name in _STEPS]
     + [(name, _f8) for name in (*_AT_EVENT, *_AT_END)]
 )
 """What becomes of a test. ``component`` is the stratum or importance function that it was drawn from, -1 for none;
 ``took_over_step`` the first in which the AV did what it asked for, -1 for none, ``asked_to_speed_up`` whether it
-asked for that while it was held, and ``braked_before`` whether it asked to brake at the end of its warm-up."""
+asked for that while it was held, ``braked_before`` whether it asked to brake at the end of its warm-up, and
+``fell_behind`` whether it was more than `FAR_BEHIND_S` behind the vehicle ahead when the event began."""
+FAR_BEHIND_S = 5.0
+"""Longer than who follows is behind another vehicle [assumed]."""
 
 
 class Cells(NamedTuple):

@@ -7,7 +7,8 @@ from typing import Any
 
 from harness.compiled import compiled, compiled_inline
 from harness.families.script import Script
-from harness.loop.cells import KernelState
+from harness.loop.cells import FAR_BEHIND_S, KernelState
+from harness.loop.drive import leader_of
 from harness.vehicles.kinematics import gap
 from harness.vehicles.sideways import onset_of
 from harness.vocabulary import RecordArray
@@ -107,9 +108,17 @@ def repeat(kernel: KernelState) -> None:
         test = kernel.episode[cell.row]
         if cell.step == cell.onset_step:
             test.onset_gap_m, test.onset_rate_mps = gap_and_rate(k, kernel)
+            test.fell_behind = cell.acts_from == 0 and is_far_behind(k, kernel)
         if cell.step == script.at[cell.row]:
             note_event(k, kernel)
             test.n_control_steps += test.component >= 0 or test.log_weight != 0.0  # drawn otherwise than traffic would
+
+
+@compiled_inline
+def is_far_behind(k: int, kernel: KernelState) -> bool:
+    """Whether an AV that has followed from the start is far behind the vehicle ahead."""
+    av, leader = kernel.x.shape[1] - 1, leader_of(k, kernel.cells.lane_before, True, kernel)
+    return leader >= 0 and gap(kernel.x[k, leader], kernel.x[k, av]) > FAR_BEHIND_S * kernel.v[k, av]
 
 
 @compiled_inline

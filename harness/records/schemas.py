@@ -73,6 +73,9 @@ def episodes_schema(
             _or_null("took_over_step", _I2, "0.1 s", "first step in which the AV did what its vehicle asked for"),
             _field("asked_to_speed_up", pa.bool_(), "", "whether it asked to speed up while it was held at its speed"),
             _field("braked_before", pa.bool_(), "", "whether it asked to brake while nothing happened, in its warm-up"),
+            _field(
+                "fell_behind", pa.bool_(), "", "whether it was over 5 s behind the vehicle ahead when the event began"
+            ),
             _or_null("crash_time_s", _F8, "s", "time of the crash"),
             _or_null("impact_speed_mps", _F8, "m/s", "v_AV - v_BV at the crash"),
             _or_null("min_ttc_s", _F8, "s", "smallest R2/-R2dot after the cut-in while closing"),
@@ -282,7 +285,7 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
         "seed": np.full(n, seed, np.int64),
         "log_q": rows(log_q),
         "martingale": rows(martingale),
-        **{name: e[name] > 0 for name in ("asked_to_speed_up", "braked_before")},
+        **{name: e[name] > 0 for name in ("asked_to_speed_up", "braked_before", "fell_behind")},
         "pool_row": pa.nulls(n, pa.int64()) if prescribed is None else prescribed.row,
     }
     if prescribed is not None:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.estimate import finite_json
+from harness.loop.cells import FAR_BEHIND_S
 from harness.report.words import brakes_before_words, late_words
 from harness.shown import ShownInPython
 
@@ -171,6 +172,8 @@ def verdict(found: AvCheck) -> str:
         advice += f" But {late_words(script=found.script)}."
     if found.shows and seen.n_braked_before:
         advice += f" But {brakes_before_words(seen.n_braked_before, script=found.script)}."
+    if found.follows is not None and found.follows.headway_s > FAR_BEHIND_S:
+        advice += f" But it is {found.follows.headway_s:.1f} s behind the vehicle ahead by then: does it keep up?"
     return (
         f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
         f"{found.events}, {seen.reaction_s:.1f} s after they began (median; some leave time to wait); "

@@ -15,11 +15,11 @@ from harness.report.lines import columns, headed, wrapped
 from harness.report.rows import decided, looking_words, ratio_texts
 from harness.report.words import (
     GO_ON,
+    acts_words,
     doubt_words,
     early_words,
     ended_words,
     milder_words,
-    overlap_words,
     scope_words,
     unseen_words,
 )
@@ -107,7 +107,7 @@ def warnings(content: Mapping[str, Any]) -> Iterator[str]:
             most = found.most * (of["ci_high"] if of["n_crashes"] else of["upper_bound"])
             yield f"{called(name)}: {unseen_words(found.where)}, here {number(most)} per hour"
         doubts = doubt_words({**of, "rate": of["rate_per_hour"]}, " per hour")
-        early = *early_words(of["n_crashes_before_event"]), *overlap_words(of.get("before_overlap"))
+        early = *early_words(of["n_crashes_before_event"]), *acts_words(of.get("before_event"))
         yield from (f"{called(name)}: {text}" for text in (*early, *doubts))
 
 

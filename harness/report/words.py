@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.estimators.answer import STORED_ESTIMATES, Elsewhere, Estimates, before_overlap
+from harness.estimators.answer import STORED_ESTIMATES, Elsewhere, Estimates, before_event
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.numbers import WIDEST_RHW, count, leaves, number, plain, share, words
@@ -79,7 +79,7 @@ def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimate
         rows=tuple(with_traffic(list(rows_of(campaign, manifest, told)), told.traffic)),
         warnings=(
             *_warnings(campaign, manifest, told),
-            *overlap_words(before_overlap(campaign, manifest, told.diagnostics)),
+            *acts_words(before_event(campaign, manifest, told.diagnostics)),
             *(() if told.traffic is None else too_few(told.traffic.n_replicates, told.traffic.confidence)),
         ),
         scope=_scope(campaign, manifest, told),
@@ -180,6 +180,10 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
         yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
 
 
+FEW_BEHIND = 0.1
+"""Share of tests in which who follows may be far behind the vehicle ahead [assumed]."""
+
+
 def late_words(*, script: bool) -> str:
     """That a vehicle does nothing before BV is in its lane, and what would show it."""
     what = "getLateralLanePosition" if script else "bv_lateral_m"
@@ -192,9 +196,12 @@ def brakes_before_words(n: int, *, script: bool) -> str:
     return f"in {count(n)} tests it braked with nobody ahead, which makes cut-ins milder: let it cruise at {speed}"
 
 
-def overlap_words(of: Mapping[str, Any] | None) -> Iterator[str]:
-    """What the vehicle did before BV was on its lane (`before_overlap`), a line each."""
-    if of is None:
+def acts_words(of: Mapping[str, Any] | None) -> Iterator[str]:
+    """What the vehicle did before the event (`before_event`), a line each."""
+    if of is not None and (n := of["n_fell_behind"]) > FEW_BEHIND * of["n_events"] and not of["built_in"]:
+        why = "which makes the event milder: let it keep up"
+        yield f"in {count(n)} tests it was over 5 s behind the vehicle ahead when the event began, {why}"
+    if of is None or not of["waits"]:
         return
     if of["source"] in ("sumo", "traci"):
         yield "SUMO changes lanes in one step: this vehicle cannot see the other car (BV) coming over, as drivers can"

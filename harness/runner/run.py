@@ -21,7 +21,7 @@ from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of, dump_campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
-from harness.estimators.answer import before_overlap, ended_by
+from harness.estimators.answer import before_event, ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
 from harness.estimators.shells import SeenShells
@@ -229,7 +229,7 @@ def doubts_of(
         EARLY: n_left_out(campaign, estimates["diagnostics"].get(EARLY, 0)), "milder": estimates["milder"],
         "if_failed_had_crashed": times * best["details"]["crash_rate_if_failed_had_crashed"],
         "cut_off": times * estimates["cut_off"], "cautions": best["cautions"], "repeated": manifest.get("repeated"),
-        "assumed": estimates["assumed"], "before_overlap": before_overlap(campaign, manifest, estimates["diagnostics"]),
+        "assumed": estimates["assumed"], "before_event": before_event(campaign, manifest, estimates["diagnostics"]),
     }  # fmt: skip
 
 

@@ -46,6 +46,22 @@ def test_the_same_model_has_the_same_bits_in_every_form(name):
     assert 3 < (shards[0].episode["outcome"] == CRASH).sum() < 37
 
 
+class Lags:
+    """Its own set speed is lower than that of the traffic: nobody ahead can become a danger."""
+
+    def step(self, seen):
+        return max(-1.0, 18.0 - seen.speed_mps)
+
+
+@pytest.mark.parametrize("name", LADDERS)
+def test_one_that_does_not_keep_up_is_seen_when_the_event_begins(name):
+    traffic = traffic_from(name, 20)
+    lags, follows = (
+        drive(name, each, traffic) for each in ("tests.families.test_controllers:Lags", "examples.idm:IDM")
+    )
+    assert (lags.episode["fell_behind"].sum(), follows.episode["fell_behind"].sum()) == (20, 0)
+
+
 def ahead_on_lane(trace, step, visible):
     """Gap (m) to, and place of, the nearest that is seen ahead on the AV's lane."""
     av = trace[step, -1, 0]

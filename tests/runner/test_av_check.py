@@ -10,6 +10,7 @@ import resource
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -355,6 +356,10 @@ def test_of_a_vehicle_that_follows_it_is_said_how():
     assert found.events in told
     assert "headway at the onset, median, s" in told
     assert "cut-in" not in " ".join(told)
+    lags = replace(found, follows=replace(found.follows, headway_s=9.0))
+    early = replace(found, shows=True, behaviour=replace(found.behaviour, n_braked_before=3))
+    said = "But it is 9.0 s behind the vehicle ahead by then", "But in 3 tests it braked with nobody ahead"
+    assert [[text in verdict(each) for text in said] for each in (lags, early)] == [[True, False], [False, True]]
     never_brakes = "av={model: constant, parameters: {acceleration_mps2: 2}}"
     blind = check_av(load_campaign("idm", ["scenario=cut_out", never_brakes]), 6)
     assert blind.follows.headway_s > found.follows.headway_s  # it does nothing before the event

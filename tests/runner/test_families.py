@@ -266,15 +266,17 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
 
 def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_scenario(run):
     of = run.content["families"]
-    assert of["cut_in"]["before_overlap"]["built_in"]
-    acted = {**of["cut_in"]["before_overlap"], "n_braked_before": 1234, "n_took_over_early": 0}
-    content = {**run.content, "families": {**of, "cut_in": {**of["cut_in"], "before_overlap": acted}}}
+    assert of["cut_in"]["before_event"]["built_in"]
+    acted = {**of["cut_in"]["before_event"], "n_braked_before": 1234, "n_took_over_early": 0}
+    content = {**run.content, "families": {**of, "cut_in": {**of["cut_in"], "before_event": acted}}}
     told = " ".join(" ".join(hour_lines(content)).split())
-    for said in (
-        "! cut-in: in 1,234 tests it braked with nobody ahead",
-        "! cut-in: it did nothing before the other car",
-    ):
-        assert said in told
+    assert "! cut-in: in 1,234 tests it braked with nobody ahead" in told
+    assert "! cut-in: it did nothing before the other car" in told
+    brakes = {**of["lead_brakes"]["before_event"], "built_in": False, "n_events": 50}
+    for n, warned in ((6, True), (5, False)):
+        part = {**of["lead_brakes"], "before_event": {**brakes, "n_fell_behind": n}}
+        lines = " ".join(" ".join(hour_lines({**content, "families": {**of, "lead_brakes": part}})).split())
+        assert (f"! lead brakes: in {n} tests it was over 5 s behind the vehicle ahead" in lines) == warned
 
 
 @pytest.mark.parametrize(("times", "warned"), [([0.2, 4.0], True), ([0.99, 1.01], False), (None, False)])
