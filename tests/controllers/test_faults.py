@@ -67,7 +67,7 @@ def without_place(cause):
 
 
 def _episodes(folder):
-    return stored_table(folder / "run", "episodes").to_pylist()
+    return stored_table(folder / "run", "episodes").drop_columns("braked_before").to_pylist()  # asked of own code alone
 
 
 @pytest.fixture(scope="module")
