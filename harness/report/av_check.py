@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -149,17 +149,8 @@ def verdict(found: AvCheck) -> str:
         return f"NOT READY: {sum(found.failures.values())} of {n} tests failed: {next(iter(found.failures))}."
     if found.differing:
         return f"NOT REPRODUCIBLE: {len(found.differing)} of {n} tests differed when run again. {cause(found)}"
-    if not seen.n_events or not seen.braking_share > 0.0:
-        return f"LOOK AGAIN: it braked after none of {seen.n_events} {found.events}. Does it see the other vehicle?"
-    if found.follows is not None and found.follows.n_hit:
-        return f"LOOK AGAIN: in {found.follows.n_hit} of {n} tests it hit the vehicle ahead before anything happened."
-    longest, moved = max(found.moved_mps2.items(), default=(0.0, 0.0))
-    if longest and moved > MOVES_MPS2:
-        return (
-            f"LOOK AGAIN: its first answer moves by up to {moved:.1f} m/s² where the warm-up takes {longest:g} s. "
-            "State winds up while its answers are not used, as an integral does: limit it (anti-windup), or begin "
-            "it when BV comes; then av.warm_up_s need be no longer than its filters."
-        )
+    if doubt := next(_doubts(found), None):
+        return f"LOOK AGAIN: {doubt}"
     slower, speed, advice = found.speed.us_per_step / found.idm_speed.us_per_step, found.speed, "."
     if speed.us_per_step > 100.0:  # which slows a run; in Python it is some 15
         advice = f", {slower:.0f} times as long as IDM’s."
@@ -170,15 +161,32 @@ def verdict(found: AvCheck) -> str:
         )
     if found.shows and found.source == "controller" and not seen.n_took_over_early:
         advice += f" But {late_words(script=found.script)}."
-    if found.shows and seen.n_braked_before:
-        advice += f" But {brakes_before_words(seen.n_braked_before, script=found.script)}."
-    if found.follows is not None and found.follows.headway_s > FAR_BEHIND_S:
-        advice += f" But it is {found.follows.headway_s:.1f} s behind the vehicle ahead by then: does it keep up?"
     return (
         f"READY: {n} tests twice, the same bits; it braked after {seen.braking_share:.0%} of {seen.n_events} "
         f"{found.events}, {seen.reaction_s:.1f} s after they began (median; some leave time to wait); "
         f"it takes {speed.us_per_step:.1f} µs a step{advice}"
     )
+
+
+def _doubts(found: AvCheck) -> Iterator[str]:
+    """What makes tests of the vehicle say little, the worst first."""
+    seen, follows = found.behaviour, found.follows
+    if not seen.n_events or not seen.braking_share > 0.0:
+        yield f"it braked after none of {seen.n_events} {found.events}. Does it see the other vehicle?"
+    if follows is not None and follows.n_hit:
+        yield f"in {follows.n_hit} of {found.n_episodes} tests it hit the vehicle ahead before anything happened."
+    if found.shows and seen.n_braked_before:
+        yield f"{brakes_before_words(seen.n_braked_before, script=found.script)}."
+    if follows is not None and follows.headway_s > FAR_BEHIND_S:
+        behind = f"{follows.headway_s:.1f} s behind the vehicle ahead"
+        yield f"when the event begins it is {behind}, which makes that milder: let it keep up."
+    longest, moved = max(found.moved_mps2.items(), default=(0.0, 0.0))
+    if longest and moved > MOVES_MPS2:
+        yield (
+            f"its first answer moves by up to {moved:.1f} m/s² where the warm-up takes {longest:g} s. "
+            "State winds up while its answers are not used, as an integral does: limit it (anti-windup), or begin "
+            "it when BV comes; then av.warm_up_s need be no longer than its filters."
+        )
 
 
 def cause(found: AvCheck) -> str:

@@ -21,6 +21,7 @@ from harness.report.words import (
     ended_words,
     milder_words,
     scope_words,
+    touch_words,
     unseen_words,
 )
 
@@ -108,6 +109,7 @@ def warnings(content: Mapping[str, Any]) -> Iterator[str]:
             yield f"{called(name)}: {unseen_words(found.where)}, here {number(most)} per hour"
         doubts = doubt_words({**of, "rate": of["rate_per_hour"]}, " per hour")
         early = *early_words(of["n_crashes_before_event"]), *acts_words(of.get("before_event"))
+        early = *early, *touch_words(of.get("share_below_1_mps"))
         yield from (f"{called(name)}: {text}" for text in (*early, *doubts))
 
 

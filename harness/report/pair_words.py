@@ -12,7 +12,16 @@ from harness.report.hour_words import called, scenarios_words
 from harness.report.hour_words import warnings as hour_warnings
 from harness.report.lines import LABEL, columns, wrapped
 from harness.report.notes import note_words
-from harness.report.words import ENDED, acts_words, doubt_words, early_words, milder_words, scope_words, unseen_words
+from harness.report.words import (
+    ENDED,
+    acts_words,
+    doubt_words,
+    early_words,
+    milder_words,
+    scope_words,
+    touch_words,
+    unseen_words,
+)
 from harness.strata import LIBRARY_STATEMENT
 
 
@@ -45,7 +54,7 @@ def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
         told = doubt_words({**of, "rate": of["crash_rate"], "n_failed": of["details"]["n_failed"]}, " per test")
         more = [each for each in of["warnings"] if each["key"] not in elsewhere and each not in of["cautions"]]
         left_out = *milder_words(content["scenario"], of["milder"]), *early_words(of["n_crashes_before_event"])
-        acts = acts_words(of.get("before_event"))
+        acts = *acts_words(of.get("before_event")), *touch_words(of.get("share_below_1_mps"))
         yield from (f"{name}: {text}" for text in (*told, *map(note_words, more), *left_out, *acts))
     if where := content.get("unseen"):
         yield unseen_words(where)

@@ -156,6 +156,13 @@ def doubt_words(of: Mapping[str, Any], unit: str, but: str = "") -> Iterator[str
         yield f"some tests ended while the vehicle was still closing in; had all crashed: {number(worst)}{unit}{but}"
 
 
+def touch_words(part: float | None) -> Iterator[str]:
+    """That most crashes are hardly any, where a share of more than half is below `TOUCH_MPS`."""
+    if part is not None and part > 0.5:
+        left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
+        yield f"{share(part)} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
+
+
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[str]:
     """What changes the meaning of the rows, a line each."""
     best, severity, assumed = told.best, told.severity, told.assumed
@@ -165,12 +172,9 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
     rates = {"rate": best.crash_rate, "ci_high": best.ci_high, "cut_off": told.cut_off}
     rates["if_failed_had_crashed"] = best.details["crash_rate_if_failed_had_crashed"]
     of_tests = {"n_failed": best.details["n_failed"], "n_episodes": best.n_episodes, "cautions": best.cautions}
-    but = "" if told.decision is None else ", as ACCEPTED would have to allow for"
+    but = "" if told.decision is None else "; ACCEPTED counts them as crashes"
     yield from doubt_words({**rates, **of_tests, "repeated": manifest.get("repeated")}, " per test", but)
-    if severity is not None and severity.share_below_1_mps > 0.5:
-        left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
-        part = share(severity.share_below_1_mps)
-        yield f"{part} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
+    yield from touch_words(None if severity is None else severity.share_below_1_mps)
     if assumed is not None and assumed.where and assumed.times is None:
         yield unseen_words(assumed.where)
     on_rate = told.decision is not None and not told.decision.get("driver")

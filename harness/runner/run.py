@@ -229,6 +229,7 @@ def doubts_of(
         EARLY: n_left_out(campaign, estimates["diagnostics"].get(EARLY, 0)), "milder": estimates["milder"],
         "if_failed_had_crashed": times * best["details"]["crash_rate_if_failed_had_crashed"],
         "cut_off": times * estimates["cut_off"], "cautions": best["cautions"], "repeated": manifest.get("repeated"),
+        "share_below_1_mps": (estimates["severity"] or {}).get("share_below_1_mps"),
         "assumed": estimates["assumed"], "before_event": before_event(campaign, manifest, estimates["diagnostics"]),
     }  # fmt: skip
 

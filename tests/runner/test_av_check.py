@@ -358,7 +358,7 @@ def test_of_a_vehicle_that_follows_it_is_said_how():
     assert "cut-in" not in " ".join(told)
     lags = replace(found, follows=replace(found.follows, headway_s=9.0))
     early = replace(found, shows=True, behaviour=replace(found.behaviour, n_braked_before=3))
-    said = "But it is 9.0 s behind the vehicle ahead by then", "But in 3 tests it braked with nobody ahead"
+    said = "LOOK AGAIN: when the event begins it is 9.0 s", "LOOK AGAIN: in 3 tests it braked with nobody ahead"
     assert [[text in verdict(each) for text in said] for each in (lags, early)] == [[True, False], [False, True]]
     never_brakes = "av={model: constant, parameters: {acceleration_mps2: 2}}"
     blind = check_av(load_campaign("idm", ["scenario=cut_out", never_brakes]), 6)

@@ -274,9 +274,10 @@ def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_sce
     assert "! cut-in: it did nothing before the other car" in told
     brakes = {**of["lead_brakes"]["before_event"], "built_in": False, "n_events": 50}
     for n, warned in ((6, True), (5, False)):
-        part = {**of["lead_brakes"], "before_event": {**brakes, "n_fell_behind": n}}
+        part = {**of["lead_brakes"], "before_event": {**brakes, "n_fell_behind": n}, "share_below_1_mps": 0.1 * n}
         lines = " ".join(" ".join(hour_lines({**content, "families": {**of, "lead_brakes": part}})).split())
         assert (f"! lead brakes: in {n} tests it was over 5 s behind the vehicle ahead" in lines) == warned
+        assert (f"! lead brakes: {10 * n} % of these crashes are touches" in lines) == warned
 
 
 @pytest.mark.parametrize(("times", "warned"), [([0.2, 4.0], True), ([0.99, 1.01], False), (None, False)])
