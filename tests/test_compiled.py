@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numba
@@ -16,6 +17,7 @@ import pytest
 import harness
 from harness import cache
 from harness.compiled import KERNEL_SOURCES, KERNELS, compiled, source_files, source_hash, unboxed
+from harness.processes import WorkerDeath
 from harness.runner.setup import compile_kernels
 
 ROOT = Path(harness.__file__).parent
@@ -224,4 +226,8 @@ def test_what_was_compiled_is_not_compiled_again(tmp_path, monkeypatch):
     monkeypatch.setenv(cache.FOLDER, str(tmp_path))
     monkeypatch.setattr("harness.runner.setup.run_campaign", lambda *_, **__: None)
     monkeypatch.setattr("harness.runner.setup._OTHERS", [])
+    died = SimpleNamespace(answer=lambda: WorkerDeath(-9, None))
+    with monkeypatch.context() as patch:
+        patch.setattr("harness.runner.setup.first_to_answer", lambda _: died)
+        assert [compile_kernels(), compile_kernels()] == [True, True]
     assert [compile_kernels(), compile_kernels()] == [True, False]

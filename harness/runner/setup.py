@@ -11,7 +11,7 @@ from harness import cache
 from harness.campaign.files import load_campaign
 from harness.compiled import KERNELS
 from harness.families import R157
-from harness.processes import Child, first_to_answer, tell
+from harness.processes import Child, WorkerDeath, first_to_answer, tell
 from harness.progress import Progress
 from harness.runner.run import run_campaign
 
@@ -45,11 +45,12 @@ def compile_kernels(progress: Progress | None = None) -> bool:
         beside = Child(tell, partial(_run_all, _OTHERS, Path(folder) / "others"))
         try:
             _run_all(campaigns, Path(folder), progress)
-            first_to_answer([beside]).answer()
+            died = isinstance(first_to_answer([beside]).answer(), WorkerDeath)
             progress.advance(1)
         finally:
             beside.kill()
-    cache.keep(done, b"")
+    if not died:  # as for want of memory: the next call tries again
+        cache.keep(done, b"")
     return True
 
 
