@@ -129,12 +129,6 @@ class ShellDesign:
         return math.sqrt(max(square - rate * rate, 0.0) / self.n_independent)
 
     @property
-    def first_reference(self) -> tuple[str, float] | None:
-        """The first reference driver of the library that crashes at all, and its crash rate; None without one."""
-        rates = zip(self.references, self.reference_rate.tolist(), strict=True)
-        return next(((each.name, rate) for each, rate in rates if rate > 0.0), None)
-
-    @property
     def readings(self) -> list[str]:
         """The first reference driver, and other readings of it: references that are named after that one."""
         names = [each.name for each in self.references]

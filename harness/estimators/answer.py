@@ -18,7 +18,8 @@ from harness.estimators.likelihood import Level
 from harness.estimators.one_pass import BEFORE_EVENT, one_pass
 from harness.estimators.own import Asked, headline_of
 from harness.estimators.severity import Severity
-from harness.estimators.stopping import RoundRule, Rule
+from harness.estimators.shells import SeenShells
+from harness.estimators.stopping import Rule
 from harness.estimators.traffic import TrafficError
 from harness.families import family_named
 from harness.numbers import two_digits_up
@@ -180,13 +181,14 @@ def pool_remedy(rule: Rule, campaign: Campaign, stopped_by: StoppedBy) -> dict[s
     """
     if stopped_by not in ("pool", "pool_error"):
         return None
-    pool, target, from_pool = campaign.pool, campaign.stop.rhw, rule.look.rhw_from_pool
-    if campaign.has_baseline_runs or target is None or not isinstance(rule, RoundRule) or math.isinf(rule.look.rhw):
+    pool, target, from_pool, seen = campaign.pool, campaign.stop.rhw, rule.look.rhw_from_pool, rule.seen
+    if campaign.has_baseline_runs or target is None or not isinstance(seen, SeenShells) or math.isinf(rule.look.rhw):
         paths = "pool.shadow_paths" if campaign.has_baseline_runs else "pool.relative_error"
         return {paths if stopped_by == "pool_error" else "pool.events_per_shell": None}
     finer = max(2.0 * (from_pool / target) ** 2, 1.0)
-    times = rule.seen.events_for(rule.more_tests(target, finer) * ROOM)
-    own = target / math.sqrt(2.0) / Level.two_sided(campaign.stop.confidence).z  # a pool has some paths in any case
+    level = Level.two_sided(campaign.stop.confidence)
+    times = seen.events_for(seen.more_tests(campaign.testing.shells.statement, level, target, finer) * ROOM)
+    own = target / math.sqrt(2.0) / level.z  # a pool has some paths in any case
     error = min((pool.relative_error or family_named(campaign.scenario).pool_error) / math.sqrt(finer), own)
     kept = two_digits_up(min(pool.events_per_shell * times, 1e9))
     if error < LEAST_POOL_ERROR or kept > MOST_EVENTS:
@@ -197,11 +199,11 @@ def pool_remedy(rule: Rule, campaign: Campaign, stopped_by: StoppedBy) -> dict[s
 
 def expected_for(rule: Rule, campaign: Campaign, n_tests: int) -> dict[str, int] | None:
     """How many baseline ``runs`` and ``tests`` in all the asked precision may take; None where nobody can tell."""
-    target, n_runs, pool = campaign.stop.rhw, campaign.pool.shadow_paths, rule.look.rhw_from_pool
-    if not campaign.has_baseline_runs or not isinstance(rule, RoundRule) or target is None or not 0.0 < pool < math.inf:
+    target, n_runs, pool, seen = campaign.stop.rhw, campaign.pool.shadow_paths, rule.look.rhw_from_pool, rule.seen
+    if not (campaign.has_baseline_runs and isinstance(seen, SeenShells) and target and 0.0 < pool < math.inf):
         return None
-    more_runs = max(2.0 * (pool / target) ** 2, 1.0)
-    if math.isinf(more_tests := rule.more_tests(target, more_runs)):
+    more_runs, level = max(2.0 * (pool / target) ** 2, 1.0), Level.two_sided(campaign.stop.confidence)
+    if math.isinf(more_tests := seen.more_tests(campaign.testing.shells.statement, level, target, more_runs)):
         return None  # a stratum that cannot be tested: nothing will do
     runs, tests = two_digits_up(n_runs * more_runs), two_digits_up(n_tests * more_tests)
     return {"runs": n_runs if more_runs == 1.0 else runs, "tests": n_tests if more_tests <= 1.0 else tests}

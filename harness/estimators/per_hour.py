@@ -20,6 +20,7 @@ from harness.estimators.likelihood import Counts, Level, likelihood_limit
 from harness.estimators.shells import SeenShells
 from harness.estimators.tally import FEWEST_PATHS, RateLimits, Tally, paths_that_count, pool_variance
 from harness.families.protocol import Exposure
+from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import FloatArray
 
 _GRID = 13
@@ -71,7 +72,7 @@ class OfFamily(NamedTuple):
 
     def limits(self, level: Level) -> RateLimits:
         """Rate per hour of the family alone."""
-        times, found = self.per_hour, self.seen.limits_of("assumption_free", level)
+        times, found = self.per_hour, self.seen.limits(level)
         return RateLimits(*(times * each for each in found))
 
 
@@ -97,9 +98,9 @@ class PerHour:
         n, crashes, failed = (sum(column) for column in zip(*(of.tally.totals for of in self.families), strict=True))
         return n, crashes, failed
 
-    def limits(self, level: Level, *, inside: bool = False) -> RateLimits:
+    def limits(self, level: Level, statement: str = ASSUMPTION_FREE) -> RateLimits:
         """Rate per hour with limits; anything is possible where crashes lie on too few paths of a pool."""
-        parts = [(of, slice(0, of.seen.design.n_inside if inside else None)) for of in self.families]
+        parts = [(of, slice(0, of.seen.design.n_within(statement))) for of in self.families]
         tallies = [of.tally.part(strata) for of, strata in parts]
         p = np.concatenate([of.p[strata] for of, strata in parts])
         rate = math.fsum(float(of.p[strata] @ tally.share) for (of, strata), tally in zip(parts, tallies, strict=True))
@@ -189,6 +190,19 @@ class PerHour:
             errors += of.seen.design.p_event_error**2 * np.array((mine * mine, mine * theirs, theirs * theirs))
         p, counts = np.concatenate([of.p for of in self.families]), np.concatenate(outcomes)
         return limits_over(self.reference_rate, p, counts.astype(np.float64), errors.tolist(), level)
+
+    @property
+    def first_reference(self) -> tuple[str, float] | None:
+        """The competent driver of all, and its rate; None where that never crashes."""
+        return ("", self.reference_rate) if self.reference_rate > 0.0 else None
+
+    def expected(self, limit: float, _driver: str | None, _statement: str) -> float:
+        """Crashes that these tests would have brought at a multiple of the reference rate, see `SeenShells`."""
+        return limit * self.reference_rate * self.totals[0] / math.fsum(float(of.p.sum()) for of in self.families)
+
+    def beside(self, _driver: str, _statement: str, level: Level) -> tuple[float, float]:
+        """Limits of `ratio`."""
+        return self.ratio(level)[1:]
 
     def over_assumed(self) -> tuple[float, float] | None:
         """The least and the largest ratio over all ends of the assumed exposures; None where it has none."""

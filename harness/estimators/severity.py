@@ -18,7 +18,6 @@ from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator, Number
 from harness.estimators.likelihood import Level
 from harness.estimators.shells import SeenShells
-from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import FloatArray
 
 SPEEDS_MPS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0)
@@ -113,8 +112,8 @@ def _exceedance(speed: float, state: Accumulator, confidence: float) -> Exceedan
         of = state.result(confidence)
         return Exceedance(speed, of.crash_rate, of.ci_low, of.ci_high, of.upper_bound, of.n_crashes)
     n, n_crashes, _ = state.tally.totals
-    limits = state.limits_of(ASSUMPTION_FREE, Level.two_sided(confidence))
-    bound = state.limits_of(ASSUMPTION_FREE, Level.of_bound(confidence, n)).high
+    limits = state.limits(Level.two_sided(confidence))
+    bound = state.limits(Level.of_bound(confidence, n)).high
     return Exceedance(speed, limits.rate, limits.low, limits.high, bound, n_crashes)
 
 

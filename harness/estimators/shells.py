@@ -33,7 +33,7 @@ from harness.estimators.tally import (
     pool_variance,
 )
 from harness.numbers import two_digits_up
-from harness.strata import ShellDesign, weight_of_a_test
+from harness.strata import ASSUMPTION_FREE, ShellDesign, weight_of_a_test
 from harness.vocabulary import FloatArray
 
 GROWTH, MOST_TIMES = 1.1, 1e6
@@ -209,12 +209,23 @@ class SeenShells:
         of_tests = p * weight_of_a_test(p, tally.tests) * tally.share * (1.0 - tally.share)
         return math.sqrt(float(of_tests.sum()) + pool_variance(p, tally, self.design.n_independent))
 
+    @property
+    def totals(self) -> tuple[int, int, int]:
+        """Tests, crashes and failed tests."""
+        return self.tally.totals
+
+    @property
+    def first_reference(self) -> tuple[str, float] | None:
+        """The first reference driver of the library that crashes at all, and its crash rate; None without one."""
+        rates = zip(self.design.references, self.design.reference_rate.tolist(), strict=True)
+        return next(((each.name, rate) for each, rate in rates if rate > 0.0), None)
+
     def weight_of_a_crash(self) -> FloatArray:
         """What a crash in each stratum adds to the rate, p_s/n_s, shape (S,)."""
         return weight_of_a_test(self.design.p, self.tally.tests)
 
-    def limits_of(self, statement: str, level: Level) -> RateLimits:
-        """Rate and limits of a statement, or of all strata."""
+    def limits(self, level: Level, statement: str = ASSUMPTION_FREE) -> RateLimits:
+        """Rate and limits of a statement, by default of all strata."""
         return self._limits(self.design.n_within(statement), level)
 
     def expected(self, limit: float, driver: str | None, statement: str) -> float:
@@ -242,7 +253,7 @@ class SeenShells:
 
         That is with so many times as many baseline runs; 1 if these tests are enough, infinite beyond a million times.
         """
-        n, times, width = self.design.n_within(statement), 1.0, 2.0 * rhw * self.limits_of(statement, level).rate
+        n, times, width = self.design.n_within(statement), 1.0, 2.0 * rhw * self.limits(level, statement).rate
         p, tally = self.design.p[:n], self.tally.part(slice(0, n))
         variance = pool_variance(p, tally, self.design.n_independent) / more_runs
 

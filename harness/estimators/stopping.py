@@ -133,6 +133,8 @@ class Rule:
     """
 
     of_first_tests = False
+    seen: SeenShells | PerHour | None = None
+    """All tests at the last look, of rules about a rate from shells."""
     _needed = 1  # looks in a row that must find it
 
     def __init__(self, target: float | None, min_crashes: int) -> None:
@@ -223,112 +225,60 @@ class StopRule(Rule):
 
 
 class RoundRule(Rule):
-    """Looks at the crash rate from shells after each round, or whether it is below a limit.
+    """Looks at the crash rate from shells after each round, of one scenario or of the sum of several per hour.
 
-    Before the tests ``held`` by the run folder nothing is given up, whatever is asked for now. A limit is decided by
-    ``level_at`` an expected number of crashes and a confidence, whatever the budget: a run that is continued is looked
-    at where it would have been without the break, and once more where that was.
+    Or whether it is below a limit, which is decided by ``level_at`` an expected number of crashes and a confidence,
+    whatever the budget: a run that is continued is looked at where it would have been without the break, and once more
+    where that was. Before the tests ``held`` by the run folder nothing is given up, whatever is asked for now.
     """
 
-    seen: SeenShells
-    """All tests at the last look."""
     level_at = staticmethod(decision_level)
 
     def __init__(self, campaign: Campaign, held: int = 0) -> None:
         super().__init__(campaign.stop.rhw, campaign.min_crashes)
         self._held, self._confidence = held, campaign.stop.confidence
         self._statement, self._accept = campaign.testing.shells.statement, campaign.accept
-        self._below_reference = campaign.stop.below_reference
+        self._below_reference, self._each = campaign.stop.below_reference, campaign.stop.each_family
 
-    def observe(self, seen: SeenShells) -> bool:
+    def observe(self, seen: SeenShells | PerHour) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
-        self.seen = seen
+        self.seen, (n, n_crashes, _) = seen, seen.totals
         if self._accept is not None:
-            return self._decided(seen, self._accept)
-        limits, tally = seen.limits_of(self._statement, Level.two_sided(self._confidence)), seen.tally
-        n_crashes, also = int(tally.crashes.sum()), note("first_tests") if self.of_first_tests else None
+            return self._decided(seen, self._accept) and n >= self._held
+        level = Level.two_sided(self._confidence)
+        limits, limit = seen.limits(level, self._statement), self._below_reference
+        of_each = [of.limits(level).rhw for of in seen.families] if self._each and isinstance(seen, PerHour) else []
+        also = note("first_tests") if self.of_first_tests else None
         pool = limits.from_pool_relative() if n_crashes >= self._min_crashes else (0.0, 0.0)
-        enough = self._looked(limits.rhw, n_crashes, also=also, pool=pool)
-        if not self.look.stopped and (limit := self._below_reference) is not None and self._is_below(seen, limit):
+        enough = self._looked(max(of_each, default=limits.rhw), n_crashes, also=also, pool=pool)
+        if not self.look.stopped and limit is not None and not of_each and self._is_below(seen, limit, limits.high):
             self.look = replace(self.look, ended="below_reference", unmet=(note("below_reference", limit=limit),))
-        return self.look.stopped or (enough and tally.tests.sum() >= self._held)
+        return self.look.stopped or (enough and n >= self._held)
 
-    def more_tests(self, target: float, more_runs: float) -> float:
-        """How many times as many tests are expected to reach a relative half-width, see `SeenShells.more_tests`."""
-        return self.seen.more_tests(self._statement, Level.two_sided(self._confidence), target, more_runs)
-
-    def _is_below(self, seen: SeenShells, limit: float) -> bool:
-        """Whether the rate is below a multiple of a reference driver's, at the level of decisions."""
-        if (first := seen.design.first_reference) is None:
+    def _is_below(self, seen: SeenShells | PerHour, limit: float, high: float) -> bool:
+        """Whether the rate, ``high`` at most, is below a multiple of a reference driver's, as decisions are made."""
+        if (first := seen.first_reference) is None:
             return False
         driver, rate = first
         # Limits of a ratio take a hundred times as long as those of a rate: most looks are far from an end.
-        if seen.limits_of(self._statement, Level.two_sided(self._confidence)).high > 2.0 * limit * rate:
-            return False
-        return self._beside(seen, limit, driver).verdict == "accepted"
+        return high <= 2.0 * limit * rate and self._beside(seen, limit, driver).verdict == "accepted"
 
-    def _beside(self, seen: SeenShells, limit: float, driver: str | None) -> Decision:
+    def _beside(self, seen: SeenShells | PerHour, limit: float, driver: str | None) -> Decision:
         """What is known about a limit after these tests, at the level of decisions."""
-        n, statement = int(seen.tally.tests.sum()), self._statement
+        statement = self._statement
         level = self.level_at(seen.expected(limit, driver, statement), self._confidence)
-        ends = seen.limits_of(statement, level)[1:3] if driver is None else seen.beside(driver, statement, level)
-        return Decision(limit, statement, (1.0 + self._confidence) / 2.0, *ends, n, driver=driver)
+        ends = seen.limits(level, statement)[1:3] if driver is None else seen.beside(driver, statement, level)
+        return Decision(limit, statement, (1.0 + self._confidence) / 2.0, *ends, seen.totals[0], driver=driver)
 
-    def _decided(self, seen: SeenShells, accept: Accept) -> bool:
+    def _decided(self, seen: SeenShells | PerHour, accept: Accept) -> bool:
         """Look at a limit until it is decided; that answer stays, also while the folder holds further tests."""
-        n, found = int(seen.tally.tests.sum()), self.look.decision
-        if found is None or found.verdict == "undecided":
+        if not self.look.stopped:
             key, limit, driver = accept.asked
             found = self._beside(seen, limit, driver)
-            rhw = seen.limits_of(self._statement, Level.two_sided(self._confidence)).rhw
+            rhw = seen.limits(Level.two_sided(self._confidence), self._statement).rhw
             ended: Ended | None = None if found.verdict == "undecided" else "accept"
             self.look = Look(rhw, ended, (note("accept", asked=key, limit=limit),), decision=found)
-        return found.verdict != "undecided" and n >= self._held
-
-
-class HourRule(Rule):
-    """Looks at the rate per hour of several families after each round, or at each of theirs (``stop.each_family``).
-
-    Or at its ratio to the competent driver's: whether that is below ``stop.below_reference``, or on which side of
-    ``accept.times_reference`` it lies.
-    """
-
-    level_at = staticmethod(decision_level)
-
-    def __init__(self, campaign: Campaign) -> None:
-        super().__init__(campaign.stop.rhw, campaign.min_crashes)
-        self._confidence, self._accept = campaign.stop.confidence, campaign.accept
-        self._each, self._below = campaign.stop.each_family, campaign.stop.below_reference
-
-    def observe(self, hour: PerHour) -> bool:
-        """Whether to stop at the end of a round."""
-        level, n_crashes = Level.two_sided(self._confidence), hour.totals[1]
-        limits = hour.limits(level)
-        if self._accept is not None and self._accept.times_reference is not None:
-            beside, found = self._accept.times_reference, self.look.decision
-            if found is None or found.verdict == "undecided":  # an answer stays while the folder holds further tests
-                found = self._beside(hour, beside.at_most, beside.driver)
-            ended: Ended | None = None if found.verdict == "undecided" else "accept"
-            asked = note("accept", asked="times_reference", limit=beside.at_most)
-            self.look = Look(limits.rhw, ended, (asked,), decision=found)
-            return self.look.stopped
-        rhw = max(of.limits(level).rhw for of in hour.families) if self._each else limits.rhw
-        also = note("first_tests") if self.of_first_tests else None
-        pool = limits.from_pool_relative() if n_crashes >= self._min_crashes else (0.0, 0.0)
-        enough = self._looked(rhw, n_crashes, also=also, pool=pool)
-        if not self.look.stopped and (limit := self._below) is not None and not self._each:
-            likely = (
-                limits.high <= 2.0 * limit * hour.reference_rate
-            )  # the ratio's own limits take a hundred times as long
-            if likely and self._beside(hour, limit, "").verdict == "accepted":
-                self.look = replace(self.look, ended="below_reference", unmet=(note("below_reference", limit=limit),))
-        return self.look.stopped or enough
-
-    def _beside(self, hour: PerHour, limit: float, driver: str) -> Decision:
-        n, mass = hour.totals[0], math.fsum(float(of.p.sum()) for of in hour.families)
-        level = self.level_at(limit * hour.reference_rate * n / mass, self._confidence)
-        _, low, high = hour.ratio(level)
-        return Decision(limit, ASSUMPTION_FREE, (1.0 + self._confidence) / 2.0, low, high, n, driver=driver)
+        return self.look.stopped
 
 
 class PairRule(Rule):

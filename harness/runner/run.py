@@ -25,7 +25,7 @@ from harness.estimators.answer import before_event, ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
 from harness.estimators.shells import SeenShells
-from harness.estimators.stopping import Decision, HourRule
+from harness.estimators.stopping import Decision, RoundRule
 from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
 from harness.printed import PRINTED
@@ -123,7 +123,7 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     names, began = campaign.scenarios or [], time.monotonic()
     ready = {name: require_ready(campaign.of_family(name)) for name in names}
     require_same_driver(campaign, ready)
-    rule = HourRule(campaign)
+    rule = RoundRule(campaign)
     with ExitStack() as held:
         held.enter_context(sole_use(out))
         require_no_other(out, [*names, FAMILIES, CAMPAIGN])
@@ -159,7 +159,7 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
 
 
 def _run(
-    campaign: Campaign, begins: Mapping[str, AbstractContextManager[Underway]], rule: HourRule, progress: Progress
+    campaign: Campaign, begins: Mapping[str, AbstractContextManager[Underway]], rule: RoundRule, progress: Progress
 ) -> tuple[PerHour, dict[str, RunResult], Decision | None]:
     runs: dict[str, Underway] = {}
     with ExitStack() as working:

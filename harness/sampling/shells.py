@@ -22,7 +22,7 @@ from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
 from harness.estimators.pairs import FAILED, Pairs
 from harness.estimators.per_hour import PerHour
 from harness.estimators.shells import SeenShells
-from harness.estimators.stopping import HourRule, PairRule, RoundRule
+from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import Tally, empty_tally
 from harness.families.protocol import Recorded
 from harness.loop.loop import EpisodeLoop, Shard
@@ -36,7 +36,7 @@ from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
 from harness.sampling.allocation import LEVEL, Allocation, Joined
 from harness.sampling.protocol import Rounds, ShardRequest, Source
-from harness.strata import ShellDesign, StoredDesign
+from harness.strata import LIBRARY_STATEMENT, ShellDesign, StoredDesign
 from harness.vocabulary import IntArray
 
 MOST_SHARDS_PER_ROUND = 16
@@ -192,7 +192,7 @@ class HourRounds:
     each round.
     """
 
-    def __init__(self, campaign: Campaign, hour: PerHour, available: Sequence[IntArray], rule: HourRule) -> None:
+    def __init__(self, campaign: Campaign, hour: PerHour, available: Sequence[IntArray], rule: RoundRule) -> None:
         self.rule, self._budget, self._each = rule, campaign.stop.episodes, campaign.stop.each_family
         shells, designs = campaign.testing.shells, [of.seen.design for of in hour.families]
         self._own = [Allocation.of(shells, *each) for each in zip(designs, available, strict=True)]
@@ -208,7 +208,7 @@ class HourRounds:
             of_each[worst] = self._own[worst].next_round(tallies[worst], left)
             return of_each
         columns = [np.concatenate(column) for column in zip(*(each[:3] for each in tallies), strict=True)]
-        added, first = self._all.next_round(columns, left, lambda: hour.limits(LEVEL, inside=True).rhw)
+        added, first = self._all.next_round(columns, left, lambda: hour.limits(LEVEL, LIBRARY_STATEMENT).rhw)
         self.rule.of_first_tests = first
         return added
 

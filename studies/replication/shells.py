@@ -282,7 +282,7 @@ class ShellCampaign(_Drawn):
         """A verdict, for now with an interval that holds whatever is true."""
         verdict = "undecided" if rule.look.decision is None else rule.look.decision.verdict
         level, (n, n_crashes, _) = Level.two_sided(self.campaign.stop.confidence), seen.tally.totals
-        rate = seen.limits_of(self.campaign.testing.shells.statement, level).rate
+        rate = seen.limits(level, self.campaign.testing.shells.statement).rate
         decided = verdict != "undecided"
         return Row(verdict, replication, n, n_crashes, rate, seen.std_error(), 0.0, math.inf, decided)
 

@@ -12,7 +12,7 @@ from harness.campaign.files import load_campaign
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.shells import SeenShells
-from harness.estimators.stopping import HourRule
+from harness.estimators.stopping import RoundRule
 from harness.estimators.tally import Tally
 from harness.families.protocol import Exposure
 from harness.sampling.shells import HourRounds
@@ -110,7 +110,7 @@ def test_ratio_to_the_competent_driver_and_what_assumed_exposures_do_to_it():
 def test_a_verdict_stays_while_a_folder_holds_further_tests():
     """Looked at without it, the same tests leave it open."""
     accept = {"times_reference": {"driver": "r157-cc", "at_most": 1.0}}
-    rule, late = (HourRule(load_campaign("idm", [f"accept={accept}", "stop.rhw=null"])) for _ in range(2))
+    rule, late = (RoundRule(load_campaign("idm", [f"accept={accept}", "stop.rhw=null"])) for _ in range(2))
     few = PerHour([family("cut_in", [1e-6, 4e-5], [9, 9], [1, 0], ASSUMED, CC)])
     many = PerHour([family("cut_in", [1e-6, 4e-5], [9, 900], [5, 300], ASSUMED, CC)])
     for hour in (many, few):
@@ -120,7 +120,7 @@ def test_a_verdict_stays_while_a_folder_holds_further_tests():
     assert late.look.decision.verdict == "undecided"
 
 
-class WithoutLooks(HourRule):
+class WithoutLooks(RoundRule):
     """Decides by the 90 % interval after every round."""
 
     level_at = staticmethod(lambda _, confidence: Level.two_sided(confidence))
@@ -154,7 +154,7 @@ def test_verdicts_at_their_limit_are_seldom_wrong():
 
     One that errs in 5 % of gates errs more than 22 times in one run of 250. The sibling does.
     """
-    rng, found = np.random.default_rng(47), {HourRule: [], WithoutLooks: []}
+    rng, found = np.random.default_rng(47), {RoundRule: [], WithoutLooks: []}
     for _ in range(5):
         sizes = rng.integers(2, 7, 3)
         p = [10.0 ** rng.uniform(-5, -1, n) for n in sizes]
@@ -162,7 +162,7 @@ def test_verdicts_at_their_limit_are_seldom_wrong():
         for rule, verdicts in found.items():
             verdicts += [verdict(rng, p, share, rule) for _ in range(50)]
     wrong = {rule: [each.count(told) for told in ("accepted", "rejected")] for rule, each in found.items()}
-    assert max(wrong[HourRule]) <= 22
+    assert max(wrong[RoundRule]) <= 22
     assert min(wrong[WithoutLooks]) > 22
 
 

@@ -258,7 +258,7 @@ def test_few_paths_end_nothing_while_another_stratum_is_to_be_tested(untested, a
     design = replace(design, cell_p=P[:2], available=(9_000, available), n_inside=1)
     seen = SeenShells()
     seen.count(design, two, place)
-    limits = seen.limits_of("assumption_free", LEVEL)
+    limits = seen.limits(LEVEL)
     assert (limits.from_pool, limits.from_pool_at_least) == (math.inf, math.inf if sure else 0.0)
 
 

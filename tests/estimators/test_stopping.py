@@ -171,7 +171,7 @@ def test_a_vehicle_that_always_crashes_may_have_a_rate_above_that_of_this_pool()
         found = SeenShells.of(design, Tally(tests, tests, none, drawn, np.zeros((3, 3))))
         pairs = no_pairs(design)
         pairs.ends[:, CRASH, NO_CRASH], pairs.mass[:, CRASH, NO_CRASH] = tests, drawn
-        free, alone = found.limits_of(ASSUMPTION_FREE, LEVEL), pairs.alone(0, LEVEL)
+        free, alone = found.limits(LEVEL), pairs.alone(0, LEVEL)
         low = np.array([free.low, 0.0, alone.ci_low])
         high = np.array([free.high, found.within(0.9).upper_bound_outside, alone.ci_high])
         true = np.array([truth.sum(), truth[2], truth.sum()])
@@ -190,7 +190,7 @@ def test_tests_that_are_missing_are_those_that_would_do():
         enough, few = (
             seen(*(np.rint(each * k).astype(np.int64) for each in (tests, crashes))) for k in (times, times / 1.2)
         )
-        assert enough.limits_of(ASSUMPTION_FREE, level).rhw <= 1.02 * target < few.limits_of(ASSUMPTION_FREE, level).rhw
+        assert enough.limits(level).rhw <= 1.02 * target < few.limits(level).rhw
 
 
 @pytest.mark.parametrize(

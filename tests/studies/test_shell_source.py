@@ -16,7 +16,6 @@ from harness.families.cut_in.loading import load_environment
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.sampling.shells import ShellRounds
-from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.library import load_library
 from harness.vocabulary import CRASH, FAILED, TIMEOUT
 from studies.replication.experiment import Adversary
@@ -165,8 +164,8 @@ def test_counted_tests_say_what_their_records_would(with_references, shadow_runs
         numbers = ((*tally[:5], *(tally.runs or ())) for tally in (seen.tally, by_row.tally))
         for one, other in zip(*numbers, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-12)
-        limits = by_row.seen.limits_of(ASSUMPTION_FREE, level)
-        assert seen.limits_of(ASSUMPTION_FREE, level) == pytest.approx(limits, rel=1e-12)
+        limits = by_row.seen.limits(level)
+        assert seen.limits(level) == pytest.approx(limits, rel=1e-12)
     assert n == 2_000
     of_all = combined(design.p, by_row.tally, design.n_independent, level)
     assert limits == of_all  # not of an earlier look
