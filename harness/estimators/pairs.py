@@ -9,11 +9,9 @@ round, whichever takes it farther.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache, cached_property
-from typing import Any, Literal, NamedTuple, Self
+from functools import cache
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -25,7 +23,7 @@ from harness.estimators.tally import Tally, mean_square
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vocabulary import FloatArray, IntArray
 
-NO_CRASH, CRASH, FAILED = range(N_ENDS := 3)
+NO_CRASH, CRASH, FAILED = range(3)
 """How a test of a pair ended."""
 A_CRASHES, B_CRASHES = np.array([1.0, 1.0, 0.0, 0.0]), np.array([1.0, 0.0, 1.0, 0.0])
 """Of the outcomes: both crash, only A, only B, neither."""
@@ -36,7 +34,7 @@ PairVerdict = Literal["proven", "refuted", "open"]
 
 @cache
 def _kinds(worse: float) -> IntArray:
-    """Of the four outcomes, which ends of A and B belong to each, shape (3, 3, 4); ``worse`` see `PairCounts`."""
+    """Of the four outcomes, which ends of A and B belong to each, shape (3, 3, 4); ``worse`` see `Pairs`."""
     a, b = np.meshgrid([False, True, worse > 0.0], [False, True, worse < 0.0], indexing="ij")
     return np.stack((a & b, a & ~b, ~a & b, ~a & ~b), axis=2).astype(np.int64)
 
@@ -82,41 +80,104 @@ class Interval(NamedTuple):
         return (self.ci_high - self.ci_low) / 2.0
 
 
-class Pairs(ABC):
-    """Pairs of tests of some strata, of one scenario or of several side by side, and limits of what they say.
+class PairCounts(NamedTuple):
+    """Pairs of one scenario, of strata that are the first of the design's.
 
     ``ends`` (S, 3, 3) is how often A ended in one way (second axis) and B in another (third): no crash, crash, failed.
+    ``mass`` (S, 3, 3, S) is, over the same pairs, the sum of their paths' probability of an event of every stratum.
+    """
+
+    design: ShellDesign
+    ends: Counts
+    mass: FloatArray
+
+    def within(self, statement: str | None) -> PairCounts:
+        """See `Pairs`."""
+        n = self.design.n_inside if statement is None else self.design.n_within(statement)
+        return PairCounts(self.design, self.ends[:n], self.mass[:n, :, :, :n])
+
+    def tally(self, side: int) -> Tally:
+        """Tests of A (0) or B (1) by themselves."""
+        ends, mass = self.ends.sum(2 - side), self.mass.sum(2 - side)
+        return Tally(self.ends.sum((1, 2)), ends[:, CRASH], ends[:, FAILED], mass[:, CRASH], mass[:, FAILED])
+
+    def pool_variance(self, weights: FloatArray, worse: float) -> float:
+        """See `Pairs`.
+
+        The mean square of a path's part in it is at most that of its outcomes of positive weight and that of those of
+        negative weight together, as the product of the two only lowers it.
+        """
+        scale = weight_of_a_test(self.design.p[: len(self.ends)], self.ends.sum((1, 2)))
+        square, rate, kinds = 0.0, 0.0, _kinds(worse)
+        outcomes = np.tensordot(self.ends, kinds)
+        for sign in (1.0, -1.0):
+            part = np.maximum(sign * weights, 0.0)
+            mass = np.tensordot(self.mass, kinds @ part, ((1, 2), (0, 1)))
+            square += float(part.max()) * mean_square(scale, mass)
+            rate += sign * float(scale @ (outcomes @ part))
+        return max(square - rate**2, 0.0) / self.design.n_paths
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of tests of some strata, and limits of what they say: of one scenario per test, or of several per hour.
+
+    ``tests_per_hour`` are those that an hour of driving stands for, of each scenario; None of one alone, per test.
     Where something is asked with A, or B, the ``worse`` (1, or -1; 0 for neither), its failed tests count as crashes.
     """
 
-    ends: Counts
+    each: tuple[PairCounts, ...]
+    tests_per_hour: tuple[float, ...] | None = None
 
     @property
-    @abstractmethod
     def p(self) -> FloatArray:
         """What the strata stand for, shape (S,): their probabilities per test; of several scenarios events per hour."""
+        return np.concatenate([times * of.design.p[: len(of.ends)] for times, of in self._parts])
 
     @property
-    @abstractmethod
-    def designs(self) -> Sequence[ShellDesign]:
-        """Whose strata they are, of each scenario."""
+    def ends(self) -> Counts:
+        """How pairs ended, of all strata, see `PairCounts`."""
+        return np.concatenate([of.ends for of in self.each])
 
-    @abstractmethod
-    def within(self, statement: str | None = None) -> Self:
+    @property
+    def _parts(self) -> zip[tuple[float, PairCounts]]:
+        return zip(self.tests_per_hour or (1.0,), self.each, strict=True)
+
+    def within(self, statement: str | None = None) -> Pairs:
         """Those of the strata that a statement is about, by default those within the boundary."""
+        return replace(self, each=tuple(of.within(statement) for of in self.each))
 
-    @abstractmethod
-    def times(self, factor: float) -> Self:
+    def times(self, factor: float) -> Pairs:
         """So many times as many pairs of each stratum, ending as often."""
+        each = (PairCounts(of.design, np.asarray(of.ends * factor, np.float64), of.mass * factor) for of in self.each)
+        return replace(self, each=tuple(each))
 
-    @abstractmethod
     def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
-        """Variance of a weighted sum that comes from the pools' finite number of paths."""
+        """Variance of a weighted sum that comes from the pools' finite number of paths.
+
+        Pools of several scenarios are independent, and none knows exactly how often a test has an event.
+        """
+        found = []
+        for times, of in self._parts:
+            events = 0.0 if self.tests_per_hour is None else of.design.p_event_error * Pairs((of,)).rate(weights)
+            found.append(times**2 * (of.pool_variance(weights, worse) + events**2))
+        return math.fsum(found)
 
     @property
-    @abstractmethod
     def reference(self) -> tuple[float, float] | None:
-        """Crash rate of the reference driver, and its standard error; None where none crashes."""
+        """Crash rate of the reference driver, and its standard error; None where none crashes.
+
+        That is the first of the library that crashes; of several scenarios the first of each, if it crashes or not.
+        """
+        total, errors = 0.0, list[float]()
+        for times, of in self._parts:
+            crash = np.flatnonzero(of.design.reference_rate) if self.tests_per_hour is None else [0]
+            if of.design.references and len(crash):
+                rate, error = float(of.design.reference_rate[crash[0]]), of.design.reference_error(int(crash[0]))
+                events = 0.0 if self.tests_per_hour is None else of.design.p_event_error * rate
+                total += times * rate
+                errors.append(times * math.hypot(error, events))
+        return (total, math.hypot(*errors)) if total else None
 
     @property
     def tests(self) -> IntArray:
@@ -202,113 +263,6 @@ class Pairs(ABC):
         return "refuted" if self.limit(excess, level, 1.0) < 0.0 else "open"
 
 
-@dataclass(frozen=True, eq=False)
-class PairCounts(Pairs):
-    """Pairs of one scenario, of strata that are the first of the design's; ``ends`` see `Pairs`.
-
-    ``mass`` (S, 3, 3, S) is, over the same pairs, the sum of their paths' probability of an event of every stratum.
-    """
-
-    design: ShellDesign
-    ends: Counts
-    mass: FloatArray
-
-    @property
-    def p(self) -> FloatArray:
-        """See `Pairs`."""
-        return self.design.p[: len(self.ends)]
-
-    @property
-    def designs(self) -> Sequence[ShellDesign]:
-        """See `Pairs`."""
-        return (self.design,)
-
-    def within(self, statement: str | None = None) -> PairCounts:
-        """See `Pairs`."""
-        n = self.design.n_inside if statement is None else self.design.n_within(statement)
-        return PairCounts(self.design, self.ends[:n], self.mass[:n, :, :, :n])
-
-    def times(self, factor: float) -> PairCounts:
-        """See `Pairs`."""
-        return PairCounts(self.design, np.asarray(self.ends * factor, np.float64), self.mass * factor)
-
-    def tally(self, side: int) -> Tally:
-        """Tests of A (0) or B (1) by themselves."""
-        ends, mass = self.ends.sum(2 - side), self.mass.sum(2 - side)
-        return Tally(self.tests, ends[:, CRASH], ends[:, FAILED], mass[:, CRASH], mass[:, FAILED])
-
-    def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
-        """See `Pairs`.
-
-        The mean square of a path's part in it is at most that of its outcomes of positive weight and that of those of
-        negative weight together, as the product of the two only lowers it.
-        """
-        scale, square, rate, kinds = weight_of_a_test(self.p, self.tests), 0.0, 0.0, _kinds(worse)
-        for sign in (1.0, -1.0):
-            part = np.maximum(sign * weights, 0.0)
-            mass = np.tensordot(self.mass, kinds @ part, ((1, 2), (0, 1)))
-            square += float(part.max()) * mean_square(scale, mass)
-            rate += sign * float(scale @ (self.outcomes(worse) @ part))
-        return max(square - rate**2, 0.0) / self.design.n_paths
-
-    @property
-    def reference(self) -> tuple[float, float] | None:
-        """See `Pairs`: the first of the library that crashes at all."""
-        crash = np.flatnonzero(self.design.reference_rate)
-        if not crash.size:
-            return None
-        return float(self.design.reference_rate[crash[0]]), self.design.reference_error(int(crash[0]))
-
-
-@dataclass(frozen=True, eq=False)
-class PairsPerHour(Pairs):
-    """Pairs of several scenarios: of each, its own, and how many ``tests_per_hour`` an hour of driving stands for."""
-
-    each: tuple[PairCounts, ...]
-    tests_per_hour: tuple[float, ...]
-
-    @property
-    def p(self) -> FloatArray:
-        """See `Pairs`."""
-        return np.concatenate([times * of.p for times, of in zip(self.tests_per_hour, self.each, strict=True)])
-
-    @cached_property
-    def ends(self) -> Counts:  # type: ignore[override] # nobody writes to it
-        """See `Pairs`."""
-        return np.concatenate([of.ends for of in self.each])
-
-    @property
-    def designs(self) -> Sequence[ShellDesign]:
-        """See `Pairs`."""
-        return [of.design for of in self.each]
-
-    def within(self, statement: str | None = None) -> PairsPerHour:
-        """See `Pairs`."""
-        return replace(self, each=tuple(of.within(statement) for of in self.each))
-
-    def times(self, factor: float) -> PairsPerHour:
-        """See `Pairs`."""
-        return replace(self, each=tuple(of.times(factor) for of in self.each))
-
-    def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
-        """See `Pairs`: pools are independent, and none knows exactly how often a test has an event."""
-        return math.fsum(
-            times**2 * (of.pool_variance(weights, worse) + (of.design.p_event_error * of.rate(weights)) ** 2)
-            for times, of in zip(self.tests_per_hour, self.each, strict=True)
-        )
-
-    @property
-    def reference(self) -> tuple[float, float] | None:
-        """See `Pairs`: the first of each library, whether it crashes there or not."""
-        total, errors = 0.0, list[float]()
-        for times, of in zip(self.tests_per_hour, self.each, strict=True):
-            if of.design.references:
-                rate, error = float(of.design.reference_rate[0]), of.design.reference_error(0)
-                total += times * rate
-                errors.append(times * math.hypot(error, of.design.p_event_error * rate))
-        return (total, math.hypot(*errors)) if total else None
-
-
 class PairedShells:
     """Tests of A and B as they come; the i-th of a stratum with A and the i-th with B are the same event."""
 
@@ -331,20 +285,20 @@ class PairedShells:
         """Tests of A or B by stratum, shape (S,)."""
         return np.array([ends.size for ends in self._ends[side]], np.int64)
 
-    def first(self, n_pairs: IntArray) -> PairCounts:
+    def first(self, n_pairs: IntArray) -> Pairs:
         """The first pairs of each stratum, of which both tests must be there."""
-        counted = no_pairs(self._design)
+        (counted,) = (pairs := no_pairs(self._design)).each
         for s, n in enumerate(n_pairs.tolist()):
             a, b = (of_side[s][:n] for of_side in self._ends)
             np.add.at(counted.ends[s], (a, b), 1)
             np.add.at(counted.mass[s], (a, b), self._mass[s][:n])
-        return counted
+        return pairs
 
 
-def no_pairs(design: ShellDesign) -> PairCounts:
+def no_pairs(design: ShellDesign) -> Pairs:
     """That of no tests."""
     n = len(design.strata)
-    return PairCounts(design, np.zeros((n, N_ENDS, N_ENDS), np.int64), np.zeros((n, N_ENDS, N_ENDS, n)))
+    return Pairs((PairCounts(design, np.zeros((n, 3, 3), np.int64), np.zeros((n, 3, 3, n))),))
 
 
 def contrast(pairs: Pairs, level: Level) -> dict[str, Any]:
@@ -365,13 +319,14 @@ def contrast(pairs: Pairs, level: Level) -> dict[str, Any]:
     }
 
 
-def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
-    """Content of ``compare.json`` that comes from pairs, at least one: each vehicle, what lies between, all shells.
+def paired_estimate(pairs: Pairs, confidence: float) -> dict[str, Any]:
+    """Content of ``compare.json`` that comes from one scenario's pairs, at least one: each vehicle, and all shells.
 
     ``conditional`` is what lies between if neither crashes beyond the boundary, ``refuted`` once one has.
     """
-    level, design, inside = Level.two_sided(confidence), pairs.design, pairs.within()
-    each, tallies = [_own(pairs, side, confidence) for side in (0, 1)], [pairs.tally(side) for side in (0, 1)]
+    level, inside, (own,) = Level.two_sided(confidence), pairs.within(), pairs.each
+    design, tallies = own.design, [own.tally(side) for side in (0, 1)]
+    a, b = (_own(design, tally, confidence).shown for tally in tallies)
     counts = "n_both", "n_only_a", "n_only_b", "n_neither"
     shells = [
         {
@@ -391,10 +346,9 @@ def paired_estimate(pairs: PairCounts, confidence: float) -> dict[str, Any]:
         "refuted": any(tally.crashes[design.n_inside :].any() for tally in tallies),
     }
     more = {"confidence": confidence, "conditional": conditional, "shells": shells}
-    return finite_json({"a": each[0].shown, "b": each[1].shown, **contrast(pairs, level), **more})
+    return finite_json({"a": a, "b": b, **contrast(pairs, level), **more})
 
 
-def _own(pairs: PairCounts, side: int, confidence: float) -> Estimate:
-    tally = pairs.tally(side)
-    worst = SeenShells.of(pairs.design, tally.failed_as_crashes())
-    return FailureBounds(SeenShells.of(pairs.design, tally), worst, int(tally.failed.sum())).result(confidence)
+def _own(design: ShellDesign, tally: Tally, confidence: float) -> Estimate:
+    worst = SeenShells.of(design, tally.failed_as_crashes())
+    return FailureBounds(SeenShells.of(design, tally), worst, int(tally.failed.sum())).result(confidence)

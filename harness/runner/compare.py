@@ -23,7 +23,7 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.likelihood import Level
-from harness.estimators.pairs import PairDecision, Pairs, PairsPerHour, PairVerdict, contrast, paired_estimate
+from harness.estimators.pairs import PairDecision, Pairs, PairVerdict, contrast, paired_estimate
 from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
@@ -167,7 +167,7 @@ def compare_campaigns(
         "ended": ended_by(a, rule, int(pairs.tests.sum())),
     }  # fmt: skip
     told = labels or (a.name, b.name), LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE
-    if not isinstance(pairs, PairsPerHour):
+    if a.scenarios is None:
         return _written(scenarios[0], ended, *told, code)
     each = {}
     for of in scenarios:
@@ -212,7 +212,7 @@ def _written(
 def _sum_written(
     out: Path,
     campaign: Campaign,
-    pairs: PairsPerHour,
+    pairs: Pairs,
     scenarios: Sequence[PairedScenario],
     ended: Mapping[str, Any],
     decisions: Mapping[str, Any],
@@ -227,14 +227,12 @@ def _sum_written(
         told = {of.name: (of.results[i].estimates, of.results[i].shown.manifest) for of in scenarios}
         families = [OfFamily(of.name, of.exposure, of.tests_of_pairs(i)) for of in scenarios]
         sides[side] = hour_answer(PerHour(families), ready, told, confidence)
-    of_each = zip(scenarios, pairs.each, pairs.tests_per_hour, strict=True)
     content = finite_json({
         "format": 1, "method": campaign.testing.method, "seed": campaign.seed, "exposure": campaign.exposure,
         "campaigns": {side: {"label": label} for side, label in zip(SIDES, labels, strict=True)},
         **sides, **contrast(pairs, level), **ended, "confidence": confidence,
         "families": {
-            of.name: {**contrast(PairsPerHour((own,), (times,)), level), "decision": decisions[of.name]}
-            for of, own, times in of_each
+            of.name: {**contrast(together([of], campaign), level), "decision": decisions[of.name]} for of in scenarios
         },
     })  # fmt: skip
     write_sealed(out / COMPARISON, content)

@@ -18,7 +18,7 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.estimators.block import joined
-from harness.estimators.pairs import PairCounts, PairedShells, Pairs, PairsPerHour
+from harness.estimators.pairs import PairedShells, Pairs
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule
 from harness.families.protocol import Exposure
@@ -48,7 +48,7 @@ class PairedScenario:
         self.folder, self.runs, self._exposures = folder, (a, b), exposures
         self._tests = PairedShells(a.prescribed.design)  # as B's: one environment and one library make one pool
         self._n = np.zeros_like(self._tests.tests(0))
-        self.pairs: PairCounts = self._tests.first(self._n)
+        self.pairs = self._tests.first(self._n)
 
     @property
     def name(self) -> str:
@@ -63,7 +63,7 @@ class PairedScenario:
     @property
     def tests_per_hour(self) -> float:
         """Tests that an hour of driving stands for."""
-        return self.exposure.per_hour / self.pairs.design.p_event
+        return self.exposure.per_hour / self.runs[0].prescribed.design.p_event
 
     def take_over(self, rule: PairRule) -> None:
         """Take what the folders hold."""
@@ -133,7 +133,8 @@ def together(scenarios: list[PairedScenario], campaign: Campaign) -> Pairs:
     """The pairs of one scenario, per test; of several, those of all, per hour."""
     if campaign.scenarios is None:
         return scenarios[0].pairs
-    return PairsPerHour(tuple(of.pairs for of in scenarios), tuple(of.tests_per_hour for of in scenarios))
+    each = tuple(own for of in scenarios for own in of.pairs.each)
+    return Pairs(each, tuple(of.tests_per_hour for of in scenarios))
 
 
 def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:

@@ -165,7 +165,8 @@ class PairRounds:
 
     def __init__(self, campaign: Campaign, none: Pairs, available: Sequence[IntArray], rule: PairRule) -> None:
         self.rule, self._budget, self._available = rule, campaign.stop.episodes, np.concatenate(available)
-        self._joined = Joined(campaign.testing.shells, none.designs, none.p, available)
+        designs = [of.design for of in none.each]
+        self._joined = Joined(campaign.testing.shells, designs, none.p, available)
 
     def next_round(self, pairs: Pairs) -> list[IntArray]:
         """Pairs to add per stratum of each pool; all 0 when no stratum or no budget is left."""

@@ -23,7 +23,7 @@ from harness.campaign.sections import Accept, TimesReference
 from harness.errors import CampaignError
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level, likelihood_limit
-from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, no_pairs
+from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, Pairs, no_pairs
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import CrashedTests, Tally
@@ -354,26 +354,27 @@ class PairedCampaign(_Drawn):
         yield self._row(DIFFERENCE, replication, pairs, reached=planner.rule.look.stopped)
         yield self._row(CONDITIONAL_DIFFERENCE, replication, early or pairs.within(), reached=early is not None)
 
-    def _row(self, result: str, replication: int, pairs: PairCounts, *, reached: bool) -> Row:
+    def _row(self, result: str, replication: int, pairs: Pairs, *, reached: bool) -> Row:
         level = Level.two_sided(self.campaign.stop.confidence)
-        found, beyond = pairs.difference(level), pairs.ends[pairs.design.n_inside :]
+        found, beyond = pairs.difference(level), pairs.ends[pairs.each[0].design.n_inside :]
         counts = int(pairs.tests.sum()), sum(pairs.n_alone)
         numbers = found.value, found.half_width / level.z, found.ci_low, found.ci_high
         outside = int(beyond.sum() - beyond[:, NO_CRASH, NO_CRASH].sum())
         return Row(result, replication, *counts, *numbers, reached, outside)
 
 
-def _with_round(pairs: PairCounts, drawn: Sequence[DrawnPool], added: IntArray, rng: np.random.Generator) -> PairCounts:
+def _with_round(pairs: Pairs, drawn: Sequence[DrawnPool], added: IntArray, rng: np.random.Generator) -> Pairs:
     """The pairs after a round of so many more of each stratum (S,), by a multinomial of each."""
     share = np.column_stack([pool.share for pool in drawn])
     share = np.column_stack([share, np.maximum(1.0 - share.sum(1), 0.0)])
     counts = rng.multinomial(added, share / share.sum(1, keepdims=True))
-    ends, mass = pairs.ends.copy(), pairs.mass.copy()
+    (own,) = pairs.each
+    ends, mass = own.ends.copy(), own.mass.copy()
     ends[:, NO_CRASH, NO_CRASH] += counts[:, -1]
     for kind, pool, of_kind in zip(_CRASHING, drawn, counts.T[:-1], strict=True):
         ends[:, *kind] += of_kind
         mass[:, *kind] += [pool.mass[rows].sum(0) for rows in pool.paths_of(of_kind, rng)]
-    return PairCounts(pairs.design, ends, mass)
+    return Pairs((PairCounts(own.design, ends, mass),))
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from harness.estimators.pairs import (
     NO_CRASH,
     PairCounts,
     PairedShells,
+    Pairs,
     no_pairs,
     paired_estimate,
 )
@@ -26,11 +27,11 @@ LEVEL = Level.two_sided(0.9)
 
 def pairs_of(*strata, mass=0.0):
     """Counts of both, only A, only B, neither for each stratum; ``mass`` of every path in its own stratum."""
-    pairs = no_pairs(DESIGN)
+    (own,) = (pairs := no_pairs(DESIGN)).each
     for s, counts in enumerate(strata):
         for (a, b), n in zip(((1, 1), (1, 0), (0, 1), (0, 0)), counts, strict=True):
-            pairs.ends[s, a, b] += n
-            pairs.mass[s, a, b, s] += n * mass
+            own.ends[s, a, b] += n
+            own.mass[s, a, b, s] += n * mass
     return pairs
 
 
@@ -57,8 +58,8 @@ def test_rates_are_those_of_each_and_intervals_hold_what_was_seen():
 def test_failed_tests_widen_both_ways():
     """A fails 3 times where B does not crash, B twice where A does."""
     failed = pairs_of((30, 8, 2, 5), (0, 5, 0, 45), (0, 0, 0, 4000))
-    failed.ends[0, FAILED, NO_CRASH] = 3
-    failed.ends[0, CRASH, FAILED] = 2
+    failed.each[0].ends[0, FAILED, NO_CRASH] = 3
+    failed.each[0].ends[0, CRASH, FAILED] = 2
     worst_a = pairs_of((30, 13, 2, 5), (0, 5, 0, 45), (0, 0, 0, 4000))
     worst_b = pairs_of((32, 8, 2, 8), (0, 5, 0, 45), (0, 0, 0, 4000))
     found = failed.difference(LEVEL)
@@ -90,7 +91,8 @@ def test_a_margin_is_where_the_ratio_ends():
     for factor, verdict in ((1.001, "proven"), (0.999, "open")):
         assert PAIRS.verdict(factor / low - 1.0, LEVEL) == verdict
     assert PAIRS.verdict(1.001 / high - 1.0, LEVEL) == "open"
-    swapped = PairCounts(DESIGN, PAIRS.ends.transpose(0, 2, 1), PAIRS.mass.transpose(0, 2, 1, 3))
+    (own,) = PAIRS.each
+    swapped = Pairs((PairCounts(DESIGN, own.ends.transpose(0, 2, 1), own.mass.transpose(0, 2, 1, 3)),))
     assert swapped.within().verdict(0.1, LEVEL) == "refuted"
 
 

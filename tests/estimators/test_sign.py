@@ -13,7 +13,7 @@ from scipy.stats import binomtest
 
 from harness.campaign.campaign import Campaign
 from harness.estimators.likelihood import Level
-from harness.estimators.pairs import CRASH, NO_CRASH, PairsPerHour, no_pairs
+from harness.estimators.pairs import CRASH, NO_CRASH, Pairs, no_pairs
 from harness.estimators.stopping import PairRule
 from harness.sampling.shells import PairRounds
 from harness.strata import Reference, ShellDesign
@@ -62,14 +62,14 @@ def rounds_of(statement, shares, seed, *args, **stop):
     campaign, rng = Campaign.model_validate({"name": "x", **settings}), np.random.default_rng(seed)
     several = isinstance(shares, list)
     shares = shares if several else [shares]
-    rule, each = PairRule(campaign, *args), [no_pairs(DESIGN) for _ in shares]
-    pairs = PairsPerHour(tuple(each), PER_HOUR) if several else each[0]
+    rule, each = PairRule(campaign, *args), [no_pairs(DESIGN).each[0] for _ in shares]
+    pairs = Pairs(tuple(each), PER_HOUR if several else None)
     rounds = PairRounds(campaign, pairs, [KEPT for _ in shares], rule)
     while np.concatenate(added := rounds.next_round(pairs)).any():
         for of, ends, more in zip(each, shares, added, strict=True):
             for end, n in zip(ENDS, rng.multinomial(more, ends).T, strict=True):
                 of.ends[:, *end] += n
-        pairs = PairsPerHour(tuple(each), PER_HOUR) if several else each[0]
+        pairs = Pairs(tuple(each), PER_HOUR if several else None)
         enough = rule.observe(pairs)
         yield rule, pairs
         if enough:
@@ -138,5 +138,5 @@ def test_pairs_that_would_decide_do():
     assert pairs.tests.sum() < more.tests.sum() < 3 * foreseen
     assert foreseen < 3 * more.tests.sum()
     none = no_pairs(DESIGN)
-    none.ends[:, NO_CRASH, NO_CRASH] = 100
+    none.each[0].ends[:, NO_CRASH, NO_CRASH] = 100
     assert rule.more_pairs(none) == float("inf")

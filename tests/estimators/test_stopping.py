@@ -169,8 +169,8 @@ def test_a_vehicle_that_always_crashes_may_have_a_rate_above_that_of_this_pool()
         drawn = np.array([mass[rng.choice(n_paths, 400, p=of / of.sum())].sum(0) for of in mass.T])
         design = replace(DESIGN, cell_p=mass.mean(0), n_paths=n_paths)
         found = SeenShells.of(design, Tally(tests, tests, none, drawn, np.zeros((3, 3))))
-        pairs = no_pairs(design)
-        pairs.ends[:, CRASH, NO_CRASH], pairs.mass[:, CRASH, NO_CRASH] = tests, drawn
+        (own,) = (pairs := no_pairs(design)).each
+        own.ends[:, CRASH, NO_CRASH], own.mass[:, CRASH, NO_CRASH] = tests, drawn
         free, alone = found.limits(LEVEL), pairs.alone(0, LEVEL)
         low = np.array([free.low, 0.0, alone.ci_low])
         high = np.array([free.high, found.within(0.9).upper_bound_outside, alone.ci_high])
