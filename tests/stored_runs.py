@@ -19,7 +19,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.records.folder import SEAL, read_kept, read_manifest, write_part, write_sealed
 from harness.records.reader import read_campaign
-from harness.report.words import answer_of
+from harness.report.words import short_answer
 from tests.golden.campaigns import BASE, RUNS
 from tests.golden.record import TABLES, tables_of
 
@@ -70,7 +70,7 @@ def estimates(folder: Path) -> dict[str, Any]:
 
 def answer(content: dict[str, Any], campaign: Campaign, of: dict[str, Any] | None = None) -> dict[str, Any]:
     """The answer of estimates.json in words, with those of a manifest."""
-    return json.loads(json.dumps(asdict(answer_of(campaign, of or {}, content))))
+    return json.loads(json.dumps(asdict(short_answer(campaign, of or {}, content))))
 
 
 def answer_in(folder: Path) -> dict[str, Any]:

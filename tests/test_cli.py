@@ -20,7 +20,7 @@ from harness.commands.printing import print_table, say
 from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.progress import Progress
 from harness.report.lines import lines
-from harness.report.words import answer_of
+from harness.report.words import short_answer
 from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
@@ -56,7 +56,7 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     assert main(command) == 0
     out, content = capsys.readouterr().out.splitlines(), estimates(folder)
     short = lines(
-        answer_of(golden("shells-refuted"), manifest(folder), content),
+        short_answer(golden("shells-refuted"), manifest(folder), content),
         manifest(folder)["wall_time_s"],
         folder / "report.html",
     )

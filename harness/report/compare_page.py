@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from harness.numbers import count, tenths
 from harness.report.crashes import rows_of
 from harness.report.drawing import Plot
 from harness.report.hour_words import beside_row, called
-from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words, ratio_words
+from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words, rates_of, ratio_words
 from harness.report.player import ReplayResult, Scene, Scenes, beside_other
 from harness.report.plots import WHO, pairs_plot
 from harness.report.summary import RunFolder, summarise
@@ -35,14 +35,15 @@ SHOWN = 2
 
 def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder], replay: Replay) -> Path:
     """Write the page of a comparison in hand; ``replay`` runs a test of one of its folders again."""
-    pairs, asked = crashing_pairs(runs, stored["shells"]), pair_asked(stored)
-    family = family_named(runs[0].campaign.scenario)
-    return write_page(
-        folder / "report.html", "compare.html.j2",
-        **_told(stored), asked=asked, given=asked is not stored,
-        answers=[short_answer(run.campaign, run.manifest, run.estimates) for run in runs],
-        above=runs[0].campaign.crash.counts_above_mps,
-        sides=list(zip("AB", runs, stored["campaigns"].values(), strict=True)),
+    pairs, campaign = crashing_pairs(runs, stored["shells"]), runs[0].campaign
+    family = family_named(campaign.scenario)
+    answers = [short_answer(run.campaign, run.manifest, run.estimates) for run in runs]
+    of_each = [{row.key: row for row in answer.rows} for answer in answers]
+    shown = {"ratio": "× competent driver", "impact": "impact"}
+    return _write(
+        folder, stored, [(answer.vehicle, answer.parameters) for answer in answers],
+        [(what, [rows.get(key) for rows in of_each]) for key, what in shown.items()],
+        above=campaign.crash.counts_above_mps, level=campaign.environment.lane_change_level,
         family=family, words=family.words, plot=pairs.plot(family),
         scenes=list(scenes_of(runs, pairs, replay)), counts=pairs.counts,
     )  # fmt: skip
@@ -50,22 +51,26 @@ def write_page_of(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder
 
 def write_sum(folder: Path, stored: dict[str, Any]) -> Path:
     """Write the page of a comparison in several scenarios: the sum, and the way to each one's own page."""
-    sides = list(zip("AB", (stored["a"], stored["b"]), stored["campaigns"].values(), strict=True))
-    rows = [
-        (called(name), name, of, {"ratio": ratio_words(of), "verdict": pair_words(of["decision"])})
-        for name, of in stored["families"].items()
+    beside = [beside_row("", stored[side]["beside"], seen=stored[side]["n_crashes"] > 0) for side in "ab"]
+    scenarios = [
+        (called(name), name, of, ratio_words(of), pair_words(of["decision"])) for name, of in stored["families"].items()
     ]
-    beside = [beside_row("", side["beside"], seen=side["n_crashes"] > 0) for _, side, _ in sides]
-    told = {**_told(stored), "ratio": ratio_words(stored), "beside": beside}
-    return write_page(folder / "report.html", "compare_sum.html.j2", **told, sides=sides, rows=rows)
+    vehicles = [(of["label"], ()) for of in stored["campaigns"].values()]
+    return _write(folder, stored, vehicles, [("× competent driver", beside)], above=0.0, scenarios=scenarios)
 
 
-def _told(stored: dict[str, Any]) -> dict[str, Any]:
-    """What both kinds of pages tell."""
-    return {
-        "compared": stored, "verdict": pair_words(stored["decision"]), "to_decide": deciding_words(stored),
-        "warnings": list(pair_warnings(stored)),
-    }  # fmt: skip
+def _write(
+    folder: Path, stored: dict[str, Any], vehicles: Iterable[tuple[Any, ...]], rows: Sequence[Any], **content: Any
+) -> Path:
+    """Write either page; ``rows`` are what its table has besides, of A and of B."""
+    asked, sides = pair_asked(stored), zip("AB", vehicles, strict=True)
+    return write_page(
+        folder / "report.html", "compare.html.j2",
+        compared=stored, asked=asked, given=asked is not stored, ratio=ratio_words(asked),
+        verdict=pair_words(stored["decision"]), to_decide=deciding_words(stored), warnings=list(pair_warnings(stored)),
+        vehicles=[(name, *of) for name, of in sides], rates=[rates_of(stored[side]) for side in "ab"],
+        rows=rows, **content,
+    )  # fmt: skip
 
 
 class CrashPairs(NamedTuple):

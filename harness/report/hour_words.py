@@ -12,18 +12,8 @@ from harness.families import family_named
 from harness.families.words import EXCLUDED
 from harness.numbers import count, interval, number, plain, ratio, share, tenths
 from harness.report.lines import columns, headed, wrapped
-from harness.report.rows import decided, looking_words, ratio_texts
-from harness.report.words import (
-    GO_ON,
-    acts_words,
-    doubt_words,
-    early_words,
-    ended_words,
-    milder_words,
-    scope_words,
-    touch_words,
-    unseen_words,
-)
+from harness.report.rows import Row, decided, looking_words, ratio_texts
+from harness.report.words import GO_ON, ShortAnswer, ended_words, scope_words, tests_words, unseen_words, warnings_of
 
 
 def called(family: str) -> str:
@@ -36,53 +26,55 @@ def scenarios_words(families: Sized) -> str:
     return f"{count(len(families))} scenario{'s' * (len(families) > 1)}"
 
 
+def answer_of_sum(content: Mapping[str, Any], *, readings: bool = False) -> ShortAnswer:
+    """The answer of ``families.json``; with ``readings`` also beside others of the regulation's driver."""
+    verdict = [] if content["decision"] is None else [decided(content["decision"])]
+    return ShortAnswer(
+        vehicle=content["vehicle"],
+        parameters=content["parameters"],
+        tests=tests_words(content["n_episodes"], content["engine"], scenarios_words(content["families"])),
+        rows=(*verdict, *_sum_rows(content, readings=readings)),
+        warnings=tuple(sum_warnings(content)),
+        scope=_scope(content),
+    )
+
+
 def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readings: bool = False) -> list[str]:
     """The answer for a terminal, at most ten lines of 100 columns; with ``readings`` two more."""
-    n, engine = count(content["n_episodes"]), "SUMO" if content["engine"] == "sumo" else "SUMO’s twin"
-    scenarios = scenarios_words(content["families"])
-    took_s = None if readings else content["wall_time_s"]  # of the run, not of an answer given anew
-    head = headed(content["vehicle"], content.get("parameters", ()), f"{n} tests in {engine}, {scenarios}", took_s)
-    verdict = [] if content["decision"] is None else [decided(content["decision"]).texts]
-    rows = [*verdict, *sum_rows(content), *(reading_rows(content) if readings else ())]
-    ends = [] if report is None else [f"  report  {report}"]
+    answer, took_s = answer_of_sum(content, readings=readings), content["wall_time_s"]
+    head = headed(answer, None if readings else took_s)  # of the run, not of an answer given anew
     parts = columns([(row[1], row[2] + " of all" * (i == 0), *row[3:]) for i, row in enumerate(family_rows(content))])
-    under = wrapped([*(f"! {text}" for text in warnings(content)), exposures(content), scope(content)])
-    return [head, *columns(rows), *parts, *under, *ends]
+    under = wrapped([*(f"! {text}" for text in answer.warnings), exposures(content), answer.scope])
+    ends = [] if report is None else [f"  report  {report}"]
+    return [head, *columns([row.texts for row in answer.rows]), *parts, *under, *ends]
 
 
-def sum_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
-    """Crashes per hour, and beside the competent driver: what, value, interval, remark."""
-    hour, from_below = content["per_hour"], _from_below(content)
+def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
+    """Crashes per hour, and beside the competent driver."""
+    hour, seen, decision = content["per_hour"], content["n_crashes"] > 0, content["decision"]
+    # Where few tests have rejected a limit upper ends say nothing.
+    wide = hour["rhw"] is None or hour["rhw"] > WIDE_RHW
+    from_below = wide and decision is not None and decision["verdict"] == "rejected"
     if from_below:
-        yield "crashes so far", f"> {number(hour['ci_low'])} per hour", f"estimate {number(hour['rate'])}", ""
-    elif content["n_crashes"]:
+        yield Row("rate", "crashes so far", f"> {number(hour['ci_low'])} per hour", f"estimate {number(hour['rate'])}")
+    elif seen:
         ends = between(hour["ci_low"], hour["ci_high"], hour["rate"])
         per_km = f"{number(content['per_1e6_km'])} per million km"
-        yield "crashes", f"{number(hour['rate'])} per hour", ends, per_km
+        yield Row("rate", "crashes", f"{number(hour['rate'])} per hour", ends, per_km)
     else:
-        yield "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen", ""
-    yield beside_row("× competent driver", content["beside"], seen=content["n_crashes"] > 0, from_below=from_below)
+        yield Row("rate", "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen")
+    yield beside_row("× competent driver", content["beside"], seen=seen, from_below=from_below)
+    for each in content["readings"] if readings else ():
+        yield beside_row(f"× {each['reference']}", each, seen=seen, from_below=from_below)
 
 
-def _from_below(content: Mapping[str, Any]) -> bool:
-    """Whether few tests have rejected a limit: upper ends say nothing then."""
-    rhw, decision = content["per_hour"]["rhw"], content["decision"]
-    return decision is not None and decision["verdict"] == "rejected" and (rhw is None or rhw > WIDE_RHW)
-
-
-def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool, from_below: bool = False) -> tuple[str, ...]:
-    """The rate beside a reading of that driver, where crashes were ``seen`` or none: name, ratio, interval, remark."""
+def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool, from_below: bool = False) -> Row:
+    """The rate beside a reading of that driver, where crashes were ``seen`` or none."""
     if beside["ratio"] is None:
-        return name, "no ratio", "", "such a driver never crashes here"
+        return Row("ratio", name, "no ratio", "", "such a driver never crashes here")
     found, ends = (beside if seen else {**beside, "ratio": 0.0}), beside["over_assumed"]
     over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed ranges"
-    return name, *ratio_texts(found, wide=from_below, from_below=from_below), over
-
-
-def reading_rows(content: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """The same beside other readings of the regulation's driver."""
-    how = {"seen": content["n_crashes"] > 0, "from_below": _from_below(content)}
-    return [beside_row(f"× {each['reference']}", each, **how) for each in content["readings"]]
+    return Row("ratio", name, *ratio_texts(found, wide=from_below, from_below=from_below), over)
 
 
 def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -100,17 +92,14 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         yield name, called(name), part, rate, beside, hard
 
 
-def warnings(content: Mapping[str, Any]) -> Iterator[str]:
+def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
     for name, of in content["families"].items():
-        yield from milder_words(name, of["milder"])
+        told = list(warnings_of(name, {**of, "rate": of["rate_per_hour"]}, " per hour"))
         if (left := of.get("assumed")) and (found := AssumedOfRate(**left)).no_lower_limit:
             most = found.most * (of["ci_high"] if of["n_crashes"] else of["upper_bound"])
-            yield f"{called(name)}: {unseen_words(found.where)}, here {number(most)} per hour"
-        doubts = doubt_words({**of, "rate": of["rate_per_hour"]}, " per hour")
-        early = *early_words(of["n_crashes_before_event"]), *acts_words(of.get("before_event"))
-        early = *early, *touch_words(of.get("share_below_1_mps"))
-        yield from (f"{called(name)}: {text}" for text in (*early, *doubts))
+            told.append(f"{unseen_words(found.where)}, here {number(most)} per hour")
+        yield from (f"{called(name)}: {text}" for text in told)
 
 
 def exposures(content: Mapping[str, Any]) -> str:
@@ -128,12 +117,6 @@ def exposures(content: Mapping[str, Any]) -> str:
     return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
 
 
-def far_above(name: str, given: float, shipped: float) -> str:
-    """That events of a scenario per hour, as they are given, are likely to be of other events than the shipped ones."""
-    times = f"{given / shipped:.0f} times the shipped one, of events in scope"
-    return f"exposure {name}={given:g} is {times} (docs/families.md)"
-
-
 def between(low: float, high: float | None, rate: float) -> str:
     """The interval of a rate; its ends apart where they are far apart, "no limit" where it is open."""
     if high is None:
@@ -141,7 +124,7 @@ def between(low: float, high: float | None, rate: float) -> str:
     return interval(low, high, beside=rate) if low > 0.0 and high < 100.0 * low else f"{number(low)} to {number(high)}"
 
 
-def scope(content: Mapping[str, Any]) -> str:
+def _scope(content: Mapping[str, Any]) -> str:
     """How far the interval goes, and why the tests ended."""
     ended, target = ended_words(content["stopped_by"], content["decision"]), content["asked_rhw"]
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:

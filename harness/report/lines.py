@@ -27,15 +27,14 @@ def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None 
         warnings[MOST_WARNINGS - 1 :] = [f"! {count(len(warnings) - MOST_WARNINGS + 1)} more warnings: see the report"]
     ends = [answer.scope, *([] if report is None else [f"report  {report}"])]
     rows = answer.rows[: LINES - 1 - len(warnings) - len(ends)]
-    head = headed(answer.vehicle, answer.parameters, answer.tests, took_s)
     table = columns([row.texts for row in rows])
-    return [head, *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+    return [headed(answer, took_s), *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
 
 
-def headed(vehicle: str, parameters: Iterable[Sequence[str]], tests: str, took_s: float | None) -> str:
-    """The first line: who was tested, with as many of its ``parameters`` as there is room for, and how often."""
-    head = [vehicle, tests, *([] if took_s is None else [duration(took_s)])]
-    if told := ", ".join(map(" ".join, parameters)):
+def headed(answer: ShortAnswer, took_s: float | None) -> str:
+    """The first line: who was tested, with as many of its parameters as there is room for, and how often."""
+    head = [answer.vehicle, answer.tests, *([] if took_s is None else [duration(took_s)])]
+    if told := ", ".join(map(" ".join, answer.parameters)):
         room = WIDTH - len(" · ".join(head)) - 3
         head[0] += f" ({textwrap.shorten(told, max(room, 8), placeholder=' …')})"
     return " · ".join(head)
@@ -45,9 +44,9 @@ def run_lines(
     campaign: Campaign, manifest: Mapping[str, Any], content: Estimates | Mapping[str, Any], report: Path
 ) -> list[str]:
     """The answer of a run; the ``report`` is named if it is there, and of the same traffic."""
-    told, took_s = STORED_ESTIMATES.validate_python(content), manifest.get("wall_time_s")
+    told = STORED_ESTIMATES.validate_python(content)
     page = report if told.elsewhere is None and report.is_file() else None
-    return lines(short_answer(campaign, manifest, told), took_s, page)
+    return lines(short_answer(campaign, manifest, told), manifest.get("wall_time_s"), page)
 
 
 def estimate_lines(content: Mapping[str, Any]) -> list[str]:

@@ -15,9 +15,8 @@ from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.report.crashes import crash_gallery, shown_of
 from harness.report.drawing import Plot
-from harness.report.hour_words import called, exposures, family_rows, reading_rows, scope, sum_rows, warnings
+from harness.report.hour_words import answer_of_sum, called, exposures, family_rows
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
-from harness.report.rows import decided
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, summarise
 from harness.report.templates import write_page
 from harness.report.words import short_answer
@@ -47,13 +46,11 @@ def write_page_of(run: RunFolder) -> Path:
 
 def write_hours(folder: Path, content: dict[str, Any]) -> Path:
     """Write the page of several scenarios: the sum, each one's part of it, and the way to each one's own page."""
-    decision = content["decision"]
     return write_page(
         folder / "report.html", "hours.html.j2",
-        content=content, sums=[*sum_rows(content), *reading_rows(content)],
-        verdict=None if decision is None else decided(decision).texts,
+        content=content, answer=answer_of_sum(content, readings=True),
         rows=[(row, content["families"][row[0]]) for row in family_rows(content)],
-        warnings=list(warnings(content)), exposures=exposures(content), scope=scope(content), called=called,
+        exposures=exposures(content), called=called,
         moved=_sensitivity(folder, tests_of_sum(content), str(folder)),
     )  # fmt: skip
 

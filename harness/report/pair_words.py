@@ -8,20 +8,10 @@ from typing import Any
 
 from harness.campaign.campaign import Campaign
 from harness.numbers import count, duration, interval, number, plain, ratio, share, two_digits_up
-from harness.report.hour_words import called, scenarios_words
-from harness.report.hour_words import warnings as hour_warnings
+from harness.report.hour_words import called, scenarios_words, sum_warnings
 from harness.report.lines import LABEL, columns, wrapped
 from harness.report.notes import note_words
-from harness.report.words import (
-    ENDED,
-    acts_words,
-    doubt_words,
-    early_words,
-    milder_words,
-    scope_words,
-    touch_words,
-    unseen_words,
-)
+from harness.report.words import ENDED, scope_words, unseen_words, warnings_of
 from harness.strata import LIBRARY_STATEMENT
 
 
@@ -47,15 +37,14 @@ def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     sides = {name: content[name.lower()] for name in "AB"}
     if "families" in content:
         for name, of in sides.items():
-            yield from (f"{name}, {text}" for text in hour_warnings(of))
+            yield from (f"{name}, {text}" for text in sum_warnings(of))
         return
     elsewhere = ["failed"] if content["asked"] == LIBRARY_STATEMENT else ["failed", "refuted"]
     for name, of in sides.items():
-        told = doubt_words({**of, "rate": of["crash_rate"], "n_failed": of["details"]["n_failed"]}, " per test")
+        rates = {**of, "rate": of["crash_rate"], "n_failed": of["details"]["n_failed"]}
+        told = warnings_of(content["scenario"], rates, " per test")
         more = [each for each in of["warnings"] if each["key"] not in elsewhere and each not in of["cautions"]]
-        left_out = *milder_words(content["scenario"], of["milder"]), *early_words(of["n_crashes_before_event"])
-        acts = *acts_words(of.get("before_event")), *touch_words(of.get("share_below_1_mps"))
-        yield from (f"{name}: {text}" for text in (*told, *map(note_words, more), *left_out, *acts))
+        yield from (f"{name}: {text}" for text in (*told, *map(note_words, more)))
     if where := content.get("unseen"):
         yield unseen_words(where)
 

@@ -25,6 +25,7 @@ from harness.sampling.milder import n_left_out
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
 
+EARLY = "n_crashes_before_event"
 CUT_OFF_SHARE = 0.2
 """Weight, relative to the rate, from which tests that were cut off are warned of, if the interval leaves them out."""
 ENDED = {
@@ -62,28 +63,25 @@ class ShortAnswer:
     scope: str
 
 
-def answer_of(campaign: Campaign, manifest: Mapping[str, Any], content: Mapping[str, Any]) -> ShortAnswer:
-    """The answer of ``estimates.json``."""
-    return short_answer(campaign, manifest, STORED_ESTIMATES.validate_python(content))
-
-
-def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> ShortAnswer:
-    """The answer by a campaign's own estimate, with what the ``manifest`` of the run says besides."""
+def short_answer(
+    campaign: Campaign, manifest: Mapping[str, Any], content: Estimates | Mapping[str, Any]
+) -> ShortAnswer:
+    """The answer of ``estimates.json``, with what the ``manifest`` of the run says besides."""
+    told = STORED_ESTIMATES.validate_python(content)
     vehicle, parameters = vehicle_words(campaign.av, script=manifest.get("script"))
-    engine = "SUMO" if campaign.world.engine == "sumo" else "SUMO’s twin"
-    scenario = family_named(campaign.scenario).words.called
     return ShortAnswer(
         vehicle=vehicle,
         parameters=tuple(parameters),
-        tests=f"{count(told.n_episodes)} tests in {engine}, {scenario}",
+        tests=tests_words(told.n_episodes, campaign.world.engine, family_named(campaign.scenario).words.called),
         rows=tuple(with_traffic(list(rows_of(campaign, manifest, told)), told.traffic)),
-        warnings=(
-            *_warnings(campaign, manifest, told),
-            *acts_words(before_event(campaign, manifest, told.diagnostics)),
-            *(() if told.traffic is None else too_few(told.traffic.n_replicates, told.traffic.confidence)),
-        ),
+        warnings=tuple(_warnings(campaign, manifest, told)),
         scope=_scope(campaign, manifest, told),
     )
+
+
+def tests_words(n: int, engine: str, scenario: str) -> str:
+    """How many tests, and of what."""
+    return f"{count(n)} tests in {'SUMO' if engine == 'sumo' else 'SUMO’s twin'}, {scenario}"
 
 
 def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple[str, list[tuple[str, str]]]:
@@ -117,64 +115,59 @@ def unseen_words(where: str) -> str:
     return f"no lane change was seen at {where} in the data of this traffic: rates have only an upper limit"
 
 
-def milder_words(scenario: str, milder: Mapping[str, Any] | None) -> Iterator[str]:
-    """That a vehicle crashes on events too mild to count, or fails, if it does."""
+def doubts_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates, times: float = 1.0) -> dict[str, Any]:
+    """What may make the rate of a run doubtful, for `warnings_of`: rates per test, or ``times`` as large."""
+    best, severity = told.best, told.severity
+    return {
+        EARLY: n_left_out(campaign, told.diagnostics.get(EARLY, 0)), "milder": told.milder,
+        "if_failed_had_crashed": times * best.details["crash_rate_if_failed_had_crashed"],
+        "cut_off": times * told.cut_off, "cautions": best.cautions, "repeated": manifest.get("repeated"),
+        "share_below_1_mps": None if severity is None else severity.share_below_1_mps,
+        "assumed": told.assumed, "before_event": before_event(campaign, manifest, told.diagnostics),
+    }  # fmt: skip
+
+
+def warnings_of(scenario: str, of: Mapping[str, Any], unit: str, but: str = "") -> Iterator[str]:
+    """What changes the meaning of a rate, a line each: ``of`` are it and its upper limit, tests, and `doubts_of`.
+
+    Rates are in a ``unit``. ``but`` is added where tests ended too early to be told safe.
+    """
+    milder, repeated, touches = of["milder"], of["repeated"] or {}, of.get("share_below_1_mps")
     if milder is not None and (found := milder["n_crashes"] + milder["n_failed"]):
-        words, n, of = family_named(scenario).words, count(found), count(milder["n_tests"])
-        ends = "end in a crash or FAIL" if milder["n_failed"] else "end in a crash"
+        events, ends = family_named(scenario).words.events, " or FAIL" if milder["n_failed"] else ""
         rate = number(milder["per_hour"] * found / milder["n_tests"], 2)
         yield (
-            f"{n} of {of} MILDER {words.events} {ends}, too: some {rate} an hour, which this rate leaves out "
-            "(docs/families.md says how to count them)"
+            f"{count(found)} of {count(milder['n_tests'])} MILDER {events} end in a crash{ends}, too: some {rate} an "
+            "hour, which this rate leaves out (docs/families.md says how to count them)"
         )
-
-
-def early_words(n_early: int) -> Iterator[str]:
-    """That a vehicle crashes while it follows, before anything happens, if it does."""
-    if n_early:
+    if n := of[EARLY]:
         yield (
-            f"{count(n_early)} tests crashed BEFORE the event, as it just followed: it does so in all driving, which "
+            f"{count(n)} tests crashed BEFORE the event, as it just followed: it does so in all driving, which "
             "this rate leaves out (testing.method=nde counts it)"
         )
-
-
-def doubt_words(of: Mapping[str, Any], unit: str, but: str = "") -> Iterator[str]:
-    """What makes a rate doubtful, if anything does: ``of`` are rates in a ``unit``, and of how many tests.
-
-    ``but`` is added where tests ended too early to be told safe.
-    """
     yield from map(note_words, of["cautions"])
-    repeated = of["repeated"] or {}
     if n := len(repeated.get("differing", ())):
         again = count(repeated["n_episodes"])
         yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests that ran twice differed: see `harness av-check`"
-    if n_failed := of["n_failed"]:
+    if n := of["n_failed"]:
         tests, had = count(of["n_episodes"]), f"{number(of['if_failed_had_crashed'])}{unit}"
-        yield f"{count(n_failed)} of {tests} tests FAILED; had they all crashed, the rate would be {had}"
+        yield f"{count(n)} of {tests} tests FAILED; had they all crashed, the rate would be {had}"
     worst = of["rate"] + of["cut_off"]
     if worst > max((1.0 + CUT_OFF_SHARE) * of["rate"], of["ci_high"]):
         yield f"some tests ended while the vehicle was still closing in; had all crashed: {number(worst)}{unit}{but}"
-
-
-def touch_words(part: float | None) -> Iterator[str]:
-    """That most crashes are hardly any, where a share of more than half is below `TOUCH_MPS`."""
-    if part is not None and part > 0.5:
+    if touches is not None and touches > 0.5:
         left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
-        yield f"{share(part)} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
+        yield f"{share(touches)} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
+    yield from _acts(of.get("before_event"))
 
 
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[str]:
     """What changes the meaning of the rows, a line each."""
-    best, severity, assumed = told.best, told.severity, told.assumed
-    yield from milder_words(campaign.scenario, told.milder)
-    n_early = told.diagnostics.get("n_crashes_before_event", 0)
-    yield from early_words(n_left_out(campaign, n_early))
-    rates = {"rate": best.crash_rate, "ci_high": best.ci_high, "cut_off": told.cut_off}
-    rates["if_failed_had_crashed"] = best.details["crash_rate_if_failed_had_crashed"]
-    of_tests = {"n_failed": best.details["n_failed"], "n_episodes": best.n_episodes, "cautions": best.cautions}
+    best, assumed, traffic = told.best, told.assumed, told.traffic
+    rates = {"rate": best.crash_rate, "ci_high": best.ci_high}
+    of = {**rates, "n_episodes": best.n_episodes, "n_failed": best.details["n_failed"]}
     but = "" if told.decision is None else "; ACCEPTED counts them as crashes"
-    yield from doubt_words({**rates, **of_tests, "repeated": manifest.get("repeated")}, " per test", but)
-    yield from touch_words(None if severity is None else severity.share_below_1_mps)
+    yield from warnings_of(campaign.scenario, of | doubts_of(campaign, manifest, told), " per test", but)
     if assumed is not None and assumed.where and assumed.times is None:
         yield unseen_words(assumed.where)
     on_rate = told.decision is not None and not told.decision.get("driver")
@@ -182,6 +175,8 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
         yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; use --accept r157-cc"
     if (level := campaign.environment.lane_change_level) != 1.0:
         yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
+    if traffic is not None:
+        yield from too_few(traffic.n_replicates, traffic.confidence)
 
 
 FEW_BEHIND = 0.1
@@ -200,7 +195,7 @@ def brakes_before_words(n: int, *, script: bool) -> str:
     return f"in {count(n)} tests it braked with nobody ahead, which makes cut-ins milder: let it cruise at {speed}"
 
 
-def acts_words(of: Mapping[str, Any] | None) -> Iterator[str]:
+def _acts(of: Mapping[str, Any] | None) -> Iterator[str]:
     """What the vehicle did before the event (`before_event`), a line each."""
     if of is not None and (n := of["n_fell_behind"]) > FEW_BEHIND * of["n_events"] and not of["built_in"]:
         why = "which makes the event milder: let it keep up"

@@ -33,9 +33,10 @@ from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, require_sum, write_sealed
 from harness.records.origin import code_of, require_trust
+from harness.report.words import doubts_of
 from harness.resolved import require_ready
 from harness.runner.paired import SIDES, Both, PairedScenario, copy_stored, drive_pairs, together
-from harness.runner.run import doubts_of, hour_answer, require_no_other
+from harness.runner.run import hour_answer, require_no_other
 from harness.runner.stored import MEND, read_families, replay_episode
 from harness.sampling.shells import PairRounds
 from harness.shown import ShownInPython
@@ -201,7 +202,7 @@ def _written(
         "unseen": resolved[0].parameters.unseen,
     })  # fmt: skip
     for side, each in zip(SIDES, of.results, strict=True):
-        content[side] |= doubts_of(each.shown.campaign, each.estimates, each.shown.manifest)
+        content[side] |= finite_json(doubts_of(each.shown.campaign, each.shown.manifest, each.shown.estimates))
     write_sealed(of.folder / COMPARISON, content)
     from harness.report.compare_page import write_page_of  # noqa: PLC0415 - draws
 
@@ -224,7 +225,7 @@ def _sum_written(
     level, sides = Level.two_sided(confidence), {}
     for i, side in enumerate(SIDES):
         ready = {of.name: of.runs[i].run.resolved for of in scenarios}
-        told = {of.name: (of.results[i].estimates, of.results[i].shown.manifest) for of in scenarios}
+        told = {of.name: (of.results[i].shown.estimates, of.results[i].shown.manifest) for of in scenarios}
         families = [OfFamily(of.name, of.exposure, of.tests_of_pairs(i)) for of in scenarios]
         sides[side] = hour_answer(PerHour(families), ready, told, confidence)
     content = finite_json({

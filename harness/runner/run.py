@@ -11,7 +11,7 @@ import time
 import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of, dump_campaign
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
-from harness.estimators.answer import before_event, ended_by
+from harness.estimators.answer import Estimates, ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
 from harness.estimators.shells import SeenShells
@@ -31,15 +31,14 @@ from harness.families.protocol import Exposure
 from harness.printed import PRINTED
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, SENSITIVITY, sole_use, write_bytes, write_sealed
+from harness.report.words import doubts_of, vehicle_words
 from harness.resolved import Resolved, require_ready
 from harness.runner.kept import require_no_fewer, require_own_folder
 from harness.runner.underway import EXIT_OF, RunResult, Underway, begun, doubted
-from harness.sampling.milder import n_left_out
 from harness.sampling.shells import HourRounds
 from harness.shown import ShownInPython
 from harness.vocabulary import FAMILIES
 
-EARLY = "n_crashes_before_event"
 FAR_ABOVE = 10.0
 """Of what is assumed at most, from which on an exposure is likely to be of other events [assumed]."""
 
@@ -138,12 +137,11 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
         hour, results, decision = _run(campaign, begins, rule, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
-    told = {name: (each.estimates, each.shown.manifest) for name, each in results.items()}
+    told = {name: (each.shown.estimates, each.shown.manifest) for name, each in results.items()}
     answer = hour_answer(hour, ready, told, campaign.stop.confidence)
     if decision is not None:
         code = EXIT_OF[decision.verdict]
     from harness.report.page import write_hours  # noqa: PLC0415 - draws
-    from harness.report.words import vehicle_words  # noqa: PLC0415
 
     vehicle, parameters = vehicle_words(campaign.av, script=next(iter(ready.values())).script)
     asked = {
@@ -198,7 +196,7 @@ def _no_test_yet(underway: Underway, exposures: Mapping[str, float]) -> OfFamily
 def hour_answer(
     hour: PerHour,
     ready: Mapping[str, Resolved],
-    told: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Any]]],
+    told: Mapping[str, tuple[Estimates, Mapping[str, Any]]],
     confidence: float,
     *,
     counts: bool = False,
@@ -212,35 +210,20 @@ def hour_answer(
     found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
     for part, (name, (estimates, manifest)) in zip(hour.families, told.items(), strict=True):
         of, p = found["families"][name], part.seen.design.p
-        of["median_impact_mps"] = (estimates["severity"] or {}).get("median_mps")
-        of |= doubts_of(ready[name].campaign, estimates, manifest, part.per_hour)
-        if (left := of["assumed"]) and left["times"]:  # per event, of which there are more per test in other traffic
-            moved = (p @ np.array(manifest["assumed"]["times"]).T / p.sum()).tolist()
-            of["assumed"] = {**left, "times": [a / b for a, b in zip(left["times"], moved, strict=True)]}
+        of["median_impact_mps"] = None if estimates.severity is None else estimates.severity.median_mps
+        of |= doubts_of(ready[name].campaign, manifest, estimates, part.per_hour)
+        if (left := estimates.assumed) and left.times:  # per event, of which there are more per test in other traffic
+            low, high = (p @ np.array(manifest["assumed"]["times"]).T / p.sum()).tolist()
+            of["assumed"] = replace(left, times=(left.times[0] / low, left.times[1] / high))
     return found
-
-
-def doubts_of(
-    campaign: Campaign, estimates: Mapping[str, Any], manifest: Mapping[str, Any], times: float = 1.0
-) -> dict[str, Any]:
-    """What may make the rate of a run doubtful, for its reader to be told: rates per test, or ``times`` as large."""
-    best = estimates["estimates"][estimates["headline"]]
-    return {
-        EARLY: n_left_out(campaign, estimates["diagnostics"].get(EARLY, 0)), "milder": estimates["milder"],
-        "if_failed_had_crashed": times * best["details"]["crash_rate_if_failed_had_crashed"],
-        "cut_off": times * estimates["cut_off"], "cautions": best["cautions"], "repeated": manifest.get("repeated"),
-        "share_below_1_mps": (estimates["severity"] or {}).get("share_below_1_mps"),
-        "assumed": estimates["assumed"], "before_event": before_event(campaign, manifest, estimates["diagnostics"]),
-    }  # fmt: skip
 
 
 def exposure_of(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
     """How often events of a scenario are met: the shipped number, or the one that is given for it."""
     shipped, name = resolved.family.exposure(resolved.environment, resolved.parameters), resolved.campaign.scenario
     if (own := given.get(name)) is not None and own > FAR_ABOVE * shipped.high:
-        from harness.report.hour_words import far_above  # noqa: PLC0415 - draws
-
-        sys.stderr.write(f"note: {far_above(name, own, shipped.per_hour)}\n")
+        times = f"{own / shipped.per_hour:.0f} times the shipped one, of events in scope"
+        sys.stderr.write(f"note: exposure {name}={own:g} is {times} (docs/families.md)\n")
     return own_exposure(shipped, given.get(name))
 
 

@@ -17,7 +17,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Confidence, EventsPerHour
 from harness.controllers.find import require_controller, run_apart
 from harness.errors import CampaignError, HarnessError, RunFolderError
-from harness.estimators.answer import estimate_blocks
+from harness.estimators.answer import Estimates, estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
 from harness.estimators.one_pass import even
@@ -347,7 +347,7 @@ def estimate_families(
         manifest, seen = read_manifest(of), SeenShells.of_blocks(stored_blocks(of, moments=False))
         resolved = ready[name] = resolve(read_campaign(of, manifest))
         families.append(OfFamily(name, exposure_of(resolved, given), seen))
-        told[name] = read_as(dict[str, Any], of / ESTIMATES, mend=MEND), manifest
+        told[name] = read_as(Estimates, of / ESTIMATES, mend=MEND), manifest
     answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
     decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
     content = finite_json({**stored, "exposure": given, "decision": decision, **answer})

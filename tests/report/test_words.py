@@ -10,7 +10,7 @@ from harness.numbers import number, plain
 from harness.records.folder import read_manifest
 from harness.report.lines import LINES, WIDTH, columns, lines
 from harness.report.summary import read_run_folder
-from harness.report.words import answer_of, short_answer
+from harness.report.words import short_answer
 from harness.runner.stored import stored_blocks
 from tests.stored_runs import answer_in, estimates, golden
 
@@ -57,7 +57,7 @@ def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     """Of the same tests had none crashed: above 50 m/s none did."""
     folder, campaign = stored_run("shells-twin"), golden("shells-twin", "crash.counts_above_mps=50")
     blocks, known = [block.harder_than(50.0) for block in stored_blocks(folder, moments=False)], read_manifest(folder)
-    rows = {row.key: row for row in answer_of(campaign, known, estimate_blocks(blocks, campaign, known)).rows}
+    rows = {row.key: row for row in short_answer(campaign, known, estimate_blocks(blocks, campaign, known)).rows}
     assert set(rows) == {"rate", "ratio"}
     assert (rows["rate"].what, rows["rate"].interval) == ("crash rate > 50 m/s", "no crash seen")
     assert rows["rate"].value.startswith("< ")
