@@ -1,4 +1,4 @@
-"""Compile kernels by running small campaigns in the twin, once per version of the harness."""
+"""Compile kernels by running small campaigns in the twin, and build the default pool: once per version of the harness."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from harness.processes import Child, WorkerDeath, first_to_answer, tell
 from harness.progress import Progress
 from harness.runner.run import run_campaign
 
-_SMALL = [
-    "world.engine=twin", "pool.relative_error=0.2", "pool.events_per_shell=100", "stop.rhw=null", "stop.episodes=200",
-]  # fmt: skip
+_SHORT = "world.engine=twin", "stop.rhw=null", "stop.episodes=200"
+_SMALL = *_SHORT, "pool.relative_error=0.2", "pool.events_per_shell=100"
 _CONTROLLER = """class Holds:
     def step(self, seen):
         return 0.0
 """
 _OTHERS = [
-    ("idm", "testing.method=step_mixture", "environment.parameters=ndd-overtaking-1"),
-    *(("idm", f"scenario={name}", "testing.method=forced") for name in R157[1:]),
+    ("idm", *_SMALL, "testing.method=step_mixture", "environment.parameters=ndd-overtaking-1"),
+    *(("idm", *_SMALL, f"scenario={name}", "testing.method=forced") for name in R157[1:]),
 ]
 
 
 def compile_kernels(progress: Progress | None = None) -> bool:
     """Compile what campaigns of all methods and scenarios need, on two cores; False where it was done.
 
-    The cache keeps them. Where it cannot be written this says nothing: the first run compiles them again.
+    Once compiled, one half goes on with the pool that most first campaigns ask for, while the other half compiles. The
+    cache keeps all of it. Where it cannot be written this says nothing: the first run compiles them again.
     """
     done = f"{KERNELS}/all"
     if cache.has(done):
@@ -40,7 +40,7 @@ def compile_kernels(progress: Progress | None = None) -> bool:
     with TemporaryDirectory() as folder:
         controller = Path(folder) / "holds.py"
         controller.write_text(_CONTROLLER)
-        campaigns = [("idm",), (f"{controller}:Holds",)]
+        campaigns = [(f"{controller}:Holds", *_SMALL), ("idm", *_SHORT)]
         progress.stage("compiling", len(campaigns) + 1)
         beside = Child(tell, partial(_run_all, _OTHERS, Path(folder) / "others"))
         try:
@@ -56,5 +56,5 @@ def compile_kernels(progress: Progress | None = None) -> bool:
 
 def _run_all(campaigns: Sequence[tuple[str, ...]], folder: Path, progress: Progress | None = None) -> None:
     for number, (vehicle, *settings) in enumerate(campaigns):
-        run_campaign(load_campaign(vehicle, [*_SMALL, *settings]), folder / str(number), workers=1)
+        run_campaign(load_campaign(vehicle, settings), folder / str(number), workers=1)
         (progress or Progress()).advance(1)
