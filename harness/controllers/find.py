@@ -161,7 +161,8 @@ def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
         takes = [each for each in {**loads, **_signature(found).parameters} if each not in handed]
         wrong = next((each for each in parameters if each not in takes), "")
         what = f"{', '.join(parameters) or 'none'}, with which {name} cannot be made ({error})"
-        mend = "Give what it needs: --set av.parameters.NAME=…; or correct its code."
+        missing = re.findall(r"argument: '(\w+)'", str(error)) or ["NAME"]
+        mend = f"Give what it needs: --set av.parameters.{missing[0]}=…; or correct its code."
         mend = f"Leave out av.parameters.{wrong}." if "unexpected" in str(error) else mend
         expected = f"keyword arguments of the controller: {', '.join(takes) or 'it has none'}"
         raise CampaignError("av.parameters", what, expected, did_you_mean(wrong, takes) or mend) from error
@@ -231,6 +232,7 @@ def _require_controller(made: Any, name: str) -> None:
     if not _is_controller(made):
         expected = "a function step(seen), or a class with step (per vehicle) or step_batch (arrays)"
         mend = "See docs/controllers.md. A function without arguments says what it makes: `def make() -> MyAv:`."
+        mend = "docs/policies.md has an adapter for what has predict(obs)." if hasattr(made, "predict") else mend
         meant = did_you_mean("step", [each for each in dir(made) if each[0] != "_"])
         raise CampaignError("av.controller", f"{name} without step", expected, meant or mend)
 

@@ -13,6 +13,7 @@ _REFUSED = {
     **dict.fromkeys(("saveState", "simulationStep", "step", "executeMove"), _STEPS),
     "addStepListener": "name the listener in the campaign, as av.controller",
     "changeLane": "the AV stays on its lane",
+    "setMaxSpeed": "each test says how fast the AV cruises (getAllowedSpeed): delete the line",
 }
 _NO_MODEL = "no model of SUMO's drives the AV: setSpeed, setAcceleration, slowDown do, bounded by setAccel and setDecel"
 _REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
 from harness.records.folder import write_bytes
 from harness.report.pair_words import pair_words
-from harness.report.rows import limit_words, within
+from harness.report.rows import limit_words
 from harness.strata import LIBRARY_STATEMENT
 
 Outcome = Literal["passed", "failure", "error"]
@@ -19,7 +19,7 @@ Outcome = Literal["passed", "failure", "error"]
 
 @dataclass(frozen=True)
 class Case:
-    """A statement: its name, what it says, what that means for a gate, and what was seen besides.
+    """A statement: its name, what it says, and what that means for a gate.
 
     An ``error`` is a question left open, as by a spent budget.
     """
@@ -27,7 +27,6 @@ class Case:
     name: str
     message: str
     outcome: Outcome
-    besides: tuple[str, ...] = ()
     verdict: str = ""
     """In one line; by default the message's second row, below what was tested."""
 
@@ -43,16 +42,14 @@ def statement_case(content: dict[str, Any], message: str, asked: str, exit_code:
     """Case of ``estimates.json``, which the ``message`` tells: the statement that was asked about decides.
 
     It fails where a test has refuted it. Where there is no such statement, as under other methods than shells, the
-    answer itself decides: a gate in which nothing does would let everything pass. What is stated besides was not asked,
-    and is no test that was skipped.
+    answer itself decides: a gate in which nothing does would let everything pass. What was not asked is not told.
     """
     found = content["estimates"][content["headline"]].get("details", {}).get("within")
     asks = found is not None and asked == LIBRARY_STATEMENT
-    besides = () if found is None or asks else (" ".join(filter(None, within(found).texts)),)
     outcome = "failure" if asks and found["refuted"] else outcome_of(exit_code)
     decision = content.get("decision")
     name = "crash rate" if decision is None else f"crash rate below {limit_words(decision)}"
-    return Case(f"{name}, given the {LIBRARY_STATEMENT}" if asks else name, message, outcome, besides)
+    return Case(f"{name}, given the {LIBRARY_STATEMENT}" if asks else name, message, outcome)
 
 
 def difference_case(content: dict[str, Any], message: str, exit_code: int) -> Case:
@@ -69,11 +66,10 @@ def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path])
     of_suite = ET.SubElement(root, "testsuite", {"name": suite, "tests": "1", **counted})
     element = ET.SubElement(of_suite, "testcase", classname=suite, name=case.name)
     attached = [f"[[ATTACHMENT|{each.resolve()}]]" for each in attachments]
-    told = [case.message, *case.besides]
-    if case.outcome != "passed":
-        answer = told.pop(0)
-        rows = answer.replace("\n    ", " ").splitlines()[:2] or [""]  # those too long go on below
-        ET.SubElement(element, case.outcome, message=case.verdict or " ".join(rows[-1].split())).text = answer
+    told = [case.message] if case.outcome == "passed" else []
+    if not told:
+        rows = case.message.replace("\n    ", " ").splitlines()[:2] or [""]  # those too long go on below
+        ET.SubElement(element, case.outcome, message=case.verdict or " ".join(rows[-1].split())).text = case.message
     ET.SubElement(element, "system-out").text = "\n".join([*told, *attached, ""])
     ET.indent(root)
     text = printable(ET.tostring(root, encoding="unicode", xml_declaration=True))
