@@ -1,4 +1,4 @@
-"""Compile kernels by running small campaigns in the twin, and build the default pool: once per version of the harness."""
+"""Compile kernels by small campaigns in the twin, and build the default pool: once per version of the harness."""
 
 from __future__ import annotations
 
