@@ -132,6 +132,7 @@ def test_a_copy_of_the_package_finds_what_another_has_compiled_unless_it_is_dama
     assert hits == [["0", "0", "False"], ["1", "1", "True"], ["0", "1", "True"], ["1", "1", "True"]]
 
 
+@pytest.mark.slow
 def test_processes_side_by_side_compile_a_kernel_once(tmp_path):
     script = (
         "from harness import random_stream; random_stream.uniforms(1, 0, 1, 0, 1);"

@@ -7,7 +7,6 @@ import shlex
 from pathlib import Path
 
 import click
-import matplotlib.pyplot as plt
 import pytest
 
 from docs import generate
@@ -82,7 +81,7 @@ def test_python_lines_run(tmp_path, monkeypatch, capsys):
 
 def test_the_notebook_runs(stored_run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(plt, "show", lambda: None)
+    monkeypatch.setattr("matplotlib.pyplot.show", lambda: None)
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs/smoke").symlink_to(stored_run("shells-twin"))
     cells = json.loads((ROOT / "docs/first_look.ipynb").read_text(encoding="utf-8"))["cells"]

@@ -17,8 +17,18 @@ from harness.families.following.fitting import TAIL, Seen
 from harness.families.lead_brakes.fitting import EVENT, MOST_NOISE_MPS2, BrakingFitter, tail_scale
 from harness.families.words import EXCLUDED
 from harness.fitting.tracks import noise_of
-from tests.fitting.following import LANE_M, RATE_HZ, braked, braking, leaving, led, positions, recording, table
-from tests.fitting.trajectories import overtaking
+from tests.fitting.trajectories import (
+    LANE_M,
+    RATE_HZ,
+    braked,
+    braking,
+    leaving,
+    led,
+    overtaking,
+    positions,
+    recording,
+    table,
+)
 
 
 def seen(law, recordings: list[pd.DataFrame]) -> Seen:

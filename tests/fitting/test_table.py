@@ -2,6 +2,7 @@
 
 import gzip
 import os
+import random
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -78,7 +79,6 @@ def flickering() -> pd.DataFrame:
 
 REFUSED = {
     "feet beside m/s": (changed(s_m=ROWS.s_m * FEET), "speeds 0.305 times the change"),
-    "km/h": (changed(speed_mps=ROWS.speed_mps * 3.6), "speeds 3.6 times"),
     "feet throughout": (
         lambda: ROWS.assign(**{each: ROWS[each] * FEET for each in ("s_m", "speed_mps", "length_m")}),
         "found a median of .* in speed_mps.*feet|a median of .* in speed_mps.*ft",
@@ -109,7 +109,6 @@ REFUSED = {
     "congested": (congested, "outside the fit range"),
     "nobody closes in": (lambda: ROWS[ROWS.vehicle_id != 2].query("vehicle_id < 2"), "beside it|closes? in"),
     "straight": (changed(lateral_m=first("lateral_m")), "or without lateral motion"),
-    "lateral feet": (changed(lateral_m=ROWS.lateral_m * FEET), r"lanes 11\.8 m apart.*units: \{lateral_m: ft\}"),
     "no lateral number": (changed(lateral_m=ROWS.lateral_m * 1e300), r"lanes 3\.6e\+300 m apart"),
     "lanes' middles": (changed(lateral_m=3.5 * ROWS.lane), "in a jump"),
     "no length": (with_value(3, "length_m", 0.0), r"row 4 \(vehicle 0 of recording 0, t = 0\.3 s\): found length_m 0;"),
@@ -117,7 +116,6 @@ REFUSED = {
     "a lone row each": (lambda: ROWS[ROWS.time_s == 0], "one row per vehicle"),
     "misspelt": (lambda: ROWS.rename(columns={"speed_mps": "sped_mps"}), "Did you mean 'sped_mps'"),
     "without lengths": (lambda: ROWS.drop(columns="length_m"), "Gaps need lengths"),
-    "of highD": (lambda: ROWS.rename(columns={"speed_mps": "xVelocity"}), "--mapping highd"),
     "text": (changed(lane="left"), "invalid value .left|cannot be read"),
     "nobody's row": (with_value(7, "vehicle_id", None), "row 8, vehicle_id: found nothing"),
     "the end of time": (with_value(7, "time_s", 1e12), r"row 8 .*found time_s 1e\+12"),
@@ -129,7 +127,6 @@ REFUSED = {
         changed(s_m=ROWS.s_m.where(ROWS.recording_id != 3, first("s_m"))),
         r"of recording 3, t = 0 s\): found s_m -40, and -40 in row 4981, where speeds say -36.* such pairs of rows",
     ),
-    "all stand still": (changed(s_m=first("s_m")), r"row 1 .*found s_m 60, and 60 in row 11, where speeds say 8"),
     "a vehicle twice": (
         lambda: pd.concat([ROWS, ROWS[(ROWS.vehicle_id == 1) & (ROWS.recording_id == 3)].assign(vehicle_id=9)]),
         "vehicle 9 of recording 3, t = 0 s.: found the time, lane and s_m of another vehicle",
@@ -140,18 +137,14 @@ REFUSED = {
 HEAD = b"vehicle_id,time_s,s_m,speed_mps,lane,length_m\n"
 FILES = {
     "empty.csv": (b"", "an empty file"),
-    "header.csv": (HEAD, "no rows"),
     "ragged.csv": (HEAD + b"1,0,0,30,0,5\n1,0.1,3\n", "as many values as"),
     "comma.csv": (HEAD + b"1,0,0,30,5,0,5\n", "got 7.*Decimal commas"),
     "both.csv": (b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n", r"invalid value .996\.58"),
     "twice.csv": (HEAD[:-1] + b",Lane\n1,0,0,30,0,5,1\n", "more than one column lane"),
-    "cut.parquet": (b"PAR1 and no more", "cannot be read"),
     "latin.csv": (HEAD + b"\xfcber,0,0,30,0,5\n", "text in UTF-8"),
-    "cut.csv.gz": (gzip.compress(ROWS.to_csv(index=False).encode())[:-2000], "cannot be read"),
+    "cut.csv.gz": (gzip.compress(HEAD + random.Random(1).randbytes(9000))[:-2000], "cannot be read"),
     "utf16.csv": ("vehicle_id,time_s\n1,0.1\n".encode("utf-16"), "text in UTF-16"),
-    "excel.csv": (b"PK\x03\x04" + bytes(40), "an Excel workbook"),
     "gzip.csv": (gzip.compress(b"vehicle_id,time_s\n1,0.1\n"), "does not end in .gz"),
-    "parquet.csv": (b"PAR1" + bytes(40), "does not end in .parquet"),
     "zeros.csv": (HEAD + b"1,0,0,30,0,5\n" + bytes(9), "zero bytes"),
     "returns.csv": (HEAD[:-1] + b"\r1,0,0,30,0,5\r", "cannot be read .*new-line"),
     "headless.csv": (b"1,0,0,30,0,5\n1,0.1,3,30,0,5\n", r"numbers in place of a header: 6 columns.*header: \["),
@@ -182,7 +175,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
             judged(tmp_path / file)
 
 
-@pytest.mark.parametrize(("cut", "n"), [(0, 0), (1, 1), (3, 1)])
+@pytest.mark.parametrize(("cut", "n"), [(0, 0), (3, 1)])
 def test_a_row_that_may_be_cut_is_told(cut, n, tmp_path, capsys):
     """One that has lost a value is refused; of a shorter last value nothing else tells."""
     content = ROWS.to_csv(index=False).encode()

@@ -1,7 +1,12 @@
-"""What the player plays is what was simulated, and what the twin says of others; which crashes come first."""
+"""What the player plays, and what other tools are given, is what was simulated; which crashes come first."""
 
+import csv
 import json
 import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pyarrow as pa
@@ -11,16 +16,20 @@ import pytest
 import harness
 from harness.campaign.files import load_campaign
 from harness.cli import main
+from harness.errors import CampaignError
 from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.words import STAND_INS
 from harness.records.reader import traffic_of
 from harness.report import crashes, player
-from harness.report.player import UNKNOWN, Scenes
+from harness.report.player import LANE_M, UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
+from harness.report.sumo_files import gui_program, write_sumo
 from harness.resolved import resolve
 from harness.runner.stored import write_report
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M
-from tests.stored_runs import copy_of, stored_table
+from harness.vocabulary import VEHICLES
+from harness.worlds.sumo import sumo_program
+from tests.stored_runs import copy_of, part_files, stored_table, truncate
 
 KINDS = ("shells-twin", "shells-lateral-sumo", "forced-lateral-twin", "shells-acting-twin", "forced-krauss", "nde-twin")
 
@@ -143,3 +152,164 @@ def test_others_who_follow_are_told_with_their_headway(scenario, crashing, tmp_p
     for ghost in scene["ghosts"]:
         headway_s = (lead["x"][at] - VEHICLE_LENGTH_M - ghost["x"][at]) / ghost["v"][at]
         assert f", {headway_s:.1f} s behind at the onset: " in dict(scene["facts"])[ghost["name"]]
+
+
+# -- for other tools --
+
+
+def complaints(file):
+    """Of ASAM's own checker: schema, references, names."""
+    from qc_baselib import Configuration, Result  # half a second, for whoever runs this
+    from qc_openscenario.main import run_checks
+
+    config, result = Configuration(), Result()
+    config.set_config_param("InputFile", str(file))
+    result.register_checker_bundle(name="xoscBundle", description="", version="1.0.0")
+    result.set_result_version("1.0.0")
+    run_checks(config, result)
+    assert len(result.get_checker_results("xoscBundle")) == 17
+    return [issue.description for each in result.get_checker_results("xoscBundle") for issue in each.issues]
+
+
+@pytest.mark.parametrize("name", ["shells-twin", "forced-lateral-sumo"])
+def test_openscenario_moves_everybody_as_the_trace_does(name, stored_run, tmp_path, capsys):
+    folder, file = stored_run(name), tmp_path / "out" / "crash.xosc"
+    tests = harness.read(folder).episodes(["episode", "outcome", "event_step"])
+    crash = tests[tests.outcome == "crash"].iloc[0]
+    assert main(["replay", str(folder), str(crash.episode), "--out", str(file)]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [str(file), str(file.with_suffix(".xodr"))]
+    assert complaints(file) == []
+    trace = harness.replay(folder, int(crash.episode)).trace.to_pandas()
+    scenario = ElementTree.parse(file)
+    assert scenario.find("RoadNetwork/LogicFile").get("filepath") == "crash.xodr"
+    for group in scenario.iterfind(".//ManeuverGroup"):
+        vehicle = group.find("Actors/EntityRef").get("entityRef")
+        rows = trace[trace.vehicle == vehicle]
+        vertices = [(each.get("time"), each.find(".//WorldPosition")) for each in group.iterfind(".//Vertex")]
+        time_s, x, y = np.array([(time, at.get("x"), at.get("y")) for time, at in vertices], float).T
+        assert time_s.tolist() == [step / 10 for step in rows.step]
+        centre = float(scenario.find(f".//Vehicle[@name='{vehicle}']/BoundingBox/Center").get("x"))
+        np.testing.assert_allclose(x + centre + 2.5, rows.x_m, rtol=0, atol=1e-9)  # the middle, and half a vehicle
+        ends = {"LV": (-0.5, -0.5), "BV": (-0.5, -1.5), "AV": (-1.5, -1.5)}[vehicle]
+        steps = -np.diff(y)[np.diff(y) != 0.0]
+        if vehicle == "BV" and "lateral_m" in rows:  # as fast after the overlap as before, until it is all over
+            assert steps[:-1] == pytest.approx(steps[0])
+            assert 0.0 < steps[-1] <= steps[0] + 1e-9
+            assert y[rows.lane.to_numpy() == 0][0] == pytest.approx(-0.5 * LANE_M - 1.7)
+            ends = ends[0], y[-1] / LANE_M
+        assert (y[0], y[-1]) == pytest.approx([LANE_M * end for end in ends])
+        assert (steps >= 0.0).all()
+    actors = [each.get("entityRef") for each in scenario.iterfind(".//EntityRef") if each.get("entityRef")]
+    assert set(actors) == set(VEHICLES)
+
+
+def test_csv_has_units_in_its_names(stored_run, tmp_path):
+    folder, file = stored_run("shells-twin"), tmp_path / "episode_3.csv"
+    assert main(["replay", str(folder), "3", "--out", str(file)]) == 0
+    with file.open() as content:
+        rows = list(csv.DictReader(content))
+    trace = harness.replay(folder, 3).trace.to_pylist()
+    assert list(rows[0]) == ["time_s", "vehicle", "lane", "x_m", "v_mps", "a_mps2"]
+    assert [(round(float(row["time_s"]) * 10), row["vehicle"], float(row["x_m"])) for row in rows] == [
+        (row["step"], row["vehicle"], row["x_m"]) for row in trace
+    ]
+
+
+def test_what_cannot_be_written_is_said_and_nothing_is_left(stored_run, tmp_path, monkeypatch, capsys):
+    folder = stored_run("shells-twin")
+    for name in ("a.txt", "a"):
+        assert main(["replay", str(folder), "0", "--out", str(tmp_path / name)]) == 2
+        assert "a.html" in capsys.readouterr().err
+    damaged = copy_of(folder, tmp_path / "damaged")
+    truncate(part_files(damaged)[0])
+    assert main(["replay", str(damaged), "0", "--out", str(tmp_path / "a.csv")]) == 2
+    monkeypatch.setitem(sys.modules, "scenariogeneration", None)
+    monkeypatch.delitem(sys.modules, "harness.report.openscenario", raising=False)
+    assert main(["replay", str(folder), "0", "--out", str(tmp_path / "a.xosc")]) == 2
+    assert "pip install -c requirements.lock -e '.[export]'" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
+
+
+# -- for SUMO itself: plain sumo repeats the motion and the collision --
+
+
+FILES = {"test.sumocfg", "test.net.xml", "test.add.xml", "test.fcd.xml", "test.view.xml"}
+
+
+def simulated(file: Path, tmp_path: Path) -> tuple[dict, list]:
+    """What plain sumo says of its configuration: each vehicle's state in each step, and who collides when."""
+    written = "--fcd-output", tmp_path / "states.xml", "--collision-output", tmp_path / "hits.xml", "--precision", "15"
+    done = subprocess.run([sumo_program("sumo", "test"), "-c", file.name, *written], cwd=file.parent, check=True)
+    assert done.returncode == 0
+    states = {
+        (round(10 * float(frame.get("time"))), each.get("id")): each
+        for frame in ElementTree.parse(tmp_path / "states.xml").getroot()
+        for each in frame
+    }
+    hits = ElementTree.parse(tmp_path / "hits.xml").getroot()
+    return states, [(round(10 * float(hit.get("time"))), hit.get("collider"), hit.get("victim")) for hit in hits]
+
+
+@pytest.mark.parametrize(
+    ("name", "scenario"),
+    [
+        pytest.param("shells-twin", "cut_in", id="at once", marks=pytest.mark.slow),
+        pytest.param("shells-lateral-twin", "cut_in", id="comes over"),
+        pytest.param("", "lead_brakes", id="lead brakes", marks=pytest.mark.slow),
+        pytest.param("", "cut_out", id="cut-out"),
+    ],
+)
+def test_plain_sumo_repeats_the_motion_and_the_crash(name, scenario, crashing, stored_run, tmp_path, capsys):
+    folder = stored_run(name) if name else crashing[scenario]
+    for episode in crashed(folder, 2):
+        place = tmp_path / "a, b" / f"{episode}"
+        assert main(["replay", str(folder), str(episode), "--sumo", str(place)]) == 0
+        assert {file.name for file in place.iterdir()} == FILES
+        assert str(place / "test.sumocfg") in capsys.readouterr().out
+        states, hits = simulated(place / "test.sumocfg", tmp_path)
+        result = harness.replay(folder, episode)
+        first, n_steps = result.scene["first"], result.row["n_steps"]
+        assert hits == [(n_steps, "AV", result.scene["principal"])]
+        for row in result.trace.to_pylist():
+            if row["step"] < first:
+                continue
+            state = states[row["step"], row["vehicle"]]
+            assert float(state.get("pos")) == pytest.approx(row["x_m"], rel=0, abs=1e-12)
+            if row["step"] > first:  # at first SUMO lets them in as fast as it finds safe
+                assert float(state.get("speed")) == pytest.approx(row["v_mps"], rel=0, abs=1e-12)
+            assert state.get("lane") == f"cell0_{row['lane']}"
+
+
+def test_a_test_without_a_crash_ends_without_a_collision(stored_run, tmp_path):
+    folder = stored_run("nde-twin")
+    table = harness.read(folder).episodes(["episode", "outcome", "event_step"])
+    for of in (table[(table.outcome != "crash") & table.event_step.notna()], table[table.event_step.isna()]):
+        result = harness.replay(folder, int(of.iloc[0].episode))
+        states, hits = simulated(write_sumo(result, tmp_path / "a&b.sumocfg")[0], tmp_path)
+        assert hits == []
+        assert max(step for step, _ in states) == result.row["n_steps"] + 1
+
+
+def test_without_its_extra_or_a_screen_the_gui_is_refused_in_words(stored_run, monkeypatch, capsys, tmp_path):
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "sumo", None)
+        patch.setenv("PATH", str(tmp_path))
+        with pytest.raises(
+            CampaignError, match=r"found no sumo-gui; .* the extra .* -c requirements.lock -e '\.\[sumo\]'"
+        ):
+            gui_program()
+        folder = str(stored_run("shells-twin"))
+        assert main(["replay", folder, "3", "--sumo", str(tmp_path / "sumo")]) == 0
+        told = r"note: no sumo on this machine to run it \(extra 'sumo'\)\. .* -e '\.\[sumo\]'"
+        assert re.search(told, capsys.readouterr().err)
+        own = tmp_path / "sumo-gui"
+        own.write_text("#!/bin/sh\nexit 3\n")
+        own.chmod(0o755)
+        patch.setenv("DISPLAY", ":none")
+        assert gui_program() == own
+        assert main(["replay", folder, "3", "--gui"]) == 2
+        assert "a sumo-gui that ends with 3" in capsys.readouterr().err
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(CampaignError, match="DISPLAY is not set"):
+        gui_program()

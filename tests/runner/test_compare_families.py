@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import pytest
 
-import harness
-from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.records.folder import read_manifest
 from harness.runner.compare import compare_campaigns
 from harness.runner.stored import write_report
-from tests.in_process import one_process
-from tests.runner.test_families import NAMES, QUICK
-
-HARDER = "av.parameters.min_acceleration_mps2=-5"
-
-
-def campaign(*overrides):
-    return harness.load_campaign("idm", [*QUICK, *overrides])
+from tests.in_process import one_process, without_page
+from tests.runner.test_families import HARDER, NAMES, campaign
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -70,40 +61,10 @@ def test_pages_are_written_anew(done):
     assert [page.read_text() for page in pages] == before
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return harness.run(campaign(), tmp_path_factory.mktemp("stored") / "run", workers=1)
-
-
 def test_what_an_earlier_call_has_driven_is_not_driven_again(done, monkeypatch):
     monkeypatch.setattr("harness.runner.workers.ShardRunner.run", None)
-    again = compare_campaigns(campaign(), campaign(HARDER), done.folder, workers=1)
-    assert again.content == done.content
-
-
-@pytest.mark.slow
-def test_nor_are_tests_of_a_stored_run_of_a_in_the_same_scenarios(run, tmp_path, capsys):
-    call = ["compare", str(run.folder), "late-600ms", "--out", str(tmp_path / "out"), "--workers", "1", "--json"]
-    assert main(call) in (0, 4)  # so small a pool may be used up
-    found = json.loads(capsys.readouterr().out)
-    for name in NAMES:
-        held, n_pairs = read_manifest(run.folder / name)["n_episodes"], found["families"][name]["n_pairs"]
-        n = read_manifest(tmp_path / "out" / name / "a")["n_episodes"]
-        assert max(held, n_pairs) <= n < held + n_pairs  # those held are of strata that pairs need, or not
-    assert [of["label"] for of in found["campaigns"].values()] == ["idm", "late-600ms"]  # as A's campaign says
-    a, b = (found[side] for side in "ab")
-    assert a["per_hour"]["rate"] - b["per_hour"]["rate"] == pytest.approx(found["difference"])
-    assert a["n_episodes"] == b["n_episodes"] == found["n_pairs"]  # further tests that are held do not count
-
-
-def test_a_stored_campaign_that_is_damaged_is_not_believed(run, tmp_path):
-    stored = tmp_path / "stored"
-    shutil.copytree(run.folder, stored)
-    file = stored / "campaign.yaml"
-    file.write_text(file.read_text().replace("exposure: {}", "exposure: {lead_brakes: 7.0}"))
-    with pytest.raises(RunFolderError, match="checksum"):
-        compare_campaigns(campaign(), campaign(HARDER), tmp_path / "out", stored=stored)
-    assert not (tmp_path / "out").exists()
+    with without_page():
+        assert compare_campaigns(campaign(), campaign(HARDER), done.folder, workers=1).content == done.content
 
 
 def test_what_cannot_be_compared_is_refused(done, tmp_path):

@@ -22,8 +22,9 @@ from harness.printed import PRINTED
 from harness.records.folder import read_manifest, write_sealed
 from harness.report.hour_words import hour_lines
 from harness.resolved import resolve
+from harness.runner.compare import compare_campaigns
 from harness.runner.stored import estimate_families
-from tests.in_process import one_process
+from tests.in_process import one_process, run_with_workers
 from tests.stored_runs import copy_of
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
@@ -31,6 +32,7 @@ QUICK = [
     f"scenarios=[{', '.join(NAMES)}]", "world.engine=twin", "pool.relative_error=0.2", "pool.events_per_shell=200",
     "stop.below_reference=null", "stop.rhw=0.6",
 ]  # fmt: skip
+HARDER = "av.parameters.min_acceleration_mps2=-5"
 
 
 def campaign(*overrides):
@@ -89,19 +91,14 @@ def test_the_sum_is_shown_in_ten_lines_by_python_too(run):
 
 
 def test_workers_and_interruptions_change_no_bit(run, tmp_path):
-    both, stopped = tmp_path / "two", tmp_path / "stopped"
-    harness.run(campaign("stop.rhw=2.0"), stopped, workers=2)
-    held = json.loads((stopped / "families.json").read_text())["n_episodes"]
-    assert held < run.content["n_episodes"]
-    (stopped / PRINTED).write_text("what a vehicle has printed")
-    shutil.copytree(stopped, both)
-    harness.run(campaign(), both, workers=2, resume=True)
-    assert bits(both) == bits(run.folder)
-    with one_process():
-        harness.run(campaign(), stopped, workers=1, resume=True)
-    assert bits(stopped) == bits(run.folder)
+    out = tmp_path / "run"
+    stopped = run_with_workers(campaign("stop.rhw=2.0"), out, workers=2)
+    assert stopped.content["n_episodes"] < run.content["n_episodes"]
+    (out / PRINTED).write_text("what a vehicle has printed")
+    run_with_workers(campaign(), out, workers=2, resume=True)
+    assert bits(out) == bits(run.folder)
     with pytest.raises(RunFolderError, match="already begun"):
-        harness.run(campaign(), stopped)
+        harness.run(campaign(), out)
 
 
 @pytest.mark.slow
@@ -342,3 +339,27 @@ def test_a_run_that_goes_on_to_another_end_says_so(run, tmp_path, capsys):
     with one_process():
         assert main([*call, "--set", "stop.rhw=0.9"]) == 0
     assert "note: stop.rhw is 0.9 now; before it was 0.6\n" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_comparison_drives_no_test_that_a_stored_run_of_a_has(run, tmp_path, capsys):
+    call = ["compare", str(run.folder), "late-600ms", "--out", str(tmp_path / "out"), "--workers", "1", "--json"]
+    assert main(call) in (0, 4)  # so small a pool may be used up
+    found = json.loads(capsys.readouterr().out)
+    for name in NAMES:
+        held, n_pairs = read_manifest(run.folder / name)["n_episodes"], found["families"][name]["n_pairs"]
+        n = read_manifest(tmp_path / "out" / name / "a")["n_episodes"]
+        assert max(held, n_pairs) <= n < held + n_pairs  # those held are of strata that pairs need, or not
+    assert [of["label"] for of in found["campaigns"].values()] == ["idm", "late-600ms"]  # as A's campaign says
+    a, b = (found[side] for side in "ab")
+    assert a["per_hour"]["rate"] - b["per_hour"]["rate"] == pytest.approx(found["difference"])
+    assert a["n_episodes"] == b["n_episodes"] == found["n_pairs"]  # further tests that are held do not count
+
+
+def test_a_stored_campaign_that_is_damaged_is_not_believed(run, tmp_path):
+    stored = copy_of(run.folder, tmp_path / "stored")
+    file = stored / "campaign.yaml"
+    file.write_text(file.read_text().replace("exposure: {}", "exposure: {lead_brakes: 7.0}"))
+    with pytest.raises(RunFolderError, match="checksum"):
+        compare_campaigns(campaign(), campaign(HARDER), tmp_path / "out", stored=stored)
+    assert not (tmp_path / "out").exists()

@@ -28,11 +28,11 @@ DF = "  df: {value: 16.0, source: ndd}"
 
 @pytest.fixture
 def mine(tmp_path):
-    """An environment of the user's own, from the text of its file."""
+    """An environment of the user's own, from the text of its file, or its content."""
 
-    def environment(text):
+    def environment(content):
         path = tmp_path / "mine.yaml"
-        path.write_text(text, encoding="utf-8")
+        path.write_text(content if isinstance(content, str) else yaml.safe_dump(content), encoding="utf-8")
         return EnvironmentSettings(parameters=str(path))
 
     return environment
@@ -83,11 +83,6 @@ def lateral(**numbers):
     return TEXT + "lateral:\n" + "".join(lines)
 
 
-def dumped(**changes):
-    """Tables in place of formulas, but for some changes."""
-    return yaml.safe_dump(tabled(**changes))
-
-
 RANGED = {"value": 1.0, "source": "user"}
 REFUSED = [
     *((changed(("cut_in", "ignore_share", text)), "cut_in.ignore_share.value") for text in ["7", *NOT_NUMBERS]),
@@ -107,14 +102,14 @@ REFUSED = [
     (lateral(distance_m=1.7, lead_s=1.0, speed_median_mps=0.7), ": found lead_s, speed_median_mps; expected"),
     (lateral(distance_m=1.7, lead_s=0.55), "lateral.lead_s.value"),
     (lateral(distance_m=0.0, lead_s=0.5), "lateral.distance_m.value"),
-    (dumped(acceptance_steps__share=of([0.5] * 5)), "acceptance_steps.share"),
-    (dumped(acceptance_steps__share=of([0.0] * 6)), "acceptance_steps.share.0.value"),
-    (dumped(acceptance_steps__events=[1, 2]), "acceptance_steps.events"),
-    (dumped(hazard_table__v_mps=of([20.0, 20.0, 30.0])), "hazard_table.v_mps"),
-    (dumped(hazard_table__r1_log=of([0.0, 1.0])), "hazard_table.r1_log"),
-    (dumped(cut_in__ignore_share={"value": 0.1, "source": "user"}), "ignore_share besides"),
-    (yaml.safe_dump(tabled() | {"hazard_table": None}), "u, log_gap"),
-    (dumped(guard__margin_m={**RANGED, "range": [2.0, 3.0]}), "guard.margin_m.range"),
+    (tabled(acceptance_steps__share=of([0.5] * 5)), "acceptance_steps.share"),
+    (tabled(acceptance_steps__share=of([0.0] * 6)), "acceptance_steps.share.0.value"),
+    (tabled(acceptance_steps__events=[1, 2]), "acceptance_steps.events"),
+    (tabled(hazard_table__v_mps=of([20.0, 20.0, 30.0])), "hazard_table.v_mps"),
+    (tabled(hazard_table__r1_log=of([0.0, 1.0])), "hazard_table.r1_log"),
+    (tabled(cut_in__ignore_share={"value": 0.1, "source": "user"}), "ignore_share besides"),
+    (tabled() | {"hazard_table": None}, "u, log_gap"),
+    (tabled(guard__margin_m={**RANGED, "range": [2.0, 3.0]}), "guard.margin_m.range"),
     ("like: ndd-overtaking-3\n", "like ("),
     ("like: ndd-overtaking-1\nguard: {margn_m: {value: 2.0, source: user}}\n", "guard.margn_m"),
 ]
@@ -131,7 +126,7 @@ def test_what_does_not_fit_together_names_the_place(mine, text, named):
 
 
 def test_a_table_reaches_the_kernels_linear_between_its_knots_and_constant_beyond(mine):
-    given = load_environment(mine(yaml.safe_dump(tabled())))
+    given = load_environment(mine(tabled()))
     assert given.numbers.dtype == load_environment(EnvironmentSettings()).numbers.dtype  # kernels are compiled once
     states = [(30.0, 20.0, 0.0), (25.0, 10.0, 4.0), (50.0, 200.0, -20.0), (0.0, -1.0, 99.0)]
     approaches = [(9.9, -10.0), (10.0, -10.0), (24.9, -10.0), (1e3, -10.0), (5.0, 0.0), (5.0, 3.0), (0.0, -1.0)]

@@ -19,7 +19,7 @@ from harness.worlds import sumo
 from harness.worlds.shim import open_shim, shim_library
 from harness.worlds.sumo import committed_file
 from harness.worlds.twin import TwinWorld
-from tests.episode.test_lateral import BESIDE, at_once, beside
+from tests.episode.test_path import BESIDE, at_once, beside
 from tests.worlds.running import smoke
 
 X, V = (np.tile(values, (8, 1)) for values in ([300.0, 200.0, 100.0], [30.0, 28.0, 35.0]))
