@@ -154,14 +154,9 @@ def run(
 
     content = result.estimates if isinstance(result, RunResult) else result.content
     if junit is not None:
-        from harness.report.junit import Case, outcome_of, statement_case, write_junit
-        from harness.report.rows import limit_words
+        from harness.report.junit import statement_case, write_junit
 
-        if isinstance(result, RunResult):
-            case = statement_case(content, repr(result), campaign.testing.shells.statement, result.exit_code)
-        else:
-            below = "" if content["decision"] is None else f" below {limit_words(content['decision'])}"
-            case = Case(f"crashes per hour{below}", repr(result), outcome_of(result.exit_code))
+        case = statement_case(content, repr(result), campaign.testing.shells.statement, result.exit_code)
         write_junit(junit, campaign.name, case, [result.report])
     print_either(content, [result], as_json=as_json)
     ctx.exit(result.exit_code)

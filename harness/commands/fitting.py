@@ -38,18 +38,7 @@ from harness.vocabulary import MOST_ASKED
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the replicates.")
 @click.option("--force", is_flag=True, help="Write over files that no fit has written.")
 @json_option
-def fit(
-    files: Sequence[Path],
-    out: Path,
-    *,
-    mapping: str | None,
-    mirror: bool | None,
-    leave_out: Sequence[str],
-    replicates: int,
-    seed: int,
-    force: bool,
-    as_json: bool,
-) -> None:
+def fit(files: Sequence[Path], out: Path, *, replicates: int, as_json: bool, **given: Any) -> None:
     """Fit the traffic's laws to trajectories in CSV or Parquet FILEs, and write an environment file.
 
     One row per vehicle and time, 10 Hz or more: vehicle_id, time_s, s_m (centre, along the road), speed_mps, lane (0 =
@@ -60,8 +49,7 @@ def fit(
     computes how uncertain the rate is; and FILE.lead_brakes.yaml and FILE.cut_out.yaml, by what drivers met who follow.
     """
     with progress_bar() as bar:
-        given: dict[str, Any] = {"mapping": mapping, "mirror": mirror, "leave_out": leave_out, "force": force}
-        found = harness.fit(files, out, n_replicates=replicates, seed=seed, progress=bar, **given)
+        found = harness.fit(files, out, n_replicates=replicates, progress=bar, **given)
     written = repr(found).splitlines()
     if as_json:
         print_json({"files": written, **found.facts})

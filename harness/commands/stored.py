@@ -295,8 +295,7 @@ def replay(
     from harness.records.folder import read_manifest, require_place
     from harness.records.origin import code_of
     from harness.records.reader import read_campaign
-    from harness.report.motion import writer_of
-    from harness.report.sumo_files import gui_program, watch
+    from harness.report.motion import gui_program, watch, writer_of
     from harness.runner.stored import changed_since
     from harness.worlds.sumo import sumo_program
 

@@ -14,7 +14,6 @@ from harness.errors import HarnessError, RunFolderError
 from harness.families import family_named
 from harness.families.protocol import Family
 from harness.numbers import count, tenths
-from harness.report.crashes import rows_of
 from harness.report.drawing import Plot
 from harness.report.hour_words import beside_row, called
 from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words, rates_of, ratio_words
@@ -140,4 +139,4 @@ def motion_of(run: RunFolder, episode: int, replay: Replay) -> tuple[pa.Table, p
     if trace is None:
         with suppress(HarnessError):  # of another version, a vehicle that is gone or does not do the same again
             trace = replay(run.path, episode).trace
-    return rows_of(run, {episode}), trace
+    return run.crashes({episode}), trace

@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.estimators.severity import weighted_quantiles
@@ -74,7 +73,7 @@ def crash_gallery(
         chosen = sorted(enumerate(ranked, 1), key=lambda item: episode[item[1]] not in traced)[:SHOWN]
         for rank, place in sorted(chosen):
             reasons.setdefault(place, []).append(f"{reason} no. {rank}")
-    total, stored = float(crashes["weight"].sum()), rows_of(run, {int(episode[place]) for place in reasons} & traced)
+    total, stored = float(crashes["weight"].sum()), run.crashes({int(episode[place]) for place in reasons} & traced)
     rows, shown = list[GalleryRow](), list[Scene]()
     for place, why in reasons.items():
         crash = {name: float(crashes[name][place]) for name in SHOWN_COLUMNS}
@@ -118,13 +117,8 @@ def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArra
     judged = np.sort(np.argsort(-impact, kind="stable")[: MOST_TRACED if acts else MOST_JUDGED])
     asked = {int(each) for each in episode[judged]}
     if asked:
-        ends[judged] = scenes.ends(rows_of(run, asked), run.traces(asked) if acts else None)
+        ends[judged] = scenes.ends(run.crashes(asked), run.traces(asked) if acts else None)
     return ends
-
-
-def rows_of(run: RunFolder, episodes: set[int]) -> pa.Table:
-    """What scenes need of episodes, in index order."""
-    return run.tests.crashes.filter(pc.field("episode").isin(sorted(episodes)))
 
 
 def _component_name(run: RunFolder, component: int) -> str:

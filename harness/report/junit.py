@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,8 @@ from harness.report.rows import limit_words
 from harness.strata import LIBRARY_STATEMENT
 
 Outcome = Literal["passed", "failure", "error"]
+OUTCOMES: Mapping[int, Outcome] = {EXIT_DONE: "passed", EXIT_BUDGET_SPENT: "error"}
+"""What a command's exit code means for a gate; any other is a failure."""
 
 
 @dataclass(frozen=True)
@@ -31,24 +33,20 @@ class Case:
     """In one line; by default the message's second row, below what was tested."""
 
 
-def outcome_of(exit_code: int) -> Outcome:
-    """What a command's exit code means for a gate."""
-    if exit_code == EXIT_DONE:
-        return "passed"
-    return "error" if exit_code == EXIT_BUDGET_SPENT else "failure"
-
-
 def statement_case(content: dict[str, Any], message: str, asked: str, exit_code: int) -> Case:
-    """Case of ``estimates.json``, which the ``message`` tells: the statement that was asked about decides.
+    """Case of an answer, which the ``message`` tells: the statement that was asked about decides.
 
     It fails where a test has refuted it. Where there is no such statement, as under other methods than shells, the
     answer itself decides: a gate in which nothing does would let everything pass. What was not asked is not told.
     """
-    found = content["estimates"][content["headline"]].get("details", {}).get("within")
-    asks = found is not None and asked == LIBRARY_STATEMENT
-    outcome = "failure" if asks and found["refuted"] else outcome_of(exit_code)
-    decision = content.get("decision")
-    name = "crash rate" if decision is None else f"crash rate below {limit_words(decision)}"
+    name, found = "crashes per hour", dict[str, Any]()
+    if "families" not in content:
+        name, answer = "crash rate", content["estimates"][content["headline"]]
+        found = answer.get("details", {}).get("within") or {}
+    asks = bool(found) and asked == LIBRARY_STATEMENT
+    outcome = "failure" if asks and found["refuted"] else OUTCOMES.get(exit_code, "failure")
+    if (decision := content.get("decision")) is not None:
+        name += f" below {limit_words(decision)}"
     return Case(f"{name}, given the {LIBRARY_STATEMENT}" if asks else name, message, outcome)
 
 
@@ -56,7 +54,7 @@ def difference_case(content: dict[str, Any], message: str, exit_code: int) -> Ca
     """Case of ``compare.json``, which the ``message`` tells: that B is not worse by more than the margin, if any."""
     decision = content["decision"]
     name = pair_words({**decision, "verdict": "proven"}) if decision["margin"] else "difference"
-    return Case(name, message, outcome_of(exit_code), verdict=pair_words(decision))
+    return Case(name, message, OUTCOMES.get(exit_code, "failure"), verdict=pair_words(decision))
 
 
 def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path]) -> None:

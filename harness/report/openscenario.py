@@ -14,7 +14,7 @@ import pyarrow as pa
 from scenariogeneration import xodr, xosc
 
 from harness.files import write_atomically
-from harness.report.player import LANE_M, share_over, tracks_of
+from harness.report.player import LANE_M, ReplayResult, share_over, tracks_of
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
 WIDTH_M, HEIGHT_M = 1.9, 1.5
@@ -27,10 +27,10 @@ AHEAD_M = 200.0
 """Road beyond the last position."""
 
 
-def write_openscenario(trace: pa.Table, file: Path) -> list[Path]:
-    """Write the trace of an episode as ``file`` (.xosc), and its road beside it (.xodr)."""
+def write_openscenario(result: ReplayResult, file: Path) -> list[Path]:
+    """Write the motion of an episode as ``file`` (.xosc), and its road beside it (.xodr)."""
     roads, init, entities = file.with_suffix(".xodr"), xosc.Init(), xosc.Entities()
-    tracks = tracks_of(trace)
+    tracks = tracks_of(result.trace)
     story = xosc.StoryBoard(init, _at((len(tracks["AV"]) - 1) * STEP_S, "stop"))
     for name, track in tracks.items():
         positions = _positions(track)

@@ -351,7 +351,7 @@ def _when(step: int, cut: int, since: str) -> str:
     return f"{STEP_S * step:.1f} s, {STEP_S * abs(step - cut):.1f} s {side} {since}"
 
 
-def write_player(scene: Scene, file: str | Path) -> None:
-    """Write a page with nothing but the player of a scene."""
-    family = family_named(scene["scenario"])
-    write_page(Path(file), "replay.html.j2", scene=scene, scenes=[scene], family=family, words=family.words)
+def write_player(result: ReplayResult, file: Path) -> None:
+    """Write a page with nothing but the player of an episode."""
+    scene, family = result.scene, family_named(result.scene["scenario"])
+    write_page(file, "replay.html.j2", scene=scene, scenes=[scene], family=family, words=family.words)

@@ -10,6 +10,7 @@ import os
 import shlex
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -66,35 +67,23 @@ class ShownShells(ShellDetails):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A finished run: its campaign, manifest, estimates and tests; ``shells`` is None where these were drawn otherwise.
+    """A finished run: its campaign, manifest, estimates and tests; ``design`` is None where these were not of shells.
 
-    ``traffic`` is None where that can no longer be driven in. ``typed`` is how commands on the page name the folder.
+    ``traffic`` is None where that can no longer be driven in.
     """
 
     path: Path
     campaign: Campaign
     manifest: dict[str, Any]
     estimates: Estimates
+    design: ShellDesign | None
     tests: ShownTests
     traffic: Environment | None
-    shells: ShownShells | None
-    typed: str
 
-    @classmethod
-    def of(
-        cls,
-        path: Path,
-        campaign: Campaign,
-        manifest: dict[str, Any],
-        estimates: Estimates | dict[str, Any],
-        design: ShellDesign | None,
-        tests: ShownTests,
-        traffic: Environment | None,
-    ) -> RunFolder:
-        """A run in hand; ``estimates`` as they are written, or read."""
-        told = STORED_ESTIMATES.validate_python(estimates)
-        shells = None if design is None else _shells(path, told.best, design)
-        return cls(path, campaign, manifest, told, tests, traffic, shells, typed_folder(path))
+    @cached_property
+    def shells(self) -> ShownShells | None:
+        """What its shells say, if its tests are of any."""
+        return None if self.design is None else _shells(self.path, self.estimates.best, self.design)
 
     @property
     def sees(self) -> bool:
@@ -105,28 +94,31 @@ class RunFolder:
         """Their stored motion; None where none of them was traced."""
         return read_traces(self.path, self.manifest["parts"], episodes)
 
+    def crashes(self, episodes: set[int]) -> pa.Table:
+        """What scenes need of crashes, in index order."""
+        return self.tests.crashes.filter(pc.field("episode").isin(sorted(episodes)))
 
-def typed_folder(folder: Path) -> str:
-    """Return the folder as it is typed in a shell: relative to the working directory, or its bare name.
+    @property
+    def typed(self) -> str:
+        """The folder as commands on the page name it: relative to the working directory, or its bare name.
 
-    The bare name stands for a folder that is not below the working directory. An absolute path would say where somebody
-    keeps their files to everybody whom the page is mailed to.
-    """
-    here = Path.cwd()
-    unlinked = Path(os.path.abspath(folder))  # noqa: PTH100 - resolve() would leave by a link what was typed below `here`
-    for path in (unlinked, folder.resolve()):
-        if path.is_relative_to(here):
-            return shlex.quote(path.relative_to(here).as_posix())
-    return shlex.quote(folder.resolve().name)
+        The bare name stands for a folder that is not below it. An absolute path would say where somebody keeps their
+        files to everybody whom the page is mailed to.
+        """
+        here, resolved = Path.cwd(), self.path.resolve()
+        unlinked = Path(os.path.abspath(self.path))  # noqa: PTH100 - resolve() would leave by a link what was typed below `here`
+        below = (path.relative_to(here) for path in (unlinked, resolved) if path.is_relative_to(here))
+        return shlex.quote(next(below, Path(resolved.name)).as_posix())
 
 
 def read_run_folder(path: Path, told: dict[str, Any] | None = None) -> RunFolder:
     """Read campaign, manifest, tests and, where they are not ``told``, estimates of a run."""
     manifest = read_manifest(path)
-    estimates, campaign = told or _read_estimates(path, manifest["campaign_hash"]), read_campaign(path, manifest)
+    estimates = STORED_ESTIMATES.validate_python(told or _read_estimates(path, manifest["campaign_hash"]))
+    campaign = read_campaign(path, manifest)
     tests = ShownTests.stored(path, manifest, family_named(campaign.scenario))
     design = Shells.stored_design(path) if campaign.sampling.strata else None
-    return RunFolder.of(path, campaign, manifest, estimates, design, tests, traffic_of(campaign, manifest))
+    return RunFolder(path, campaign, manifest, estimates, design, tests, traffic_of(campaign, manifest))
 
 
 def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
-from harness.estimators.answer import ended_by, estimate_blocks, expected_for, pool_remedy
+from harness.estimators.answer import STORED_ESTIMATES, ended_by, estimate_blocks, expected_for, pool_remedy
 from harness.estimators.one_pass import even
 from harness.estimators.stopping import Decision, Rule, Verdict
 from harness.files import remove_unfinished
@@ -199,7 +199,8 @@ class Underway:
         from harness.report.summary import RunFolder  # noqa: PLC0415
 
         tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
-        shown = RunFolder.of(run.folder, campaign, manifest, estimates, run.source.design, tests, traffic)
+        told = STORED_ESTIMATES.validate_python(estimates)
+        shown = RunFolder(run.folder, campaign, manifest, told, run.source.design, tests, traffic)
         return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
 
 

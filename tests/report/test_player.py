@@ -23,7 +23,7 @@ from harness.records.reader import traffic_of
 from harness.report import crashes, player
 from harness.report.player import LANE_M, UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
-from harness.report.sumo_files import gui_program, write_sumo
+from harness.report.motion import gui_program, write_sumo
 from harness.resolved import resolve
 from harness.runner.stored import write_report
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M
