@@ -19,8 +19,7 @@ from harness.commands.options import run_folder
 from harness.commands.printing import print_table, say
 from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.progress import Progress
-from harness.report.lines import lines
-from harness.report.words import short_answer
+from harness.report.words import lines, short_answer
 from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page

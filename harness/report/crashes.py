@@ -75,11 +75,13 @@ def crash_gallery(
             reasons.setdefault(place, []).append(f"{reason} no. {rank}")
     total, stored = float(crashes["weight"].sum()), run.crashes({int(episode[place]) for place in reasons} & traced)
     rows, shown = list[GalleryRow](), list[Scene]()
+    # Shells, or importance functions, of which the forced event is the first.
+    names = ["forced", *run.campaign.surrogates] if run.shells is None else [each.shell for each in run.shells.shells]
     for place, why in reasons.items():
         crash = {name: float(crashes[name][place]) for name in SHOWN_COLUMNS}
-        number, component = int(episode[place]), _component_name(run, int(crashes["component"][place]))
-        names = [name for name, avoids in zip(family.stand_ins, avoided[place], strict=True) if avoids]
-        by, scene = ", ".join(names) or ("nobody" if (ends[place] != UNKNOWN).all() and ends.size else "–"), None
+        number, component = int(episode[place]), int(crashes["component"][place])
+        avoid = [name for name, avoids in zip(family.stand_ins, avoided[place], strict=True) if avoids]
+        by, scene = ", ".join(avoid) or ("nobody" if (ends[place] != UNKNOWN).all() and ends.size else "–"), None
         if traces is not None and number in traced:
             impact, scene = tenths(crash["impact_speed_mps"]), len(shown)
             row, trace = (each.filter(pc.equal(each["episode"], number)) for each in (stored, traces))
@@ -88,7 +90,8 @@ def crash_gallery(
             shown.append(scenes.scene(row, trace, why=f"{event}, impact at {impact} m/s ({kinds})"))
         share = crash["weight"] / total if total > 0.0 else math.nan
         shown_facts = [float(each[place]) for each in facts]
-        rows.append(GalleryRow(number, crash, shown_facts, ", ".join(why), share, component, by, scene))
+        drawn_by = names[component] if 0 <= component < len(names) else "–"
+        rows.append(GalleryRow(number, crash, shown_facts, ", ".join(why), share, drawn_by, by, scene))
     return rows, shown
 
 
@@ -119,11 +122,3 @@ def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArra
     if asked:
         ends[judged] = scenes.ends(run.crashes(asked), run.traces(asked) if acts else None)
     return ends
-
-
-def _component_name(run: RunFolder, component: int) -> str:
-    """Name the shell of an episode, or the importance function it followed, of which the forced cut-in is the first."""
-    names = ["forced", *run.campaign.surrogates] if run.shells is None else [s.shell for s in run.shells.shells]
-    if component < 0:
-        return "–"
-    return names[component] if component < len(names) else str(component)

@@ -11,7 +11,6 @@ from harness.estimators.estimate import WIDE_RHW
 from harness.families import family_named
 from harness.families.words import EXCLUDED
 from harness.numbers import count, interval, number, plain, ratio, share, tenths
-from harness.report.lines import columns, headed, wrapped
 from harness.report.rows import Row, decided, looking_words, ratio_texts
 from harness.report.words import GO_ON, ShortAnswer, ended_words, scope_words, tests_words, unseen_words, warnings_of
 

@@ -9,9 +9,8 @@ from typing import Any
 from harness.campaign.campaign import Campaign
 from harness.numbers import count, duration, interval, number, plain, ratio, share, two_digits_up
 from harness.report.hour_words import called, scenarios_words, sum_warnings
-from harness.report.lines import LABEL, columns, wrapped
 from harness.report.notes import note_words
-from harness.report.words import ENDED, scope_words, unseen_words, warnings_of
+from harness.report.words import ENDED, LABEL, columns, scope_words, unseen_words, warnings_of, wrapped
 from harness.strata import LIBRARY_STATEMENT
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -221,18 +222,13 @@ def where_plot(summary: RunSummary, family: Family, environment: Environment | N
     lines = {} if environment is None else limits_of_others(family, environment, summary, panels[0].y.high)
     for (name, (speeds, gaps)), colour, dash in zip(lines.items(), ("ink", "blue"), ("", DASHED), strict=False):
         panels[0].add("line", colour, gaps, speeds, dash=dash, label=f"{name}’s limit")
-    x, y = (_bare(each.words) for each in family.maps[0])
+    x, y = (re.split(" (?:at|of|when) ", each.words)[0] for each in family.maps[0])  # without when
     n_crashes = count(int(np.count_nonzero(rows["outcome"][met] == CRASH)))
     text = (
         f"Each of {count(met.sum())} {words.events} by its {x} and {y}; {n_crashes} of them crashed. "
         "Where no cell is drawn, nothing was tested."
     )
     return Plot("where", panels, text + words.limits * bool(lines), text + words.limits * bool(lines))
-
-
-def _bare(words: str) -> str:
-    """What an axis shows, without when."""
-    return words.partition(" at ")[0].partition(" of ")[0].partition(" when ")[0]
 
 
 def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArray, events: str) -> PlotPanel:

@@ -1,12 +1,13 @@
 """The answer at a glance, in words, from the numbers of ``estimates.json``: for terminal, page and JUnit.
 
-Here stand whose answer it is, what to be warned of, and how far it goes; its rows are in `harness.report.rows`.
-`harness.report.lines` lays all of it out for a terminal.
+Here stand whose answer it is, what to be warned of, and how far it goes, and all of it laid out for a terminal; its
+rows are in `harness.report.rows`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.answer import STORED_ESTIMATES, Elsewhere, Estimates, before_event
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
-from harness.numbers import WIDEST_RHW, count, leaves, number, plain, share, words
+from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, share, words
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, held_back, rows_of, too_few, with_traffic
 from harness.sampling.milder import n_left_out
@@ -257,3 +258,74 @@ def elsewhere_words(found: Elsewhere) -> str:
     known = f" (off by {share(found.off, least=0.001)} for {drivers})" if drivers else ""
     rests = f"assumes that the same share of each shell crashes in both{known}"
     return f"tested in {found.tested_in}, answered for {found.answered_for}: {rests}"
+
+
+# -- for a terminal: some nine lines of 100 columns --
+
+WIDTH, LINES, LABEL = 100, 9, 26
+MOST_WARNINGS = 3
+
+
+def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None = None) -> list[str]:
+    """An answer for a terminal: at most `LINES` lines.
+
+    Those of more than `WIDTH` columns go on below. Where there is much to warn of the last rows give way: all of it is
+    on the page.
+    """
+    warnings = [f"! {text}" for text in answer.warnings]
+    if len(warnings) > MOST_WARNINGS:
+        warnings[MOST_WARNINGS - 1 :] = [f"! {count(len(warnings) - MOST_WARNINGS + 1)} more warnings: see the report"]
+    ends = [answer.scope, *([] if report is None else [f"report  {report}"])]
+    rows = answer.rows[: LINES - 1 - len(warnings) - len(ends)]
+    table = columns([row.texts for row in rows])
+    return [headed(answer, took_s), *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+
+
+def headed(answer: ShortAnswer, took_s: float | None) -> str:
+    """The first line: who was tested, with as many of its parameters as there is room for, and how often."""
+    head = [answer.vehicle, answer.tests, *([] if took_s is None else [duration(took_s)])]
+    if told := ", ".join(map(" ".join, answer.parameters)):
+        room = WIDTH - len(" · ".join(head)) - 3
+        head[0] += f" ({textwrap.shorten(told, max(room, 8), placeholder=' …')})"
+    return " · ".join(head)
+
+
+def run_lines(
+    campaign: Campaign, manifest: Mapping[str, Any], content: Estimates | Mapping[str, Any], report: Path
+) -> list[str]:
+    """The answer of a run; the ``report`` is named if it is there, and of the same traffic."""
+    told = STORED_ESTIMATES.validate_python(content)
+    page = report if told.elsewhere is None and report.is_file() else None
+    return lines(short_answer(campaign, manifest, told), manifest.get("wall_time_s"), page)
+
+
+def estimate_lines(content: Mapping[str, Any]) -> list[str]:
+    """The estimators of ``estimates.json``, a line each; those that its records do not allow are not named."""
+    head = f"{content['campaign']}: {count(content['n_crashes'])} crashes in {count(content['n_episodes'])} tests"
+    found = {name: each for name, each in content["estimates"].items() if each["crash_rate"] is not None}
+    rows = [
+        (name, interval(each.get("ci_low"), each.get("ci_high"), each["crash_rate"])) for name, each in found.items()
+    ]
+    return [f"{head}; crash rate per test ({share(content['confidence'])})", *(columns(rows) if rows else ())]
+
+
+def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Rows of equally many texts, each column as wide as its widest; a row too long for that is narrower at its end."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        padded = [text.ljust(width) for text, width in zip(row, widths, strict=True)]
+        left, remark = "  ".join(["", *padded[:-1]]).rstrip(), row[-1]
+        line = "  ".join(["", *padded]).rstrip()
+        if len(line) > WIDTH:
+            line = f"{left}  {remark:>{max(WIDTH - 2 - len(left), 0)}}"
+        for n in reversed(range(len(row) - 1)):
+            line = line if len(line) <= WIDTH else "  ".join(["", *padded[:n], *filter(None, row[n:])])
+        yield from [line] if len(line) <= WIDTH else wrapped(["  ".join(filter(None, row))])
+
+
+def wrapped(texts: Iterable[str]) -> Iterator[str]:
+    """Lines of at most `WIDTH` columns, which begin after two spaces and go on after four."""
+    fill = textwrap.TextWrapper(WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
+    for text in texts:
+        whole = text.replace(" %", "\u00a0%").replace("± ", "±\u00a0")  # a number and its sign stay together
+        yield from (line.replace("\u00a0", " ") for line in fill.wrap(whole))

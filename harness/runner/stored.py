@@ -59,7 +59,7 @@ class StoredEstimates(ShownInPython, dict[str, Any]):
 
     def _lines(self) -> list[str]:
         from harness.report.hour_words import hour_lines  # noqa: PLC0415 - draws
-        from harness.report.lines import estimate_lines, run_lines  # noqa: PLC0415
+        from harness.report.words import estimate_lines, run_lines  # noqa: PLC0415
 
         if self._by_estimator or "families" in self:
             return estimate_lines(self) if self._by_estimator else hour_lines(self)

@@ -65,7 +65,7 @@ class RunResult(ShownInPython):
     """What its page is made of."""
 
     def _lines(self) -> list[str]:
-        from harness.report.lines import run_lines  # noqa: PLC0415 - draws
+        from harness.report.words import run_lines  # noqa: PLC0415 - draws
 
         return run_lines(self.shown.campaign, self.shown.manifest, self.shown.estimates, self.report)
 

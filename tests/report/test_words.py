@@ -8,9 +8,8 @@ import pytest
 from harness.estimators.answer import AssumedOfRate, estimate_blocks
 from harness.numbers import number, plain
 from harness.records.folder import read_manifest
-from harness.report.lines import LINES, WIDTH, columns, lines
 from harness.report.summary import read_run_folder
-from harness.report.words import short_answer
+from harness.report.words import LINES, WIDTH, columns, lines, short_answer
 from harness.runner.stored import stored_blocks
 from tests.stored_runs import answer_in, estimates, golden
 
