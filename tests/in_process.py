@@ -28,7 +28,7 @@ def without_page() -> Iterator[None]:
     """It takes longer than small campaigns; test_api.py looks at it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("harness.report.page.write_page_of", lambda run: run.path / "report.html")
-        patch.setattr("harness.report.compare_page.write_page_of", lambda folder, *_: folder / "report.html")
+        patch.setattr("harness.report.page.write_comparison", lambda folder, *_: folder / "report.html")
         yield
 
 

@@ -41,7 +41,7 @@ def test_importing_it_loads_nothing_slow_and_a_report_nothing_to_drive_or_to_plo
     slow = {"numba", "scipy", "libsumo", "pandas", "pyarrow", "matplotlib"}
     of_report = {"matplotlib", "libsumo", "ray", "fmpy", "scipy.optimize", "rich"}
     code = f"import harness.cli, sys; print({slow} & {{*sys.modules}})"
-    code += f"; import harness.report.page, harness.report.compare_page; print({of_report} & {{*sys.modules}})"
+    code += f"; import harness.report.page; print({of_report} & {{*sys.modules}})"
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=MIXTURE_FILE.parents[1], capture_output=True, text=True, check=True)
     assert done.stdout.split("\n") == ["set()", "set()", ""]

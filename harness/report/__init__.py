@@ -2,6 +2,6 @@
 
 All is made from a finished folder alone, so it can be made again at any time and on any machine. ``summary`` reads;
 ``notes``, ``rows``, ``words``, ``hour_words`` and ``pair_words`` say it, ``junit`` for a gate; ``plots`` and
-``crashes`` draw (with ``drawing``), ``page`` and ``compare_page`` put all together by ``templates``; ``player`` plays a
-test, ``motion`` and ``openscenario`` write one.
+``crashes`` draw (with ``drawing``), ``page`` puts all together by ``templates``; ``player`` plays a test, ``motion``
+and ``openscenario`` write one.
 """

@@ -1,21 +1,32 @@
-"""Which crashes to look at first: a row of the table for each, and of those that were traced a scene of the player."""
+"""Which crashes to look at first: in a table of a run, and of those that were traced a scene of the player.
+
+Of a comparison those on which only one of the two crashes.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 
+from harness.errors import HarnessError, RunFolderError
 from harness.estimators.severity import weighted_quantiles
 from harness.families import family_named
 from harness.families.protocol import Environment, Family
 from harness.families.words import Shown
-from harness.numbers import tenths
-from harness.report.player import UNKNOWN, Scene, Scenes
-from harness.report.summary import RunFolder, RunSummary
-from harness.vocabulary import BoolArray, FloatArray, IntArray
+from harness.numbers import count, tenths
+from harness.report.drawing import Plot
+from harness.report.player import UNKNOWN, ReplayResult, Scene, Scenes, beside_other
+from harness.report.plots import WHO, pairs_plot
+from harness.report.summary import RunFolder, RunSummary, summarise
+from harness.strata import weight_of_a_test
+from harness.vocabulary import COMPARISON, CRASH, FAILED, BoolArray, FloatArray, IntArray
 
 CANDIDATES, SHOWN = 50, 3
 """Crashes considered and shown per ranking: with a share of traces only some of the worst have one."""
@@ -23,6 +34,11 @@ MOST_JUDGED, MOST_TRACED = 20_000, 1_000
 """Hardest crashes of which it is asked who would have avoided them; of vehicles whose motion the traces must tell."""
 SHOWN_COLUMNS = ("impact_speed_mps", "crash_time_s", "weight", "event_s")
 """Of a crash in the table, beside its episode; as in `RunSummary`."""
+SHOWN_ALONE = 2
+"""Crashes of A or B alone: a vehicle in foreign code is run again in a process of its own."""
+COMPARE_AGAIN = "Run `harness compare` again with the same --out."
+
+Replay = Callable[[Path, int], ReplayResult]
 
 
 class GalleryRow(NamedTuple):
@@ -122,3 +138,76 @@ def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArra
     if asked:
         ends[judged] = scenes.ends(run.crashes(asked), run.traces(asked) if acts else None)
     return ends
+
+
+# -- of a comparison --
+
+
+class CrashPairs(NamedTuple):
+    """Pairs with a crash: who of `WHO`, what it adds to the rate, and of the event what a map's axes show, (2, n).
+
+    The event is that of the vehicle that crashes, A's where both do. ``episode`` and ``impact_mps`` are of A and B,
+    (2, n); a failed test, which counts as no crash, has no impact, and a negative episode.
+    """
+
+    who: IntArray
+    weight: FloatArray
+    values: FloatArray
+    episode: IntArray
+    impact_mps: FloatArray
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Pairs by who crashes."""
+        return {name: int(np.count_nonzero(self.who == place)) for place, name in enumerate(WHO)}
+
+    def plot(self, family: Family) -> Plot | None:
+        """Their map; None without any."""
+        return pairs_plot(self.who, self.weight, self.values, family)
+
+
+def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> CrashPairs:
+    """Pairs on which A or B crashes, by the records: the i-th test of a shell of A and of B."""
+    axes = family_named(runs[0].campaign.scenario).maps[0]
+    n_pairs, found = [shell["n_pairs"] for shell in shells], []
+    for run in runs:
+        rows = summarise(run).rows
+        first = [np.flatnonzero(rows["component"] == s)[:n] for s, n in enumerate(n_pairs)]
+        if [each.size for each in first] != n_pairs:
+            raise RunFolderError(str(run.path), "fewer tests than pairs", f"those of {COMPARISON}", COMPARE_AGAIN)
+        found.append({name: column[np.concatenate(first)] for name, column in rows.items()})
+    a, b = (each["outcome"] == CRASH for each in found)
+    kept = a | b
+    of_map = np.stack([np.where(a, axis.of(found[0]), axis.of(found[1]))[kept] for axis in axes])
+    episode = np.stack([np.where(each["outcome"] == FAILED, -1.0, each["episode"])[kept] for each in found])
+    impact = np.stack([each["impact_speed_mps"][kept] for each in found])
+    weight = np.repeat(weight_of_a_test(np.array([shell["p"] for shell in shells]), np.array(n_pairs)), n_pairs)
+    who = np.where(a & b, 0, np.where(a, 1, 2))[kept]
+    return CrashPairs(who, weight[kept], of_map, episode.astype(np.int64), impact)
+
+
+def scenes_of(runs: Sequence[RunFolder], pairs: CrashPairs, replay: Replay) -> Iterator[Scene]:
+    """The hardest crashes of B alone, then of A alone, beside the other vehicle on the same event."""
+    family = family_named(runs[0].campaign.scenario)
+    for side, other in ((1, 0), (0, 1)):
+        name, impact = "AB"[side], pairs.impact_mps[side]
+        places = np.flatnonzero((pairs.who == 1 + side) & (pairs.episode[other] >= 0))
+        for place in places[np.argsort(-impact[places], kind="stable")][:SHOWN_ALONE]:
+            episodes = [int(each) for each in pairs.episode[:, place]]
+            told = f"{tenths(float(impact[place]))} m/s"
+            row, trace = motion_of(runs[side], episodes[side], replay)
+            if trace is None:
+                continue
+            scene = Scenes(runs[side].campaign, None).scene(row, trace)
+            scene = beside_other(scene, name, "AB"[other], motion_of(runs[other], episodes[other], replay)[1], family)
+            where = " and ".join(f"test {count(n)} of {of}" for n, of in zip(episodes, "AB", strict=True))
+            yield {**scene, "episode": f"only {name}, {told}", "title": f"Only {name} crashes, at {told} ({where})"}
+
+
+def motion_of(run: RunFolder, episode: int, replay: Replay) -> tuple[pa.Table, pa.Table | None]:
+    """Row of a crash, and the trace of any episode: the stored one, or of the test run again; None if it cannot be."""
+    trace = run.traces({episode})
+    if trace is None:
+        with suppress(HarnessError):  # of another version, a vehicle that is gone or does not do the same again
+            trace = replay(run.path, episode).trace
+    return run.crashes({episode}), trace

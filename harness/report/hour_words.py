@@ -11,8 +11,9 @@ from harness.estimators.estimate import WIDE_RHW
 from harness.families import family_named
 from harness.families.words import EXCLUDED
 from harness.numbers import count, interval, number, plain, ratio, share, tenths
+from harness.report import words
 from harness.report.rows import Row, decided, looking_words, ratio_texts
-from harness.report.words import GO_ON, ShortAnswer, ended_words, scope_words, tests_words, unseen_words, warnings_of
+from harness.report.words import ShortAnswer
 
 
 def called(family: str) -> str:
@@ -31,7 +32,7 @@ def answer_of_sum(content: Mapping[str, Any], *, readings: bool = False) -> Shor
     return ShortAnswer(
         vehicle=content["vehicle"],
         parameters=content["parameters"],
-        tests=tests_words(content["n_episodes"], content["engine"], scenarios_words(content["families"])),
+        tests=words.tests_words(content["n_episodes"], content["engine"], scenarios_words(content["families"])),
         rows=(*verdict, *_sum_rows(content, readings=readings)),
         warnings=tuple(sum_warnings(content)),
         scope=_scope(content),
@@ -41,11 +42,13 @@ def answer_of_sum(content: Mapping[str, Any], *, readings: bool = False) -> Shor
 def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readings: bool = False) -> list[str]:
     """The answer for a terminal, at most ten lines of 100 columns; with ``readings`` two more."""
     answer, took_s = answer_of_sum(content, readings=readings), content["wall_time_s"]
-    head = headed(answer, None if readings else took_s)  # of the run, not of an answer given anew
-    parts = columns([(row[1], row[2] + " of all" * (i == 0), *row[3:]) for i, row in enumerate(family_rows(content))])
-    under = wrapped([*(f"! {text}" for text in answer.warnings), exposures(content), answer.scope])
+    head = words.headed(answer, None if readings else took_s)  # of the run, not of an answer given anew
+    parts = words.columns(
+        [(row[1], row[2] + " of all" * (i == 0), *row[3:]) for i, row in enumerate(family_rows(content))]
+    )
+    under = words.wrapped([*(f"! {text}" for text in answer.warnings), exposures(content), answer.scope])
     ends = [] if report is None else [f"  report  {report}"]
-    return [head, *columns([row.texts for row in answer.rows]), *parts, *under, *ends]
+    return [head, *words.columns([row.texts for row in answer.rows]), *parts, *under, *ends]
 
 
 def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
@@ -94,10 +97,10 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
     for name, of in content["families"].items():
-        told = list(warnings_of(name, {**of, "rate": of["rate_per_hour"]}, " per hour"))
+        told = list(words.warnings_of(name, {**of, "rate": of["rate_per_hour"]}, " per hour"))
         if (left := of.get("assumed")) and (found := AssumedOfRate(**left)).no_lower_limit:
             most = found.most * (of["ci_high"] if of["n_crashes"] else of["upper_bound"])
-            told.append(f"{unseen_words(found.where)}, here {number(most)} per hour")
+            told.append(f"{words.unseen_words(found.where)}, here {number(most)} per hour")
         yield from (f"{called(name)}: {text}" for text in told)
 
 
@@ -125,11 +128,11 @@ def between(low: float, high: float | None, rate: float) -> str:
 
 def _scope(content: Mapping[str, Any]) -> str:
     """How far the interval goes, and why the tests ended."""
-    ended, target = ended_words(content["stopped_by"], content["decision"]), content["asked_rhw"]
+    ended, target = words.ended_words(content["stopped_by"], content["decision"]), content["asked_rhw"]
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else f', at ± {share(rhw)}'} (asked: ± {share(target)})"
     if content["stopped_by"] == "episodes" and (target is not None or content["decision"] is not None):
-        ended += GO_ON
+        ended += words.GO_ON
     counted = ", that of the sum also of counted events," if content["counts_in_interval"] else ""
-    return scope_words(content["confidence"], ended, counted)
+    return words.scope_words(content["confidence"], ended, counted)

@@ -1,9 +1,10 @@
-"""Put the report of what was read together: draw, write what is told in rows, fill the template."""
+"""Put pages together, of a run, of several scenarios, of a comparison: draw, tell in rows, fill the template."""
 
 from __future__ import annotations
 
 import base64
 import re
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ from harness.estimators.traffic import Sensitivity, tests_of_sum
 from harness.families import family_named
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
-from harness.report.crashes import crash_gallery, shown_of
+from harness.report.crashes import Replay, crash_gallery, crashing_pairs, scenes_of, shown_of
 from harness.report.drawing import Plot
-from harness.report.hour_words import answer_of_sum, called, exposures, family_rows
+from harness.report.hour_words import answer_of_sum, beside_row, called, exposures, family_rows
+from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words, rates_of, ratio_words
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, summarise
 from harness.report.templates import write_page
@@ -52,6 +54,46 @@ def write_hours(folder: Path, content: dict[str, Any]) -> Path:
         rows=[(row, content["families"][row[0]]) for row in family_rows(content)],
         exposures=exposures(content), called=called,
         moved=_sensitivity(folder, tests_of_sum(content), str(folder)),
+    )  # fmt: skip
+
+
+def write_comparison(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder], replay: Replay) -> Path:
+    """Write the page of a comparison in hand; ``replay`` runs a test of one of its folders again."""
+    pairs, campaign = crashing_pairs(runs, stored["shells"]), runs[0].campaign
+    family = family_named(campaign.scenario)
+    answers = [short_answer(run.campaign, run.manifest, run.estimates) for run in runs]
+    of_each = [{row.key: row for row in answer.rows} for answer in answers]
+    shown = {"ratio": "× competent driver", "impact": "impact"}
+    return _write_comparison(
+        folder, stored, [(answer.vehicle, answer.parameters) for answer in answers],
+        [(what, [rows.get(key) for rows in of_each]) for key, what in shown.items()],
+        above=campaign.crash.counts_above_mps, level=campaign.environment.lane_change_level,
+        family=family, words=family.words, plot=pairs.plot(family),
+        scenes=list(scenes_of(runs, pairs, replay)), counts=pairs.counts,
+    )  # fmt: skip
+
+
+def write_comparison_of_sum(folder: Path, stored: dict[str, Any]) -> Path:
+    """Write the page of a comparison in several scenarios: the sum, and the way to each one's own page."""
+    beside = [beside_row("", stored[side]["beside"], seen=stored[side]["n_crashes"] > 0) for side in "ab"]
+    scenarios = [
+        (called(name), name, of, ratio_words(of), pair_words(of["decision"])) for name, of in stored["families"].items()
+    ]
+    vehicles = [(of["label"], ()) for of in stored["campaigns"].values()]
+    return _write_comparison(folder, stored, vehicles, [("× competent driver", beside)], above=0.0, scenarios=scenarios)
+
+
+def _write_comparison(
+    folder: Path, stored: dict[str, Any], vehicles: Iterable[tuple[Any, ...]], rows: Sequence[Any], **content: Any
+) -> Path:
+    """Write either page; ``rows`` are what its table has besides, of A and of B."""
+    asked, sides = pair_asked(stored), zip("AB", vehicles, strict=True)
+    return write_page(
+        folder / "report.html", "compare.html.j2",
+        compared=stored, asked=asked, given=asked is not stored, ratio=ratio_words(asked),
+        verdict=pair_words(stored["decision"]), to_decide=deciding_words(stored), warnings=list(pair_warnings(stored)),
+        vehicles=[(name, *of) for name, of in sides], rates=[rates_of(stored[side]) for side in "ab"],
+        rows=rows, **content,
     )  # fmt: skip
 
 

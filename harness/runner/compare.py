@@ -75,7 +75,7 @@ class Comparison(ShownInPython):
 
     def _plot(self) -> Plot | None:
         """Events on which one of them crashes."""
-        from harness.report.compare_page import crashing_pairs  # noqa: PLC0415 - draws
+        from harness.report.crashes import crashing_pairs  # noqa: PLC0415 - draws
 
         if "shells" not in self.content:  # of several scenarios, each of which has its own map
             return None
@@ -204,10 +204,10 @@ def _written(
     for side, each in zip(SIDES, of.results, strict=True):
         content[side] |= finite_json(doubts_of(each.shown.campaign, each.shown.manifest, each.shown.estimates))
     write_sealed(of.folder / COMPARISON, content)
-    from harness.report.compare_page import write_page_of  # noqa: PLC0415 - draws
+    from harness.report.page import write_comparison  # noqa: PLC0415 - draws
 
     shown = [each.shown for each in of.results]
-    return Comparison(of.folder, content, code, write_page_of(of.folder, content, shown, replay_episode), shown)
+    return Comparison(of.folder, content, code, write_comparison(of.folder, content, shown, replay_episode), shown)
 
 
 def _sum_written(
@@ -237,10 +237,10 @@ def _sum_written(
         },
     })  # fmt: skip
     write_sealed(out / COMPARISON, content)
-    from harness.report.compare_page import write_sum  # noqa: PLC0415 - draws
+    from harness.report.page import write_comparison_of_sum  # noqa: PLC0415 - draws
 
     shown = [each.shown for of in scenarios for each in of.results]
-    return Comparison(out, content, code, write_sum(out, content), shown)
+    return Comparison(out, content, code, write_comparison_of_sum(out, content), shown)
 
 
 def _decided(rule: PairRule, scenarios: Sequence[PairedScenario]) -> PairDecision:

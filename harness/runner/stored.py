@@ -382,17 +382,18 @@ def write_report(folder: str | Path) -> Path:
 
 def _write_comparison(folder: Path) -> Path:
     """Of the comparison, and of each scenario's where it is a sum."""
-    from harness.report import compare_page  # noqa: PLC0415 - draws
+    from harness.report.crashes import COMPARE_AGAIN  # noqa: PLC0415 - draws
+    from harness.report.page import write_comparison, write_comparison_of_sum  # noqa: PLC0415
     from harness.report.summary import read_run_folder  # noqa: PLC0415
 
-    stored = read_as(dict[str, Any], folder / COMPARISON, mend=compare_page.MEND)
+    stored = read_as(dict[str, Any], folder / COMPARISON, mend=COMPARE_AGAIN)
     if "families" in stored:
         for name in stored["families"]:
             _write_comparison(folder / name)
-        return compare_page.write_sum(folder, stored)
+        return write_comparison_of_sum(folder, stored)
     runs = [read_run_folder(folder / side) for side in ("a", "b")]
     for run, of in zip(runs, stored["campaigns"].values(), strict=True):
         if (found := run.manifest["campaign_hash"]) != of["campaign_hash"]:
             expected = f"campaign {of['campaign_hash']} ({COMPARISON})"
-            raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, compare_page.MEND)
-    return compare_page.write_page_of(folder, stored, runs, replay_episode)
+            raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, COMPARE_AGAIN)
+    return write_comparison(folder, stored, runs, replay_episode)

@@ -9,7 +9,7 @@ import harness
 from harness.campaign.files import dump_campaign
 from harness.cli import main
 from harness.records.origin import signature
-from harness.report.compare_page import motion_of
+from harness.report.crashes import motion_of
 from harness.report.summary import read_run_folder
 from harness.resolved import resolve
 from tests.in_process import run_here

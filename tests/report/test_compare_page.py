@@ -11,7 +11,7 @@ import pytest
 import harness
 from harness.errors import RunFolderError
 from harness.numbers import interval, number, ratio
-from harness.report.compare_page import crashing_pairs
+from harness.report.crashes import crashing_pairs
 from harness.report.pair_words import deciding_words, pair_lines
 from harness.report.plots import WHO
 from harness.report.summary import read_run_folder

@@ -21,9 +21,9 @@ from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.words import STAND_INS
 from harness.records.reader import traffic_of
 from harness.report import crashes, player
+from harness.report.motion import gui_program, write_sumo
 from harness.report.player import LANE_M, UNKNOWN, Scenes
 from harness.report.summary import read_run_folder, summarise
-from harness.report.motion import gui_program, write_sumo
 from harness.resolved import resolve
 from harness.runner.stored import write_report
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M
