@@ -71,9 +71,10 @@ def _work_here(_: Any, work: Callable[..., Any], *arguments: Any) -> Any:
 
 @contextmanager
 def controllers_here() -> Iterator[None]:
-    """Where a controller is tried before a run, it is here: for those that are known to end no process."""
+    """Where a controller is tried, or tests are run again, it is here: for those that end no process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.controllers.find.run_apart", _work_here)
+        for module in ("controllers.find", "runner.again"):
+            patch.setattr(f"harness.{module}.run_apart", _work_here)
         yield
 
 

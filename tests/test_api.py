@@ -169,9 +169,6 @@ def test_a_run_without_an_answer_is_shown_all_the_same(stored_run, tmp_path):
     assert "<img" not in found._repr_html_()
 
 
-# -- the recommended method against a committed reference --
-
-
 REFERENCE = json.loads((ROOT / "tests/reference/default.json").read_text(encoding="utf-8"))
 
 

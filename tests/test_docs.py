@@ -4,11 +4,14 @@ import json
 import re
 import runpy
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import click
 import pytest
 
+from benchmarks.contenders import CONTENDERS, missing
 from docs import generate
 from harness.cli import cli
 
@@ -96,3 +99,11 @@ def test_the_notebook_runs(stored_run, tmp_path, monkeypatch):
 def test_generated_parts_are_current():
     stale = [page for page in generate.pages() if generate.regenerate(text := page.read_text("utf-8")) != text]
     assert stale == [], "run: python -m docs.generate"
+
+
+@pytest.mark.slow
+def test_all_contenders_run():
+    names = [name for name in CONTENDERS if not missing(name) and name != "traci"]
+    command = [sys.executable, "-m", "benchmarks.speed", "--quick", "--repetitions", "1", "--only", ",".join(names)]
+    found = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert all(f"\n{name}  " in found for name in names)

@@ -57,9 +57,6 @@ def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeyp
     assert re.fullmatch(r"\d\d:\d\d:\d\d waiting for a pool\n", waiting.getvalue())
 
 
-# -- how numbers are written --
-
-
 @pytest.mark.parametrize(
     ("written", "text"),
     [

@@ -91,9 +91,6 @@ def test_texts_that_other_readers_misread_are_quoted(load, text):
     assert load(dumped).description == text
 
 
-# -- broken --
-
-
 @settings(max_examples=75, deadline=None)
 @given(text=st.sampled_from(TEXTS), draw=st.data())
 def test_damaged_text_loads_or_is_a_clear_error(load, text, draw):

@@ -17,7 +17,7 @@ from harness.sampling.protocol import KnownRounds
 from studies.case_study.theorems import small_chains
 from studies.chains.chain import CHAINS, DECISIVE, decisive, enumerate_episodes, overtaking
 from studies.chains.sampler import Sampler, draw
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.estimators.small_blocks import blocks, fed
 
 IMMEDIATE = overtaking("immediate", skill=0.6, level=0.05, horizon=4, surrogates=[0.6, 0.3], challenge="immediate")
@@ -67,9 +67,6 @@ def test_a_surrogate_that_is_the_vehicle_leaves_less():
     p, y, d = exactly(CERTAIN, of_episodes=False)
     left = [p @ (y - each) ** 2 - CERTAIN.crash_rate**2 for each in (0.0, *d.T)]
     assert left[1] < 0.9 * left[0]
-
-
-# -- the estimate --
 
 
 @pytest.mark.parametrize("method", ["step_mixture", "episode_mixture"])

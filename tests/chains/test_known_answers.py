@@ -20,7 +20,7 @@ from studies.chains.sampler import Sampler, draw, with_optimal_function
 from studies.chains.shells import ChainShells, joint_outcomes
 from studies.replication.judgement import Judgement, Subject, estimate_row, judge
 from studies.replication.populations import Known
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.estimators.small_blocks import blocks, fed
 
 SIZES = [5_000] * 6

@@ -1,21 +1,15 @@
 """``av.fmu`` is checked against the FMU before anything runs; an instance per cell, a reset per episode."""
 
-import errno
-import hashlib
 import re
 import sys
-import tempfile
 import zipfile
 from contextlib import closing
-from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import pytest
 
 from harness.campaign.files import load_campaign
 from harness.campaign.vehicle import FmuController
-from harness.commands.printing import system_error
 from harness.controllers import EpisodeStart, Neighbour, Observation
 from harness.controllers.find import build_host, require_controller
 from harness.controllers.fmu import OBSERVATIONS, fmu_maker, wire
@@ -94,29 +88,6 @@ def test_inputs_that_are_named_as_observations_and_an_only_output_need_no_wiring
         wire(own, variables(gap_m="input", v="input", a="output"))
     with pytest.raises(CampaignError, match=r"av.fmu.output: found a, b;.*--set av.fmu.output=NAME"):
         wire(own, variables(gap_m="input", a="output", b="output"))
-
-
-def test_where_the_disk_is_full_nothing_half_unpacked_stays_and_the_fmu_is_not_blamed(fmu, tmp_path, monkeypatch):
-    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(zipfile.ZipFile, "extractall", Mock(side_effect=OSError(errno.ENOSPC, "No space left")))
-    with pytest.raises(OSError, match="No space left") as raised:
-        fmu_maker(load(tmp_path, f"{{file: '{fmu}', {WIRED}}}").av.fmu)
-    assert str(tmp_path) in system_error(raised.value).where
-    assert list((tmp_path / "fmu").iterdir()) == []
-
-
-@pytest.mark.parametrize("there", [Path.touch, lambda path: path.symlink_to("nowhere")])
-def test_what_cannot_be_unpacked_in_its_place_goes_elsewhere_and_the_fmu_is_not_blamed(
-    fmu, tmp_path, monkeypatch, capsys, there
-):
-    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.delenv("HARNESS_CACHE_SAID", raising=False)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    (tmp_path / "cache" / "fmu").mkdir(parents=True)
-    there(tmp_path / "cache" / "fmu" / hashlib.sha256(fmu.read_bytes()).hexdigest()[:16])
-    for _ in range(2):
-        fmu_maker(load(tmp_path, f"{{file: '{fmu}', {WIRED}}}").av.fmu)
-    assert capsys.readouterr().err.count("cannot be written (Not a directory)") == 1
 
 
 @pytest.mark.parametrize(

@@ -166,9 +166,6 @@ def test_a_built_in_model_is_held_by_the_same_rule(takes_over):
     assert any((ours.traces[row][:-1, 2, 2] > 0.0).any() for row in range(200))
 
 
-# -- one that acts from the start meets the methods that do not need to know the AV's speed --
-
-
 EARLY = "av={controller: 'tests.controllers.test_forms:Faster', before_event: controller}"
 
 

@@ -93,8 +93,6 @@ def test_parameters_are_options_of_a_script_and_arguments_of_a_function():
         assert motion(script(name, ", parameters: {hardest: 2.0, ego: other}"), n=40) == motion(hook, n=40)
 
 
-# -- what goes wrong --
-
 LOOP = """
 traci.start(["sumo"])
 while traci.simulation.getMinExpectedNumber() > 0:
@@ -275,9 +273,6 @@ def test_what_imports_traci_is_a_script_and_its_settings_need_one(tmp_path, monk
     assert (campaign.name, campaign.av.controller) == ("script", str(tmp_path / "script.py"))
     with pytest.raises(CampaignError, match=r"av\.traci_style.*it only beside a controller"):
         load_campaign("idm", ["av.traci_style.ego=ego"])
-
-
-# -- through the command line --
 
 
 @pytest.mark.parametrize(("name", "engine"), [("main_guard.py", "sumo"), ("remembers.py", "twin")])

@@ -123,9 +123,6 @@ def test_replay_in_plain_python(method, hold_s):
     assert len(seen) > 1
 
 
-# -- cut-ins that take time --
-
-
 MANY = 3000
 LATERAL = [{"lead_s": 1.5}, {"parameters": LATERAL_FILE}]
 

@@ -15,7 +15,7 @@ from harness.sampling import prepare
 from harness.sampling.protocol import Source
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
-from tests.chains.seed import SEED
+from tests.chains import SEED
 
 CELLS = 512
 AVS = {

@@ -12,7 +12,7 @@ from harness.estimators.estimate import Unavailable, finite_json
 from harness.estimators.one_pass import ACCUMULATORS, Diagnostics, accumulator, one_pass, refusal
 from harness.vocabulary import CONTACT, ESTIMATORS, FAILED, OUTCOMES, SAMPLING, TIMEOUT
 from studies.chains.chain import overtaking
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.estimators.small_blocks import block, blocks, fed, in_shells
 from tests.stored_runs import answer, golden, stored_table
 

@@ -133,9 +133,6 @@ def test_a_crash_of_either_outside_refutes_the_assumption():
     assert found["conditional"]["refuted"] is True
 
 
-# -- of several scenarios --
-
-
 OTHER = pairs_of((3, 0, 9, 8), (1, 2, 3, 44), (0, 0, 1, 900), mass=1e-9)
 
 

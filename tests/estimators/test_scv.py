@@ -12,7 +12,7 @@ from harness.estimators.scv import CHUNK_ROWS, MixtureCv, Scv, Stratum, n_column
 from harness.estimators.weighted import Nade
 from harness.report.notes import note_words
 from studies.chains.chain import DECISIVE, PANEL, overtaking
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.estimators.small_blocks import block, blocks, fed
 
 SMALL = overtaking("short", skill=0.5, surrogates=[0.5, 0.2, 0.8], level=0.02, horizon=5)

@@ -130,9 +130,6 @@ def test_a_traci_script_knows_the_vehicles_by_the_scenarios_names(name):
                 )
 
 
-# -- controllers that drive as the intelligent driver model and keep what they were shown --
-
-
 SEEN = []
 """What was told of a test, and then step by step."""
 

@@ -28,7 +28,7 @@ from harness.resolved import Resolved, resolve
 from harness.sampling import prepare
 from harness.vocabulary import BoolArray
 from harness.worlds.twin import TwinWorld
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.pool.conftest import SMALL_POOL
 from tests.stored_runs import MIXTURE_FILE
 

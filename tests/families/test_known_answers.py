@@ -269,9 +269,6 @@ def test_a_wrong_number_gives_one_error_with_its_place(name, content, words, tmp
     assert str(caught.value).count("expected") == 1
 
 
-# -- how often there are events: what was counted, and its limits --
-
-
 def test_a_counted_exposure_is_what_it_is_counted_from():
     """Exact Poisson limits at 90 %: half a quantile of χ² with 2 k and 2 k + 2 degrees of freedom."""
     told = CUT_IN.exposure(None, None)

@@ -100,9 +100,6 @@ def test_a_recording_too_short_to_tell_is_none():
     assert fingerprint(recording(rows)).motions.size == 0
 
 
-# -- observations --
-
-
 def observed(rows: pd.DataFrame, tmp_path, **mapping) -> tuple[list[Observations], BesideCounts]:
     file = tmp_path / "rows.parquet"
     rows.to_parquet(file, index=False)

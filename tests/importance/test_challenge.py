@@ -12,7 +12,7 @@ from harness.campaign.drivers import CarefulCompetentParameters, IDMParameters, 
 from harness.families.cut_in.nade import challenge
 from harness.vehicles.drivers import driver_records
 from harness.vehicles.kinematics import CONTACT_M
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.episode.twin_runs import Mean, prepared, run
 from tests.kernels import tabulated
 

@@ -144,9 +144,6 @@ def test_a_folder_from_elsewhere_runs_it_only_if_trusted(of, tmp_path):
     assert harness.replay(tmp_path / "run", 3, trust=True).bit_equal
 
 
-# -- the cache of tables --
-
-
 DEFAULT = driver_records([IDMParameters()])
 FIELDS = [name for name in DEFAULT.dtype.names if name != "max_jerk_mps3"]  # infinite
 

@@ -13,7 +13,7 @@ from harness.pool.build import campaign_pool
 from harness.pool.kept import Pool
 from harness.resolved import resolve
 from harness.vehicles.drivers import Followers
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.stored_runs import MIXTURE_FILE
 
 SMALL_POOL = ("pool.relative_error=0.03", "pool.events_per_shell=1500")

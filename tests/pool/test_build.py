@@ -18,7 +18,7 @@ from harness.resolved import resolve
 from harness.vehicles.library import load_library
 from harness.vocabulary import CRASH, PASSED
 from harness.worlds.twin import TwinWorld
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.golden.campaigns import LATERAL
 from tests.pool.conftest import GOLDEN_POOL, MIXTURE_FILE, SMALL_POOL, enumerated
 
@@ -125,9 +125,6 @@ def test_weights_of_a_proposal_make_up_for_its_aim():
         assert abs((weights * f).mean() - mean) < 4.0 * (weights * f).std() / np.sqrt(20_000)
     unweighted = np.exp(-8.0 * points[:, 0])
     assert unweighted.mean() > 1.5 * -np.expm1(-8.0) / 8.0  # it does aim
-
-
-# -- enumerated cut-ins and strata --
 
 
 STRIDE = family_named("cut_in").stride

@@ -137,9 +137,6 @@ def test_records_say_when_it_began_and_how_it_ended(stored_run):
     assert (traces[traces.vehicle != "BV"].lateral_m == 0.0).all()
 
 
-# -- as pandas frames and Arrow tables --
-
-
 def test_frames_have_all_rows_and_say_what_columns_mean(stored_run):
     run = harness.read(str(stored_run("forced-inattentive")))
     tests = run.episodes()

@@ -230,9 +230,6 @@ def test_what_cannot_be_written_is_said_and_nothing_is_left(stored_run, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
 
 
-# -- for SUMO itself: plain sumo repeats the motion and the collision --
-
-
 FILES = {"test.sumocfg", "test.net.xml", "test.add.xml", "test.fcd.xml", "test.view.xml"}
 
 

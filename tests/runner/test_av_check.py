@@ -81,8 +81,21 @@ class Sharing(Steady):
         self.all_of_them.discard(id(self))
 
 
+CLOCKS = {
+    "monotonic": (lambda: 1.0 * time.monotonic(), "time.monotonic"),
+    "strftime": (lambda: float(time.strftime("%Y%j%H")), "time.time"),
+    "clock_gettime_ns": (lambda: time.clock_gettime_ns(time.CLOCK_MONOTONIC) / 1e9, "time.clock_gettime"),
+    "now": (lambda: datetime.datetime.now().minute / 60.0, "time.time"),
+    "times": (lambda: os.times().user + resource.getrusage(resource.RUSAGE_SELF).ru_utime, "os.times"),
+}
+"""And as what each is told."""
+
+
 class KeepsItsAnswer(Steady):
     """As PID controllers of packages do, it computes nothing anew within 10 ms."""
+
+    def __init__(self, clock):
+        self.now = CLOCKS[clock][0]
 
     def start(self, episode):
         self.at = -1.0
@@ -91,29 +104,6 @@ class KeepsItsAnswer(Steady):
         if (now := self.now()) > self.at + 0.01:
             self.at, self.answer = now, -0.01 * seen.bv.speed_mps
         return self.answer
-
-    def now(self):
-        return time.monotonic()
-
-
-class KeepsItForAnHour(KeepsItsAnswer):
-    def now(self):
-        return float(time.strftime("%Y%j%H"))
-
-
-class KeepsItByClockGettime(KeepsItsAnswer):
-    def now(self):
-        return time.clock_gettime_ns(time.CLOCK_MONOTONIC) / 1e9
-
-
-class KeepsItByTheMinute(KeepsItsAnswer):
-    def now(self):
-        return datetime.datetime.now().minute / 60.0
-
-
-class KeepsItByItsOwnTime(KeepsItsAnswer):
-    def now(self):
-        return os.times().user + resource.getrusage(resource.RUSAGE_SELF).ru_utime
 
 
 class LooksAtTheClock(Steady):
@@ -186,17 +176,17 @@ def test_the_built_in_idm_is_fine():
         pytest.param("Remembering", "it remembers the last one", marks=pytest.mark.slow),
         pytest.param("Sharing", "they share something", marks=pytest.mark.slow),
         pytest.param("LooksAtTheClock", "", marks=pytest.mark.slow),
-        pytest.param("KeepsItsAnswer", "on the clock (time.monotonic, test_av_check.py:", marks=pytest.mark.slow),
-        pytest.param("KeepsItForAnHour", "on the clock (time.time, test_av_check.py:", marks=pytest.mark.slow),
-        pytest.param("KeepsItByClockGettime", "on the clock (time.clock_gettime, test_a", marks=pytest.mark.slow),
-        pytest.param("KeepsItByTheMinute", "on the clock (time.time, test_av_check.py:", marks=pytest.mark.slow),
-        pytest.param("KeepsItByItsOwnTime", "on the clock (os.times, test_av_check.py:", marks=pytest.mark.slow),
+        *(
+            pytest.param(f"KeepsItsAnswer {clock}", f"on the clock ({told}, test_av_check.py:", marks=pytest.mark.slow)
+            for clock, (_, told) in CLOCKS.items()
+        ),
         pytest.param("OfItsProcess", "It differs from process to process: ", marks=pytest.mark.slow),
         pytest.param("HashesAText", "It differs from process to process: ", marks=pytest.mark.slow),
     ],
 )
 def test_a_controller_that_is_not_reproduced_is_found_out(name, why):
-    found, differs = check(name), bool(why)
+    name, *clock = name.split()
+    found, differs = check(name, *(f"av.parameters.clock={each}" for each in clock)), bool(why)
     assert why in cause(found)
     assert (found.exit_code, bool(found.differing), bool(found.failures)) == (3 if differs else 0, differs, False)
     if name == "Steady":
@@ -241,7 +231,8 @@ def test_a_slow_constructor_is_measured_and_counted(name):
     assert (found.speed.construction_s > 0.1, "calls it 8 times" in verdict(found)) == (name == "Slow",) * 2
 
 
-@pytest.mark.parametrize(("name", "late"), [("Waits", True), pytest.param("Steady", False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "late"), [("Waits", True), ("Steady", False)])
 def test_a_vehicle_that_waits_for_the_overlap_is_told_so(name, late):
     found = check_av(load_campaign(f"{__name__}:{name}", ["world.engine=twin"]), 6)
     assert (found.shows, "bv_lateral_m shows it some 2 s earlier" in verdict(found)) == (True, late)
@@ -264,9 +255,6 @@ def test_the_command_line(capfd):
     out, err = capfd.readouterr()
     assert out == ""
     assert err.startswith("error: av.controller\n  found:    the controller ended the worker process (exit code 7)\n")
-
-
-# -- vehicles that are no Python classes --
 
 
 @pytest.mark.parametrize(
@@ -333,9 +321,6 @@ def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
     assert "the vehicle does not do the same again" in changed_since(manifest, campaign).words()
     assert "made of, has been changed" in changed_since({**manifest, "controller_sha256": "0"}, campaign).words()
     assert "CPU Z80 (here" in changed_since({**manifest, "cpu": "Z80"}, campaign).words()
-
-
-# -- where cut-ins take time --
 
 
 @pytest.mark.slow

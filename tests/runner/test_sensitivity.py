@@ -41,13 +41,6 @@ def test_the_rate_is_in_proportion_to_who_does_not_look_and_the_ratio_is_not(fol
     assert content["campaign_hash"] == manifest(folder)["campaign_hash"]
 
 
-def test_a_terminal_says_which_end_stands_where_and_names_the_default_traffic(folder, capsys):
-    assert main(["sensitivity", str(folder), "--range", "cut_in.ignore_share=0.005:0.04"]) == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert "the left value is by how much they are multiplied with the number at its lower end" in out
-    assert ("What moves the answer: the default traffic, ndd" in out) == ("ndd-overtaking-2" in out)
-
-
 @pytest.mark.slow
 def test_of_traffic_in_which_nobody_crashes_nothing_is_said(folder, capsys):
     """Tests too short for a crash: the reference driver's rate is 0, to which there is no ratio."""

@@ -215,9 +215,6 @@ def test_the_interval_holds_what_may_have_happened(method, campaign, run_here, t
         assert found["rhw"] == pytest.approx((found["ci_high"] - found["ci_low"]) / 2.0 / found["crash_rate"])
 
 
-# -- examples/what_crashes_share.py: a bug at one speed shows --
-
-
 class AtOneSpeed(IDM):
     """Does not brake where its speed at the cut-in is 30.0 to 30.5 m/s."""
 

@@ -26,7 +26,7 @@ from studies.case_study.study import Context, Made, SmallCase, load_study
 from studies.case_study.theorems import bound
 from studies.chains.chain import CHAINS, Episodes
 from studies.chains.sampler import with_optimal_function
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.estimators.small_blocks import blocks, fed
 from tests.kernels import smallest_gaps
 from tests.stored_runs import SCENARIOS

@@ -10,7 +10,7 @@ from harness.estimators.scv import Scv
 from studies import rnot
 from studies.case_study.figures import figure
 from studies.chains.chain import overtaking
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.estimators.small_blocks import block, blocks, fed
 
 CHAIN = overtaking("two surrogates", skill=0.5, surrogates=[0.5, 0.2], level=0.02, horizon=6)

@@ -9,7 +9,7 @@ from scipy import special, stats
 from harness.compiled import compiled
 from harness.families.cut_in.laws import InitialStates, t_table
 from harness.random_stream import DIAGNOSTIC, uniform, uniforms
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.kernels import bv_accelerations, cut_in_terms, environment, t_distribution
 
 speeds = st.floats(0.0, 60.0)
@@ -89,9 +89,6 @@ def step_probability(p_1s):
     return 1.0 - (1.0 - np.minimum(p_1s, 0.5)) ** 0.1
 
 
-# -- probabilities and draws --
-
-
 @pytest.mark.parametrize("follows", [False, True])
 @given(speeds, gaps, rates)
 def test_probabilities_are_the_formula_and_the_guard_caps_at_the_largest_safe_acceleration(follows, speed, r1, r1dot):
@@ -114,9 +111,6 @@ def test_draws_invert_the_distribution(state, follows):
     assert drawn.max() <= cap
 
 
-# -- Student's t as a table --
-
-
 @pytest.mark.parametrize("df", DEGREES_OF_FREEDOM)
 def test_noise_is_within_1e_8_of_scipys_and_rises_from_0_to_1(df):
     table = t_table(df)
@@ -126,9 +120,6 @@ def test_noise_is_within_1e_8_of_scipys_and_rises_from_0_to_1(df):
     assert np.abs(found - stats.t.cdf(z, df))[within].max() < 1e-8
     assert (np.diff(found) >= 0.0).all()
     assert t_distribution(np.array([-np.inf, -64.1, 64.1, np.inf]), table).tolist() == [0.0, 0.0, 1.0, 1.0]
-
-
-# -- the hazard of the cut-in --
 
 
 av_gaps = st.floats(-10.0, 110.0)

@@ -75,9 +75,6 @@ def test_the_hash_is_that_of_the_numbers_alone(mine):
     assert other.content_hash() != "838b5235175d4be5"
 
 
-# -- what is refused --
-
-
 def lateral(**numbers):
     lines = [f"  {name}: {{value: {value}, source: user}}\n" for name, value in numbers.items()]
     return TEXT + "lateral:\n" + "".join(lines)

@@ -23,7 +23,7 @@ from harness.campaign.drivers import (
 )
 from harness.errors import CampaignError
 from harness.vehicles.library import SHIPPED_FOLDER, load_library
-from tests.chains.seed import SEED
+from tests.chains import SEED
 from tests.kernels import accelerations, follow, fuzzy_metrics, smallest_gaps, steps_late
 
 speeds = st.floats(0.0, 60.0)
@@ -123,9 +123,6 @@ def test_the_share_of_inattentive_episodes_is_the_one_asked_for(share):
     assert binomtest(late, steps.size, 0.85 * share).pvalue < 1e-6  # the test would notice another share
 
 
-# -- drivers that remember a danger --
-
-
 ALONE = {"following_min_acceleration_mps2": -0.0, "max_acceleration_mps2": 1e-9}
 """Without the braking and speeding up of the IDM."""
 JERK = 12.65 * 0.1
@@ -149,9 +146,6 @@ def test_the_delay_stated_is_the_one_kept(section, lateral_speed):
     assert found[: int(whole)] == pytest.approx(idle)
     assert found[int(whole)] == pytest.approx(idle - (1.0 - part) * JERK)
     assert found[int(whole) + 1] == pytest.approx(found[int(whole)] - JERK)
-
-
-# -- fuzzy safety model --
 
 
 @pytest.mark.parametrize(
@@ -263,9 +257,6 @@ def test_outcomes_of_cut_ins_are_those_of_the_published_code():
     assert not agrees(PUBLISHED, reaction_time_s=0.85)  # the test has teeth
     assert not agrees(PUBLISHED, reaction_time_s=0.65)
     assert not agrees(PUBLISHED, braking_jerk_mps3=20.0)
-
-
-# -- a library says what is wrong with it --
 
 
 SHIPPED = (SHIPPED_FOLDER / "ladder-2.yaml").read_text(encoding="utf-8")

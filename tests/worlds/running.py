@@ -65,9 +65,6 @@ def bits(shard: Shard, row: int) -> bytes:
     return record.tobytes() + shard.traces[row].tobytes()
 
 
-# -- controllers plugged in, in the twin --
-
-
 def forced(*overrides: str) -> Campaign:
     """Forced cut-ins."""
     return smoke("testing={method: forced}", "world.engine=twin", *overrides)

@@ -44,9 +44,6 @@ def drive(world, *, steps: int = 1) -> None:
         world.step(V[: world.n_cells], LANES[: world.n_cells])
 
 
-# -- one simulation per process --
-
-
 def test_a_second_simulation_is_refused_and_closing_twice_leaves_the_next_one_alone(open_world, driving):
     first = driving(2)
     with pytest.raises(CampaignError, match="already runs in this process"):
@@ -57,9 +54,6 @@ def test_a_second_simulation_is_refused_and_closing_twice_leaves_the_next_one_al
     second = driving(2)
     first.close()
     drive(second)
-
-
-# -- a world that disobeys --
 
 
 @pytest.mark.parametrize("shim", [True, False])
@@ -107,9 +101,6 @@ def test_a_command_to_one_vehicle_that_has_no_effect_is_noticed(command, victim,
         place_and_cut_in(world)
 
 
-# -- the collision flag and the formula --
-
-
 class LyingTwin(TwinWorld):
     """Flags no collision, or one in cell 3 at its 20th step, when nobody touches anybody."""
 
@@ -138,9 +129,6 @@ def test_a_flag_that_the_positions_do_not_show_or_lack_stops_the_run_and_names_t
         run_in(LyingTwin(16, nervous=True))
 
 
-# -- cells are used again --
-
-
 def test_a_collision_in_the_first_step_of_a_refilled_cell_is_flagged(open_world):
     world = open_world(2)
     speed = np.tile([0.0, 30.0, 20.0], (2, 1))
@@ -150,8 +138,6 @@ def test_a_collision_in_the_first_step_of_a_refilled_cell_is_flagged(open_world)
     world.place(np.array([0]), X[:2], speed, LANES[:2])
     assert world.step(speed, LANES[:2]).tolist() == [False, True]
 
-
-# -- the compiled shim --
 
 compiled_shim = pytest.mark.skipif(shim_library() is None, reason="no compiled shim")
 
@@ -171,9 +157,6 @@ def test_vehicles_that_are_gone_are_an_error_and_those_of_another_simulation_are
     world.place(np.arange(2), X[:2], V[:2], LANES[:2])
     drive(world, steps=3)
     assert world.x[0, 0] == libsumo.vehicle.getLanePosition("LV0") > 300.0
-
-
-# -- prescribed traffic: cut-ins close to LV and to the AV, and fewer episodes than cells --
 
 
 STATES = np.array(
