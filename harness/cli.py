@@ -11,10 +11,9 @@ from collections.abc import Sequence
 
 import click
 
-from harness.commands.campaigns import av_check, check, pool, run, schema, setup
-from harness.commands.compare import compare
-from harness.commands.fitting import fit
+from harness.commands.campaigns import av_check, check, compare, pool, run
 from harness.commands.options import examples, quiet_option
+from harness.commands.preparing import fit, schema, setup
 from harness.commands.printing import go_on_unread, show_error, show_interrupted, system_error, usage_error
 from harness.commands.stored import estimate, replay, report, sensitivity
 from harness.errors import EXIT_DONE, HarnessError

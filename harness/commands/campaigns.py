@@ -1,9 +1,8 @@
-"""Campaigns: check, run and compare them, look at their vehicle and their pool; before all, set up the machine."""
+"""Campaigns: check, run and compare them, look at their vehicle and their pool."""
 
 from __future__ import annotations
 
 import re
-import shlex
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -15,7 +14,7 @@ import click
 import harness
 from harness.commands import options
 from harness.commands.options import CAMPAIGN, FOLDER, examples, progress_bar
-from harness.commands.printing import named_if_written, print_either, print_json, print_table, prints_kept_in, say
+from harness.commands.printing import print_either, print_json, print_table, prints_kept_in, say
 from harness.errors import HarnessError
 from harness.numbers import leaves, words
 from harness.processes import start_server
@@ -129,8 +128,7 @@ def run(
     limit = [] if accept is None else options.accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
     seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
-    met = [f"exposure.{each}" for each in exposures]
-    given = [*options.of_scenario(scenario), *met, *seeds, *overrides]
+    given = [*options.of_scenario(scenario), *(f"exposure.{each}" for each in exposures), *seeds, *overrides]
     if limit and (own := harness.load_campaign(campaign_file, given, av=av).accept) is not None:
         asked = own.model_dump(exclude_defaults=True)
         say(f"note: --accept {accept} replaces the limit of {campaign_file}: {asked}", err=True)
@@ -138,17 +136,15 @@ def run(
         campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)
-    chosen, folder = (
-        folder is None,
-        folder or options.run_folder(campaign.name, sorted(campaign.scenarios or [campaign.scenario]), resume=resume),
-    )
+    scenarios, chosen = sorted(campaign.scenarios or [campaign.scenario]), folder is None
+    folder = folder or options.run_folder(campaign.name, scenarios, resume=resume)
     if resume:
         _note_other_stop(folder, campaign)
     elif chosen and folder.name != campaign.name and not ctx.meta.get("quiet"):
         say(f"note: {options.RUNS / campaign.name} is there already: this run goes to {folder}", err=True)
     if campaign.run.executor == "local":
         start_server()
-    with _told_as_typed(accept), named_if_written(folder, chosen=chosen), prints_kept_in(folder), progress_bar() as bar:
+    with _told_as_typed(accept), prints_kept_in(folder, chosen=chosen), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
     from harness.runner.underway import RunResult
 
@@ -181,6 +177,104 @@ def _told_as_typed(limit: str | None) -> Iterator[None]:
             times = re.sub(r"^([\d.]+) ?([a-zA-Z].*)", r"\1*\2", limit)
             error.where, error.mend = f"--accept {limit}", error.mend if times == limit else f"Write --accept {times}."
         raise
+
+
+@click.command(
+    short_help="Which of two vehicles crashes less often, and by how much?",
+    epilog=examples(
+        "harness compare old_av.py:MyClass new_av.py:MyClass --out runs/old_new",
+        "harness compare runs/old new.yaml --margin 0.1 --out runs/old_new       # is the new one 10 % worse?",
+        "harness compare scenarios/smoke.yaml --av idm --against-av late-600ms --out runs/late",
+    ),
+)
+@click.argument("source_a", metavar="A", type=CAMPAIGN)
+@click.argument("file_b", metavar="[B]", type=CAMPAIGN, required=False)
+@click.option("--out", "folder", type=FOLDER, help="Folder of the run folders a and b. Default: runs/A-B.")
+@click.option(
+    "--against", multiple=True, metavar="A.B=C",
+    help="Setting that differs in B; with it B may be left out. May be given several times.",
+)  # fmt: skip
+@click.option("--against-av", metavar="VEHICLE", help="Vehicle of B; with it B may be left out.")
+@click.option(
+    "--margin", type=click.FloatRange(0.0, 1e6), metavar="R",
+    help="Run until it is known whether B's crash rate is at most 1 + R times A's. Replaces the precision.",
+)  # fmt: skip
+@options.workers_option
+@options.junit_option
+@options.av_option
+@options.scenario_option
+@options.set_option
+@options.json_option
+@click.pass_context
+def compare(
+    ctx: click.Context,
+    source_a: Path,
+    file_b: Path | None,
+    folder: Path | None,
+    *,
+    against: Sequence[str],
+    against_av: str | None,
+    margin: float | None,
+    workers: int | None,
+    junit: Path | None,
+    av: str | None,
+    scenario: str | None,
+    overrides: Sequence[str],
+    as_json: bool,
+) -> None:
+    """Test the vehicles of A and B (campaigns or vehicles) in the same traffic, and print the difference.
+
+    Both meet the same events (testing.method: shells), round by round, until it is known which crashes less often, or
+    the half-width of the difference is 0.1 of the larger rate, or both are below stop.below_reference; or until
+    --margin is decided; or, with --set stop.rhw=R, until that half-width is R.
+
+    B is a vehicle, which is driven as A's campaign says, or a campaign that is equal but for the vehicle.
+    With --scenario all the difference is in crashes per hour, summed over three scenarios, each in a folder of its own.
+
+    A may be a run folder: its tests are copied, not run again. So are finished tests of an earlier call with the same
+    --out. The folder receives the run folders a and b, compare.json and report.html.
+
+    Exit code 5: B is worse than A by more than --margin; 4: tests or pool were used up before that was known.
+    """
+    if file_b is None and not against and against_av is None:
+        raise click.UsageError("Name a second campaign, or say with --against or --against-av how B differs.")
+    from harness.campaign.files import names_a_campaign
+    from harness.campaign.models import parse_override
+    from harness.report.words import vehicle_words
+
+    stored = source_a if source_a.is_dir() else None
+    file_a = source_a if stored is None else stored / "campaign.yaml"
+    overrides = [*options.of_scenario(scenario), *overrides]
+    a = harness.load_campaign(file_a, overrides, av=av)
+    of_b = file_b or file_a
+    if names_a_campaign(file_a) and not names_a_campaign(of_b):  # a vehicle, driven as A's campaign says
+        b = harness.load_campaign(file_a, [*overrides, *against], av=against_av or av or str(of_b))
+        b = b.model_copy(update={"name": harness.load_campaign(of_b).name})
+    else:
+        b = harness.load_campaign(of_b, [*overrides, *against], av=against_av or av)
+    if stored is not None:  # how far it was run before says nothing about now
+        a = a.model_copy(update={"stop": b.stop})
+    vehicles = vehicle_words(a.av)[0], vehicle_words(b.av)[0]
+    name_b = ", ".join([*filter(None, [against_av]), *against]) if file_b is None else b.name
+    labels = (a.name, b.name) if a.name != b.name else (str(source_a), str(file_b))
+    if vehicles[0] != vehicles[1] or file_b is None:
+        labels = vehicles if vehicles[0] != vehicles[1] else (vehicles[0], f"{vehicles[0]}, {name_b}")
+    if junit is not None and margin is None:
+        say("note: without --margin the JUnit file says only whether it came to an end, whichever is worse", err=True)
+    if chosen := folder is None:
+        folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', name_b)}"
+    rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
+    with prints_kept_in(folder, chosen=chosen), progress_bar() as bar:
+        found = harness.compare(
+            a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
+        )
+    if junit is not None:
+        from harness.report.junit import difference_case, write_junit
+
+        case = difference_case(found.content, repr(found), found.exit_code)
+        write_junit(junit, " and ".join(labels), case, [found.report, folder / "compare.json"])
+    print_either(found.content, [found], as_json=as_json)
+    ctx.exit(found.exit_code)
 
 
 @click.command(
@@ -258,50 +352,3 @@ def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str],
         print_table("Reference drivers", references)
     for name, value in leaves(content):
         say(f"{name.replace('_', ' ')}: {words(value, 4)}")
-
-
-@click.command(
-    short_help="Print the JSON schema of a campaign.", epilog=examples("harness schema > campaign.schema.json")
-)
-def schema() -> None:
-    """Print the JSON schema of a campaign, with which an editor completes and checks campaign files.
-
-    Let the first line of a campaign name the file: '# yaml-language-server: $schema=campaign.schema.json'.
-    """
-    from harness.campaign.files import schema_text
-
-    click.echo(schema_text(), nl=False)
-
-
-@click.command(
-    short_help="Set up this machine: SUMO's system libraries, and compiling.",
-    epilog=examples(
-        "harness setup             # once per machine and version",
-        "harness setup --dry-run   # only print the commands",
-    ),
-)
-@click.option("--dry-run", is_flag=True, help="Print the commands that would be run, and run none.")
-def setup(*, dry_run: bool) -> None:
-    """Install the system libraries that SUMO needs, if any are missing, and compile what runs need (a minute).
-
-    pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get, dnf or apk, as root or
-    with sudo, which may ask for your password at a terminal. A campaign with world.engine twin needs none.
-
-    Exit code 2 says that they could not be installed; the message names the packages.
-    """
-    from harness.runner.setup import compile_kernels
-    from harness.worlds.system_libraries import install, install_commands, missing_libraries, require_libsumo
-
-    missing = missing_libraries()
-    commands = install_commands(missing) if missing else []
-    if dry_run:
-        click.echo("\n".join(map(shlex.join, commands)) or "Nothing to install.")
-        return
-    if missing:
-        click.echo(f"Installing what SUMO needs: {shlex.join(commands[-1])}", err=True)
-        install(missing, commands)
-    require_libsumo()
-    click.echo("SUMO's system libraries are installed." if missing else "SUMO's system libraries are there.")
-    with progress_bar() as bar:
-        compiled = compile_kernels(bar)
-    click.echo("Kernels are compiled." if compiled else "Kernels are compiled already.")

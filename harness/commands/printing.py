@@ -19,8 +19,6 @@ from harness.numbers import count, half_width, interval, share, words
 from harness.printed import PRINTED, Kept, Printed
 
 _WIDTH_OF_FILES = 140
-_PARTS = {"found": "found", "expected": "expected", "fix": "mend"}
-"""Parts of an error, by what they are called on the screen."""
 
 
 def say(*lines: object, err: bool = False) -> None:
@@ -35,14 +33,16 @@ def say(*lines: object, err: bool = False) -> None:
 
 
 @contextmanager
-def prints_kept_in(folder: Path | None = None) -> Iterator[None]:
+def prints_kept_in(folder: Path | None = None, *, chosen: bool = False) -> Iterator[None]:
     """Let what is printed in workers be a file of the run folder, and say so; to stderr where nothing was run there.
 
-    Without a folder only how much it was is said.
+    Without a folder only how much it was is said. One that was ``chosen`` here is named where the work was not done.
     """
     began, before, Printed.kept, Printed.folder = time.time(), Printed.kept, (kept := Kept()), folder
+    done = False
     try:
         yield
+        done = True
     finally:
         Printed.kept = before
         with suppress(OSError):  # what ends the command is told first of all
@@ -56,6 +56,8 @@ def prints_kept_in(folder: Path | None = None) -> Iterator[None]:
                         file.write(kept.text)
                     told += f": {folder / PRINTED}"
                 say(told, f"  the first: {first[:80]}", err=True)
+        if chosen and not done and folder is not None and folder.exists():
+            say(f"Run folder: {folder}", err=True)
 
 
 def go_on_unread(stream: TextIO) -> None:
@@ -70,10 +72,9 @@ def show_error(error: HarnessError) -> None:
         say(f" {error.where}: {error.found}", err=True)
     for part in error.problems or (error,):
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
-        told = (
-            (shown, getattr(part, of).replace("`", "'")) for shown, of in _PARTS.items()
-        )  # ` is of commands in docs
-        say(f" {part.where}", *(f"  {shown + ':':<9} {text}" for shown, text in told), err=True)
+        told = {"found:": part.found, "expected:": part.expected, "fix:": part.mend}
+        # ` is of commands in docs
+        say(f" {part.where}", *(f"  {name:<9} {text}".replace("`", "'") for name, text in told.items()), err=True)
 
 
 _AGAIN = "Nothing finished is lost: then give the same command again (`run` with --resume)."
@@ -194,14 +195,3 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
     if shells := shown.get("shells", {}).get("details", {}).get("shells"):
         names = ("shell", "inside", "p", "n_episodes", "n_crashes", "contribution")
         print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])
-
-
-@contextmanager
-def named_if_written(folder: Path, *, chosen: bool) -> Iterator[None]:
-    """Say where an unfinished run is, if its folder was ``chosen`` here and exists."""
-    try:
-        yield
-    except BaseException:
-        if chosen and folder.exists():
-            say(f"Run folder: {folder}", err=True)
-        raise

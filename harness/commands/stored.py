@@ -199,7 +199,8 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     if as_json:
         print_json(content)
         return
-    bars = [_bar(bar) for bar in content["bars"] if any(map(_tells, (*bar["rate"], *bar["ratio"])))]
+    ends = [(bar, (*bar["rate"], *bar["ratio"])) for bar in content["bars"]]
+    bars = [_bar(bar) for bar, times in ends if any(t is None or abs(t - 1.0) >= LEAST_MOVE for t in times)]
     n_still = len(content["bars"]) - len(bars)
     if not any(bar["remark"] for bar in bars):
         bars = [{key: value for key, value in bar.items() if key != "remark"} for bar in bars]
@@ -216,10 +217,6 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
         "for a reference driver.",
         f"report  {page}",
     )
-
-
-def _tells(times: float | None) -> bool:
-    return times is None or abs(times - 1.0) >= LEAST_MOVE
 
 
 def _bar(bar: dict[str, Any]) -> dict[str, str]:

@@ -131,7 +131,8 @@ def _rankings(summary: RunSummary, stand_in: str, avoided: BoolArray, someone: B
 
 def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArray) -> IntArray:
     """After which step the family's `stand_ins` crash where the AV has (n, D), below zero for never."""
-    ends = np.full((episode.size, scenes.n_stand_ins), UNKNOWN, np.int64)
+    n_stand_ins = len(family_named(run.campaign.scenario).stand_ins)
+    ends = np.full((episode.size, n_stand_ins), UNKNOWN, np.int64)
     acts = run.campaign.av.acts_before_event
     judged = np.sort(np.argsort(-impact, kind="stable")[: MOST_TRACED if acts else MOST_JUDGED])
     asked = {int(each) for each in episode[judged]}

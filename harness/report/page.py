@@ -22,7 +22,7 @@ from harness.report.plots import convergence_plot, sensitivity_plot, severity_pl
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, summarise
 from harness.report.templates import write_page
 from harness.report.words import short_answer
-from harness.vocabulary import OUTCOMES
+from harness.vocabulary import FAILED, OUTCOMES
 
 PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")
 
@@ -147,7 +147,7 @@ def _write_plots(folder: Path, plots: list[Plot]) -> None:
 def uncovered(run: RunFolder, summary: RunSummary) -> list[str]:
     """A warning of estimates that are not of these records."""
     n_tests, n_estimated = summary.n_episodes, run.estimates.n_episodes
-    if n_estimated in (n_tests, n_tests - summary.n_failed):
+    if n_estimated in (n_tests, n_tests - int(summary.count[FAILED])):
         return []
     found = f"the estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}"
     return [f"{found}: run harness estimate {run.typed} --write"]

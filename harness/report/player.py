@@ -105,18 +105,14 @@ class Scenes:
         self._vehicle, self._acts = vehicle_words(campaign.av)[0], campaign.av.acts_before_event
         self._family, self._environment = family_named(campaign.scenario), environment
 
-    @property
-    def n_stand_ins(self) -> int:
-        """How many others are driven in the AV's place."""
-        return len(self._family.stand_ins)
-
     def ends(self, rows: pa.Table, traces: pa.Table | None) -> IntArray:
-        """After which step each stand-in runs into the principal vehicle in episodes with an event, negative for never.
+        """After which step each stand-in runs into the principal vehicle in episodes with an event (n, D); or below 0.
 
-        Shape (n, D).
+        Negative is never, or `UNKNOWN`.
         """
-        if self._environment is None or not rows.num_rows or not self.n_stand_ins:
-            return np.full((rows.num_rows, self.n_stand_ins), UNKNOWN)
+        shape = rows.num_rows, len(self._family.stand_ins)
+        if self._environment is None or 0 in shape:
+            return np.full(shape, UNKNOWN)
         return self._drive(self._environment, rows, traces).end
 
     def _drive(
@@ -183,7 +179,7 @@ class Scenes:
         self, environment: Environment, row: pa.Table, trace: pa.Table, onset: int, bv: Scene, av: Scene
     ) -> list[Scene]:
         """Stand-ins along an episode from its begin; after a crash the one ahead goes on as long as they are shown."""
-        if not self.n_stand_ins:
+        if not self._family.stand_ins:
             return []
         [end], motion, ahead = self._drive(environment, row, trace, last=True)
         last = shown = av["x"].size - 1
@@ -219,8 +215,7 @@ def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None, f
             ghost[key] = ghost[key][first:shown]
         ghosts.append(ghost | {"name": other, "crash": None, "brakes": _brakes(ghost["v"], first)})
         told[other] = _ending(ghosts[0], bv, scene, family)
-    said = scene["facts"]
-    facts = [(name.replace("AV", label), phrase) for name, phrase in said]
+    facts = [(name.replace("AV", label), phrase) for name, phrase in scene["facts"]]
     moments = [(step, name.replace("AV", label)) for step, name in scene["moments"]]
     av["label"] = label
     return {**scene, "ghosts": ghosts, "facts": [*facts, *told.items()], "moments": moments}

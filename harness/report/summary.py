@@ -49,12 +49,6 @@ class ShownShells(ShellDetails):
         return {each.name: each.described for each in self.design.references}
 
     @property
-    def weight(self) -> FloatArray:
-        """What a test of each shell stands for, shape (S,)."""
-        p, tests = np.array([(shell.p, shell.n_episodes) for shell in self.shells]).T
-        return weight_of_a_test(p, tests.astype(np.int64))
-
-    @property
     def pool_half_width(self) -> float:
         """What the pool's own error leaves open of the rate."""
         return self.rhw_from_pool * self.rate
@@ -84,11 +78,6 @@ class RunFolder:
     def shells(self) -> ShownShells | None:
         """What its shells say, if its tests are of any."""
         return None if self.design is None else _shells(self.path, self.estimates.best, self.design)
-
-    @property
-    def sees(self) -> bool:
-        """Whether events can be seen before they happen."""
-        return LEAD in self.tests.rows.column_names
 
     def traces(self, episodes: set[int]) -> pa.Table | None:
         """Their stored motion; None where none of them was traced."""
@@ -175,11 +164,6 @@ class RunSummary:
         return int(self.count[CRASH])
 
     @property
-    def n_failed(self) -> int:
-        """Number of tests that failed."""
-        return int(self.count[FAILED])
-
-    @property
     def crashes(self) -> dict[str, FloatArray]:
         """`rows` of the crashes alone, and when they were: ``event_s`` and ``response_s`` (s)."""
         crashes = {name: column[self.rows["outcome"] == CRASH] for name, column in self.rows.items()}
@@ -209,7 +193,11 @@ def summarise(run: RunFolder) -> RunSummary:
         outcome[(outcome == CRASH) & (rows["impact_speed_mps"] <= counted)] = TIMEOUT
     count = left_out + np.bincount(outcome, minlength=len(OUTCOMES))
     rows["outcome"] = outcome.astype(np.float64)
-    weight = np.exp(rows["log_weight"]) if run.shells is None else run.shells.weight[rows["component"].astype(np.int64)]
+    if run.shells is None:
+        weight = np.exp(rows["log_weight"])
+    else:
+        p, n = np.array([(shell.p, shell.n_episodes) for shell in run.shells.shells]).T
+        weight = weight_of_a_test(p, n.astype(np.int64))[rows["component"].astype(np.int64)]
     rows["weight"] = np.where(outcome == FAILED, 0.0, weight)
     weight = left_out + np.bincount(outcome, weights=rows["weight"], minlength=len(OUTCOMES))
     weight[FAILED] = 0.0
@@ -223,9 +211,9 @@ def lateral_facts(run: RunFolder) -> dict[str, Any] | None:
     ``lead_s`` are 5 %, 50 % and 95 % quantiles of the leads of ``n_events``; ``n_side`` of ``n_crashes`` were side
     contacts.
     """
-    if not run.sees:
-        return None
     rows = run.tests.rows
+    if LEAD not in rows.column_names:
+        return None
     lead_s = STEP_S * floats(rows.filter(pc.is_valid(rows["event_step"]))[LEAD])
     contacts = Counter(rows["contact"].drop_null().to_pylist())
     quantiles = np.quantile(lead_s, (0.05, 0.5, 0.95)).tolist() if lead_s.size else [math.nan] * 3

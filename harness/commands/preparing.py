@@ -1,4 +1,4 @@
-"""Fitting traffic to trajectories."""
+"""What is done once, before campaigns: set up the machine, get the schema for an editor, fit traffic of one's own."""
 
 from __future__ import annotations
 
@@ -56,3 +56,50 @@ def fit(files: Sequence[Path], out: Path, *, replicates: int, as_json: bool, **g
     else:
         setting = shlex.quote(f"environment.parameters={out}")
         say(*found.told, *written, f"next: harness run my_av.py:MyAV --set {setting}")
+
+
+@click.command(
+    short_help="Print the JSON schema of a campaign.", epilog=examples("harness schema > campaign.schema.json")
+)
+def schema() -> None:
+    """Print the JSON schema of a campaign, with which an editor completes and checks campaign files.
+
+    Let the first line of a campaign name the file: '# yaml-language-server: $schema=campaign.schema.json'.
+    """
+    from harness.campaign.files import schema_text
+
+    click.echo(schema_text(), nl=False)
+
+
+@click.command(
+    short_help="Set up this machine: SUMO's system libraries, and compiling.",
+    epilog=examples(
+        "harness setup             # once per machine and version",
+        "harness setup --dry-run   # only print the commands",
+    ),
+)
+@click.option("--dry-run", is_flag=True, help="Print the commands that would be run, and run none.")
+def setup(*, dry_run: bool) -> None:
+    """Install the system libraries that SUMO needs, if any are missing, and compile what runs need (a minute).
+
+    pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get, dnf or apk, as root or
+    with sudo, which may ask for your password at a terminal. A campaign with world.engine twin needs none.
+
+    Exit code 2 says that they could not be installed; the message names the packages.
+    """
+    from harness.runner.setup import compile_kernels
+    from harness.worlds.system_libraries import install, install_commands, missing_libraries, require_libsumo
+
+    missing = missing_libraries()
+    commands = install_commands(missing) if missing else []
+    if dry_run:
+        click.echo("\n".join(map(shlex.join, commands)) or "Nothing to install.")
+        return
+    if missing:
+        click.echo(f"Installing what SUMO needs: {shlex.join(commands[-1])}", err=True)
+        install(missing, commands)
+    require_libsumo()
+    click.echo("SUMO's system libraries are installed." if missing else "SUMO's system libraries are there.")
+    with progress_bar() as bar:
+        compiled = compile_kernels(bar)
+    click.echo("Kernels are compiled." if compiled else "Kernels are compiled already.")
