@@ -29,8 +29,17 @@ from harness.resolved import Resolved
 from harness.runner.kept import Run, cpu_name, require_few_failed, require_same_pool, take_over
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
-from harness.sampling.baseline import IN_WORDS, begin, requests_before, stored_baseline, stored_table
-from harness.sampling.milder import N_TESTS, beyond_scope, milder_of, n_left_out
+from harness.sampling.baseline import (
+    IN_WORDS,
+    N_MILDER,
+    begin,
+    beyond_scope,
+    milder_of,
+    n_left_out,
+    requests_before,
+    stored_baseline,
+    stored_table,
+)
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import Shells, round_requests
 from harness.shown import ShownInPython
@@ -102,7 +111,7 @@ class Underway:
         """
         run, paths, resolved = self.run, self.run.source.baseline_paths, self.run.resolved
         if resolved.family.milder(resolved.environment) is not None:
-            driven = self._before(MILDER, N_TESTS)
+            driven = self._before(MILDER, N_MILDER)
             self.run = self.run.noting(milder=milder_of(resolved, driven))
         if paths is None:
             return

@@ -1,8 +1,7 @@
 """The one shape that all ways of drawing tests have: what episodes need, rounds of tests, and when they are enough.
 
-A way of drawing is a class, one per file of this package, named after ``testing.method``. What holds for the way itself
-stands on the class and is asked before anything is built; an instance holds what the tests of one campaign are drawn
-from. The runner knows no more of a method than this.
+A way of drawing is a class. What holds for the way itself stands on the class and is asked before anything is built; an
+instance holds what the tests of one campaign are drawn from. The runner knows no more of a method than this.
 """
 
 from __future__ import annotations

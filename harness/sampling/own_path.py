@@ -1,4 +1,4 @@
-"""Every test has an event; its weight is the probability that there is one on its path."""
+"""Tests whose event is drawn from those of their own path: as naturalistic traffic would have them, or forced."""
 
 from __future__ import annotations
 
@@ -7,21 +7,43 @@ import numpy as np
 from harness.families.protocol import HOLDING, Paths, Recorded
 from harness.families.script import Script
 from harness.loop.judge import motion_hashes
-from harness.loop.loop import EpisodeLoop, Shard
+from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
 from harness.random_stream import CUT_IN as EVENT
 from harness.random_stream import uniforms
 from harness.resolved import Resolved
-from harness.sampling.baseline import recorded, without_event
-from harness.sampling.naturalistic import EVENT_DRAW, NOBODY
 from harness.sampling.protocol import ShardRequest, Source
+from harness.vehicles.drivers import Followers, driver_records
+from harness.vocabulary import FAILED, FloatArray, IntArray
 
+EVENT_DRAW = 1
+"""Index within the event's stream."""
+NOBODY = Followers(driver_records([]))
 AT_ONCE = 1000
 """Baseline runs whose motion is held in memory at once: some 15 MB."""
+ALL_MOTION = RecordPolicy("all", 0.0)
+
+
+def chosen_by(u: FloatArray, probability: FloatArray) -> IntArray:
+    """Events (n,) of paths whose events have the ``probability`` (n, E), by uniforms (n,); -1 beyond their sum."""
+    cumulative = np.cumsum(probability, axis=1)
+    return np.where(u < cumulative[:, -1], (cumulative <= u[:, None]).sum(1), -1)
+
+
+class Naturalistic(Source):
+    """At most one event, by its probability, from one uniform: each test weighs 1."""
+
+    def tests(self, first_episode: int, n_episodes: int) -> Traffic:
+        resolved, paths = self.resolved, self.paths(first_episode, n_episodes)
+        family, environment, seed = resolved.family, resolved.environment, self.campaign.seed
+        events = family.events(environment, seed, paths, NOBODY)
+        u = uniforms(seed, first_episode, n_episodes, EVENT, EVENT_DRAW + 1)[:, EVENT_DRAW]
+        chosen = family.choose(environment, seed, paths, chosen_by(u, events.probability), of_pool=False)
+        return Traffic(family.script(environment, chosen), chosen.facts)
 
 
 class Forced(Source):
-    """The event is drawn given that there is one.
+    """Every test has an event, drawn given that there is one; its weight is the probability of that on its path.
 
     A vehicle that acts before the event is driven along the path without one first, which prescribes the test.
     """
@@ -66,3 +88,23 @@ def forced(resolved: Resolved, paths: Paths, runs: Recorded = HOLDING) -> Traffi
         motion = motion_hashes(runs.x_m, runs.v_mps)[np.arange(n), onset]
         script = script._replace(announced_index=paths.number, motion_hash=motion)
     return Traffic(script, chosen.facts)
+
+
+def without_event(loop: EpisodeLoop, resolved: Resolved, seed: int, paths: Paths, first: int | None = None) -> Shard:
+    """Drive the loop's vehicle along paths (n,) on which nothing happens.
+
+    The first is its episode ``first``, or of the path's own number.
+    """
+    none = np.full(len(paths.number), -1, np.int64)
+    chosen = resolved.family.choose(resolved.environment, seed, paths, none)
+    traffic = Traffic(resolved.family.script(resolved.environment, chosen), chosen.facts)
+    return loop.beside(keep=ALL_MOTION).run(int(paths.number[0]) if first is None else first, traffic)
+
+
+def recorded(shard: Shard) -> Recorded:
+    """Baseline runs as they come from the loop."""
+    episode = shard.episode
+    x, v = np.zeros((2, episode.size, shard.scenario.max_steps + 1))
+    for row, trace in shard.traces.items():
+        x[row, : len(trace)], v[row, : len(trace)] = trace[:, -1, 0], trace[:, -1, 1]
+    return Recorded(episode["n_steps"].astype(np.int64), episode["outcome"] == FAILED, x, v)
