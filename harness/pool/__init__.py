@@ -6,6 +6,6 @@ most conservative to crash; its probability is known, so that crashes of the AV 
 rate.
 
 What a shell is says `shells`: `shells_of` and `cells_of`, and `shells_in_strata` for the strata made of them. A change
-goes through `build.pool_of` as well, which asks for it, `kept.Pool`, which keeps it, and `harness.strata`, which
+goes through `build.pool_of` as well, which asks for it, `Pool`, which keeps it, and `harness.strata`, which
 tells estimators and allocation what strata there are: these know nothing else of a shell.
 """

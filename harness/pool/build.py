@@ -15,8 +15,16 @@ from harness.campaign.sections import PoolSettings
 from harness.compiled import WORLD_SOURCES, source_hash
 from harness.families.protocol import Paths
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, Enumerator
-from harness.pool.kept import FORMAT, KeptEvents, Pool, pool_content, pool_from
-from harness.pool.shells import cells_of, conservative_first, shells_of
+from harness.pool.shells import (
+    FORMAT,
+    KeptEvents,
+    Pool,
+    cells_of,
+    conservative_first,
+    pool_content,
+    pool_from,
+    shells_of,
+)
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.resolved import Resolved
@@ -35,7 +43,7 @@ POOL_SEED = 0x706F6F6C
 """Keeps a pool's random numbers apart from those of a campaign with the same seed."""
 KEEP_DRAW = 1
 """Draw of a shell within the diagnostic stream."""
-_MADE_BY = ("aim.py", "build.py", "kept.py", "shells.py")
+_MADE_BY = ("aim.py", "build.py", "shells.py")
 """Code that decides what is in a pool, beside the kernels."""
 
 
@@ -157,10 +165,7 @@ def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArra
     n_surrogates = names.size
     rates, mass = paths.rates(n_surrogates), paths.mass
     order = conservative_first(rates) if order is None else order
-    n = len(rates)
-    ordered = rates[:, order]
-    mu, both = ordered.mean(0), ordered * (rates[:, -1] / paths.weight)[:, None]
-    at_most = both.mean(0) + 3.0 * both.std(0) / np.sqrt(n)
+    n, ordered = len(rates), rates[:, order]
     shell, references = shells_of(paths.crashes, order), paths.crashes >> n_surrogates
     cell, cell_shell, cell_references, by_path = cells_of(mass, shell, references, n_references)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
@@ -179,9 +184,8 @@ def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArra
         n_paths=n,
         p_event=float(rates[:, -1].mean()),
         p_event_se=float(rates[:, -1].std() / np.sqrt(n)),
-        mu=mu,
+        mu=ordered.mean(0),
         mu_covariance=np.atleast_2d(np.cov(ordered.T, bias=True)) / n,
-        p_event_at_crash=np.divide(at_most, mu, out=np.ones_like(mu), where=mu > 0.0),
         cell_shell=cell_shell,
         cell_references=cell_references,
         cell_p=by_path.mean(0),

@@ -20,8 +20,7 @@ from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import take_aim
-from harness.pool.kept import Pool
-from harness.pool.shells import acceleration_limit, shells_in_strata, shells_of
+from harness.pool.shells import Pool, acceleration_limit, shells_in_strata, shells_of, strata_of_shells
 from harness.progress import Progress
 from harness.resolved import Resolved
 from harness.strata import Assumed, ShellDesign
@@ -60,9 +59,7 @@ class FewPaths:
         self._resolved, self._progress = resolved, progress
         self._order = np.array([list(library.surrogates).index(name) for name in pool.names])
         self._references = len(library.surrogates) + np.arange(len(library.references))
-        self._stratum = np.full(len(pool.names) + 1, -1)
-        for stratum, group in enumerate(shells_in_strata(pool, limit_mps2)):
-            self._stratum[group] = stratum
+        self._stratum = strata_of_shells(pool, shells_in_strata(pool, limit_mps2))
         self._n_strata = len(design.strata)
         self._range = ranges(pool)
         self._aimed: Enumerator | None = None

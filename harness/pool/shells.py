@@ -1,4 +1,4 @@
-"""What a shell is, and shells as strata of a campaign: which events belong together, and the tests drawn from them.
+"""What a pool and its shells are, and shells as strata of a campaign: which events belong together, and the tests.
 
 Surrogates are in an order, the most conservative first, by their crash rates. An event belongs to the shell of the
 first of them that crashes on it, or to the last shell if none does. Cells divide shells by which references crash.
@@ -10,25 +10,158 @@ even the full-throttle envelope crashes is left out, with crash probability 0, i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from io import BytesIO
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.families.protocol import Chosen
 from harness.loop.cells import PrescribedEvents
 from harness.loop.repeat import Traffic
-from harness.pool.kept import Pool
+from harness.pool.aim import PILOT_PATHS
 from harness.resolved import Resolved
 from harness.strata import FAILED_BASELINE, OUTSIDE, Reference, ShellDesign
-from harness.vocabulary import FloatArray, Int8Array, IntArray
+from harness.vehicles.library import Library
+from harness.vocabulary import BoolArray, Float32Array, FloatArray, Int8Array, IntArray, RecordArray, UInt64Array
 
+FORMAT = 10
+"""Raise it when the meaning of a pool changes."""
 CANDIDATES = 32_768
 """Paths of an AV that holds its speed, of which baseline runs are chosen: they cost milliseconds each, and save two of
 three runs."""
 _REFERENCES = {"r157-cc": "a careful and competent driver", "r157-fsm": "a driver by the fuzzy safety model"}
 """Drivers of UN Regulation No. 157 in plain words."""
+
+
+def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
+    """Steps of the onset of events in given steps (n,), with a ``lead`` (n,)."""
+    return np.asarray(np.maximum(step - lead, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class KeptEvents:
+    """A weighted sample of events, each with what has to be known to repeat it.
+
+    Within a shell all have the same probability. ``path``, ``step``, ``cell`` (n,): which path of the pool, which of
+    its events, and cell; ``facts``, ``at``, ``lead`` (n,): see `Chosen` of families. ``crashes`` (n, D + R): which
+    surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
+    an event of each cell. The pool of a vehicle that acts before the event has ``motion`` (n,), hashes of what it did
+    through the step of the event, or of its onset, and ``mass`` (n,), the probability of those that each stands for.
+    """
+
+    path: IntArray
+    step: IntArray
+    cell: IntArray
+    facts: RecordArray
+    at: IntArray
+    lead: IntArray
+    crashes: BoolArray
+    path_mass: Float32Array
+    motion: UInt64Array = field(default_factory=lambda: np.zeros(0, np.uint64))
+    mass: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def acts(self) -> bool:
+        """Whether they are of one vehicle, which acts before the event."""
+        return self.motion.size > 0
+
+    @property
+    def onset(self) -> IntArray:
+        """Step of the onset of each, shape (n,)."""
+        return onset_steps(self.at, self.lead)
+
+    @property
+    def row(self) -> IntArray:
+        """Which row of the pool's paths each is of, shape (n,): in the pool of a vehicle its baseline run."""
+        return np.asarray(self.path - PILOT_PATHS)
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Pool of one environment and one library.
+
+    ``key`` is the hash of all that it was made from, ``family`` names the kind of its events, ``environment`` is the
+    hash of its environment. ``names`` (D) are the surrogates, the most conservative first, ``mu`` (D,) their crash
+    rates per test from ``n_paths`` paths, and ``mu_covariance`` (D, D) of their errors. ``p_event``, ``p_event_se``,
+    ``reference_rate`` and ``reference_square`` (R,) see `ShellDesign`. Cells divide shells by which references crash:
+    ``cell_shell``, ``cell_references`` (C,) are the shell of each and one bit per reference, ``cell_p`` (C,) its
+    probability. ``p_after_failure`` is the probability, at most, of events after a baseline run has failed: nothing is
+    known about them.
+    """
+
+    key: str
+    family: str
+    environment: str
+    library: Library
+    names: tuple[str, ...]
+    n_paths: int
+    p_event: float
+    p_event_se: float
+    mu: FloatArray
+    mu_covariance: FloatArray
+    cell_shell: IntArray
+    cell_references: IntArray
+    cell_p: FloatArray
+    reference_rate: FloatArray
+    reference_square: FloatArray
+    events: KeptEvents
+    p_after_failure: float = 0.0
+
+    @cached_property
+    def shell_p(self) -> FloatArray:
+        """Probability of each shell, shape (D + 1,); the last is an event on which no surrogate crashes."""
+        return np.asarray(np.bincount(self.cell_shell, self.cell_p, minlength=len(self.names) + 1), np.float64)
+
+    @cached_property
+    def shell(self) -> IntArray:
+        """Shell of each kept event, shape (n,)."""
+        return np.asarray(self.cell_shell[self.events.cell])
+
+    def to_json(self) -> dict[str, Any]:
+        """What is known of surrogates and shells, as plain content."""
+        p = self.shell_p.tolist()
+        error = np.sqrt(np.diag(self.mu_covariance))
+        reference_error = np.sqrt(np.maximum(self.reference_square - self.reference_rate**2, 0.0) / self.n_paths)
+        surrogates = zip(self.names, self.mu.tolist(), error.tolist(), p[:-1], strict=True)
+        references = zip(self.library.references, self.reference_rate.tolist(), reference_error.tolist(), strict=True)
+        keys = "name", "crash_rate", "std_error", "shell_probability"
+        drivers = self.library.surrogates.items()
+        delays = {name: delay for name, each in drivers if (delay := each.delay_after_event_s) is not None}
+        return {
+            "pool": self.key,
+            "n_paths": self.n_paths,
+            "p_event": self.p_event,
+            "p_event_std_error": self.p_event_se,
+            "boundary": self.library.boundary,
+            "envelope": self.library.envelope,
+            "delays_after_event_s": {} if self.events.lead.any() else delays,
+            "surrogates": [dict(zip(keys, row, strict=True)) for row in surrogates],
+            "no_surrogate_crashes": p[-1],
+            "references": [dict(zip(keys[:-1], row, strict=True)) for row in references],
+        }
+
+
+def pool_content(pool: Pool) -> bytes:
+    """A pool as the content of a file, without its library, of which the key holds what matters."""
+    known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "events")}
+    np.savez(file := BytesIO(), **known, **vars(pool.events))
+    return bytes(pa.compress(file.getbuffer(), codec="zstd", asbytes=True))
+
+
+def pool_from(content: bytes, library: Library) -> Pool:
+    """The pool that `pool_content` has written, of a library."""
+    packed = pa.input_stream(pa.BufferReader(content), compression="zstd")
+    with np.load(BytesIO(packed.read())) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    events = KeptEvents(**{each.name: arrays.pop(each.name) for each in fields(KeptEvents)})
+    names = tuple(arrays.pop("names").tolist())
+    known: dict[str, Any] = {name: array if array.ndim else array.item() for name, array in arrays.items()}
+    return Pool(**known, names=names, library=library, events=events)
 
 
 def conservative_first(rates: FloatArray) -> IntArray:
@@ -82,6 +215,14 @@ def shells_in_strata(pool: Pool, limit_mps2: float) -> list[list[int]]:
     return [*inside, outside] if outside else inside
 
 
+def strata_of_shells(pool: Pool, groups: list[list[int]]) -> IntArray:
+    """In which stratum each shell is, shape (D + 1,); -1 for none."""
+    stratum = np.full(pool.shell_p.size, -1, np.int64)
+    for place, group in enumerate(groups):
+        stratum[group] = place
+    return stratum
+
+
 def boundary_shell(pool: Pool) -> int:
     """Index of the shell up to which strata are shells: that of the library's boundary."""
     return pool.names.index(pool.library.boundary)
@@ -129,10 +270,7 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
 
 def cells_in_strata(pool: Pool, groups: list[list[int]]) -> tuple[IntArray, IntArray, IntArray]:
     """Cell of a campaign that each cell of the pool belongs to, -1 for none, (C,); stratum and references of each."""
-    stratum_of = np.full(pool.shell_p.size, -1, np.int64)
-    for place, group in enumerate(groups):
-        stratum_of[group] = place
-    stratum, n_references = stratum_of[pool.cell_shell], len(pool.library.references)
+    stratum, n_references = strata_of_shells(pool, groups)[pool.cell_shell], len(pool.library.references)
     kind = np.where(stratum < 0, -1, (stratum << n_references) | pool.cell_references)
     kinds = np.unique(kind[kind >= 0])
     cells = np.where(kind < 0, -1, np.searchsorted(kinds, kind))

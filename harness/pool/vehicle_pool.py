@@ -26,8 +26,7 @@ from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import motion_hashes
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, contributions
 from harness.pool.build import ROUND_PATHS, campaign_pool_key, pool_of, take_aim
-from harness.pool.kept import Pool
-from harness.pool.shells import CANDIDATES, conservative_first
+from harness.pool.shells import CANDIDATES, Pool, conservative_first
 from harness.progress import Progress
 from harness.random_stream import DIAGNOSTIC, uniforms
 from harness.resolved import Resolved

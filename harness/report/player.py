@@ -20,7 +20,7 @@ from harness.campaign.campaign import Campaign
 from harness.families import family_named
 from harness.families.protocol import Driven, Environment, Family
 from harness.numbers import tenths
-from harness.pool.kept import onset_steps
+from harness.pool.shells import onset_steps
 from harness.records.schemas import chosen_from
 from harness.report.summary import floats
 from harness.report.templates import write_page

@@ -24,9 +24,8 @@ from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.shells import SeenShells
 from harness.numbers import share
 from harness.pool.build import campaign_pool
-from harness.pool.kept import Pool
 from harness.pool.moved import FewPaths, OnPaths, environment_with, ranges, ratio_of
-from harness.pool.shells import acceleration_limit, design_shells
+from harness.pool.shells import Pool, acceleration_limit, design_shells
 from harness.progress import Progress
 from harness.records.folder import read_manifest
 from harness.records.reader import read_campaign

@@ -27,8 +27,7 @@ from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import judge
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
-from harness.pool.kept import Pool
-from harness.pool.shells import Draw
+from harness.pool.shells import Draw, Pool
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
 from harness.random_stream import INITIAL, uniforms

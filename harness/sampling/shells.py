@@ -28,8 +28,7 @@ from harness.families.protocol import Recorded
 from harness.loop.loop import EpisodeLoop, Shard
 from harness.numbers import plain
 from harness.pool.build import campaign_pool, campaign_pool_key, pool_name
-from harness.pool.kept import Pool
-from harness.pool.shells import Draw, PrescribedEpisodes
+from harness.pool.shells import Draw, Pool, PrescribedEpisodes
 from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_paths, vehicle_pool
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as

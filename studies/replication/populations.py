@@ -33,8 +33,7 @@ from harness.loop.judge import motion_hashes
 from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.loop.repeat import Traffic
 from harness.pool.aim import PILOT_PATHS, Enumerator
-from harness.pool.kept import onset_steps
-from harness.pool.shells import CANDIDATES, acceleration_limit
+from harness.pool.shells import CANDIDATES, acceleration_limit, onset_steps
 from harness.pool.vehicle_pool import BaselinePaths, walk_candidates
 from harness.progress import Progress
 from harness.resolved import resolve

@@ -27,8 +27,15 @@ from harness.estimators.pairs import CRASH, NO_CRASH, PairCounts, Pairs, no_pair
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
 from harness.estimators.tally import CrashedTests, Tally
-from harness.pool.kept import KeptEvents, Pool
-from harness.pool.shells import boundary_shell, cells_in_strata, design_shells, shells_in_strata, shells_of
+from harness.pool.shells import (
+    KeptEvents,
+    Pool,
+    boundary_shell,
+    cells_in_strata,
+    design_shells,
+    shells_in_strata,
+    shells_of,
+)
 from harness.sampling.allocation import Allocation
 from harness.sampling.shells import PairRounds, ShellRounds
 from harness.strata import LIBRARY_STATEMENT, ShellDesign

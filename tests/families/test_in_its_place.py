@@ -22,7 +22,7 @@ from harness.families.cut_in.replay import StoredPaths, drive_others
 from harness.families.cut_in.script import maneuvers_of, states_of
 from harness.families.protocol import Driven
 from harness.pool.build import campaign_pool
-from harness.pool.kept import Pool
+from harness.pool.shells import Pool
 from harness.records.schemas import chosen_from, episodes_table
 from harness.resolved import Resolved, resolve
 from harness.sampling import prepare

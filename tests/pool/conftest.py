@@ -10,7 +10,7 @@ from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import load_environment
 from harness.families.protocol import Paths
 from harness.pool.build import campaign_pool
-from harness.pool.kept import Pool
+from harness.pool.shells import Pool
 from harness.resolved import resolve
 from harness.vehicles.drivers import Followers
 from tests.chains import SEED

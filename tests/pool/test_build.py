@@ -12,8 +12,7 @@ from harness.families.cut_in.loading import load_environment
 from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.pool.aim import NATURALISTIC_SHARE, Enumerator, aimed_points, fit_proposal
 from harness.pool.build import build_pool, cached_pool, campaign_pool, campaign_pool_key, pool_name
-from harness.pool.kept import pool_content, pool_from
-from harness.pool.shells import Draw, PrescribedEpisodes, design_shells
+from harness.pool.shells import Draw, PrescribedEpisodes, design_shells, pool_content, pool_from
 from harness.resolved import resolve
 from harness.vehicles.library import load_library
 from harness.vocabulary import CRASH, PASSED
