@@ -22,7 +22,7 @@ from harness.printed import PRINTED
 from harness.runner.kept import require_few_failed
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
-from tests.in_process import controllers_here, one_process
+from tests.in_process import controllers_here, one_process, without_page
 from tests.stored_runs import sets, stored_table
 from tests.worlds.running import drive, forced
 
@@ -45,7 +45,8 @@ def _main(command, folder, av, *more):
     (folder / "c.yaml").write_text(SMALL)
     words, *options = command.split()
     out = ["--out", str(folder / "run"), "--workers", "1"] if words == "run" else []
-    return main([words, str(folder / "c.yaml"), *options, *out, *sets(f"av={av}", *more)])
+    with without_page():
+        return main([words, str(folder / "c.yaml"), *options, *out, *sets(f"av={av}", *more)])
 
 
 def _run(folder, av, *more):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from harness.runner.stored import estimate_run
 from harness.sampling.baseline import beyond_scope, n_left_out
 from tests.families.roads import SETTINGS, traffic_of
 from tests.families.test_same_bits import SMALL
-from tests.in_process import controllers_here, one_process, run_here
+from tests.in_process import controllers_here, one_process, run_here, without_page
 
 CUT_OUT = family_named("cut_out")
 AV = """
@@ -88,19 +89,19 @@ def test_their_rate_is_a_sum_over_the_grid():
     assert lead.milder(lead.traffic(SETTINGS)) is None
 
 
-def gate(tmp_path, vehicle, scenario="cut_out"):
+def gate(tmp_path, vehicle, scenario="cut_out", page=without_page):
     """Folder, JUnit file and exit code of a limit that is far above the rate of cut-outs in scope."""
     small = [f"--set={each}" for each in (*SMALL, "world.engine=twin", "stop.episodes=600")]
     out, junit = tmp_path / "run", tmp_path / "gate.xml"
     asked = ["--scenario", scenario, "--accept", "0.9", "--out", str(out), "--junit", str(junit)]
-    with one_process(), controllers_here():
+    with one_process(), controllers_here(), page():
         return out, junit, main(["run", vehicle, *asked, *small])
 
 
 def test_a_vehicle_that_crashes_on_them_is_told_so_and_not_accepted(tmp_path, capsys):
     """It brakes with 3 m/s² at most; a limit far above its rate is kept, and yet it does not pass."""
     (tmp_path / "my_av.py").write_text(AV)
-    out, junit, code = gate(tmp_path, f"{tmp_path}/my_av.py:MyAV")
+    out, junit, code = gate(tmp_path, f"{tmp_path}/my_av.py:MyAV", page=nullcontext)
     told, estimates = capsys.readouterr().out, json.loads((out / "estimates.json").read_text())
     n = estimates["milder"]["n_crashes"]
     assert 3 < n < 36 == estimates["milder"]["n_tests"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,9 +10,7 @@ import pytest
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.pool import moved
-from harness.runner.run import run_campaign
-from harness.runner.underway import RunResult
-from tests.in_process import one_process, without_page
+from tests.in_process import run_here
 from tests.pool.conftest import SMALL_POOL
 from tests.stored_runs import MIXTURE_FILE
 
@@ -23,22 +19,9 @@ TWIN = ("world.engine=twin", "stop.episodes=400")
 SHELLS = ("testing.method=shells", "stop.rhw=0.5", "stop.episodes=3000", "stop.min_crashes=null", *SMALL_POOL)
 
 
-@pytest.fixture(scope="session")
-def campaign() -> Callable[..., Campaign]:
+def campaign(*overrides: str) -> Campaign:
     """The smoke campaign in small, with overrides."""
-    return lambda *overrides: load_campaign(MIXTURE_FILE, [*SMALL, *overrides])
-
-
-@pytest.fixture(scope="session")
-def run() -> Callable[..., RunResult]:
-    """`run_campaign` without the page."""
-    return without_page()(run_campaign)
-
-
-@pytest.fixture(scope="session")
-def run_here() -> Callable[..., RunResult]:
-    """`run` with one worker that is this process."""
-    return one_process()(without_page()(partial(run_campaign, workers=1)))
+    return load_campaign(MIXTURE_FILE, [*SMALL, *overrides])
 
 
 @pytest.fixture(scope="session")
@@ -48,7 +31,7 @@ def sumo_run(stored_run) -> Path:
 
 
 @pytest.fixture(scope="session")
-def twin_run(campaign, run_here, made_once) -> Path:
+def twin_run(made_once) -> Path:
     """Its first 400 episodes in the twin. Never written to: damage a copy."""
     return made_once("twin", lambda out: run_here(campaign(*TWIN), out))
 

@@ -21,6 +21,7 @@ from harness.records.folder import read_manifest
 from harness.report.av_check import cause, rows, verdict
 from harness.runner.look import check_av
 from harness.runner.stored import changed_since, replay_episode
+from tests.in_process import run_here, run_with_workers
 from tests.stored_runs import answer_in, copy_of, edit, sets
 from tests.worlds.running import ROOT
 
@@ -280,7 +281,7 @@ GLOBAL = "{controller: 'tests.controllers.misbehaving:Global'}"
 
 
 @pytest.fixture
-def run_av(run_here, tmp_path):
+def run_av(tmp_path):
     def run_one(av, *overrides, name="run", run=run_here, **options):
         return run(load_campaign(FORCED, [*SMALL, f"av={av}", *overrides]), tmp_path / name, **options).folder
 
@@ -295,8 +296,8 @@ def test_a_vehicle_that_does_the_same_again_is_said_to(name, stored_run):
 
 
 @pytest.mark.slow
-def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, run, tmp_path):
-    folders = [run_av(GLOBAL, name="1"), run_av(GLOBAL, name="2", run=run, workers=2)]
+def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_after_a_resume(run_av, tmp_path):
+    folders = [run_av(GLOBAL, name="1"), run_av(GLOBAL, name="2", run=run_with_workers, workers=2)]
     one, two = (read_manifest(folder) for folder in folders)
     assert one["repeated"] == two["repeated"]
     assert len(one["repeated"]["differing"]) == one["repeated"]["n_episodes"] == 10

@@ -19,8 +19,9 @@ from harness.report.pair_words import deciding_words, pair_warnings, pair_words
 from harness.runner.compare import _decided, compare_campaigns
 from harness.runner.tables import read
 from harness.runner.workers import ShardRunner, Workers
-from tests.in_process import one_process, without_page
+from tests.in_process import one_process, run_here, without_page
 from tests.pool.conftest import SMALL_POOL
+from tests.runner.conftest import campaign
 from tests.stored_runs import manifest
 
 SHELLS = (
@@ -37,7 +38,7 @@ def _here():
 
 
 @pytest.fixture(scope="module")
-def campaigns(campaign):
+def campaigns():
     return campaign(*SHELLS), campaign(*SHELLS, HARDER)
 
 
@@ -108,7 +109,7 @@ def test_what_makes_a_rate_doubtful_is_told_of_each_vehicle(done):
     assert all(": no test in outside" in text for text in pair_warnings(done.content))
 
 
-def test_a_stored_run_of_a_is_taken_over(done, campaigns, run_here, campaign, tmp_path, driven):
+def test_a_stored_run_of_a_is_taken_over(done, campaigns, tmp_path, driven):
     run_here(campaign(*SHELLS, "stop.rhw=0.9"), tmp_path / "stored")
     os.mkfifo(tmp_path / "stored" / "pipe")  # is no file to be copied
     before = sum(driven)
@@ -200,7 +201,7 @@ def test_it_ends_when_it_is_known_who_crashes_less_often(campaigns, done, tmp_pa
         (SHELLS, "testing.epsilon=0.2", r"^testing\.epsilon"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(campaign, tmp_path, shared, other, said):
+def test_what_cannot_be_compared_is_refused(tmp_path, shared, other, said):
     with pytest.raises(CampaignError, match=said):
         compare_campaigns(campaign(*shared), campaign(*shared, other), tmp_path / "out")
     assert not (tmp_path / "out" / "a").exists()
@@ -222,7 +223,7 @@ def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
     assert again["shells"] == done.content["shells"]
 
 
-def test_a_run_that_nobody_limited_is_to_be_run_again(done, campaign, tmp_path):
+def test_a_run_that_nobody_limited_is_to_be_run_again(done, tmp_path):
     """Which the folder of the comparison does not hinder: the run is not copied."""
     early = "av={controller: 'tests.controllers.early:Speeds'}"
     sides, stored = [campaign(*SHELLS, early), campaign(*SHELLS)], done.folder / "a"

@@ -33,9 +33,9 @@ from harness.runner import workers
 from harness.runner.stored import write_report
 from harness.runner.workers import WorkerLostError
 from harness.sampling.protocol import ShardRequest
-from tests.in_process import one_process, workers_alive
+from tests.in_process import one_process, run_here, run_with_workers, workers_alive
 from tests.runner import bad_workers
-from tests.runner.conftest import MIXTURE_FILE, SHELLS, SMALL, TWIN
+from tests.runner.conftest import MIXTURE_FILE, SHELLS, SMALL, TWIN, campaign
 from tests.stored_runs import answer_in, copy_of, estimates, golden, manifest, part_files, sets, unlike_columns
 
 LOOSE, TIGHT = "stop.rhw=0.3", "stop.rhw=0.15"
@@ -46,7 +46,7 @@ COMMON = (
 
 
 @pytest.fixture(scope="module")
-def runs(run_here, campaign, tmp_path_factory):
+def runs(tmp_path_factory):
     """Folders of the same campaign, run afresh to either precision."""
     folder = tmp_path_factory.mktemp("stop")
     for name, rhw in (("loose", LOOSE), ("tight", TIGHT)):
@@ -68,7 +68,7 @@ class Bar(Progress):
         self.end += n
 
 
-def test_a_run_resumed_to_a_smaller_rhw_extends_the_same_records(runs, run_here, campaign, tmp_path):
+def test_a_run_resumed_to_a_smaller_rhw_extends_the_same_records(runs, tmp_path):
     out, bar = copy_of(runs / "loose", tmp_path / "run"), Bar()
     before = {path: path.stat().st_mtime_ns for path in part_files(out)[:-1]}  # to the last one tests are added
     run_here(campaign(*COMMON, TIGHT), out, resume=True, progress=bar)
@@ -85,7 +85,7 @@ class Interrupted(Progress):
             raise KeyboardInterrupt
 
 
-def test_what_was_interrupted_before_any_test_begins_anew(run_here, campaign, tmp_path):
+def test_what_was_interrupted_before_any_test_begins_anew(tmp_path):
     asked = campaign(*COMMON, "stop.rhw=null", "stop.episodes=50")
     with pytest.raises(KeyboardInterrupt):
         run_here(asked, tmp_path / "run", progress=Interrupted())
@@ -99,7 +99,7 @@ def files(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_resumption_that_would_give_up_tests_is_refused_and_costs_nothing(runs, run_here, campaign, tmp_path):
+def test_a_resumption_that_would_give_up_tests_is_refused_and_costs_nothing(runs, tmp_path):
     """Nor the last shard of a spent budget, which a longer one would replace: the rule is content before it."""
     wide, out = copy_of(runs / "tight", tmp_path / "wide"), tmp_path / "run"
     run_here(campaign(*COMMON, "stop.rhw=null", "stop.episodes=130"), out)
@@ -110,7 +110,7 @@ def test_a_resumption_that_would_give_up_tests_is_refused_and_costs_nothing(runs
         assert files(folder) == before
 
 
-def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campaign, tmp_path):
+def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, tmp_path):
     out = tmp_path / "run"
     result = run_here(campaign(*COMMON, "stop.episodes=130", "stop.rhw=0.01"), out)
     assert (result.exit_code, result.stopped_by) == (EXIT_BUDGET_SPENT, "episodes")
@@ -135,7 +135,7 @@ def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, run_here, campa
         ),
     ],
 )
-def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, code, verdict):
+def test_a_limit_ends_it_with_a_decision(tmp_path, changes, code, verdict):
     decided = run_here(campaign(*SHELLS, "world.engine=twin", *changes), tmp_path / "run")
     found = decided.estimates["decision"]
     assert (decided.exit_code, found["verdict"]) == (code, verdict)
@@ -152,7 +152,7 @@ def test_a_limit_ends_it_with_a_decision(campaign, run_here, tmp_path, changes, 
 
 
 @pytest.mark.slow
-def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(campaign, run_here, tmp_path):
+def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(tmp_path):
     """Where precision is out of reach; the same folder goes on when that is no longer asked."""
     asked = partial(campaign, *SHELLS, "world.engine=twin", "stop.rhw=0.01", "stop.episodes=2000")
     far = run_here(asked("stop.below_reference=2"), tmp_path / "far")
@@ -173,26 +173,26 @@ def test_a_rate_far_enough_below_a_reference_drivers_ends_it_too(campaign, run_h
 PARTS_BEFORE_FAILURE = 3
 
 
-def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(run, campaign, tmp_path, monkeypatch):
+def test_a_shard_that_kills_every_worker_ends_the_run_and_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "serve", bad_workers.dying)
     monkeypatch.setattr(workers, "ATTEMPTS", 2)
     with pytest.raises(WorkerLostError, match=r"shard 0 .*: found 2 worker processes that died") as lost:
-        run(campaign(*TWIN), tmp_path, workers=1)
+        run_with_workers(campaign(*TWIN), tmp_path, workers=1)
     assert lost.value.exit_code == EXIT_TOO_MANY_FAILED
     assert "exit code -9" in lost.value.found
     assert manifest(tmp_path)["status"] == "interrupted"
     assert workers_alive() == []
 
 
-def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(run, campaign, tmp_path, monkeypatch):
+def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "serve", bad_workers.disobedient)
     with pytest.raises(WorldDisagreementError, match="SUMO, BV3, m"):
-        run(campaign(*TWIN), tmp_path, workers=2)
+        run_with_workers(campaign(*TWIN), tmp_path, workers=2)
     assert manifest(tmp_path)["status"] == "interrupted"
     assert workers_alive() == []
 
 
-def test_one_that_is_interrupted_before_its_first_test_says_so(run_here, tmp_path, monkeypatch):
+def test_one_that_is_interrupted_before_its_first_test_says_so(tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -202,7 +202,7 @@ def test_one_that_is_interrupted_before_its_first_test_says_so(run_here, tmp_pat
     assert manifest(tmp_path)["status"] == "interrupted"
 
 
-def test_a_full_disk_is_told_and_the_run_can_be_resumed(run_here, campaign, twin_run, tmp_path, monkeypatch, capsys):
+def test_a_full_disk_is_told_and_the_run_can_be_resumed(twin_run, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
     write = Path.write_bytes
 
@@ -231,7 +231,7 @@ def test_a_full_disk_is_told_and_the_run_can_be_resumed(run_here, campaign, twin
 
 @pytest.mark.parametrize("at", ["__init__", "run"])
 @pytest.mark.parametrize("error", [CampaignError("world.cells", "300", "at most 256", "Use fewer."), KeyError(1), None])
-def test_errors_reach_the_parent(error, at, campaign, tmp_path, monkeypatch):
+def test_errors_reach_the_parent(error, at, tmp_path, monkeypatch):
     """As they are, a defect with the worker's traceback, and one that cannot be pickled in words."""
     strange = ValueError("of a strange kind")
     strange.handle = lambda: None

@@ -24,7 +24,7 @@ from harness.report.hour_words import hour_lines
 from harness.resolved import resolve
 from harness.runner.compare import compare_campaigns
 from harness.runner.stored import estimate_families
-from tests.in_process import one_process, run_with_workers
+from tests.in_process import one_process, run_here, run_with_workers, without_page
 from tests.stored_runs import copy_of
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
@@ -155,8 +155,7 @@ def test_a_budget_that_leaves_a_scenario_without_tests_is_refused_and_may_be_rai
 
 def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
     asked = {"times_reference": {"driver": "r157-cc"}}
-    with one_process():
-        run = harness.run(campaign(f"accept={asked}", "stop.rhw=null"), tmp_path / "run", workers=1)
+    run = run_here(campaign(f"accept={asked}", "stop.rhw=null"), tmp_path / "run")
     verdict = run.content["decision"]
     assert verdict["verdict"] == "rejected"
     assert estimate_families(run.folder, confidence=0.5)["decision"] == verdict
@@ -253,7 +252,7 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
             more, half = of["rate_per_hour"] / rate, 0.5 * of["reference_rate_per_hour"] / driver
             assert bars[f"{name} twice"]["rate"] == pytest.approx([1.0 + more, 1.0])
             assert bars[f"{name} twice"]["ratio"] == pytest.approx([(1.0 + more) / (1.0 - half), 1.0])
-    again = harness.run(campaign(), folder, workers=1, resume=True)  # it hinders nothing
+    again = run_here(campaign(), folder, resume=True)  # it hinders nothing
     assert again.content["per_hour"] == told["per_hour"]
     assert main(["report", str(folder)]) == 0
     assert 'id="plot-sensitivity"' in (folder / "report.html").read_text()
@@ -295,9 +294,7 @@ def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
     exposures = {name: resolve(found.of_family(name)).parameters.exposure.per_hour.value for name in NAMES[1:]}
     assert exposures == {"lead_brakes": 0.3, "cut_out": 1.0}
     one = campaign("scenarios=[lead_brakes]", f"environments={{lead_brakes: {tmp_path / 'mine.yaml'}}}")
-    with one_process():
-        alone = harness.run(one, tmp_path / "run", workers=1)
-    told = hour_lines(alone.content)
+    told = hour_lines(run_here(one, tmp_path / "run").content)
     assert " in SUMO’s twin, 1 scenario · " in told[0]
     assert "  events per hour of driving, given: lead brakes 0.3" in told
     with pytest.raises(CampaignError, match="no file"):
@@ -336,7 +333,7 @@ def test_a_run_that_goes_on_to_another_end_says_so(run, tmp_path, capsys):
     shutil.copytree(run.folder, folder)
     given = [part for each in QUICK[1:] for part in ("--set", each)]
     call = ["run", "idm", "--scenario", ",".join(NAMES), "--out", str(folder), "--resume", "--workers", "1", *given]
-    with one_process():
+    with one_process(), without_page():
         assert main([*call, "--set", "stop.rhw=0.9"]) == 0
     assert "note: stop.rhw is 0.9 now; before it was 0.6\n" in capsys.readouterr().err
 

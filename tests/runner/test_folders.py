@@ -120,7 +120,7 @@ def test_another_version_of_the_controller_is_refused(module, named, imports, tm
     assert run_here(golden("forced-twin", *settings, "stop.episodes=40"), out, resume=True).exit_code == 0
 
 
-def test_what_a_vehicle_writes_when_it_is_made_does_not_count(run_here, tmp_path, monkeypatch):
+def test_what_a_vehicle_writes_when_it_is_made_does_not_count(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "notes_it.py").write_text(
         "from examples.idm import IDM\nclass Notes(IDM):\n"

@@ -17,8 +17,8 @@ import pytest
 
 from benchmarks.kills import descendants, orphans, started_by
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
-from tests.in_process import workers_alive
-from tests.runner.conftest import SHELLS, TWIN
+from tests.in_process import run_here, run_with_workers, workers_alive
+from tests.runner.conftest import SHELLS, TWIN, campaign
 from tests.runner.test_shadow_runs import FORCED, SHADOWS, of
 from tests.stored_runs import manifest, part_files, unlike_columns
 
@@ -48,26 +48,26 @@ def below(word: bytes) -> list[int]:
     return [pid for pid in descendants(os.getpid()) if started_by(pid, word)]
 
 
-def test_a_run_begun_here_goes_on_there_with_the_same_records(run, run_here, campaign, twin_run, tmp_path):
+def test_a_run_begun_here_goes_on_there_with_the_same_records(twin_run, tmp_path):
     run_here(campaign(*TWIN, "stop.episodes=160"), tmp_path / "run")
-    run(campaign(*TWIN, ON_RAY), tmp_path / "run", resume=True)
+    run_with_workers(campaign(*TWIN, ON_RAY), tmp_path / "run", resume=True)
     assert unlike_columns(twin_run, tmp_path / "run") == []
     assert manifest(tmp_path / "run")["workers"] == 2  # the cluster's room
     assert manifest(tmp_path / "run")["cpu"] == manifest(twin_run)["cpu"]
     assert orphans(workers_alive(), 10.0) == []
 
 
-def test_shadow_runs_come_to_the_machines(run, campaign, tmp_path):
+def test_shadow_runs_come_to_the_machines(tmp_path):
     settings = (*SHELLS, *SHADOWS, f"av={of('Speeds')}", TWIN[0])
-    a = run(campaign(*settings), tmp_path / "local", workers=2)
-    b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
+    a = run_with_workers(campaign(*settings), tmp_path / "local", workers=2)
+    b = run_with_workers(campaign(*settings, ON_RAY), tmp_path / "ray")
     assert unlike_columns(a.folder, b.folder) == []
     assert a.estimates == b.estimates
 
 
-def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
+def test_killed_actors_and_workers_take_nothing_along(tmp_path):
     settings = (*FORCED, TWIN[0], "stop.episodes=12000", "run.shard_size=400")
-    a = run(campaign(*settings), tmp_path / "local", workers=2)
+    a = run_with_workers(campaign(*settings), tmp_path / "local", workers=2)
     struck: list[int] = []
 
     def strike() -> None:
@@ -79,14 +79,14 @@ def test_killed_actors_and_workers_take_nothing_along(run, campaign, tmp_path):
 
     thread = threading.Thread(target=strike)
     thread.start()
-    b = run(campaign(*settings, ON_RAY), tmp_path / "ray")
+    b = run_with_workers(campaign(*settings, ON_RAY), tmp_path / "ray")
     thread.join()
     assert len(struck) == 2
     assert unlike_columns(a.folder, b.folder) == []
 
 
 @pytest.mark.parametrize("struck", [b"", b"ray::OnMachine"], ids=["none", "actor"])
-def test_what_a_controller_starts_ends_with_the_run_and_no_file_is_left(struck, run, campaign, tmp_path, monkeypatch):
+def test_what_a_controller_starts_ends_with_the_run_and_no_file_is_left(struck, tmp_path, monkeypatch):
     """One in a session of its own, one adopted; the vehicle acts early, so that machines are handed baseline runs."""
     monkeypatch.chdir(ROOT)
     note, out, left = tmp_path / "started", tmp_path / "ray", set(Path(tempfile.gettempdir()).glob("harness-*"))
@@ -101,7 +101,7 @@ def test_what_a_controller_starts_ends_with_the_run_and_no_file_is_left(struck, 
 
     thread = threading.Thread(target=strike)
     thread.start()
-    run(campaign(*settings, ON_RAY), out)
+    run_with_workers(campaign(*settings, ON_RAY), out)
     thread.join()
     started = {int(pid) for pid in note.read_text().split()}
     assert len(started) >= 2 * 8 * 2
@@ -109,10 +109,10 @@ def test_what_a_controller_starts_ends_with_the_run_and_no_file_is_left(struck, 
     assert set(Path(tempfile.gettempdir()).glob("harness-*")) <= left
 
 
-def test_a_shard_that_is_lost_thrice_with_its_machine_is_named(run, campaign, tmp_path, monkeypatch):
+def test_a_shard_that_is_lost_thrice_with_its_machine_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(on_ray.RayWorker, "answer", lambda self: self.kill() or WorkerDeath(None, None))
     with pytest.raises(HarnessError, match="3 worker processes that died, the last with its machine") as lost:
-        run(campaign(*TWIN, ON_RAY), tmp_path / "run")
+        run_with_workers(campaign(*TWIN, ON_RAY), tmp_path / "run")
     assert lost.value.exit_code == EXIT_TOO_MANY_FAILED
 
 
@@ -123,26 +123,26 @@ def test_a_shard_that_is_lost_thrice_with_its_machine_is_named(run, campaign, tm
         ("runtime_env={working_dir: nowhere-at-all}", r"run\.ray\.runtime_env"),
     ],
 )
-def test_what_the_cluster_cannot_give(run, campaign, tmp_path, asked, said):
+def test_what_the_cluster_cannot_give(tmp_path, asked, said):
     with pytest.raises(HarnessError, match=said):
-        run(campaign(*TWIN, ON_RAY, f"run.ray.{asked}"), tmp_path / "run")
+        run_with_workers(campaign(*TWIN, ON_RAY, f"run.ray.{asked}"), tmp_path / "run")
     assert asked.startswith("runtime_env") or not (tmp_path / "run/manifest.json").exists()
 
 
-def test_nobody_answers_at_the_address(run, campaign, tmp_path, monkeypatch):
+def test_nobody_answers_at_the_address(tmp_path, monkeypatch):
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     with pytest.raises(HarnessError, match=r"run\.ray\.address: found 127\.0\.0\.1:9: .*refused"):
-        run(campaign(*TWIN, ON_RAY, "run.ray.address='127.0.0.1:9'"), tmp_path / "run")
+        run_with_workers(campaign(*TWIN, ON_RAY, "run.ray.address='127.0.0.1:9'"), tmp_path / "run")
 
 
-def test_another_version_on_a_machine_is_refused(run, campaign, tmp_path, monkeypatch):
+def test_another_version_on_a_machine_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(on_ray, "source_hash", lambda: "0123456789abcdef")
     with pytest.raises(HarnessError, match="a machine with sources of its kernels"):
-        run(campaign(*TWIN, ON_RAY), tmp_path / "run")
+        run_with_workers(campaign(*TWIN, ON_RAY), tmp_path / "run")
 
 
-def test_without_the_package(run, campaign, tmp_path, monkeypatch):
+def test_without_the_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "harness.runner.ray")
     with pytest.raises(CampaignError, match=r"pip install -c requirements.lock -e '\.\[ray\]'"):
-        run(campaign(*TWIN, ON_RAY), tmp_path / "run")
+        run_with_workers(campaign(*TWIN, ON_RAY), tmp_path / "run")

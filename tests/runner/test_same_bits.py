@@ -17,8 +17,9 @@ from harness.resolved import resolve
 from harness.runner import workers
 from harness.runner.kept import Run
 from tests.golden.campaigns import IN_BOTH_WORLDS, quick
-from tests.in_process import run_here as run_golden
+from tests.in_process import run_here
 from tests.runner import bad_workers
+from tests.runner.conftest import campaign
 from tests.stored_runs import ROOT, golden, manifest, part_files, sets, unlike_columns
 
 PATIENCE_S, POLL_S = 300.0, 0.01
@@ -43,13 +44,13 @@ def test_sumo_and_the_twin(name, stored_run):
     ],
 )
 def test_any_number_of_cells(name, cells, stored_run, tmp_path):
-    run_golden(golden(name, f"world.cells={cells}"), tmp_path / "run")
+    run_here(golden(name, f"world.cells={cells}"), tmp_path / "run")
     assert unlike_columns(stored_run(name), tmp_path / "run") == []
 
 
 @pytest.mark.parametrize(("name", "size"), [("nde-twin", 7), ("mixture-twin", 101)])
 def test_any_split_into_shards(name, size, stored_run, tmp_path):
-    run_golden(golden(name, f"run.shard_size={size}"), tmp_path / "run")
+    run_here(golden(name, f"run.shard_size={size}"), tmp_path / "run")
     assert set(unlike_columns(stored_run(name), tmp_path / "run")) <= {"estimates.json"}
 
 
@@ -112,7 +113,7 @@ def test_what_is_ignored_stays_ignored_and_ctrl_c_to_all_processes_ends_a_run_in
     assert not [*out.rglob(".*"), *temporary.iterdir()]
 
 
-def test_an_interruption_as_tests_are_written_loses_none_of_them(campaign, run_here, tmp_path, monkeypatch):
+def test_an_interruption_as_tests_are_written_loses_none_of_them(tmp_path, monkeypatch):
     add, out = Run.with_shard, tmp_path / "run"
 
     def add_and_interrupt(run, shard):

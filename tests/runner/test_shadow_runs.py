@@ -16,10 +16,10 @@ from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
 from harness.sampling.baseline import run_baseline
-from tests.in_process import run_here as run_golden
+from tests.in_process import run_here
 from tests.pool.conftest import GOLDEN_POOL
 from tests.pool.test_vehicle_pool import ACTING
-from tests.runner.conftest import SHELLS
+from tests.runner.conftest import SHELLS, campaign
 from tests.stored_runs import (
     ROOT,
     answer_in,
@@ -60,12 +60,12 @@ def test_a_run_that_was_interrupted_goes_on_where_it_was(stored_run, tmp_path):
     files_of(out)[-1].unlink()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("harness.runner.workers.run_baseline", driven := Driven())
-        run_golden(golden(ACTS), out, resume=True)
+        run_here(golden(ACTS), out, resume=True)
     assert driven.first == [50]
     assert unlike_columns(stored_run(ACTS), out) == []
     assert len(files_of(out)) == 1
     part_files(out)[-1].unlink()
-    run_golden(golden(ACTS), out, resume=True)
+    run_here(golden(ACTS), out, resume=True)
     assert unlike_columns(stored_run(ACTS), out) == []
 
 
@@ -87,7 +87,7 @@ NOISY = "parameters: {noise_mps2: 0.2}"
 @pytest.mark.parametrize(
     "method", [pytest.param(SHELLS, id="shells", marks=pytest.mark.slow), pytest.param(FORCED, id="forced")]
 )
-def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(method, campaign, run_here, tmp_path):
+def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(method, tmp_path):
     asked = (*method, *SHADOWS, TWIN)
     with pytest.raises(TooManyFailedError, match="something else than in its baseline run"):
         run_here(campaign(*asked, f"av={of('FreshNoise', NOISY)}"), tmp_path / "fresh")
@@ -99,7 +99,7 @@ def test_a_vehicle_with_noise_of_its_own_is_refused_unlike_one_with_the_given(me
     assert replay(seeded, 123).bit_equal
 
 
-def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp_path):
+def test_shadow_runs_that_fail_count_against_the_vehicle(tmp_path):
     """Three in 120 fail: refused at one per cent; with five they are a part of the upper limit that no test takes."""
     breaks = (*SHELLS, *SHADOWS, TWIN, f"av={of('Breaks')}")
     with pytest.raises(TooManyFailedError, match="3 of 120 baseline runs failed, 3 of them with: step: RuntimeError"):
@@ -117,7 +117,7 @@ def test_shadow_runs_that_fail_count_against_the_vehicle(campaign, run_here, tmp
 
 
 @pytest.mark.slow
-def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_path):
+def test_crashes_on_a_handful_of_paths_give_no_interval(tmp_path):
     """A vehicle that gives way, but on three paths of 120: the run ends, and says that it knows too little."""
     lonely = campaign(*SHELLS, *SHADOWS, TWIN, f"av={of('YieldsMostly')}", "stop.rhw=0.3", "stop.episodes=20000")
     result = run_here(lonely, tmp_path / "run")
@@ -131,7 +131,7 @@ def test_crashes_on_a_handful_of_paths_give_no_interval(campaign, run_here, tmp_
 
 
 @pytest.mark.slow
-def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(campaign, run_here, tmp_path):
+def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(tmp_path):
     """The same paths, weights and ends, with and without a shadow run before each test."""
     plain = run_here(campaign(*FORCED, TWIN, "av={controller: 'tests.controllers.early:HoldsThenIdm'}"), tmp_path / "a")
     walked = run_here(campaign(*FORCED, TWIN, f"av={of('HoldsThenIdm')}"), tmp_path / "b")
@@ -145,7 +145,7 @@ def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(camp
     assert one["n_crashes"] > 0
 
 
-def test_a_forced_test_fails_where_its_shadow_run_did(campaign, run_here, tmp_path):
+def test_a_forced_test_fails_where_its_shadow_run_did(tmp_path):
     """A row, with the weight of the cut-in that it may have hidden, and counted as a crash in the upper limit."""
     loose = campaign(*FORCED, TWIN, "stop.episodes=200", "run.max_failed_share=0.05", f"av={of('Breaks')}")
     result = run_here(loose, tmp_path / "run")
@@ -197,7 +197,7 @@ class RaisesBeforeContact(IDM):
 @pytest.mark.parametrize(
     "method", [pytest.param(each, marks=[pytest.mark.slow] * (each != "shells")) for each in METHODS]
 )
-def test_the_interval_holds_what_may_have_happened(method, campaign, run_here, tmp_path, monkeypatch):
+def test_the_interval_holds_what_may_have_happened(method, tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     truth, settings = METHODS[method]
     tested = campaign("world.engine=twin", "run.max_failed_share=1", "run.shard_size=1000", *settings, FAILING)
@@ -227,7 +227,7 @@ class AtOneSpeed(IDM):
 
 
 @pytest.mark.slow
-def test_what_crashes_share(campaign, run_here, tmp_path):
+def test_what_crashes_share(tmp_path):
     av = "av={controller: 'tests.runner.test_shadow_runs:AtOneSpeed', limits: {max_acceleration_mps2: 2}}"
     many = (*SHELLS, "world.engine=twin", "stop.episodes=1500", "records.traces=none", "records.trace_share=0", av)
     first = what_crashes_share(run_here(campaign(*many), tmp_path / "run").folder).iloc[0]

@@ -20,12 +20,12 @@ from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import SHELLS as SAFE
 from tests.estimators.small_blocks import in_shells
 from tests.estimators.small_blocks import tally as counted
-from tests.in_process import run_here as run_golden
-from tests.runner.conftest import SHELLS
+from tests.in_process import run_here
+from tests.runner.conftest import SHELLS, campaign
 from tests.stored_runs import answer_in, copy_of, edit, golden, manifest, part_files, stored_table
 
 
-def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
+def test_a_pool_that_is_used_up_ends_the_run(tmp_path):
     small = ("stop.rhw=0.1", "stop.episodes=100000", "pool.events_per_shell=100")
     result = run_here(campaign(*SHELLS, *small, "world.engine=twin"), tmp_path / "run")
     assert (result.exit_code, result.stopped_by) == (4, "pool")
@@ -37,7 +37,7 @@ def test_a_pool_that_is_used_up_ends_the_run(campaign, run_here, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_pool_that_is_too_rough_ends_the_run(campaign, run_here, tmp_path):
+def test_a_pool_that_is_too_rough_ends_the_run(tmp_path):
     """A vehicle that crashes often: after some thousand tests the pool's own error is most of the interval."""
     often = ("av={model: constant, parameters: {acceleration_mps2: -1.0}}", "world.engine=twin")
     settings = (*SHELLS, *often, "stop.episodes=100000", "pool.events_per_shell=5000")
@@ -67,7 +67,7 @@ SPENT, MORE = "stop.episodes=150", "stop.episodes=400"
 """A budget that ends within a round: its last shards are not those of a run that goes on."""
 
 
-def test_a_continuation_that_dies_leaves_what_was_there(campaign, run_here, tmp_path, monkeypatch):
+def test_a_continuation_that_dies_leaves_what_was_there(tmp_path, monkeypatch):
     out = tmp_path / "run"
     run_here(campaign(*SHELLS, "world.engine=twin", SPENT), out)
     before = {path: path.read_bytes() for path in (*part_files(out), out / "manifest.json")}
@@ -88,7 +88,7 @@ def test_a_continuation_that_dies_leaves_what_was_there(campaign, run_here, tmp_
 def test_shells_of_another_pool_or_that_are_none_are_refused(stored_run, tmp_path):
     folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
     edit(folder, "shells.json", pool="f" * 24)
-    for act in (lambda: replay(folder, 3), lambda: run_golden(golden("shells-twin"), folder, resume=True)):
+    for act in (lambda: replay(folder, 3), lambda: run_here(golden("shells-twin"), folder, resume=True)):
         with pytest.raises(RunFolderError, match="events of pool ffff"):
             act()
     for key, wrong in (("cell_p", [0.1]), ("n_inside", 9), ("strata", {})):
@@ -132,7 +132,7 @@ def test_the_boundary_is_passed_when_what_lies_within_is_known():
 
 
 @pytest.mark.slow
-def test_what_is_traced_may_change_when_a_run_goes_on(campaign, run_here, tmp_path):
+def test_what_is_traced_may_change_when_a_run_goes_on(tmp_path):
     traced, untraced = ("records.traces=all",), ("records.traces=none", "records.trace_share=0")
     out = tmp_path / "run"
     run_here(campaign(*SHELLS, "world.engine=twin", SPENT, *traced), out)
