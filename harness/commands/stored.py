@@ -113,7 +113,7 @@ def _estimate_hours(
 ) -> None:
     """What stored tests of several scenarios say, with other exposures."""
     from harness.campaign.sections import EXPOSURES
-    from harness.report.hour_words import hour_lines
+    from harness.report.several import hour_lines
     from harness.runner.stored import estimate_families
 
     given = {}

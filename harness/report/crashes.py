@@ -32,8 +32,6 @@ CANDIDATES, SHOWN = 50, 3
 """Crashes considered and shown per ranking: with a share of traces only some of the worst have one."""
 MOST_JUDGED, MOST_TRACED = 20_000, 1_000
 """Hardest crashes of which it is asked who would have avoided them; of vehicles whose motion the traces must tell."""
-SHOWN_COLUMNS = ("impact_speed_mps", "crash_time_s", "weight", "event_s")
-"""Of a crash in the table, beside its episode; as in `RunSummary`."""
 SHOWN_ALONE = 2
 """Crashes of A or B alone: a vehicle in foreign code is run again in a process of its own."""
 COMPARE_AGAIN = "Run `harness compare` again with the same --out."
@@ -94,7 +92,7 @@ def crash_gallery(
     # Shells, or importance functions, of which the forced event is the first.
     names = ["forced", *run.campaign.surrogates] if run.shells is None else [each.shell for each in run.shells.shells]
     for place, why in reasons.items():
-        crash = {name: float(crashes[name][place]) for name in SHOWN_COLUMNS}
+        crash = {name: float(column[place]) for name, column in crashes.items()}
         number, component = int(episode[place]), int(crashes["component"][place])
         avoid = [name for name, avoids in zip(family.stand_ins, avoided[place], strict=True) if avoids]
         by, scene = ", ".join(avoid) or ("nobody" if (ends[place] != UNKNOWN).all() and ends.size else "–"), None

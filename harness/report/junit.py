@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, printable
 from harness.records.folder import write_bytes
-from harness.report.pair_words import pair_words
 from harness.report.rows import limit_words
+from harness.report.several import pair_words
 from harness.strata import LIBRARY_STATEMENT
 
 Outcome = Literal["passed", "failure", "error"]

@@ -14,10 +14,9 @@ from harness.estimators.traffic import Sensitivity, tests_of_sum
 from harness.families import family_named
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
+from harness.report import several
 from harness.report.crashes import Replay, crash_gallery, crashing_pairs, scenes_of, shown_of
 from harness.report.drawing import Plot
-from harness.report.hour_words import answer_of_sum, beside_row, called, exposures, family_rows
-from harness.report.pair_words import deciding_words, pair_asked, pair_warnings, pair_words, rates_of, ratio_words
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, summarise
 from harness.report.templates import write_page
@@ -50,9 +49,9 @@ def write_hours(folder: Path, content: dict[str, Any]) -> Path:
     """Write the page of several scenarios: the sum, each one's part of it, and the way to each one's own page."""
     return write_page(
         folder / "report.html", "hours.html.j2",
-        content=content, answer=answer_of_sum(content, readings=True),
-        rows=[(row, content["families"][row[0]]) for row in family_rows(content)],
-        exposures=exposures(content), called=called,
+        content=content, answer=several.answer_of_sum(content, readings=True),
+        rows=[(row, content["families"][row[0]]) for row in several.family_rows(content)],
+        exposures=several.exposures(content), called=several.called,
         moved=_sensitivity(folder, tests_of_sum(content), str(folder)),
     )  # fmt: skip
 
@@ -75,9 +74,10 @@ def write_comparison(folder: Path, stored: dict[str, Any], runs: Sequence[RunFol
 
 def write_comparison_of_sum(folder: Path, stored: dict[str, Any]) -> Path:
     """Write the page of a comparison in several scenarios: the sum, and the way to each one's own page."""
-    beside = [beside_row("", stored[side]["beside"], seen=stored[side]["n_crashes"] > 0) for side in "ab"]
+    beside = [several.beside_row("", stored[side]["beside"], seen=stored[side]["n_crashes"] > 0) for side in "ab"]
     scenarios = [
-        (called(name), name, of, ratio_words(of), pair_words(of["decision"])) for name, of in stored["families"].items()
+        (several.called(name), name, of, several.ratio_words(of), several.pair_words(of["decision"]))
+        for name, of in stored["families"].items()
     ]
     vehicles = [(of["label"], ()) for of in stored["campaigns"].values()]
     return _write_comparison(folder, stored, vehicles, [("× competent driver", beside)], above=0.0, scenarios=scenarios)
@@ -87,12 +87,13 @@ def _write_comparison(
     folder: Path, stored: dict[str, Any], vehicles: Iterable[tuple[Any, ...]], rows: Sequence[Any], **content: Any
 ) -> Path:
     """Write either page; ``rows`` are what its table has besides, of A and of B."""
-    asked, sides = pair_asked(stored), zip("AB", vehicles, strict=True)
+    asked, sides = several.pair_asked(stored), zip("AB", vehicles, strict=True)
     return write_page(
         folder / "report.html", "compare.html.j2",
-        compared=stored, asked=asked, given=asked is not stored, ratio=ratio_words(asked),
-        verdict=pair_words(stored["decision"]), to_decide=deciding_words(stored), warnings=list(pair_warnings(stored)),
-        vehicles=[(name, *of) for name, of in sides], rates=[rates_of(stored[side]) for side in "ab"],
+        compared=stored, asked=asked, given=asked is not stored, ratio=several.ratio_words(asked),
+        verdict=several.pair_words(stored["decision"]), to_decide=several.deciding_words(stored),
+        warnings=list(several.pair_warnings(stored)), vehicles=[(name, *of) for name, of in sides],
+        rates=[several.rates_of(stored[side]) for side in "ab"],
         rows=rows, **content,
     )  # fmt: skip
 

@@ -67,7 +67,7 @@ class Comparison(ShownInPython):
     """What the page is made of, of A and of B."""
 
     def _lines(self) -> list[str]:
-        from harness.report.pair_words import pair_lines  # noqa: PLC0415 - draws
+        from harness.report.several import pair_lines  # noqa: PLC0415 - draws
 
         last = self.shown[1]
         s_per_pair = last.manifest["wall_time_s"] / self.content["n_pairs"]

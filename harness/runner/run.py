@@ -112,7 +112,7 @@ class Hours(ShownInPython):
     exit_code: int
 
     def _lines(self) -> list[str]:
-        from harness.report.hour_words import hour_lines  # noqa: PLC0415 - draws
+        from harness.report.several import hour_lines  # noqa: PLC0415 - draws
 
         return hour_lines(self.content, self.report)
 

@@ -58,7 +58,7 @@ class StoredEstimates(ShownInPython, dict[str, Any]):
         self._folder, self._by_estimator = folder, by_estimator
 
     def _lines(self) -> list[str]:
-        from harness.report.hour_words import hour_lines  # noqa: PLC0415 - draws
+        from harness.report.several import hour_lines  # noqa: PLC0415 - draws
         from harness.report.words import estimate_lines, run_lines  # noqa: PLC0415
 
         if self._by_estimator or "families" in self:

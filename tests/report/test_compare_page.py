@@ -12,8 +12,8 @@ import harness
 from harness.errors import RunFolderError
 from harness.numbers import interval, number, ratio
 from harness.report.crashes import crashing_pairs
-from harness.report.pair_words import deciding_words, pair_lines
 from harness.report.plots import WHO
+from harness.report.several import deciding_words, pair_lines
 from harness.report.summary import read_run_folder
 from harness.runner.stored import write_report
 from tests.report.page_text import Page

@@ -15,7 +15,7 @@ from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.pairs import PairDecision
 from harness.numbers import ratio
-from harness.report.pair_words import deciding_words, pair_warnings, pair_words
+from harness.report.several import deciding_words, pair_warnings, pair_words
 from harness.runner.compare import _decided, compare_campaigns
 from harness.runner.tables import read
 from harness.runner.workers import ShardRunner, Workers

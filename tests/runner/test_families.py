@@ -20,7 +20,7 @@ from harness.numbers import number, plain
 from harness.pool import moved
 from harness.printed import PRINTED
 from harness.records.folder import read_manifest, write_sealed
-from harness.report.hour_words import hour_lines
+from harness.report.several import hour_lines
 from harness.resolved import resolve
 from harness.runner.compare import compare_campaigns
 from harness.runner.stored import estimate_families
