@@ -293,7 +293,7 @@ def replay(
     from harness.records.origin import code_of
     from harness.records.reader import read_campaign
     from harness.report.motion import gui_program, watch, writer_of
-    from harness.runner.stored import changed_since
+    from harness.runner.stored import code_changed
     from harness.worlds.sumo import sumo_program
 
     files = [*files, *([] if sumo_folder is None else [sumo_folder / "test.sumocfg"])]
@@ -314,7 +314,7 @@ def replay(
     words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
-    if not stored and result.bit_equal is not False and (note := changed_since(manifest, campaign).code_words()):
+    if not stored and result.bit_equal is not False and (note := code_changed(manifest, campaign)):
         say(f"note: {note}", err=True)
     if any(file.suffix == ".sumocfg" for file in written) and not which("sumo"):
         try:
@@ -325,4 +325,4 @@ def replay(
         watch(result, program)
     if result.changed is not None:
         found = "a replay that differs from the stored motion"
-        raise WorldDisagreementError(f"test {episode} of {folder}", found, "the same bits", result.changed.words())
+        raise WorldDisagreementError(f"test {episode} of {folder}", found, "the same bits", result.changed)

@@ -7,10 +7,9 @@ there on. What the vehicle ahead does after it was hit is drawn as if it had not
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -45,40 +44,12 @@ Scene = dict[str, Any]
 """What the script reads. Moments are steps of the episode, positions (m) and speeds (m/s) those from ``first`` on."""
 
 
-class Changed(NamedTuple):
-    """What is not as when a run was made: ``versions`` (and the CPU), each then and here, and the vehicle's ``code``.
-
-    ``own`` is whether the vehicle is none of the built-in ones.
-    """
-
-    versions: Mapping[str, tuple[Any, Any]]
-    code: str
-    own: bool
-
-    def code_words(self) -> str:
-        """Whether the vehicle's code has been changed, in a sentence if so."""
-        return f"{self.code}, or a file that it is made of, has been changed since the run." if self.code else ""
-
-    def words(self) -> str:
-        """What may have made a replay differ."""
-        other = ", ".join(f"{name} {was} (here {now})" for name, (was, now) in self.versions.items())
-        found = [f"The run was made with {other}; bits are promised for equal ones."] if other else []
-        if self.own and not self.code:
-            same = "" if other else "Versions, CPU and the controller's files are the run's. "
-            found.append(
-                f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier tests, "
-                "or a file that it reads. `harness av-check` looks for that."
-            )
-        told = " ".join(filter(None, [*found, self.code_words()]))
-        return told or "Versions and CPU are the run's: the records have been changed, or it is a defect."
-
-
 @dataclass(frozen=True, repr=False)
 class ReplayResult(ShownInPython):
     """An episode run again: its row of the episodes table, and its motion with the schema of the traces table.
 
     ``bit_equal`` says whether what is stored, in the tables ``compared``, was reproduced in every bit, None where
-    nothing is; ``changed`` is what may be why if it was not. ``scene`` is what a page plays; its ``facts`` are what
+    nothing is; ``changed`` says what may be why if it was not. ``scene`` is what a page plays; its ``facts`` are what
     happens, as pairs of a name and a phrase, and what is shown of it.
     """
 
@@ -88,7 +59,7 @@ class ReplayResult(ShownInPython):
     bit_equal: bool | None
     compared: tuple[str, ...]
     scene: dict[str, Any]
-    changed: Changed | None = None
+    changed: str | None = None
 
     def _lines(self) -> list[str]:
         facts = [f"  {name:<18} {fact}" for name, fact in self.scene["facts"]]

@@ -42,7 +42,7 @@ from harness.worlds import build_world
 
 if TYPE_CHECKING:
     from harness.report.drawing import Plot
-    from harness.report.player import Changed, ReplayResult
+    from harness.report.player import ReplayResult
 
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
@@ -211,7 +211,7 @@ def _result(
     tables: Mapping[str, pa.Table],
     bit_equal: bool | None,
     compared: tuple[str, ...],
-    changed: Changed | None = None,
+    changed: str | None = None,
 ) -> ReplayResult:
     from harness.report.player import ReplayResult, Scenes, with_lateral  # noqa: PLC0415 - `run` and `estimate` draw nothing
 
@@ -247,15 +247,27 @@ def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) ->
     return {"episodes": tables.episodes, "traces": tables.traces}
 
 
-def changed_since(manifest: dict[str, Any], campaign: Campaign) -> Changed:
-    """What has changed since a run, by what its manifest knows."""
-    from harness.report.player import Changed  # noqa: PLC0415 - see above
+def code_changed(manifest: Mapping[str, Any], campaign: Campaign) -> str:
+    """Whether the vehicle's code has been changed since a run, in a sentence if so."""
+    if manifest.get("controller_sha256") == require_controller(campaign.av):
+        return ""
+    return f"{campaign.av.controller}, or a file that it is made of, has been changed since the run."
 
-    here = {**versions(), "CPU": cpu_name()}
-    there = {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
-    other = {name: (was, here.get(name)) for name, was in there.items() if was != here.get(name)}
-    same_code = manifest.get("controller_sha256") == require_controller(campaign.av)
-    return Changed(other, "" if same_code else str(campaign.av.controller), campaign.av.model is None)
+
+def changed_since(manifest: Mapping[str, Any], campaign: Campaign) -> str:
+    """What may have made a replay differ, by what the manifest of the run knows."""
+    here, there = {**versions(), "CPU": cpu_name()}, {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
+    other = ", ".join(f"{name} {was} (here {here.get(name)})" for name, was in there.items() if was != here.get(name))
+    found = [f"The run was made with {other}; bits are promised for equal ones."] if other else []
+    if code := code_changed(manifest, campaign):
+        found.append(code)
+    elif campaign.av.model is None:
+        same = "" if other else "Versions, CPU and the controller's files are the run's. "
+        found.append(
+            f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier tests, "
+            "or a file that it reads. `harness av-check` looks for that."
+        )
+    return " ".join(found) or "Versions and CPU are the run's: the records have been changed, or it is a defect."
 
 
 def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:

@@ -319,9 +319,9 @@ def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
     edit(folder, repeated=None)
     assert replay_episode(folder, 3).changed is None
     campaign = load_campaign(folder / "campaign.yaml")
-    assert "the vehicle does not do the same again" in changed_since(manifest, campaign).words()
-    assert "made of, has been changed" in changed_since({**manifest, "controller_sha256": "0"}, campaign).words()
-    assert "CPU Z80 (here" in changed_since({**manifest, "cpu": "Z80"}, campaign).words()
+    assert "the vehicle does not do the same again" in changed_since(manifest, campaign)
+    assert "made of, has been changed" in changed_since({**manifest, "controller_sha256": "0"}, campaign)
+    assert "CPU Z80 (here" in changed_since({**manifest, "cpu": "Z80"}, campaign)
 
 
 @pytest.mark.slow
