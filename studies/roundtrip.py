@@ -29,9 +29,9 @@ from scipy import stats
 from harness.campaign.files import load_campaign
 from harness.campaign.sections import EnvironmentSettings
 from harness.estimators.traffic import ONE_LAW
-from harness.families.cut_in.fitting.fit import fit_traffic, replicates
+from harness.families.cut_in.fitting.fitter import fit_traffic, replicates
 from harness.families.cut_in.fitting.laws import ObservedTraffic
-from harness.families.cut_in.fitting.observations import KINDS, observe
+from harness.families.cut_in.fitting.observations import KINDS, Observations, observe
 from harness.families.cut_in.loading import load_environment, load_parameters
 from harness.families.cut_in.parameters import FIXED, EnvironmentParameters
 from harness.families.cut_in.sections import REPLACED
@@ -65,7 +65,6 @@ HAZARD = {"v": "v_mps", "r1": "r1_m", "r1dot": "r1dot_mps"}
 STATES = ((30.0, 40.0, 0.0), (25.0, 20.0, -2.0), (35.0, 60.0, 2.0), (30.0, 15.0, 0.0), (28.0, 80.0, -4.0))
 """States (v, R1, R1dot) whose hazards are judged."""
 SEED, PART_H = 10_000, 10.0
-RECORDINGS_OF_PART = round(PART_H / RECORDING_H)
 N_PATHS = 4096
 N_STEPS, N_CHECKED = 6, 20
 
@@ -79,15 +78,14 @@ def truth() -> EnvironmentParameters:
 def simulated(n_parts: int, progress: Progress) -> ObservedTraffic:
     """Observations of ``n_parts`` of 10 vehicle-hours, 20 recordings each, as a fit reads them from files."""
     progress.stage("trajectories", n_parts)
-    parts = list[ObservedTraffic]()
+    found = list[Observations]()
     with tempfile.TemporaryDirectory() as name:
         file = Path(name, "trajectories.parquet")
         for part in range(n_parts):
             write(simulate(load_environment(TRAFFIC, truth()), PART_H, SEED + part, Differences()), file)
-            traffic = ObservedTraffic.of(map(observe, recordings([file], load_mapping())))
-            parts.append(replace(traffic, recording=traffic.recording + RECORDINGS_OF_PART * part))
+            found += map(observe, recordings([file], load_mapping()))
             progress.advance(1)
-    return ObservedTraffic.joined(parts)
+    return ObservedTraffic.of(found)
 
 
 def data_set(pool: ObservedTraffic, hours: float, index: int) -> ObservedTraffic:

@@ -133,12 +133,6 @@ class Campaign(Section):
         """Classes of the user's own among the surrogates, by name."""
         return {name: of.controller for name, of in self.surrogates.items() if isinstance(of, OwnSurrogate)}
 
-    def alpha(self) -> tuple[float, ...]:
-        """Mixture weights of the surrogates, in their order, summing to 1."""
-        if self.testing.alpha is None:
-            return tuple(1.0 / len(self.surrogates) for _ in self.surrogates)
-        return tuple(self.testing.alpha[name] for name in self.surrogates)
-
     @property
     def importance_names(self) -> tuple[str, ...]:
         """Names of the importance functions, in the order of ``log_q``."""
@@ -147,8 +141,9 @@ class Campaign(Section):
 
     @property
     def mixture_weights(self) -> tuple[float, ...]:
-        """Weights α of the importance functions, in the order of `importance_names`."""
-        alpha = self.alpha() if self.sampling.mixes else ()
+        """Weights α of the importance functions, in the order of `importance_names`, summing to 1."""
+        names, given = self.surrogates if self.sampling.mixes else (), self.testing.alpha
+        alpha = tuple(given[name] if given else 1.0 / len(names) for name in names)
         if not self.sampling.forces:
             return alpha
         share = self.testing.defensive_share if alpha else 1.0
@@ -208,12 +203,6 @@ class Combination(NamedTuple):
 
 
 _FOLLOWS = "in {scenario}, where the AV follows a vehicle from the start"
-
-
-def _natural(campaign: Campaign) -> bool:
-    return getattr(campaign.av.parameters, "time_headway_s", None) == NATURAL
-
-
 _TAKES_TIME = "where cut-ins take time (`lateral` of the environment)"
 
 REFUSED = (
@@ -346,7 +335,10 @@ REFUSED = (
         "Choose r157-cc, idm or fvdm, or bring a controller of your own.",
     ),
     Combination(
-        "av.parameters.time_headway_s", lambda c, use: use.command is not None and not use.follows and _natural(c),
+        "av.parameters.time_headway_s",
+        lambda c, use: (
+            use.command is not None and not use.follows and getattr(c.av.parameters, "time_headway_s", None) == NATURAL
+        ),
         "natural, in {scenario}", "seconds: the vehicle does not follow before the event",
         "Write a number, or scenario: lead_brakes.",
     ),

@@ -27,7 +27,7 @@ from harness.campaign.models import (
 )
 from harness.campaign.python_files import in_python_file, is_script
 from harness.campaign.sections import DEFAULT, DEFAULT_FAMILY, Section
-from harness.campaign.vehicle import AV_SOURCES, READ_BY, Panel
+from harness.campaign.vehicle import AV_SOURCES, Panel
 from harness.campaign.yaml_text import read_yaml, yaml_text
 from harness.errors import CampaignError
 from harness.families import family_named
@@ -230,8 +230,9 @@ def written_out(campaign: Campaign) -> dict[str, Any]:
     """Plain data of a campaign with every default, but of the sources of an AV only the one that drives it."""
     several = campaign.scenarios is not None and campaign.scenario == DEFAULT_FAMILY  # which is not asked then
     data = campaign.model_dump(exclude={"scenario"} if several else None)
-    none = {key for key in AV_SOURCES if data["av"][key] is None}
-    data["av"] = {key: value for key, value in data["av"].items() if READ_BY.get(key, key) not in none}
+    left_out = {key for key in AV_SOURCES if data["av"][key] is None}
+    left_out |= {"traci_style"} if "controller" in left_out else set()
+    data["av"] = {key: value for key, value in data["av"].items() if key not in left_out}
     return data
 
 

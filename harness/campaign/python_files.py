@@ -1,14 +1,32 @@
-"""What a Python file of the user's holds, told without running it: a TraCI script, or classes and functions."""
+"""Python files of the user's: what one holds, told without running it, and how it is imported.
+
+It is compiled from its source, as this is now. Python's own cache (``__pycache__``) goes by a source's size and its
+time stamp in seconds: where both are the same, as of versions that are copied, restored or edited within a second, it
+runs code that is no longer there.
+"""
 
 from __future__ import annotations
 
 import ast
+import os
+import sys
 from contextlib import suppress
+from importlib.machinery import EXTENSION_SUFFIXES, SOURCE_SUFFIXES, ExtensionFileLoader, FileFinder, SourceFileLoader
 from pathlib import Path
+from sysconfig import get_path
+from types import CodeType
 
 from harness.campaign.yaml_text import read_text
 
 TRACI_MODULES = "traci", "libsumo", "libtraci"
+NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), get_path("platstdlib")
+"""Where the harness itself lies, and Python."""
+
+
+def file_and_function(name: str) -> tuple[str, str]:
+    """Of ``file.py:main``; of ``file.py``, or any other name, the latter is empty."""
+    file, colon, function = name.partition(".py:")
+    return (f"{file}.py", function) if colon else (name, "")
 
 
 def _parsed(name: str) -> ast.Module | None:
@@ -26,8 +44,8 @@ def is_script(name: str) -> bool:
 
     A file that is not Python counts as one, so that running it says where it is wrong.
     """
-    file, colon, function = name.partition(".py:")
-    if (tree := _parsed(f"{file}.py" if colon else name)) is None:
+    file, function = file_and_function(name)
+    if (tree := _parsed(file)) is None:
         return False
     if tree.body and not any(each.partition(".")[0] in TRACI_MODULES for each in _imports(tree)):
         return False
@@ -36,7 +54,7 @@ def is_script(name: str) -> bool:
             given, makes = each.args, each.returns
             required = len(given.posonlyargs) + len(given.args) - len(given.defaults) + given.kw_defaults.count(None)
             return required == 0 and (makes is None or ast.unparse(makes) == "None")
-    return not colon
+    return not function
 
 
 def _imports(tree: ast.Module) -> set[str]:
@@ -72,3 +90,38 @@ def in_python_file(text: str) -> str:
     drive = [name for name, each in found.items() if isinstance(each, ast.FunctionDef) or "step" in ast.dump(each)]
     shown = ([name for name in drive if name[0] != "_"] or list(found))[:6]
     return f"Name its class or function: {' or '.join(f'{text}:{name}' for name in shown)}." if shown else ""
+
+
+# -- imported --
+
+
+class FromSource(SourceFileLoader):
+    """Loads a module, whatever has been kept of an earlier one."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        """The code of the file."""
+        path = self.get_filename(fullname)
+        code: CodeType = self.source_to_code(self.get_data(path), path)
+        return code
+
+
+def is_users(folder: str) -> bool:
+    """Whether what lies in a folder is neither installed there nor the harness itself."""
+    return "-packages" not in folder and not folder.startswith(NOT_THE_USERS)
+
+
+def import_from(folder: Path) -> None:
+    """Let modules of a folder be imported; from here on all that are not installed are, from their sources."""
+    if _finder not in sys.path_hooks:
+        sys.path_hooks.insert(0, _finder)
+        sys.path_importer_cache.clear()
+    if (here := str(folder)) not in sys.path:
+        sys.path.insert(0, here)
+
+
+def _finder(path: str) -> FileFinder:
+    """As a hook of ``sys.path_hooks``."""
+    path = path or os.getcwd()  # noqa: PTH109 - as Python's own
+    if not is_users(path) or not os.path.isdir(path):  # noqa: PTH112
+        raise ImportError(path)
+    return FileFinder(path, (ExtensionFileLoader, EXTENSION_SUFFIXES), (FromSource, SOURCE_SUFFIXES))

@@ -22,8 +22,6 @@ READS_NO_PARAMETERS = {
     "fmu": "Write them under av.fmu.start_values.",
 }
 """Sources of an AV beside which parameters would be lost, and where to write them."""
-READ_BY = {"traci_style": "controller"}
-"""Keys that one source alone reads."""
 CONTROLLER_PATTERN = r"^(.+\.py|([A-Za-z_][A-Za-z0-9_.]*|.+\.py):[A-Za-z_][A-Za-z0-9_]*)$"
 
 

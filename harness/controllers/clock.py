@@ -20,7 +20,8 @@ from importlib.machinery import ExtensionFileLoader
 from pathlib import Path
 from typing import Any, Self, TypeAlias
 
-from harness.controllers.hosts import NOT_THE_USERS, Guard
+from harness.campaign.python_files import NOT_THE_USERS
+from harness.controllers.hosts import Guard
 
 LATER_S = 90061.001001
 """A day and one each of its parts, down to a microsecond: all that a time is shown by changes, also its parity."""
@@ -60,7 +61,7 @@ class Clock:
             frame = frame.f_back
         file = frame.f_code.co_filename
         place = f"{name}, {Path(file).name}:{frame.f_lineno}"
-        if not file.startswith(NOT_THE_USERS) and place not in self.read_at:
+        if not file.startswith((*NOT_THE_USERS, "<")) and place not in self.read_at:
             self.read_at.append(place)
 
     @contextmanager

@@ -17,9 +17,16 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar, get_type_hints
 
-from harness.campaign.python_files import files_imported, in_python_file, is_script
+from harness.campaign.python_files import (
+    FromSource,
+    file_and_function,
+    files_imported,
+    import_from,
+    in_python_file,
+    is_script,
+    is_users,
+)
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.from_source import FromSource, import_from, is_users
 from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Guard, VehicleHost, cause_of, death_cause
 from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
@@ -290,12 +297,8 @@ def require_controller(av: AutomatedVehicle) -> str | None:
 
 def script_step_s(av: AutomatedVehicle) -> float:
     """How often a TraCI script is asked (s), as far as its text says; 0 of any other controller."""
-    return _step_length(_file_of_script(av.controller)) if av.controller and is_script(av.controller) else 0.0
-
-
-def _file_of_script(name: str) -> str:
-    """Of ``file.py`` or ``file.py:main``."""
-    return name.removesuffix(":" + name.rpartition(":")[2])
+    name = str(av.controller)
+    return _step_length(file_and_function(name)[0]) if is_script(name) else 0.0
 
 
 @cache
@@ -319,7 +322,7 @@ def _sources_of_made(av: AutomatedVehicle) -> str | None:
     if av.controller is None:
         return None
     if is_script(av.controller):
-        file, above = _file_of_script(av.controller), 0
+        file, above = file_and_function(av.controller)[0], 0
     else:
         name = getattr(own_code(av.controller), "__module__", "")
         file, above = getattr(sys.modules.get(name), "__file__", None) or "", name.count(".")

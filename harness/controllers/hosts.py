@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import parent_process
 from pathlib import Path
-from sysconfig import get_path
 from time import monotonic, sleep
 from traceback import walk_tb
 from types import FrameType
@@ -24,6 +23,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from harness.campaign.python_files import NOT_THE_USERS
 from harness.campaign.vehicle import AutomatedVehicle, Limits
 from harness.controllers.process_state import CHANGED_MODES, FloatingPointModes, OtherModules, closed_to_files
 from harness.controllers.protocol import (
@@ -92,13 +92,10 @@ def cause_of(error: BaseException) -> str:
     return (line if len(line) <= LONGEST_CAUSE else f"{line[:LONGEST_CAUSE]} …") + _place_of(error)
 
 
-NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), "<"
-
-
 def _place_of(error: BaseException) -> str:
     """`` (my_av.py:12)``: the last line of the user's code on the way to an error; empty where there is none."""
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
-    theirs = [place for place in places if not place[0].startswith(NOT_THE_USERS)]
+    theirs = [place for place in places if not place[0].startswith((*NOT_THE_USERS, "<"))]
     own = [place for place in theirs if "site-packages" not in place[0]] or theirs
     return f" ({Path(own[-1][0]).name}:{own[-1][1]})" if own else ""
 

@@ -22,8 +22,7 @@ from xml.etree import ElementTree
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
-from harness.campaign.python_files import TRACI_MODULES
-from harness.controllers.from_source import FromSource
+from harness.campaign.python_files import TRACI_MODULES, FromSource, file_and_function
 from harness.controllers.protocol import EpisodeStart, Observation
 from harness.controllers.traci_refused import Domain, FatalTraCIError, RefusedError
 from harness.controllers.traci_style import SimulationDomain, Traci
@@ -321,11 +320,11 @@ class TraciScript:
     """
 
     def __init__(self, name: str, parameters: dict[str, Any]) -> None:
-        file, colon, self._function = name.partition(".py:")
-        self._file = real_path(Path(f"{file}.py" if colon else name))
+        file, self._function = file_and_function(name)
+        self._file = real_path(file)
         self._parameters = parameters
         options = [f"--{key}" if value is True else f"--{key}={value}" for key, value in parameters.items()]
-        self.argv = [str(self._file), *([] if colon else options)]
+        self.argv = [str(self._file), *([] if self._function else options)]
         self._codes: dict[str, CodeType] = {}
         """Of the modules beside it, by name."""
         self._code: CodeType = compile(self._file.read_bytes(), self._file, "exec")

@@ -36,15 +36,6 @@ OPTIONAL: tuple[Optional, ...] = get_args(Optional)
 NO_COLUMN = ("Rename the column, or give its name in a mapping (--mapping FILE.yaml).", NO_LENGTH)
 SAMPLE = 1 << 16
 """Bytes of a file by which its separators and decimal signs are known."""
-FOREIGN = {
-    b"\xff\xfe": "text in UTF-16",
-    b"\xfe\xff": "text in UTF-16",
-    b"PK\x03\x04": "a ZIP archive, or an Excel workbook",
-    b"\xd0\xcf\x11\xe0": "an Excel workbook",
-    b"\x1f\x8b": "a file packed by gzip whose name does not end in .gz",
-    b"PAR1": "a Parquet file whose name does not end in .parquet",
-}
-"""What else a file may be, by its first bytes."""
 
 
 class Mapping(Section):
@@ -125,10 +116,9 @@ def _reading(path: Path) -> Iterator[None]:
     """Say what is wrong with a file that cannot be read."""
     expected = "a CSV or Parquet file"
     try:
-        if path.is_dir():
-            raise TrajectoryError(str(path), "a folder", expected, "Name the files in it.")
         if path.exists() and not path.is_file():
-            raise TrajectoryError(str(path), "a pipe or a device", expected, "Write its content into a file first.")
+            found, mend = "a folder, a pipe or a device", "Name the files in it, or write its content into one first."
+            raise TrajectoryError(str(path), found, expected, mend)
         yield
     except FileNotFoundError:
         mend = file_meant(path) or "Check the spelling and the current folder."
@@ -175,10 +165,10 @@ class _Text(NamedTuple):
     def of(cls, path: Path, mapping: Mapping) -> _Text:
         """Find out how a file is written; what is packed is unpacked as it is read."""
         sample = pa.input_stream(str(path)).read(SAMPLE)
-        kinds = [kind for first, kind in FOREIGN.items() if sample.startswith(first)]
-        if kinds or b"\0" in sample:
-            mend, kinds = "Write it as CSV in UTF-8 (packed by gzip: .csv.gz), or as Parquet.", [*kinds, "zero bytes"]
-            raise TrajectoryError(str(path), kinds[0], "a CSV or Parquet file", mend)
+        if b"\0" in sample:
+            found = "zero bytes, as in an Excel workbook, in what is packed, or in text that is not UTF-8"
+            mend = "Write it as CSV in UTF-8 (packed by gzip: .csv.gz), or as Parquet (.parquet)."
+            raise TrajectoryError(str(path), found, "a CSV or Parquet file", mend)
         content = pa.input_stream(str(path))
         text = sample.decode("utf-8-sig", errors="replace")
         below = text.lstrip("\r\n")

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
+from harness.campaign.python_files import FromSource
 from harness.controllers.find import own_code
-from harness.controllers.from_source import FromSource
 from tests.worlds.running import drive
 
 

@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.stats import gamma
 
 from harness.campaign.sections import EnvironmentSettings
-from harness.families.cut_in.fitting.fit import HEAVIEST_TAILS, fit_traffic
+from harness.families.cut_in.fitting.fitter import HEAVIEST_TAILS, fit_traffic
 from harness.families.cut_in.fitting.hazard import Acceptance
 from harness.families.cut_in.fitting.laws import ObservedTraffic
 from harness.families.cut_in.fitting.observations import observe

@@ -46,25 +46,16 @@ class ObservedTraffic:
     @classmethod
     def of(cls, observations: Iterable[Observations]) -> ObservedTraffic:
         """Join recordings."""
-        alone = []
+        whole = {name: [np.empty(0, dtype)] for name, dtype in KINDS.items()}
+        recording = list[int]()
         for i, seen in enumerate(observations):
-            rows = {name: getattr(seen, name) for name in KINDS}
-            n = 1 + max((int(each["vehicle"].max()) for each in rows.values() if each.size), default=-1)
-            alone.append(cls(**rows, recording=np.full(n, i)))
-        return cls.joined(alone)
-
-    @classmethod
-    def joined(cls, parts: Iterable[ObservedTraffic]) -> ObservedTraffic:
-        """Join parts, whose recordings have different numbers."""
-        parts = list(parts)
-        before = np.cumsum([0, *(part.recording.size for part in parts)])
-        whole = {}
-        for name, dtype in KINDS.items():
-            of_kind = [getattr(part, name) for part in parts]
-            whole[name] = np.concatenate([np.empty(0, dtype), *of_kind])
-            whole[name]["vehicle"] += np.repeat(before[:-1], [rows.size for rows in of_kind])
-        recording = np.concatenate([np.empty(0, np.int64), *(part.recording for part in parts)])
-        return cls(**whole, recording=recording)
+            before = len(recording)
+            for name, parts in whole.items():
+                rows = getattr(seen, name).copy()
+                rows["vehicle"] += before
+                parts.append(rows)
+                recording += [i] * (int(rows["vehicle"].max(initial=-1)) + 1 - len(recording))
+        return cls(**{name: np.concatenate(parts) for name, parts in whole.items()}, recording=np.array(recording, int))
 
     @property
     def n_recordings(self) -> int:

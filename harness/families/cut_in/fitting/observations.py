@@ -98,8 +98,6 @@ class Observations:
     """
 
     recording: str
-    place: str
-    """File and recording, for messages."""
     free: RecordArray
     """Accelerations of one second of vehicles without a leader within the fit range."""
     following: RecordArray
@@ -157,7 +155,6 @@ def observe(track: Recording) -> Observations:
     )
     return Observations(
         track.name,
-        track.place,
         _records("free", columns, second & state.fits & ~state.follows & seen),
         _records("following", columns, second & state.behind),
         _records("initial", columns, whole & state.behind & (since // n % INITIAL_EVERY_S == 0)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import special, stats
@@ -13,7 +14,6 @@ from harness.campaign.models import read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import printable
 from harness.estimators.limits import garwood
-from harness.families.cut_in.fitting.fit import Fit
 from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
 from harness.families.cut_in.fitting.laws import bins
 from harness.families.cut_in.fitting.observations import BesideCounts
@@ -26,6 +26,9 @@ from harness.numbers import number
 from harness.report.drawing import Plot, PlotAxis, PlotPanel
 from harness.report.templates import templates
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, IntArray, RecordArray
+
+if TYPE_CHECKING:
+    from harness.families.cut_in.fitting.fitter import Fit
 
 CONFIDENCE = 0.9
 SHIPPED = {"ndd-overtaking-1": "muted", "ndd-overtaking-2": "vermillion"}
