@@ -20,14 +20,14 @@ from sumolib.miscutils import getFreeSocketPort
 
 from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import World
-from harness.worlds.sumo import EXACT_OPTIONS, as_shared, committed_file, network_file
+from harness.worlds.sumo import EXACT_OPTIONS, NETWORKS, as_shared, network_file
 
 LEFT, RIGHT = 1, 0
 
 
 def sumo_arguments() -> list[str]:
     """Network, vehicle types and options, the same as for the harness."""
-    files = as_shared(network_file(1)), as_shared(committed_file("vehicles.add.xml"))
+    files = as_shared(network_file(1)), as_shared(NETWORKS / "vehicles.add.xml")
     return ["-n", str(files[0].path), "-a", str(files[1].path), *EXACT_OPTIONS]
 
 

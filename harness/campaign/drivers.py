@@ -159,8 +159,8 @@ def _of_the_model(value: Any, _by_trial: ValidatorFunctionWrapHandler, info: Val
     return value
 
 
-def schema_by_model(schema: dict[str, Any]) -> dict[str, Any]:
-    """Say in a JSON schema that parameters follow the model; returns the schemas of parameters by model."""
+def schema_by_model(schema: dict[str, Any]) -> None:
+    """Say in a JSON schema that parameters follow the model, the first of which is the IDM."""
     properties = schema["properties"]
     of_model, *_ = properties["model"].get("anyOf", [properties["model"]])
     by_model = dict(zip(PARAMETERS, properties["parameters"].pop("anyOf"), strict=False))  # and any mapping
@@ -173,11 +173,6 @@ def schema_by_model(schema: dict[str, Any]) -> dict[str, Any]:
         for model, parameters in by_model.items()
         if model in of_model["enum"]
     ]
-    return by_model
-
-
-def _with_parameters_by_model(schema: dict[str, Any]) -> None:
-    schema_by_model(schema)
 
 
 Parameters = WrapValidator(_of_the_model, json_schema_input_type=BuiltInParameters | dict[str, Any])
@@ -197,7 +192,7 @@ class Reflexes(Section):
 class Surrogate(Section):
     """A stand-in for the unknown AV, with its reflexes; the shipped libraries have some."""
 
-    model_config = ConfigDict(json_schema_extra=_with_parameters_by_model)
+    model_config = ConfigDict(json_schema_extra=schema_by_model)
 
     model: ModelName = Field(description="driver model")
     parameters: Annotated[BuiltInParameters, Parameters] = Field(default_factory=dict, validate_default=True)

@@ -106,9 +106,10 @@ class FmuController(Section):
 
 def _schema_of_sources(schema: dict[str, Any]) -> None:
     """Say in a JSON schema that parameters follow the source of the AV, which is the IDM where none is named."""
-    properties, by_model = schema["properties"], schema_by_model(schema)
+    schema_by_model(schema)
+    properties, of_idm = schema["properties"], schema["allOf"][0]["then"]
     named: list[dict[str, Any]] = [{"required": [name]} for name in AV_SOURCES]
-    schema["oneOf"] = [{"not": {"anyOf": named}, "properties": {"parameters": by_model["idm"]}}]
+    schema["oneOf"] = [{"not": {"anyOf": named}, **of_idm}]
     for name in AV_SOURCES:
         none = {"properties": {"parameters": {"maxProperties": 0}}} if name in READS_NO_PARAMETERS else {}
         schema["oneOf"].append({"required": [name], **none})

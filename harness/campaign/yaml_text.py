@@ -51,7 +51,7 @@ def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
     Any other file, and one that says a key twice, is a `CampaignError`.
     """
     name = str(path)
-    data, lines = _load(read_text(Path(path)), name)
+    data, lines = deepcopy(_parsed(read_text(Path(path)), name))
     if not lines:
         raise CampaignError(name, "an empty file", "YAML keys and values", "Is it the right file, fully written?")
     if not isinstance(data, dict):
@@ -64,7 +64,7 @@ def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
 def parse_value(text: str, where: str) -> Any:
     """Read one value by the rules of `read_yaml`, as after the ``=`` of ``--set a.b=value``; errors name ``where``."""
     try:
-        data, lines = _load(text, where)
+        data, lines = deepcopy(_parsed(text, where))
     except CampaignError as error:
         raise CampaignError(where, error.found, error.expected, error.mend) from None
     if not lines:
@@ -93,15 +93,9 @@ def read_text(path: Path) -> str:
     raise CampaignError(str(path), found, f"a {'Python' if path.suffix == '.py' else 'YAML'} file in UTF-8", mend)
 
 
-def _load(text: str, name: str) -> tuple[Any, Lines]:
-    """Value of a text, and the line of each of its parts by path; there are none when it is empty."""
-    value, lines = _parsed(text, name)
-    return deepcopy(value), lines
-
-
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=64)  # scenarios and comparisons read the same traffic again and again
 def _parsed(text: str, name: str) -> tuple[Any, Lines]:
-    """The same, shared with whoever asks: scenarios and comparisons read the same traffic again and again."""
+    """Value of a text, and the line of each of its parts by path; there are none when it is empty."""
     where, mend = name, "Correct or delete it."
     try:
         loader = StrictLoader(text)

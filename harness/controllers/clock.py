@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from functools import wraps
 from importlib.machinery import ExtensionFileLoader
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Self, TypeAlias
 
 from harness.campaign.python_files import NOT_THE_USERS
@@ -29,7 +30,6 @@ HELD_S, LOOK_S = 1e9, 1e-6
 _TRUE_DATETIME: TypeAlias = datetime.datetime
 _READ = ("time", "monotonic", "perf_counter", "process_time", "thread_time")
 _SHOWN = ("localtime", "gmtime", "ctime")
-_OTHERS = ("clock_gettime", "clock_gettime_ns", "strftime", "asctime")
 _LOADS = ("create_module", "exec_module")
 
 
@@ -67,36 +67,36 @@ class Clock:
     @contextmanager
     def shown(self) -> Iterator[None]:
         """In the place of the functions of ``time``, and of ``datetime``, that tell the time."""
-        kept: dict[tuple[Any, str], Any] = {(time, name): getattr(time, name) for name in (*_READ, *_SHOWN, *_OTHERS)}
-        kept |= {(time, f"{name}_ns"): getattr(time, f"{name}_ns") for name in _READ}
-        kept[datetime, "datetime"] = datetime.datetime
-        kept |= {(ExtensionFileLoader, name): getattr(ExtensionFileLoader, name) for name in _LOADS}
-        kept |= {(os, "times"): os.times, (resource, "getrusage"): resource.getrusage}
-        now = {name: self.function(f"time.{name}", kept[time, name]) for name in _READ}
+        own = SimpleNamespace(**vars(time))
+        now = {name: self.function(f"time.{name}", getattr(own, name)) for name in _READ}
+        gettime, times, usage = time.clock_gettime, os.times, resource.getrusage
+        instead: dict[tuple[Any, str], Any] = {(time, name): function for name, function in now.items()}
         for name, function in now.items():
-            setattr(time, name, function)
-            setattr(time, f"{name}_ns", lambda function=function: round(1e9 * function()))
+            instead[time, f"{name}_ns"] = lambda function=function: round(1e9 * function())
         for name in _SHOWN:
-            show = kept[time, name]
-            setattr(time, name, lambda secs=None, show=show: show(now["time"]() if secs is None else secs))
-        gettime, strftime, asctime = kept[time, "clock_gettime"], kept[time, "strftime"], kept[time, "asctime"]
-        time.clock_gettime = lambda clock: self.function("time.clock_gettime", lambda: gettime(clock))()
-        time.clock_gettime_ns = lambda clock: round(1e9 * time.clock_gettime(clock))
-        time.strftime = lambda form, shown=None: strftime(form, time.localtime() if shown is None else shown)
-        time.asctime = lambda shown=None: asctime(time.localtime() if shown is None else shown)
-        times, usage = kept[os, "times"], kept[resource, "getrusage"]
-        os.times = lambda: os.times_result(self.function("os.times", each.__float__)() for each in times())
-        resource.getrusage = lambda who: resource.struct_rusage(
-            [*(self.function("resource.getrusage", each.__float__)() for each in usage(who)[:2]), *usage(who)[2:]]
-        )
-        datetime.datetime = _datetime(now["time"])  # type: ignore[misc]
+            show = getattr(own, name)
+            instead[time, name] = lambda secs=None, show=show: show(now["time"]() if secs is None else secs)
         for name in _LOADS:
-            setattr(ExtensionFileLoader, name, _by_true_datetime(kept[ExtensionFileLoader, name]))
+            instead[ExtensionFileLoader, name] = _by_true_datetime(getattr(ExtensionFileLoader, name))
+        instead |= {
+            (time, "clock_gettime"): lambda clock: self.function("time.clock_gettime", lambda: gettime(clock))(),
+            (time, "clock_gettime_ns"): lambda clock: round(1e9 * time.clock_gettime(clock)),
+            (time, "strftime"): lambda form, at=None: own.strftime(form, time.localtime() if at is None else at),
+            (time, "asctime"): lambda at=None: own.asctime(time.localtime() if at is None else at),
+            (os, "times"): lambda: os.times_result(self.function("os.times", each.__float__)() for each in times()),
+            (resource, "getrusage"): lambda who: resource.struct_rusage(
+                [*(self.function("resource.getrusage", each.__float__)() for each in usage(who)[:2]), *usage(who)[2:]]
+            ),
+            (datetime, "datetime"): _datetime(now["time"]),
+        }
+        kept = {(of, name): getattr(of, name) for of, name in instead}
         try:
+            for (of, name), function in instead.items():
+                setattr(of, name, function)
             yield
         finally:
-            for (module, name), function in kept.items():
-                setattr(module, name, function)
+            for (of, name), function in kept.items():
+                setattr(of, name, function)
 
 
 def _by_true_datetime(load: Callable[..., Any]) -> Callable[..., Any]:

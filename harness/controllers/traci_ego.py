@@ -14,8 +14,8 @@ import sumo_data
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_script import ScriptController, ScriptVehicles, TraciScript
-from harness.controllers.traci_vehicle import VEH_ID, SeenVehicle
+from harness.controllers.traci_script import ScriptController, TraciScript
+from harness.controllers.traci_vehicle import VEH_ID, SeenVehicle, VehicleDomain
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
@@ -52,8 +52,8 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
             mend = f"Fix the script in that line.{other if 'is not known' in wrong else ''}"
         raise CampaignError("av.controller", found, expected, mend)
 
-    def vehicle(set_speed_mps: float, lv_name: str, bv_name: str) -> ScriptVehicles:
-        made = ScriptVehicles(set_speed_mps, ego, lv_name, bv_name)
+    def vehicle(set_speed_mps: float, lv_name: str, bv_name: str) -> VehicleDomain:
+        made = VehicleDomain(set_speed_mps, ego, lv_name, bv_name)
         made.setAccel(ego, style.accel_mps2)
         made.setDecel(ego, style.decel_mps2)
         return made
@@ -90,7 +90,7 @@ class _Anybody(dict[str, SeenVehicle]):
         return self[self._ego]
 
 
-class _Tried(ScriptVehicles):
+class _Tried(VehicleDomain):
     """Notes which vehicles a script commands."""
 
     def __init__(self, ego: str) -> None:

@@ -90,14 +90,6 @@ class _Simulation(SimulationDomain):
     getLoadedIDList, getLoadedNumber = getDepartedIDList, getDepartedNumber
 
 
-class ScriptVehicles(VehicleDomain):
-    """``traci.vehicle`` of a script."""
-
-    def add(self, vehID: str, *_arguments: Any, **_named: Any) -> None:
-        """Accepted of its own vehicle, which is there."""
-        self._require_own(vehID, "add")
-
-
 class _Routes(Domain):
     """``traci.route``: of the one that its vehicle is added on."""
 
@@ -119,7 +111,7 @@ class ScriptTraci(Traci):
 
     simulation: _Simulation
 
-    def __init__(self, vehicle: ScriptVehicles) -> None:
+    def __init__(self, vehicle: VehicleDomain) -> None:
         super().__init__()
         self.vehicle, self.simulation = vehicle, _Simulation(vehicle)
         self.gui, self.route = _Gui(), _Routes()
@@ -346,7 +338,7 @@ class ScriptController:
 
     _traci: ScriptTraci
 
-    def __init__(self, script: TraciScript, vehicle: Callable[[float, str, str], ScriptVehicles]) -> None:
+    def __init__(self, script: TraciScript, vehicle: Callable[[float, str, str], VehicleDomain]) -> None:
         self._script, self._vehicle = script, vehicle
         self._run: greenlet | None = None
         self._held, self._left = 0.0, 0

@@ -248,6 +248,10 @@ class VehicleDomain(Domain):
 
     # -- commands --
 
+    def add(self, vehID: str, *_arguments: Any, **_named: Any) -> None:
+        """Accepted of its own vehicle, which is there."""
+        self._require_own(vehID, "add")
+
     def setSpeed(self, vehID: str, speed: float) -> None:
         """Drive at this speed (m/s) from the next step on until told otherwise; -1 releases."""
         self._require_own(vehID, "setSpeed")

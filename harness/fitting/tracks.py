@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -43,8 +43,12 @@ class Scene:
             np.where((i > 0) & (self._spot[behind] == spot), behind, -1),
         )
 
-    def states(self, rows: IntArray, side: int) -> States:
-        """States of some rows (m,) towards the lane ``side``."""
+    def states(self, rows: IntArray, side: int) -> dict[str, Any]:
+        """States of some rows (m,) towards the lane ``side``: columns (m,), and what else holds of them.
+
+        ``leads`` is whether somebody does; speed ``fits``, and R1 (``follows``), the range of the laws; ``behind`` is
+        both, without overlap; ``at_risk`` that nobody is alongside, too, with the road behind in view.
+        """
         track = self._track
         leader, _ = self.neighbours(rows, 0)
         r1 = track.gap(leader, rows)
@@ -58,27 +62,9 @@ class Scene:
         ttc_s[closing] = r2[closing] / -r2dot[closing]
         seen = (after >= 0) | (track.s[rows] - track.view[0, track.road[rows]] >= IN_VIEW_M)
         at_risk = behind & (r2 > 0.0) & (track.gap(ahead, rows) > 0.0) & seen
-        return States(leader, r1, track.rate(leader, rows), fits, follows, behind, r2, r2dot, ttc_s, at_risk)
-
-
-class States(NamedTuple):
-    """States of rows (m,) towards the lane on one side."""
-
-    leader: IntArray
-    """Its row, or -1."""
-    r1: FloatArray
-    r1dot: FloatArray
-    fits: BoolArray
-    """Whether the speed is within the fit range."""
-    follows: BoolArray
-    """Whether R1 is within the fit range."""
-    behind: BoolArray
-    """Both, and vehicles do not overlap."""
-    r2: FloatArray
-    r2dot: FloatArray
-    ttc_s: FloatArray
-    at_risk: BoolArray
-    """Behind a leader, nobody alongside, and the road behind in view."""
+        columns = {"v_mps": track.v[rows], "r1_m": r1, "r1dot_mps": track.rate(leader, rows)}
+        columns |= {"r2_m": r2, "r2dot_mps": r2dot, "ttc_s": ttc_s}
+        return columns | {"leads": leader >= 0, "fits": fits, "follows": follows, "behind": behind, "at_risk": at_risk}
 
 
 def durations_s(track: Recording, rows: IntArray) -> FloatArray:

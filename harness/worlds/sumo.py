@@ -44,12 +44,16 @@ OBEY = 0
 """Speed mode in which commands are taken as they are."""
 NEVER_PLAN_S, PLAN_NOW_S = 1000.0, 0.1
 """Action steps: SUMO's own planning is switched off, except for the one step in which BV changes lanes."""
+NETWORKS = Path(__file__).parents[1] / "sumo_networks"
 PARKED_M = 100.0
 """Distance between the vehicles of a cell that has not been given a test, and of the last from the road's beginning."""
 
 
 class SumoCells(World):
-    """K roads in a SUMO, each with V vehicles."""
+    """K roads in a SUMO, each with V vehicles, of types that are in ``vehicles.add.xml`` and ``_more_types``."""
+
+    _type = _av_type = "exact"
+    _more_types: Sequence[SharedFile] = ()
 
     def __init__(self, n_cells: int, vehicles: Sequence[str] = VEHICLES) -> None:
         super().__init__(n_cells, vehicles)
@@ -64,33 +68,23 @@ class SumoCells(World):
 
     def _arguments(self) -> list[str]:
         """SUMO's command line, without the name of the program."""
-        types = ",".join(map(str, self._type_files()))
-        return ["-n", str(as_shared(network_file(self.n_cells)).path), "-a", types, *EXACT_OPTIONS]
-
-    def _type_files(self) -> list[Path]:
-        """Files with the vehicle types."""
-        return [as_shared(committed_file("vehicles.add.xml")).path]
-
-    def _type_of(self, vehicle: int) -> str:  # noqa: ARG002 - worlds whose AV is of another type look at it
-        """Name of the vehicle type of a vehicle, by its place."""
-        return "exact"
+        types = as_shared(NETWORKS / "vehicles.add.xml"), *self._more_types
+        network = as_shared(network_file(self.n_cells))
+        return ["-n", str(network.path), "-a", ",".join(str(each.path) for each in types), *EXACT_OPTIONS]
 
     def _populate(self, api: Any) -> None:
         """Put the vehicles of all cells on the road, parked."""
         self.lane[:], self.lane[:, -1] = LEFT, RIGHT
         for k, names in enumerate(self._names):
             api.route.add(f"cell{k}", [f"cell{k}"])
-            for vehicle, name in enumerate(names):
-                lane, position = str(RIGHT if self._is_av(vehicle) else LEFT), str(self._parked[vehicle])
-                api.vehicle.add(name, f"cell{k}", typeID=self._type_of(vehicle), departLane=lane, departPos=position)
+            for vehicle, (name, at) in enumerate(zip(names, self._parked.tolist(), strict=True)):
+                lane, kind = (RIGHT, self._av_type) if name is names[-1] else (LEFT, self._type)
+                api.vehicle.add(name, f"cell{k}", typeID=kind, departLane=str(lane), departPos=str(at))
                 api.vehicle.setSpeedMode(name, OBEY)
                 api.vehicle.setLaneChangeMode(name, 0)
-                self._move(api.vehicle, k, vehicle, float(self._parked[vehicle]), 0.0, int(lane))
+                self._move(api.vehicle, k, vehicle, at, 0.0, lane)
         # A vehicle that is still pending after the first step ignores moveTo: all stand on the road before it.
         api.simulationStep()
-
-    def _is_av(self, vehicle: int) -> bool:
-        return vehicle == len(self.vehicles) - 1
 
     def _put(self, to: Any, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
         """Move the vehicles of the given cells (n,) to ``x[cells]``, at ``v[cells]``, on ``lane[cells]``.
@@ -143,15 +137,7 @@ class SumoCells(World):
 
 def network_file(n_cells: int) -> Path:
     """Smallest committed network with at least ``n_cells`` roads, of which there are at most `MOST_SUMO_CELLS`."""
-    return committed_file("highway-1.net.xml" if n_cells == 1 else f"highway-{MOST_SUMO_CELLS}.net.xml")
-
-
-def committed_file(name: str) -> Path:
-    """A file of ``sumo_networks/``, which in a checkout is a link."""
-    path = Path(__file__).parents[1] / "sumo_networks" / name
-    if not path.exists():
-        raise CampaignError(str(path), "no file", "the committed network", "Reinstall the harness from a checkout.")
-    return path
+    return NETWORKS / ("highway-1.net.xml" if n_cells == 1 else f"highway-{MOST_SUMO_CELLS}.net.xml")
 
 
 @cache

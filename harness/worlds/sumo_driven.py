@@ -28,8 +28,6 @@ SUMO_DECIDES = 31
 RELEASE = -1.0
 """The speed that, commanded, gives a vehicle back to its model."""
 
-TYPE_NAME = "av"
-
 DEFAULTS: dict[str, str | float] = {
     "carFollowModel": "Krauss",
     "minGap": 2.0,
@@ -134,15 +132,15 @@ def _wrong(name: str, found: str | float, expected: str, mend: str) -> CampaignE
 class SumoAvWorld(SumoWorld):
     """`SumoWorld` whose AVs (see `av_type`) are driven by SUMO after the cut-in, or from the start of an episode."""
 
-    drives_av = True
+    drives_av, _av_type = True, "av"
 
     def __init__(self, n_cells: int, av: Mapping[str, str | float], vehicles: Sequence[str] = VEHICLES) -> None:
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._wanted: FloatArray = np.zeros((n_cells, len(vehicles)))
         attributes = av_type(av)
         written = " ".join(f"{name}={quoteattr(str(value))}" for name, value in attributes.items())
-        xml = f'<additional>\n    <vType id="{TYPE_NAME}" {written}/>\n</additional>\n'
-        self._type_file, stderr = SharedFile(xml.encode()), SharedFile()
+        xml = f'<additional>\n    <vType id="{self._av_type}" {written}/>\n</additional>\n'
+        self._more_types, stderr = (SharedFile(xml.encode()),), SharedFile()
         try:
             with _stderr_to(stderr.path):
                 super().__init__(n_cells, vehicles)
@@ -155,12 +153,6 @@ class SumoAvWorld(SumoWorld):
             where, values = (f"av.sumo.{named}", attributes[named]) if named else ("av.sumo", "values")
             found, mend = f"{values}, which SUMO refuses", f"SUMO says: {messages[0]}"
             raise CampaignError(where, found, "a vType that SUMO accepts", mend) from error
-
-    def _type_files(self) -> list[Path]:
-        return [*super()._type_files(), self._type_file.path]
-
-    def _type_of(self, vehicle: int) -> str:
-        return TYPE_NAME if self._is_av(vehicle) else super()._type_of(vehicle)
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
         """Take the AVs of these cells back under command."""

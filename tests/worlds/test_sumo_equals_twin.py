@@ -59,8 +59,7 @@ def planning(world: type) -> type:
     """A kind of world whose vehicles SUMO lets plan in every step (action step 0.1 s): a reference."""
 
     class Vanilla(world):
-        def _type_of(self, _vehicle):
-            return "vanilla"
+        _type = _av_type = "vanilla"
 
         def _plan_every(self, *_): ...
 

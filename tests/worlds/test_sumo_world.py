@@ -17,7 +17,6 @@ from harness.sampling import prepare
 from harness.vocabulary import BV, CONTACT, CRASH, LV, STATE_DTYPE, TIMEOUT, VEHICLES
 from harness.worlds import sumo
 from harness.worlds.shim import open_shim, shim_library
-from harness.worlds.sumo import committed_file
 from harness.worlds.twin import TwinWorld
 from tests.episode.test_path import BESIDE, at_once, beside
 from tests.worlds.running import smoke
@@ -204,6 +203,6 @@ def test_sumo_flags_vehicles_beside_each_other_by_the_rule_of_the_first_overlap(
 
 def test_sumo_reads_its_files_from_an_installation_in_a_folder_of_any_name(driving, tmp_path, monkeypatch):
     folder = tmp_path / "a,b ${HOME}"
-    shutil.copytree(committed_file("vehicles.add.xml").parent, folder)
-    monkeypatch.setattr(sumo, "committed_file", lambda name: folder / name)
+    shutil.copytree(sumo.NETWORKS, folder)
+    monkeypatch.setattr(sumo, "NETWORKS", folder)
     drive(driving(2))

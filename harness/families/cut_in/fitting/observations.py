@@ -132,33 +132,33 @@ def observe(track: Recording) -> Observations:
     second = whole & track.same_run(rows, n)
     acceleration = np.full(rows.size, np.nan)
     acceleration[second] = slopes(track, rows[second])
-    seen = (state.leader >= 0) | (track.s[rows] + R1_MAX_M <= track.view[1, track.road[rows]])
+    seen = state["leads"] | (track.s[rows] + R1_MAX_M <= track.view[1, track.road[rows]])
     since = track.frame[rows] - track.frame[np.searchsorted(track.vehicle, track.vehicle[rows])]
     crosses = np.isin(rows, changes)
-    columns: dict[str, Any] = {"vehicle": track.vehicle[rows], "duration_s": duration_s, "v_mps": track.v[rows]}
-    columns |= {"r1_m": state.r1, "r1dot_mps": state.r1dot, "r2_m": state.r2, "r2dot_mps": state.r2dot}
-    columns |= {"ttc_s": state.ttc_s, "acceleration_mps2": acceleration, "changes": crosses}
-    leads, odd = _leads(track, rows[crosses & state.fits])
-    overlaps = state.follows & (state.r1 < OVERLAP_M)
+    columns = state | {"vehicle": track.vehicle[rows], "duration_s": duration_s}
+    columns |= {"acceleration_mps2": acceleration, "changes": crosses}
+    fits, follows, behind, at_risk = (state[name] for name in ("fits", "follows", "behind", "at_risk"))
+    leads, odd = _leads(track, rows[crosses & fits])
+    overlaps = follows & (state["r1_m"] < OVERLAP_M)
     tally = BesideCounts(
         vehicles=np.unique(track.vehicle[rows]).size,
         driven_s=float(duration_s.sum()),
-        outside_s=float(duration_s[~state.fits].sum()),
-        followed_s=float(duration_s[state.follows].sum()),
+        outside_s=float(duration_s[~fits].sum()),
+        followed_s=float(duration_s[follows].sum()),
         overlapping_s=float(duration_s[overlaps].sum()),
         flickers=track.flickers,
         changes=changes.size,
-        used=int((state.at_risk & crosses).sum()),
+        used=int((at_risk & crosses).sum()),
         odd=odd,
-        closing_s=float((whole & state.at_risk & (state.ttc_s < CLOSING_TTC_S)).sum()),
-        closing_other_s=float((other.at_risk & (other.ttc_s < CLOSING_TTC_S)).sum()),
+        closing_s=float((whole & at_risk & (state["ttc_s"] < CLOSING_TTC_S)).sum()),
+        closing_other_s=float((other["at_risk"] & (other["ttc_s"] < CLOSING_TTC_S)).sum()),
     )
     return Observations(
         track.name,
-        _records("free", columns, second & state.fits & ~state.follows & seen),
-        _records("following", columns, second & state.behind),
-        _records("initial", columns, whole & state.behind & (since // n % INITIAL_EVERY_S == 0)),
-        _records("at_risk", columns, state.at_risk),
+        _records("free", columns, second & fits & ~follows & seen),
+        _records("following", columns, second & behind),
+        _records("initial", columns, whole & behind & (since // n % INITIAL_EVERY_S == 0)),
+        _records("at_risk", columns, at_risk),
         leads,
         noise_of(track),
         tally,
