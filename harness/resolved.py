@@ -11,8 +11,7 @@ from functools import cached_property
 from harness.campaign.campaign import Campaign, Command, Use, refusal
 from harness.controllers.find import require_controller, script_step_s, source_of_own
 from harness.errors import CampaignError
-from harness.estimators.one_pass import accumulator
-from harness.estimators.own import headline_of
+from harness.estimators.one_pass import accumulator, headline_of
 from harness.families import family_named
 from harness.families.protocol import Environment, Family, Parameters
 from harness.loop.loop import Scenario

@@ -91,7 +91,7 @@ def estimate(
                 folder, environment, confidence=confidence, own=write, progress=bar
             )
     else:
-        from harness.estimators.own import asked_for
+        from harness.estimators.one_pass import asked_for
 
         asked = asked_for(estimators, "--estimator")
         estimators = list(map(str, asked))

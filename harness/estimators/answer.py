@@ -15,8 +15,7 @@ from harness.campaign.sections import LEAST_POOL_ERROR, MOST_EVENTS
 from harness.estimators.block import Block
 from harness.estimators.estimate import Estimate, Note, Number, Point, Unavailable, finite_json
 from harness.estimators.likelihood import Level
-from harness.estimators.one_pass import BEFORE_EVENT, one_pass
-from harness.estimators.own import Asked, headline_of
+from harness.estimators.one_pass import BEFORE_EVENT, Asked, headline_of, one_pass
 from harness.estimators.severity import Severity
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Rule

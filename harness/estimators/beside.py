@@ -84,28 +84,15 @@ def unavoidable(design: ShellDesign, cells: Tally, level: Level) -> Unavoidable 
 
 def beside(design: ShellDesign, cells: Tally, r: int, n_strata: int, level: Level) -> tuple[float, float]:
     """Limits of the rate of the first strata over that of a reference."""
-    strata, p = slice(0, n_strata), design.p[:n_strata]
-    moments = float(design.reference_rate[r]), float(design.reference_square[r])
+    p, strata = design.p[:n_strata], slice(0, n_strata)
 
     def limits(tests: Tally) -> tuple[float, float]:
-        with_reference = design.joined.T @ (tests.crash_mass @ design.crashes_too(r))
-        own = tests.joined(design.joined).part(strata)
-        return rate_ratio_limits(p, own, with_reference[strata], moments, design.n_independent, level)
+        outcomes = tests.joined(design.joined).part(strata).outcomes
+        errors = path_errors(design, tests, r, n_strata)
+        return limits_over(float(design.reference_rate[r]), p, outcomes, errors, level)
 
     low, high = limits(cells)
     return low, high if (worst := cells.failed_as_crashes()) is cells else limits(worst)[1]
-
-
-def rate_ratio_limits(
-    p: FloatArray, tally: Tally, with_reference: FloatArray, moments: tuple[float, float], n_paths: float, level: Level
-) -> tuple[float, float]:
-    """Limits of Σ p_s θ_s over the crash rate of a reference.
-
-    Of that ``moments`` has the rate and the mean square of a path's probability of a crash; ``with_reference`` (S,) is,
-    over the crashed tests of each stratum, the sum of their paths' probability that the reference crashes.
-    """
-    errors = path_errors(p, tally, with_reference, moments, n_paths)
-    return limits_over(moments[0], p, tally.outcomes, errors, level)
 
 
 def limits_over(
@@ -123,15 +110,21 @@ def limits_over(
 
 
 def path_errors(
-    p: FloatArray, tally: Tally, with_reference: FloatArray, moments: tuple[float, float], n_paths: float
+    design: ShellDesign, cells: Tally, r: int | None, n_strata: int | None = None
 ) -> tuple[float, float, float]:
-    """What few paths leave open: variance of Σ p_s c_s, its covariance with a reference's rate, that rate's variance.
+    """What few paths leave open of Σ p_s c_s over the first strata, by default all, beside the rate of a reference.
 
-    Arguments see `rate_ratio_limits`.
+    Variance of the sum, its covariance with that rate, and the variance of the rate; of no reference the first alone.
     """
-    rate, square = moments
-    own, product = float(p @ tally.share), float(weight_of_a_test(p, tally.tests) @ with_reference)
-    return pool_variance(p, tally, n_paths), (product - own * rate) / n_paths, (square - rate * rate) / n_paths
+    n_paths, p, strata = design.n_independent, design.p[:n_strata], slice(0, n_strata)
+    tally = cells.joined(design.joined).part(strata)
+    own = pool_variance(p, tally, n_paths)
+    if r is None:
+        return own, 0.0, 0.0
+    rate, square = float(design.reference_rate[r]), float(design.reference_square[r])
+    with_reference = (design.joined.T @ (cells.crash_mass @ design.crashes_too(r)))[strata]
+    product = float(weight_of_a_test(p, tally.tests) @ with_reference)
+    return own, (product - float(p @ tally.share) * rate) / n_paths, (square - rate * rate) / n_paths
 
 
 def preventable_share(

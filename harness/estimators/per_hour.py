@@ -176,15 +176,8 @@ class PerHour:
         for of in self.families:
             design, cells = of.seen.design, of.seen.cells
             cells = cells.failed_as_crashes() if worst else cells
-            own = cells.joined(design.joined)
-            outcomes.append(own.outcomes)
-            if design.reference_rate.size:
-                r = of.reference
-                with_reference = design.joined.T @ (cells.crash_mass @ design.crashes_too(r))
-                moments = float(design.reference_rate[r]), float(design.reference_square[r])
-                found = path_errors(design.p, own, with_reference, moments, design.n_independent)
-            else:
-                found = pool_variance(design.p, own, design.n_independent), 0.0, 0.0
+            outcomes.append(cells.joined(design.joined).outcomes)
+            found = path_errors(design, cells, of.reference if design.references else None)
             mine, theirs = of.rate, of.reference_rate
             errors += of.per_hour**2 * np.array(found)
             errors += of.seen.design.p_event_error**2 * np.array((mine * mine, mine * theirs, theirs * theirs))

@@ -1,7 +1,7 @@
 """When tests are enough: a precision asked for beforehand, looked for at places fixed beforehand; or a decision.
 
 A run ends (`harness.runner.underway`) when a rule of this file says so; or when no test is left to be asked for:
-``stop.episodes`` are spent or, of shells, what the pool keeps (`harness.sampling.allocation`). Which of these it was
+``stop.episodes`` are spent or, of shells, what the pool keeps (`harness.sampling.shells`). Which of these it was
 says `harness.vocabulary.StoppedBy`.
 
 Whatever the tests were drawn from, a rule looks at them now and then, leaves what it has found in ``look``, and says

@@ -20,8 +20,7 @@ from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.answer import Estimates, estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
-from harness.estimators.one_pass import even
-from harness.estimators.own import asked_for
+from harness.estimators.one_pass import asked_for, even
 from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.shells import SeenShells
 from harness.families import family_named
@@ -89,7 +88,7 @@ def estimate_run(
     folder : str or Path
         Run folder.
     estimators : sequence, optional
-        Those to report beside the campaign's own, by default all: names, or your own (`harness.estimators.own`).
+        Those to report beside the campaign's own, by default all: names, or your own (`harness.estimators.one_pass`).
     confidence : float, optional
         Level of the intervals, by default the campaign's.
 

@@ -4,7 +4,7 @@ Where the event of a test is drawn, and its weight made:
 
 - `own_path`, naturalistic and forced: from all events of the test's own path;
 - `shells`: from the pool, by `harness.pool.shells.PrescribedEpisodes`, which also has the weight, log p_s; how many
-  from which shell says `allocation`;
+  from which shell says `shells.Allocation`;
 - methods of a family's own draw it in the loop (`Family.sources`), as NADE's mixtures do.
 
 All have one shape (`protocol`); what is to be known of every method, such as whether it needs surrogates, stands in

@@ -20,8 +20,7 @@ from harness.campaign.sections import LEAST_TESTS
 from harness.controllers.find import build_host
 from harness.controllers.hosts import BeforeTest
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
-from harness.estimators.one_pass import accumulator
-from harness.estimators.own import headline_of
+from harness.estimators.one_pass import accumulator, headline_of
 from harness.estimators.stopping import Rule, StopRule
 from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import judge

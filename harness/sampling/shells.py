@@ -1,14 +1,16 @@
 """Events of the pool, drawn within shells, in rounds: each decides what the next one tests.
 
 A round is run to its end before the next begins, whatever the number of workers, and the result is looked at. Rounds
-grow geometrically, to where they narrow the interval most (`harness.sampling.allocation`). That depends on counts
-alone, not on the stop rule or on time: a run can be continued to a smaller RHW. First the strata inside the
-boundary are tested until their rate is roughly known; then all.
+grow geometrically, to where they narrow the interval most (`Allocation`): first a few tests of each stratum inside the
+boundary, until their rate is roughly known; then all. That depends on counts alone, not on the stop rule or on time: a
+run can be continued to a smaller RHW.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -18,12 +20,15 @@ import numpy as np
 import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
+from harness.campaign.sections import ShellSettings
 from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
+from harness.estimators.likelihood import Level, spread
+from harness.estimators.limits import clopper_pearson
 from harness.estimators.pairs import FAILED, Pairs
 from harness.estimators.per_hour import PerHour
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
-from harness.estimators.tally import Tally, empty_tally
+from harness.estimators.tally import Tally, combined, empty_tally
 from harness.families.protocol import Recorded
 from harness.loop.loop import EpisodeLoop, Shard
 from harness.numbers import plain
@@ -33,11 +38,29 @@ from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_pat
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
-from harness.sampling.allocation import LEVEL, Allocation, Joined
 from harness.sampling.protocol import Rounds, ShardRequest, Source
-from harness.strata import LIBRARY_STATEMENT, ShellDesign, StoredDesign
-from harness.vocabulary import IntArray
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT, ShellDesign, StoredDesign
+from harness.vocabulary import FloatArray, IntArray
 
+GROWTH = 1.1
+"""Tests after a round over tests before it; also the distance of the looks at the result."""
+INNER_RHW = 0.3
+"""Relative half-width inside the boundary at which testing turns to what lies outside."""
+CONFIDENCE = 0.9
+"""Level at which widths are compared, whatever the campaign reports."""
+LEVEL = Level.two_sided(CONFIDENCE)
+FIRST_TESTS = 36
+"""First tests of all strata within the boundary together, each its share of the probability there."""
+LEAST_FIRST_TESTS, MOST_FIRST_TESTS = 3, 12
+"""Of one stratum."""
+MOST_INNER_TESTS = 8
+"""Testing turns to what lies outside after this many times the first tests, known or not."""
+SMALLEST_ROUND = 8
+ADDED = 0.25
+"""Crash, and test without one, that each stratum is thought to have had besides: without it those in which the first
+tests crash get all further ones, and the rate is 4 % too low for some vehicles (measured)."""
+USED_UP_SHARE = 0.95
+"""Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
 _FINISH = "Run `harness run` with --resume, which makes what is missing."
@@ -108,6 +131,113 @@ class Shells(Source):
         return super().is_shard(request, episodes) and not events.null_count and np.array_equal(events, wanted)
 
 
+def first_tests(design: ShellDesign, asked: int | None = None) -> IntArray:
+    """Tests that each stratum gets before anything is decided about it, shape (S,); ``asked`` is a number for all.
+
+    A stratum without a crash leaves about p_s/n_s open, and of several the largest counts. So tests go in proportion
+    to the probability, which leaves the same open in each; further ones come where crashes are seen.
+    """
+    if asked is not None:
+        return np.full(design.p.size, asked, np.int64)
+    within = design.p[: design.n_inside].sum()
+    share = np.ceil(FIRST_TESTS * design.p / within) if within > 0.0 else np.full(design.p.size, np.inf)
+    return np.asarray(np.clip(share, LEAST_FIRST_TESTS, MOST_FIRST_TESTS).astype(np.int64))
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """How many tests each shell gets next.
+
+    Strata have the probabilities ``p`` (S,), known from ``n_paths``; ``n_inside`` are inside the boundary. One gets
+    ``first_tests`` before anything is decided about it, and at most those ``available``, (S,) each. With the
+    ``statement`` `library` what lies outside the boundary is never tested. A round has at least ``smallest_round``
+    tests, where there are as many.
+    """
+
+    p: FloatArray
+    n_inside: int
+    first_tests: IntArray
+    available: IntArray
+    statement: str = ASSUMPTION_FREE
+    smallest_round: int = 1
+    n_paths: float = math.inf
+
+    @classmethod
+    def of(cls, shells: ShellSettings, design: ShellDesign, available: IntArray) -> Allocation:
+        """That of a campaign's ``testing.shells``."""
+        first, asked = first_tests(design, shells.first_tests), (shells.statement, shells.smallest_round)
+        return cls(design.p, design.n_inside, first, available, *asked, design.n_independent)
+
+    def is_first(self, tests: IntArray, added: IntArray) -> bool:
+        """Whether a round after so many tests per stratum, (S,) each, brings some that a stratum gets in any case."""
+        return bool(np.any((tests < self.first_tests)[added > 0]))
+
+    @property
+    def n_asked(self) -> int:
+        """Strata that may be tested, which come first."""
+        return self.p.size if self.statement == ASSUMPTION_FREE else self.n_inside
+
+    def next_round(
+        self,
+        tally: Tally,
+        budget: int,
+        *,
+        inner_rhw: Callable[[int], float] | None = None,
+        given_by: Callable[[int, IntArray], IntArray] | None = None,
+    ) -> IntArray:
+        """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
+
+        Failed tests widen the limits that are to be narrowed: they may have been crashes. ``inner_rhw`` gives the
+        relative half-width from so many first strata, by default that of a crash rate; ``given_by`` gives so many tests
+        to strata with so much room (S,) each, by default to where a crash rate is narrowed.
+        """
+        tests = tally.tests
+        if self._used_up(tally):
+            return np.zeros_like(tests)
+
+        def of_crashes(n: int) -> float:
+            return combined(self.p[:n], tally.part(slice(0, n)), self.n_paths, LEVEL).rhw
+
+        begun = np.arange(tests.size) < self._n_begun(tests, inner_rhw or of_crashes)
+        active = begun & (tests < self.available)
+        wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
+        if wanted.any():
+            # Further first tests by the probability of strata, while that is all that is known of them.
+            missing, p = max(self.smallest_round - int(wanted.sum()), 0), np.where(active, self.p, 0.0)
+            if p.any():
+                wanted = wanted + np.ceil(missing * p / p.sum()).astype(np.int64)
+        elif active.any():
+            size = max(SMALLEST_ROUND, self.smallest_round, int(np.ceil(tests[begun].sum() * (GROWTH - 1.0))))
+            room = np.where(active, self.available - tests, 0)
+            wanted = (given_by or partial(self._spread, tally))(min(size, budget), room)
+        wanted = np.minimum(wanted, self.available - tests)
+        return np.asarray(np.diff(np.minimum(np.cumsum(wanted), max(budget, 0)), prepend=0))  # cut from the last one on
+
+    def _used_up(self, tally: Tally) -> bool:
+        """Whether nearly all that is left to know lies in strata without further events."""
+        tests, tail = tally.tests, (1.0 - CONFIDENCE) / 2.0
+        low, high = clopper_pearson(tally.crashes, tests, tail, tally.failed)
+        relevant = np.arange(tests.size) < self.n_asked
+        squares = np.where(relevant, (self.p * (high - low)) ** 2, 0.0)
+        return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
+
+    def _n_begun(self, tests: IntArray, inner_rhw: Callable[[int], float]) -> int:
+        """Of how many strata it is time: of those inside the boundary while they leave much open."""
+        n = min(self.n_inside, self.n_asked)
+        enough = n == self.n_asked or np.any(tests[n:] > 0) or np.all(tests[:n] >= self.available[:n])
+        # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
+        enough = enough or tests[:n].sum() >= MOST_INNER_TESTS * self.first_tests[:n].sum()
+        return self.n_asked if enough or inner_rhw(n) <= INNER_RHW else n
+
+    def _spread(self, tally: Tally, size: int, most: IntArray) -> IntArray:
+        weights, room = np.column_stack([self.p, np.zeros_like(self.p)]), ADDED * (tally.tests > 0)
+        lower, upper = (
+            np.column_stack([crashes + room, tally.tests - crashes + room])
+            for crashes in (tally.crashes, tally.crashes + tally.failed)
+        )
+        return spread(weights, lower, upper, LEVEL, size, most)
+
+
 class ShellRounds(Rounds):
     """Fed with finished tests of shells in order; says what is tested next, and when it is enough.
 
@@ -154,63 +284,94 @@ class ShellRounds(Rounds):
         return self._n_episodes == self._look and self.rule.observe(self.seen)
 
 
-class PairRounds:
-    """Says which pairs of tests of two vehicles are driven next, from counts alone.
+class SideBySide:
+    """Rounds of several pools, of which the strata stand for ``p`` (S,): those inside a boundary come first.
+
+    What is tested next follows from counts alone. ``available`` (S,) of each pool are the most tests of its strata;
+    ``rule`` looks at each round.
+    """
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        designs: Sequence[ShellDesign],
+        p: FloatArray,
+        available: Sequence[IntArray],
+        rule: RoundRule | PairRule,
+    ) -> None:
+        shells, self.rule, self._budget = campaign.testing.shells, rule, campaign.stop.episodes
+        inside = np.concatenate([np.arange(design.p.size) < design.n_inside for design in designs])
+        self._order = np.argsort(~inside, kind="stable")
+        self._place = np.argsort(self._order)
+        self._ends = np.cumsum([design.p.size for design in designs])[:-1]
+        first = np.concatenate([first_tests(design, shells.first_tests) for design in designs])
+        self._available, asked = np.concatenate(available), (shells.statement, shells.smallest_round)
+        most = self._available[self._order]
+        self._all = Allocation(p[self._order], int(inside.sum()), first[self._order], most, *asked)
+
+    def _next(
+        self,
+        counts: Sequence[IntArray],
+        inner_rhw: Callable[[], float],
+        given_by: Callable[[int, IntArray], IntArray] | None = None,
+    ) -> list[IntArray]:
+        """Tests to add per stratum of each pool; ``counts`` see `Tally.counted`."""
+        tally = Tally.counted(*(column[self._order] for column in counts))
+        given = None if given_by is None else (lambda n, room: given_by(n, room[self._place])[self._order])
+        left = self._budget - int(tally.tests.sum())
+        added = self._all.next_round(tally, left, inner_rhw=lambda _: inner_rhw(), given_by=given)
+        self.rule.of_first_tests = self._all.is_first(tally.tests, added)
+        return np.split(added[self._place], self._ends)
+
+
+class PairRounds(SideBySide):
+    """Says which pairs of tests of two vehicles are driven next.
 
     Rounds are those of one vehicle, with pairs in place of tests; within a round pairs go to where the likelihood ratio
     says that one more narrows the interval of the difference most. The campaigns are equal but for the vehicle;
-    ``none`` are no pairs, ``available`` the most of each stratum, (S,) of each pool; ``rule`` looks at each round.
+    ``none`` are no pairs.
     """
 
+    rule: PairRule
+
     def __init__(self, campaign: Campaign, none: Pairs, available: Sequence[IntArray], rule: PairRule) -> None:
-        self.rule, self._budget, self._available = rule, campaign.stop.episodes, np.concatenate(available)
-        designs = [of.design for of in none.each]
-        self._joined = Joined(campaign.testing.shells, designs, none.p, available)
+        super().__init__(campaign, [of.design for of in none.each], none.p, available, rule)
 
     def next_round(self, pairs: Pairs) -> list[IntArray]:
         """Pairs to add per stratum of each pool; all 0 when no stratum or no budget is left."""
         tests, differing = pairs.tests, pairs.outcomes()[:, 1:3].sum(1)  # those stand in the crashes' place
         may_differ = np.maximum(pairs.ends[:, FAILED].sum(1), pairs.ends[:, :, FAILED].sum(1))
-        added, self.rule.of_first_tests = self._joined.next_round(
-            (tests, differing, np.minimum(may_differ, tests - differing)),
-            self._budget - int(tests.sum()),
-            lambda: pairs.within().rhw(LEVEL),
-            partial(pairs.spread, LEVEL),
-        )
-        return added
+        counts = tests, differing, np.minimum(may_differ, tests - differing)
+        return self._next(counts, lambda: pairs.within().rhw(LEVEL), partial(pairs.spread, LEVEL))
 
     def used_of_pool(self, pairs: Pairs) -> float:
         """Largest share of a pool's events of a stratum that these pairs have used."""
         return float(np.max(pairs.tests / np.maximum(self._available, 1)))
 
 
-class HourRounds:
-    """Says which tests of each family are driven next, from counts alone: the strata of all lie side by side.
+class HourRounds(SideBySide):
+    """Says which tests of each family are driven next.
 
     The next test goes where it narrows the crashes per hour of the sum most; where each family's own rate is asked for,
-    it is of the one that is known worst. ``available`` (S,) of each are the most tests of its strata; ``rule`` looks at
-    each round.
+    it is of the one that is known worst.
     """
 
     def __init__(self, campaign: Campaign, hour: PerHour, available: Sequence[IntArray], rule: RoundRule) -> None:
-        self.rule, self._budget, self._each = rule, campaign.stop.episodes, campaign.stop.each_family
-        shells, designs = campaign.testing.shells, [of.seen.design for of in hour.families]
-        self._own = [Allocation.of(shells, *each) for each in zip(designs, available, strict=True)]
-        self._all = Joined(shells, designs, np.concatenate([of.p for of in hour.families]), available)
+        designs = [of.seen.design for of in hour.families]
+        super().__init__(campaign, designs, np.concatenate([of.p for of in hour.families]), available, rule)
+        own = zip(designs, available, strict=True) if campaign.stop.each_family else ()
+        self._own = [Allocation.of(campaign.testing.shells, *each) for each in own]
 
     def next_round(self, hour: PerHour) -> list[IntArray]:
         """Tests to add per stratum of each family; all 0 when no stratum or no budget is left."""
         tallies = [of.tally for of in hour.families]
-        left = self._budget - hour.totals[0]
-        if self._each and all(tally.tests.any() for tally in tallies):
+        if self._own and all(tally.tests.any() for tally in tallies):
             worst = int(np.argmax([of.limits(LEVEL).rhw for of in hour.families]))
             of_each = [np.zeros_like(tally.tests) for tally in tallies]
-            of_each[worst] = self._own[worst].next_round(tallies[worst], left)
+            of_each[worst] = self._own[worst].next_round(tallies[worst], self._budget - hour.totals[0])
             return of_each
         columns = [np.concatenate(column) for column in zip(*(each[:3] for each in tallies), strict=True)]
-        added, first = self._all.next_round(columns, left, lambda: hour.limits(LEVEL, LIBRARY_STATEMENT).rhw)
-        self.rule.of_first_tests = first
-        return added
+        return self._next(columns, lambda: hour.limits(LEVEL, LIBRARY_STATEMENT).rhw)
 
 
 def round_requests(

@@ -36,8 +36,7 @@ from harness.pool.shells import (
     shells_in_strata,
     shells_of,
 )
-from harness.sampling.allocation import Allocation
-from harness.sampling.shells import PairRounds, ShellRounds
+from harness.sampling.shells import Allocation, PairRounds, ShellRounds
 from harness.strata import LIBRARY_STATEMENT, ShellDesign
 from harness.vehicles.library import Library
 from harness.vocabulary import BoolArray, FloatArray, IntArray

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -11,10 +12,11 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize
 from scipy.special import betaincinv, gammaln, xlogy
 
-from harness.estimators.beside import preventable_share, rate_ratio_limits
+from harness.estimators.beside import beside, preventable_share
 from harness.estimators.likelihood import Level, contrast_limit, likelihood_limit, ratio_limits, spread
 from harness.estimators.tally import Tally
-from tests.estimators.small_blocks import EXACT, tally
+from harness.strata import Reference
+from tests.estimators.small_blocks import EXACT, SHELLS, tally
 
 
 def _outcomes(share: Sequence[float], n: int) -> Iterator[tuple[float, np.ndarray]]:
@@ -272,11 +274,25 @@ TWO_SIDED = Level.two_sided(0.9)
 P = np.array([1e-7, 3e-7, 2e-6])
 
 
+def ratio_to(p, found, n_paths, crashes_too, rate, square):
+    """Limits of the rate over that of a reference which crashes on all events, or on none that are tested."""
+    of_cells = {
+        "strata": SHELLS.strata[: p.size],
+        "cell_stratum": tuple(range(p.size)),
+        "cell_p": p,
+        "n_paths": n_paths,
+    }
+    known = {"reference_rate": np.array([rate]), "reference_square": np.array([square])}
+    bits, references = (crashes_too,) * p.size, (Reference("r157-cc", "a driver"),)
+    design = replace(SHELLS, **of_cells, **known, cell_references=bits, references=references)
+    return beside(design, found, 0, p.size, TWO_SIDED)
+
+
 @pytest.mark.parametrize("crashes", [(5, 9, 0), (0, 0, 0)])
 def test_the_ratio_to_a_known_rate_is_the_rate_over_it(crashes):
     found = tally(P, crashes, (10, 20, 300))
     low, high = (likelihood_limit(P, found.crashes, found.tests, TWO_SIDED, side) / 2e-7 for side in (-1.0, 1.0))
-    ratio = rate_ratio_limits(P, found, np.zeros(3), (2e-7, 4e-14), EXACT, TWO_SIDED)
+    ratio = ratio_to(P, found, EXACT, 0, 2e-7, 4e-14)
     assert ratio == pytest.approx((low, high), rel=1e-6)
     assert (ratio[0] == 0.0) == (sum(crashes) == 0)
 
@@ -287,10 +303,12 @@ def test_the_reference_itself_is_as_often_as_itself_whatever_the_pool():
     crashed = mass[np.random.default_rng(2).choice(4_000, 1_000_000, p=mass / mass.sum())]
     found = Tally(*(np.array([x]) for x in (1_000_000, 1_000_000, 0)), crashed.sum()[None, None], np.zeros((1, 1)))
     p, square = mass.mean(), (mass**2).mean()
-    alone = rate_ratio_limits(np.array([p]), found, np.zeros(1), (p, p * p), 4_000, TWO_SIDED)
-    beside = rate_ratio_limits(np.array([p]), found, np.array([crashed.sum()]), (p, square), 4_000, TWO_SIDED)
+    alone, both = (
+        ratio_to(np.array([p]), found, 4_000, 0, p, p * p),
+        ratio_to(np.array([p]), found, 4_000, 1, p, square),
+    )
     assert alone[1] - alone[0] > 0.04
-    assert beside == pytest.approx((1.0, 1.0), abs=2e-3)
+    assert both == pytest.approx((1.0, 1.0), abs=2e-3)
 
 
 def least_cost(p, k, n, prevented, y):

@@ -6,9 +6,7 @@ import pytest
 
 import harness
 from harness.errors import CampaignError, HarnessError
-from harness.estimators import own
-from harness.estimators.one_pass import one_pass
-from harness.estimators.own import asked_for, headline_of
+from harness.estimators.one_pass import asked_for, headline_of, one_pass
 from tests.estimators.small_blocks import block
 from tests.in_process import run_here
 from tests.stored_runs import copy_of, edit, golden
@@ -113,7 +111,9 @@ def test_an_installed_package_gives_one_a_name(file, monkeypatch):
     from importlib.metadata import EntryPoint
 
     entry = EntryPoint("ratio", f"{file}:Mean", "harness.estimators")
-    monkeypatch.setattr(own, "entry_points", lambda *, group: [entry] if group == entry.group else [])
+    monkeypatch.setattr(
+        "harness.estimators.one_pass.entry_points", lambda *, group: [entry] if group == entry.group else []
+    )
     assert asked_for(["ratio"], "-e")[0].name == "ratio"
     with pytest.raises(HarnessError, match="Did you mean 'ratio'"):
         asked_for(["ratios"], "-e")

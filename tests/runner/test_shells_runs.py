@@ -14,8 +14,7 @@ from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.report.notes import note_words
 from harness.runner.kept import Run
-from harness.sampling.allocation import Allocation, first_tests
-from harness.sampling.shells import ShellRounds
+from harness.sampling.shells import Allocation, ShellRounds, first_tests
 from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import SHELLS as SAFE
 from tests.estimators.small_blocks import in_shells
