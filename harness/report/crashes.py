@@ -17,8 +17,7 @@ import pyarrow.compute as pc
 
 from harness.errors import HarnessError, RunFolderError
 from harness.estimators.severity import weighted_quantiles
-from harness.families import family_named
-from harness.families.protocol import Environment, Family
+from harness.families.protocol import Family
 from harness.families.words import Shown
 from harness.numbers import count, tenths
 from harness.report.drawing import Plot
@@ -63,15 +62,13 @@ def worst_crashes(key: FloatArray, episode: FloatArray, among: BoolArray) -> lis
     return [int(place) for place in order[among[order]][:CANDIDATES]]
 
 
-def crash_gallery(
-    run: RunFolder, summary: RunSummary, environment: Environment | None
-) -> tuple[list[GalleryRow], list[Scene]]:
+def crash_gallery(run: RunFolder, summary: RunSummary) -> tuple[list[GalleryRow], list[Scene]]:
     """Crashes that the reference driver avoids, the hardest impacts, typical ones, those of the largest weights.
 
     Of shells the outermost in place of the latter. Crashes that nobody avoids are left out, unless there are no others.
     Traced crashes go first where some of the worst have no trace: a scene is worth more than a rank.
     """
-    crashes, scenes, family = summary.crashes, Scenes(run.campaign, environment), family_named(run.campaign.scenario)
+    crashes, scenes, family = summary.crashes, Scenes(run.campaign, run.traffic), run.family
     facts = [each.of(crashes) for each in shown_of(family)]
     told = list(zip(shown_of(family), facts, strict=True))[:2]
     episode = crashes["episode"]
@@ -129,8 +126,7 @@ def _rankings(summary: RunSummary, stand_in: str, avoided: BoolArray, someone: B
 
 def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArray) -> IntArray:
     """After which step the family's `stand_ins` crash where the AV has (n, D), below zero for never."""
-    n_stand_ins = len(family_named(run.campaign.scenario).stand_ins)
-    ends = np.full((episode.size, n_stand_ins), UNKNOWN, np.int64)
+    ends = np.full((episode.size, len(run.family.stand_ins)), UNKNOWN, np.int64)
     acts = run.campaign.av.acts_before_event
     judged = np.sort(np.argsort(-impact, kind="stable")[: MOST_TRACED if acts else MOST_JUDGED])
     asked = {int(each) for each in episode[judged]}
@@ -167,7 +163,7 @@ class CrashPairs(NamedTuple):
 
 def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> CrashPairs:
     """Pairs on which A or B crashes, by the records: the i-th test of a shell of A and of B."""
-    axes = family_named(runs[0].campaign.scenario).maps[0]
+    axes = runs[0].family.maps[0]
     n_pairs, found = [shell["n_pairs"] for shell in shells], []
     for run in runs:
         rows = summarise(run).rows
@@ -187,7 +183,7 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
 
 def scenes_of(runs: Sequence[RunFolder], pairs: CrashPairs, replay: Replay) -> Iterator[Scene]:
     """The hardest crashes of B alone, then of A alone, beside the other vehicle on the same event."""
-    family = family_named(runs[0].campaign.scenario)
+    family = runs[0].family
     for side, other in ((1, 0), (0, 1)):
         name, impact = "AB"[side], pairs.impact_mps[side]
         places = np.flatnonzero((pairs.who == 1 + side) & (pairs.episode[other] >= 0))

@@ -11,7 +11,6 @@ from typing import Any
 
 from harness.campaign.files import dump_campaign
 from harness.estimators.traffic import Sensitivity, tests_of_sum
-from harness.families import family_named
 from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.report import several
@@ -28,9 +27,9 @@ PLOT_NAMES = re.compile(r"(severity|where|shells|sensitivity|convergence)\.svg")
 
 def write_page_of(run: RunFolder) -> Path:
     """Write the page of a run in hand: none of its files is read but traces of crashes."""
-    folder, summary, traffic, family = run.path, summarise(run), run.traffic, family_named(run.campaign.scenario)
+    folder, summary, family = run.path, summarise(run), run.family
     plots = _plots(run, summary)
-    gallery, scenes = crash_gallery(run, summary, traffic)
+    gallery, scenes = crash_gallery(run, summary)
     answer = short_answer(run.campaign, run.manifest, run.estimates)
     page = write_page(
         folder / "report.html", "report.html.j2",
@@ -59,7 +58,7 @@ def write_hours(folder: Path, content: dict[str, Any]) -> Path:
 def write_comparison(folder: Path, stored: dict[str, Any], runs: Sequence[RunFolder], replay: Replay) -> Path:
     """Write the page of a comparison in hand; ``replay`` runs a test of one of its folders again."""
     pairs, campaign = crashing_pairs(runs, stored["shells"]), runs[0].campaign
-    family = family_named(campaign.scenario)
+    family = runs[0].family
     answers = [short_answer(run.campaign, run.manifest, run.estimates) for run in runs]
     of_each = [{row.key: row for row in answer.rows} for answer in answers]
     shown = {"ratio": "× competent driver", "impact": "impact"}
@@ -98,11 +97,6 @@ def _write_comparison(
     )  # fmt: skip
 
 
-def where_plot_of(run: RunFolder, summary: RunSummary | None = None) -> Plot | None:
-    """The map of a run; None without an event."""
-    return where_plot(summary or summarise(run), family_named(run.campaign.scenario), run.traffic)
-
-
 def shown_with(text: str, plot: Plot | None) -> str:
     """HTML of a text with a plot below it, as a notebook shows results: the plot keeps its style to itself."""
     image = "" if plot is None else base64.b64encode(plot.file(_style())).decode()
@@ -113,7 +107,7 @@ def shown_with(text: str, plot: Plot | None) -> str:
 def _plots(run: RunFolder, summary: RunSummary) -> list[Plot]:
     plots = [
         severity_plot(run.estimates),
-        where_plot_of(run, summary),
+        where_plot(run, summary),
         None if run.shells is None else shells_plot(run.shells),
         _sensitivity(run.path, run.manifest["campaign_hash"], run.typed),
         convergence_plot(run),

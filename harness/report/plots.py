@@ -10,11 +10,11 @@ import numpy as np
 
 from harness.estimators.answer import Estimates
 from harness.estimators.traffic import Sensitivity
-from harness.families.protocol import Environment, Family
+from harness.families.protocol import Family
 from harness.families.words import Shown
 from harness.numbers import count, number, plain, share
 from harness.report.drawing import Plot, PlotAxis, PlotPanel
-from harness.report.summary import RunFolder, RunSummary, ShownShells
+from harness.report.summary import RunFolder, RunSummary, ShownShells, summarise
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.library import library_records
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray
@@ -209,17 +209,14 @@ def _open_question(found: ShownShells, names: tuple[str, ...], half_widths: list
     return f"Most of what is not known lies in {name} ({most}): further tests help most there."
 
 
-def where_plot(summary: RunSummary, family: Family, environment: Environment | None) -> Plot | None:
-    """Maps of the share of events that crash, over the family's axes, and what others avoid; None without any.
-
-    ``environment`` is that in which others can be driven, None where that is not known any more.
-    """
-    rows, words = summary.rows, family.words
+def where_plot(run: RunFolder, summary: RunSummary | None = None) -> Plot | None:
+    """Maps of the share of events that crash, over the family's axes, and what others avoid; None without any."""
+    rows, family, words = (summary or summarise(run)).rows, run.family, run.family.words
     met = np.isfinite(rows["event_gap_m"]) & np.isfinite(rows["event_rate_mps"]) & (rows["outcome"] != FAILED)
     if not met.any():
         return None
     panels = [_map(axes, rows, met, words.events) for axes in family.maps]
-    lines = {} if environment is None else limits_of_others(family, environment, summary, panels[0].y.high)
+    lines = limits_of_others(run, rows, panels[0].y.high)
     for (name, (speeds, gaps)), colour, dash in zip(lines.items(), ("ink", "blue"), ("", DASHED), strict=False):
         panels[0].add("line", colour, gaps, speeds, dash=dash, label=f"{name}’s limit")
     x, y = (re.split(" (?:at|of|when) ", each.words)[0] for each in family.maps[0])  # without when
@@ -260,13 +257,16 @@ def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArr
 
 
 def limits_of_others(
-    family: Family, environment: Environment, summary: RunSummary, fastest_mps: float
+    run: RunFolder, rows: Mapping[str, FloatArray], fastest_mps: float
 ) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Closing speeds (m/s), and the smallest gap (m) at which each stand-in avoids a crash; none where unknown."""
+    family = run.family
+    if run.traffic is None:
+        return {}
     speeds, gaps = np.linspace(0.5, fastest_mps, 40), np.linspace(0.25, 60.0, 240)
     speed, gap = (each.ravel() for each in np.meshgrid(speeds, gaps, indexing="ij"))
     drivers = library_records([driver for _, driver in family.stand_ins.values()], see_onset=False)
-    avoided = family.avoidable(environment, summary.rows, np.stack((gap, speed)), drivers)
+    avoided = family.avoidable(run.traffic, rows, np.stack((gap, speed)), drivers)
     if avoided is None:
         return {}
     crashes = ~avoided.reshape(speeds.size, gaps.size, len(family.stand_ins))

@@ -36,7 +36,7 @@ def answer_of_sum(content: Mapping[str, Any], *, readings: bool = False) -> Shor
     verdict = [] if content["decision"] is None else [decided(content["decision"])]
     return ShortAnswer(
         vehicle=content["vehicle"],
-        parameters=content["parameters"],
+        parameters=content.get("parameters", ()),
         tests=words.tests_words(content["n_episodes"], content["engine"], scenarios_words(content["families"])),
         rows=(*verdict, *_sum_rows(content, readings=readings)),
         warnings=tuple(sum_warnings(content)),

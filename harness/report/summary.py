@@ -26,7 +26,7 @@ from harness.estimators.block import outcome_places
 from harness.estimators.estimate import Estimate
 from harness.estimators.shells import ShellDetails
 from harness.families import family_named
-from harness.families.protocol import Environment
+from harness.families.protocol import Environment, Family
 from harness.records.folder import read_as, read_manifest
 from harness.records.reader import ShownTests, by_kind, read_campaign, read_traces, traffic_of
 from harness.records.schemas import LEAD
@@ -73,6 +73,11 @@ class RunFolder:
     design: ShellDesign | None
     tests: ShownTests
     traffic: Environment | None
+
+    @property
+    def family(self) -> Family:
+        """What its tests are of."""
+        return family_named(self.campaign.scenario)
 
     @cached_property
     def shells(self) -> ShownShells | None:

@@ -29,13 +29,12 @@ def sentence(text: str) -> str:
 def templates(package: str = "harness.report") -> Environment:
     """Templates of a package, which may include those of this one."""
     place = Path(__file__).parent
-    files = (place / name for name in ("report.css", "player.css", "player.js"))
-    css, more_css, script = (file.read_text(encoding="utf-8") for file in files)
+    css, script = ((place / name).read_text(encoding="utf-8") for name in ("report.css", "player.js"))
     loader = ChoiceLoader([PackageLoader(each, ".") for each in (package, "harness.report")])
     found = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     # Our own files, of which the policy of the page lets this one script run, by its hash.
-    found.globals.update(style=Markup(css + more_css), script=Markup(script), script_hash=Markup(digest))  # noqa: S704
+    found.globals.update(style=Markup(css), script=Markup(script), script_hash=Markup(digest))  # noqa: S704
     found.filters.update(getmembers(numbers, isfunction), sentence=sentence, note=note_words, method=method_words)
     found.policies["json.dumps_kwargs"] = {"default": np.ndarray.tolist, "separators": (",", ":")}
     return found

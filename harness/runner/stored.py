@@ -67,11 +67,11 @@ class StoredEstimates(ShownInPython, dict[str, Any]):
 
     def _plot(self) -> Plot | None:
         """The map of its tests, where what is told is of their own traffic."""
-        from harness.report.page import where_plot_of  # noqa: PLC0415 - draws
+        from harness.report.plots import where_plot  # noqa: PLC0415 - draws
         from harness.report.summary import read_run_folder  # noqa: PLC0415
 
         none = self.get("elsewhere") or "families" in self
-        return None if none else where_plot_of(read_run_folder(self._folder, self))
+        return None if none else where_plot(read_run_folder(self._folder, self))
 
 
 @checked("harness.estimate")

@@ -79,9 +79,9 @@ class RunResult(ShownInPython):
         return run_lines(self.shown.campaign, self.shown.manifest, self.shown.estimates, self.report)
 
     def _plot(self) -> Plot | None:
-        from harness.report.page import where_plot_of  # noqa: PLC0415 - draws
+        from harness.report.plots import where_plot  # noqa: PLC0415 - draws
 
-        return where_plot_of(self.shown)
+        return where_plot(self.shown)
 
 
 @dataclass

@@ -13,8 +13,6 @@ from junitparser import JUnitXml
 
 from harness.errors import RunFolderError
 from harness.estimators.traffic import Bar, Sensitivity
-from harness.families import family_named
-from harness.records.reader import traffic_of
 from harness.report.drawing import PlotAxis, PlotPanel
 from harness.report.junit import difference_case, statement_case, write_junit
 from harness.report.plots import POOL, limits_of_others, sensitivity_plot, severity_plot, shells_plot
@@ -223,7 +221,7 @@ def test_severity_is_drawn_as_it_was_estimated(name, runs):
 def test_others_avoid_a_crash_from_the_gap_on_that_their_brakes_need(runs):
     """No less than v²/2b and 0.1 s, no more than half a metre and half a second above; a delay of 0.47 s needs more."""
     run = runs["shells"]
-    lines = limits_of_others(family_named("cut_in"), traffic_of(run.campaign, run.manifest), summarise(run), 12.0)
+    lines = limits_of_others(run, summarise(run).rows, 12.0)
     (speeds, at_once), (_, competent) = lines["brakes-8"], lines["r157-cc"]
     needed = speeds**2 / 16.0
     assert np.all((at_once > needed - 0.3) & (at_once < needed + 0.5 * speeds + 0.5))

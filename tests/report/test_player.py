@@ -19,7 +19,6 @@ from harness.cli import main
 from harness.errors import CampaignError
 from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.words import STAND_INS
-from harness.records.reader import traffic_of
 from harness.report import crashes, player
 from harness.report.motion import gui_program, write_sumo
 from harness.report.player import LANE_M, UNKNOWN, Scenes
@@ -100,9 +99,7 @@ def test_of_a_vehicle_that_acts_nobody_knows_without_its_motion(stored_run):
 def test_a_report_shows_crashes_with_those_who_avoid_them(stored_run, tmp_path):
     folder = copy_of(stored_run("shells-twin"), tmp_path / "run")
     scenes = scenes_in(write_report(folder).read_text(encoding="utf-8"))
-    rows, _ = crashes.crash_gallery(
-        run := read_run_folder(folder), summarise(run), traffic_of(run.campaign, run.manifest)
-    )
+    rows, _ = crashes.crash_gallery(run := read_run_folder(folder), summarise(run))
     assert [row.episode for row in rows if row.scene is not None] == [scene["episode"] for scene in scenes]
     for row, scene in zip(rows, scenes, strict=True):
         avoids = [ghost["name"] for ghost in scene["ghosts"] if ghost["crash"] is None]
