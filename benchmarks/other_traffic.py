@@ -30,7 +30,7 @@ from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths, environment_with
 from harness.pool.shells import design_shells
 from harness.progress import Progress
-from harness.records.replicates import read_replicates
+from harness.records.reader import read_replicates
 from harness.resolved import Resolved, resolve
 from harness.runner.other_traffic import estimate_in_other_traffic
 from harness.runner.run import run_campaign

@@ -290,8 +290,7 @@ def replay(
     machine, that takes --trust.
     """
     from harness.records.folder import read_manifest, require_place
-    from harness.records.origin import code_of
-    from harness.records.reader import read_campaign
+    from harness.records.reader import code_of, read_campaign
     from harness.report.motion import gui_program, watch, writer_of
     from harness.runner.stored import code_changed
     from harness.worlds.sumo import sumo_program

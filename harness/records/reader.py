@@ -1,11 +1,15 @@
-"""Read what a run has left: its campaign, motion of a few tests, and what pages show of all.
+"""Read what a run has left: its campaign, motion of a few tests, and what pages show of all; and replicates of traffic.
 
 Every function raises a `RunFolderError` that names a file which is missing or damaged.
 """
 
 from __future__ import annotations
 
+import hmac
+import os
 import re
+import secrets
+import uuid
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
@@ -13,21 +17,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import platformdirs
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.campaign.models import shipped_or_own
+from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError, RunFolderError
+from harness.families.numbers import ParameterFile
 from harness.families.protocol import Environment, Family
-from harness.files import read_bytes
+from harness.files import content_hash, read_bytes
 from harness.processes import made_ahead
-from harness.records.folder import CAMPAIGN, Part, concatenated, no_episodes, read_kept, require_sum
+from harness.records.folder import CAMPAIGN, Part, concatenated, no_episodes, read_kept, read_table, require_sum
 from harness.records.schemas import LEAD, path_columns
 from harness.resolved import resolve
 
 N_READERS = 2
 """Threads; each holds a part."""
+OF_REPLICATES = b"harness fit"
+"""Key in the metadata of a file of replicates: hash of the numbers that they belong to."""
 
 
 def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: bool = False) -> Campaign:
@@ -75,6 +85,74 @@ def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) 
             table = read_kept(folder, part, "traces")
             found.append(table.filter(pc.is_in(table["episode"], pa.array(sorted(episodes)))))
     return concatenated(found, folder) if any(table.num_rows for table in found) else None
+
+
+def read_replicates(name: str, parameters: ParameterFile, shipped: Path) -> list[dict[str, float]]:
+    """Numbers that vary, of each replicate that an environment, a name of a file that is ``shipped`` or a path, names.
+
+    Raises `HarnessError`: the file is missing or damaged, or is not of these numbers.
+    """
+    file, tied = shipped_or_own(name, shipped, "environment.parameters"), parameters.replicates
+    if tied is None:
+        return []
+    path, again = file.parent / tied.file, "Write it anew with `harness fit`, or leave out the key replicates."
+    table = read_table(path, mend=again)
+    of, expected = (table.schema.metadata or {}).get(OF_REPLICATES), f"the replicates that {file.name} was written with"
+    if content_hash(path.read_bytes()) != tied.sha256:
+        raise RunFolderError(str(path), "replicates of another fit, or changed ones", expected, again)
+    if of != parameters.content_hash().encode():
+        raise RunFolderError(str(path), f"replicates of other numbers than those of {file.name}", expected, again)
+    wrong = [] if table.num_rows else ["no rows"]
+    for column, of in zip(table.column_names, table.columns, strict=True):
+        if column not in parameters.numbers():
+            wrong.append(f"column {column}")
+        elif of.null_count or not (pa.types.is_floating(of.type) or pa.types.is_integer(of.type)):
+            wrong.append(f"column {column} with something else than numbers")
+    if wrong:
+        raise RunFolderError(str(path), wrong[0], f"replicates of the numbers of {file.name}, by section__name", again)
+    rows: list[dict[str, float]] = table.to_pylist()
+    return rows
+
+
+# -- whether a folder was made on this machine by this user: else a replay runs code that somebody else has named. A key
+# of the user's own signs each run's campaign.yaml; a folder that is moved keeps its signature --
+
+
+def signature(campaign: bytes) -> str | None:
+    """What a manifest says of its campaign, so that `require_trust` knows it again; None for a user without a home."""
+    key = _key()
+    return None if key is None else hmac.new(key, campaign, "sha256").hexdigest()
+
+
+def code_of(av: AutomatedVehicle) -> str | None:
+    """Code of the user's that a vehicle runs in processes of the harness; None if it is no such vehicle."""
+    return av.controller or (None if av.fmu is None else av.fmu.file)
+
+
+def require_trust(folder: Path, manifest: Mapping[str, Any], code: str | None, mend: str) -> None:
+    """Refuse (`RunFolderError`) to run ``code`` that a folder names which this user has not made on this machine."""
+    signed = signature(read_bytes(folder / CAMPAIGN))
+    if code is not None and (signed is None or not hmac.compare_digest(signed, str(manifest.get("signature")))):
+        found = f"a run that was not made on this machine by this user; it names {code}, which would be run"
+        raise RunFolderError(str(folder), found, "a run of your own, or your word for that code", mend)
+
+
+def _key() -> bytes | None:
+    """The user's key, made when it is first asked for; None where there is no place for one."""
+    with suppress(OSError, RuntimeError):  # nobody knows where this user is at home
+        path = platformdirs.user_config_path("harness") / "key"
+        if not path.is_absolute():  # so say older versions of that package
+            return None
+        unfinished = path.with_name(f".{uuid.uuid4().hex}.part")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            unfinished.touch(0o600)
+            unfinished.write_bytes(secrets.token_bytes(32))
+            with suppress(FileExistsError):  # another process was faster
+                path.hardlink_to(unfinished)
+            unfinished.unlink()
+        return path.read_bytes() if path.stat().st_uid == os.geteuid() else None
+    return None
 
 
 # -- what pages show of tests: kept while a run makes them, or read from its folder --

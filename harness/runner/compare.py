@@ -32,7 +32,7 @@ from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, require_sum, write_sealed
-from harness.records.origin import code_of, require_trust
+from harness.records.reader import code_of, require_trust
 from harness.report.words import doubts_of
 from harness.resolved import require_ready
 from harness.runner.paired import SIDES, Both, PairedScenario, copy_stored, drive_pairs, together

@@ -42,8 +42,7 @@ from harness.records.folder import (
     write_part,
     write_sealed,
 )
-from harness.records.origin import signature
-from harness.records.reader import ShownTests, by_kind
+from harness.records.reader import ShownTests, by_kind, signature
 from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult

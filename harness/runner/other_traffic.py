@@ -24,7 +24,7 @@ from harness.estimators.traffic import ONE_LAW, Ends, TrafficError, Uncertain, U
 from harness.families.protocol import Parameters
 from harness.pool.moved import assumed
 from harness.progress import Progress
-from harness.records.replicates import read_replicates
+from harness.records.reader import read_replicates
 from harness.resolved import resolve
 from harness.runner.stored import StoredEstimates
 from harness.runner.stored_shells import ELSEWHERE, OPTION, Nearby, StoredShells, moved_to, require_shares

@@ -25,8 +25,7 @@ from harness.estimators.traffic import Bar, Sensitivity, tests_of_sum
 from harness.families.protocol import Parameters
 from harness.progress import Progress
 from harness.records.folder import SENSITIVITY, read_manifest, require_place, write_sealed
-from harness.records.reader import read_campaign
-from harness.records.replicates import read_replicates
+from harness.records.reader import read_campaign, read_replicates
 from harness.resolved import resolve
 from harness.runner.stored import read_families
 from harness.runner.stored_shells import Nearby, StoredShells, require_shares

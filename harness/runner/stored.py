@@ -27,8 +27,7 @@ from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.processes import made_ahead
 from harness.records.folder import CAMPAIGN, ESTIMATES, Part, no_episodes, read_as, read_kept, read_manifest
-from harness.records.origin import code_of, require_trust
-from harness.records.reader import N_READERS, read_campaign, require_campaign, traffic_of
+from harness.records.reader import N_READERS, code_of, read_campaign, require_campaign, require_trust, traffic_of
 from harness.records.schemas import moments_schema, shard_tables
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions

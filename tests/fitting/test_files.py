@@ -19,7 +19,7 @@ from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.fitting.files import fit_files
 from harness.fitting.table import load_mapping, recordings
-from harness.records.replicates import read_replicates
+from harness.records.reader import read_replicates
 from tests.fitting.trajectories import overtaking
 
 

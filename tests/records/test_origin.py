@@ -8,7 +8,7 @@ import pytest
 import harness
 from harness.campaign.files import dump_campaign
 from harness.cli import main
-from harness.records.origin import signature
+from harness.records.reader import signature
 from harness.report.crashes import motion_of
 from harness.report.summary import read_run_folder
 from harness.resolved import resolve

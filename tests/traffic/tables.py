@@ -12,7 +12,7 @@ from harness.campaign.yaml_text import read_yaml
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.sections import REPLACED
 from harness.files import content_hash
-from harness.records.replicates import OF_REPLICATES
+from harness.records.reader import OF_REPLICATES
 
 SHIPPED = SHIPPED_FOLDER / "ndd-overtaking-1.yaml"
 DATA, _ = read_yaml(SHIPPED)

@@ -36,7 +36,7 @@ from harness.fitting.recording import Recording
 from harness.fitting.table import places
 from harness.progress import Progress
 from harness.records.folder import parquet
-from harness.records.replicates import OF_REPLICATES
+from harness.records.reader import OF_REPLICATES
 from harness.report.rows import too_few
 from harness.vocabulary import FloatArray
 
