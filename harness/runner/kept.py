@@ -211,6 +211,15 @@ class Run:
             failures = sum((each.causes for each in self.shown), Counter[str]())
             require_few_failed(failures, self.n_episodes, self.resolved.campaign)
 
+    def require_no_fewer(self) -> None:
+        """Refuse (`RunFolderError`) to throw away finished tests, which the stop rule asked for now does not keep."""
+        if self.is_behind:
+            held, n = self.earlier.n_episodes, self.n_episodes
+            found = f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n:,}"
+            expected = "a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there"
+            mend = "Repeat the earlier run's --set options or ask for more; `harness estimate` reads what is there."
+            raise RunFolderError(str(self.folder), found, expected, mend)
+
     @property
     def took_s(self) -> float:
         """Wall time so far, that of earlier runs into the folder included."""
@@ -233,14 +242,15 @@ def take_over(
     folder: Path, resolved: Resolved, source: Source, earlier: Mapping[str, Any], began: float, **facts: Any
 ) -> Run:
     """A run that begins in a folder, or goes on there; see `require_own_folder`."""
-    campaign = resolved.campaign
+    campaign, family, environment = resolved.campaign, resolved.family, resolved.environment
     yaml = dump_campaign(campaign).encode()
     of_run = {
         "format": 1, "name": campaign.name, "campaign_hash": resolved.content_hash,
         "campaign_crc32": zlib.crc32(yaml), "signature": signature(yaml),
         "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": campaign.seed, "engine": campaign.world.engine, "versions": versions(), "cpu": cpu_name(),
-        "controller_sha256": resolved.controller_sha256, "script": resolved.script, **facts,
+        "controller_sha256": resolved.controller_sha256, "script": resolved.script,
+        "events_show": family.shows(environment), "distance_per_test_m": family.mean_distance_m(environment), **facts,
     }  # fmt: skip
     began -= float(earlier.get("wall_time_s") or 0.0)
     listed = earlier["before"].items()
@@ -315,15 +325,6 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         mend = "Restore it, drive it anew into a new folder or, to compare, keep the old version under another name."
         raise refusal(found, "the same controller for all tests of a run", mend)
     return manifest
-
-
-def require_no_fewer(folder: Path, held: int, n_episodes: int) -> None:
-    """Refuse (`RunFolderError`) to throw away finished tests, which the stop rule asked for now would not keep."""
-    if n_episodes < held:
-        found = f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n_episodes:,}"
-        expected = "a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there"
-        mend = "Repeat the --set options of the earlier run or ask for more; `harness estimate` reads what is there."
-        raise RunFolderError(str(folder), found, expected, mend)
 
 
 def require_same_pool(folder: Path, source: Source) -> None:

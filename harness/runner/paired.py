@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -29,7 +28,7 @@ from harness.records.folder import read_manifest, sole_use, write_bytes
 from harness.resolved import Resolved
 from harness.runner.kept import Earlier, require_own_folder
 from harness.runner.run import exposure_of
-from harness.runner.underway import RunResult, Underway, begun
+from harness.runner.underway import RunResult, Underway, begun, taken
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import PairRounds
 from harness.vocabulary import IntArray
@@ -94,37 +93,26 @@ def drive_pairs(
 
     ``ready`` are A and B, ready to be run in ``a`` and ``b`` of the folder of each.
     """
-    places = [(folder / side, own) for folder, both in ready.items() for side, own in zip(SIDES, both, strict=True)]
-    with ExitStack() as held, ExitStack() as working:
-        for folder, _ in places:
-            held.enter_context(sole_use(folder))
-        earlier = [require_own_folder(*each, resume=True) for each in places]  # all, before one is touched
-        runs: list[Underway] = []
-        for each, found in zip(places, earlier, strict=True):
-            if campaign.scenarios is not None:
-                progress.remark = f" ({each[1].campaign.scenario.replace('_', ' ')})"
-            runs.append(working.enter_context(begun(*each, found, workers, progress, len(places))))
-            runs[-1].drive_before_tests()
-        progress.remark = ""
-        scenarios = [
-            PairedScenario(*each, campaign.exposure) for each in zip(ready, runs[::2], runs[1::2], strict=True)
-        ]
-        available = [of.runs[0].prescribed.available for of in scenarios]
-        rounds = PairRounds(campaign, together(scenarios, campaign), available, rule)
-        progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
+    folders = {folder / side: own for folder, both in ready.items() for side, own in zip(SIDES, both, strict=True)}
+    with taken(folders, resume=True) as places:
+        with begun(places, workers, progress) as runs:
+            scenarios = [
+                PairedScenario(*each, campaign.exposure) for each in zip(ready, runs[::2], runs[1::2], strict=True)
+            ]
+            available = [of.runs[0].prescribed.available for of in scenarios]
+            rounds = PairRounds(campaign, together(scenarios, campaign), available, rule)
+            progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
+            for of in scenarios:
+                of.take_over(rule)
+            while np.concatenate(added := rounds.next_round(together(scenarios, campaign))).any():
+                for of, more in zip(scenarios, added, strict=True):
+                    of.drive(more, rule)
+                if rule.observe(together(scenarios, campaign)):
+                    break
+            for underway in runs:
+                underway.require_tests()
         for of in scenarios:
-            of.take_over(rule)
-        while np.concatenate(added := rounds.next_round(together(scenarios, campaign))).any():
-            for of, more in zip(scenarios, added, strict=True):
-                of.drive(more, rule)
-            if rule.observe(together(scenarios, campaign)):
-                break
-        for underway in runs:
-            underway.require_tests()
-        working.close()
-        several = campaign.scenarios is not None
-        for of in scenarios:
-            a, b = (each.finish(rule, of_sum=several) for each in of.runs)
+            a, b = (each.finish(rule, of_sum=campaign.scenarios is not None) for each in of.runs)
             of.results = a, b
         return rounds, scenarios
 

@@ -10,7 +10,7 @@ import sys
 import time
 import zlib
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,8 +33,7 @@ from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, SENSITIVITY, sole_use, write_bytes, write_sealed
 from harness.report.words import doubts_of, vehicle_words
 from harness.resolved import Resolved, require_ready
-from harness.runner.kept import require_no_fewer, require_own_folder
-from harness.runner.underway import EXIT_OF, RunResult, Underway, begun, doubted
+from harness.runner.underway import EXIT_OF, Places, RunResult, Underway, begun, doubted, taken
 from harness.sampling.shells import HourRounds
 from harness.shown import ShownInPython
 from harness.vocabulary import FAMILIES
@@ -87,13 +86,10 @@ def run_campaign(
     if campaign.scenarios is not None:
         return run_families(campaign, out, workers=workers, resume=resume, progress=progress)
     resolved = require_ready(campaign)
-    with sole_use(out):
-        earlier = require_own_folder(out, resolved, resume=resume)
-        require_no_fewer(out, earlier["n_episodes"], resolved.campaign.stop.episodes)
-        with begun(out, resolved, earlier, workers, progress) as underway:
-            underway.drive_before_tests()
+    with taken({out: resolved}, resume=resume) as places:
+        with begun(places, workers, progress) as (underway,):
             rule = underway.drive_tests()
-        require_no_fewer(out, earlier["n_episodes"], underway.run.n_episodes)
+        underway.run.require_no_fewer()
         return underway.finish(rule)
 
 
@@ -126,15 +122,10 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     with ExitStack() as held:
         held.enter_context(sole_use(out))
         require_no_other(out, [*names, FAMILIES, CAMPAIGN])
-        for name in names:
-            held.enter_context(sole_use(out / name))
-        earlier = {name: require_own_folder(out / name, ready[name], resume=resume) for name in names}
-        begins = {
-            name: begun(out / name, each, earlier[name], workers, progress, len(names)) for name, each in ready.items()
-        }
+        places = held.enter_context(taken({out / name: each for name, each in ready.items()}, resume=resume))
         yaml = dump_campaign(campaign).encode()
         write_bytes(out / CAMPAIGN, yaml)
-        hour, results, decision = _run(campaign, begins, rule, progress)
+        hour, results, decision = _run(campaign, places, rule, workers, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     told = {name: (each.shown.estimates, each.shown.manifest) for name, each in results.items()}
@@ -157,15 +148,10 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
 
 
 def _run(
-    campaign: Campaign, begins: Mapping[str, AbstractContextManager[Underway]], rule: RoundRule, progress: Progress
+    campaign: Campaign, places: Places, rule: RoundRule, workers: int | None, progress: Progress
 ) -> tuple[PerHour, dict[str, RunResult], Decision | None]:
-    runs: dict[str, Underway] = {}
-    with ExitStack() as working:
-        for name, each in begins.items():
-            progress.remark = f" ({name.replace('_', ' ')})"
-            runs[name] = working.enter_context(each)
-            runs[name].drive_before_tests()
-        progress.remark = ""
+    with begun(places, workers, progress) as each_run:
+        runs = dict(zip(campaign.scenarios or [], each_run, strict=True))
         hour = PerHour([_no_test_yet(underway, campaign.exposure) for underway in runs.values()])
         rounds = HourRounds(campaign, hour, [underway.prescribed.available for underway in runs.values()], rule)
         n_held = sum(underway.run.earlier.n_episodes for underway in runs.values())
@@ -178,7 +164,8 @@ def _run(
                 break
         for underway in runs.values():
             underway.require_tests()
-            require_no_fewer(underway.run.folder, underway.run.earlier.n_episodes, underway.run.n_episodes)
+    for underway in runs.values():
+        underway.run.require_no_fewer()
     results = {name: underway.finish(rule, of_sum=True) for name, underway in runs.items()}
     if campaign.accept is not None:  # tests that were cut off count as crashes in its decision alone
         seen = {name: SeenShells.of_blocks(underway.run.blocks) for name, underway in runs.items()}

@@ -6,7 +6,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
@@ -23,10 +23,10 @@ from harness.files import remove_unfinished
 from harness.pool.moved import assumed
 from harness.pool.shells import PrescribedEpisodes
 from harness.progress import Progress
-from harness.records.folder import ESTIMATES, MILDER, SHELLS, parquet, write_sealed
+from harness.records.folder import ESTIMATES, MILDER, SHELLS, parquet, sole_use, write_sealed
 from harness.records.reader import ShownTests
 from harness.resolved import Resolved
-from harness.runner.kept import Run, cpu_name, require_few_failed, require_same_pool, take_over
+from harness.runner.kept import Run, cpu_name, require_few_failed, require_own_folder, require_same_pool, take_over
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
 from harness.sampling.baseline import (
@@ -109,13 +109,15 @@ class Underway:
 
         Where there are events too mild to count, it meets a few of them.
         """
-        run, paths, resolved = self.run, self.run.source.baseline_paths, self.run.resolved
+        self.keep_design()
+        resolved, source = self.run.resolved, self.run.source
+        self.run = self.run.noting(assumed=assumed(resolved, source.pool, source.design, self.progress))
         if resolved.family.milder(resolved.environment) is not None:
             driven = self._before(MILDER, N_MILDER)
             self.run = self.run.noting(milder=milder_of(resolved, driven))
-        if paths is None:
+        if (paths := source.baseline_paths) is None:
             return
-        table, runs = begin(run.source, self._before)
+        table, runs = begin(source, self._before)
         self.crew.follow_from(parquet(table))
         self.run = self.run.noting(distance_per_test_m=runs.mean_distance_m(paths.weight)).written()
         self.keep_design()
@@ -219,27 +221,43 @@ def doubted(decision: Decision, runs: Iterable[Underway]) -> Decision:
     return replace(decision, n_milder=n_milder, n_differing=n_differing)
 
 
-@contextmanager
-def begun(
-    out: Path, resolved: Resolved, earlier: dict[str, Any], workers: int | None, progress: Progress, n_runs: int = 1
-) -> Iterator[Underway]:
-    """A run that begins in a folder, or goes on there; the folder can be read wherever it is interrupted.
+Places = Mapping[Path, tuple[Resolved, dict[str, Any]]]
+"""Folders of runs, each with the manifest of the run that is to go on there (`require_own_folder`)."""
 
-    Its workers end with it; those of ``n_runs`` take turns.
+
+@contextmanager
+def taken(folders: Mapping[Path, Resolved], *, resume: bool) -> Iterator[Places]:
+    """Keep other processes from the folders, all of which are looked at before one is touched."""
+    with ExitStack() as held:
+        for folder in folders:
+            held.enter_context(sole_use(folder))
+        yield {folder: (own, require_own_folder(folder, own, resume=resume)) for folder, own in folders.items()}
+
+
+@contextmanager
+def begun(places: Places, workers: int | None, progress: Progress) -> Iterator[list[Underway]]:
+    """Runs that begin in folders, or go on there, once what comes before their tests is driven.
+
+    The folders can be read wherever it is interrupted. Workers end with it; those of several runs take turns.
     """
-    with closing(workers_of(resolved, workers, n_runs=n_runs)) as crew:
-        began = time.monotonic()
-        remove_unfinished(out.rglob(".*.part"))
-        source, family, environment = prepare(resolved, progress), resolved.family, resolved.environment
-        shows, distance_m = family.shows(environment), family.mean_distance_m(environment)
-        facts = {"workers": crew.n_workers, "events_show": shows, "distance_per_test_m": distance_m}
-        underway = Underway(take_over(out, resolved, source, earlier, began, **facts), crew, progress)
+    several = len({resolved.campaign.scenario for resolved, _ in places.values()}) > 1
+    runs: list[Underway] = []
+    with ExitStack() as working:
         try:
-            underway.keep_design()
-            underway.run = underway.run.noting(assumed=assumed(resolved, source.pool, source.design, progress))
-            yield underway
+            for folder, (resolved, earlier) in places.items():
+                progress.remark = f" ({resolved.campaign.scenario.replace('_', ' ')})" if several else ""
+                crew = working.enter_context(closing(workers_of(resolved, workers, n_runs=len(places))))
+                began = time.monotonic()
+                remove_unfinished(folder.rglob(".*.part"))
+                source = prepare(resolved, progress)
+                run = take_over(folder, resolved, source, earlier, began, workers=crew.n_workers)
+                runs.append(Underway(run, crew, progress))
+                runs[-1].drive_before_tests()
+            progress.remark = ""
+            yield runs
         except BaseException:
-            underway.run.written("interrupted")
+            for each in runs:
+                each.run.written("interrupted")
             raise
 
 
