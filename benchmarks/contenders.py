@@ -96,7 +96,7 @@ class Recorded(Contender):
 
     def write(self, shard: Shard) -> None:
         tables = shard_tables(shard, self.prepared.campaign.seed, keep_traces=False)
-        write_part(self.folder, [tables._asdict()], shard.first_episode, tables.episodes.num_rows)
+        write_part(self.folder, [tables], shard.first_episode, tables["episodes"].num_rows)
 
     def rows(self, n: int) -> bytes:
         episode = self.loop.run(0, self.prepared.tests(0, n)).episode
@@ -226,7 +226,7 @@ class Workers(Contender):
         specs = [ShardRequest(i, first + i * SHARD, SHARD) for i in range(n_shards)]
         results: Iterator[ShardResult] = self._pool.run(iter(specs), lambda _: None)
         for done in results:
-            write_part(self._folder, [done.tables._asdict()], done.request.first_episode, done.request.n_episodes)
+            write_part(self._folder, [done.tables], done.request.first_episode, done.request.n_episodes)
         return Work(n_shards * SHARD, 0)
 
     def rows(self, n: int) -> None:  # starts the workers; their rows are on disk

@@ -56,11 +56,8 @@ def interval(low: float | None, high: float | None, point: float | None = None, 
         like = abs(beside)
     exponent = exponent_of(like)
     if exponent and 0.0 < abs(low) * FAR_APART <= abs(high):
-        return (
-            f"{number(low)} to {number(high)}"
-            if point is None
-            else f"{number(point)} ({number(low)} to {number(high)})"
-        )
+        ends = f"{number(low)} to {number(high)}"
+        return ends if point is None else f"{number(point)} ({ends})"
     ends = " to ".join(number(end, exponent=exponent, like=max(like, abs(end))) for end in (low, high))
     if point is not None:
         ends = f"{number(point, exponent=exponent)} ({ends})"

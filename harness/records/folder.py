@@ -25,8 +25,8 @@ from harness.files import read_bytes, write_atomically
 from harness.vocabulary import COMPARISON, FAMILIES, StoppedBy
 
 T = TypeVar("T")
-Tables = Mapping[str, pa.Table | None]
-"""Tables of the same tests, by name; None where the campaign keeps none."""
+Tables = dict[str, pa.Table]
+"""Tables of the same tests that are kept, by name."""
 
 MANIFEST = "manifest.json"
 CAMPAIGN = "campaign.yaml"
@@ -45,21 +45,22 @@ NO_RUN = "Give a folder that `harness run` has written."
 
 def require_place(folder: Path) -> None:
     """Refuse a folder in which nothing can be written, before work is spent on it; leaves it as it was."""
-    try:
-        with _made(folder):
-            tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        found, expected = f"a place where nothing can be written ({error.strerror})", "a folder, or a place for one"
-        mend = "Choose another place, or change its permissions."
-        raise RunFolderError(str(folder), found, expected, mend) from error
+    with _made(folder):
+        pass
 
 
 @contextmanager
 def _made(folder: Path) -> Iterator[None]:
-    """Make a folder; what of it and of those above was new and stays empty, goes again."""
+    """Make a folder to write in; what of it and of those above was new and stays empty, goes again."""
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            found, expected = f"a place where nothing can be written ({error.strerror})", "a folder, or a place for one"
+            mend = "Choose another place, or change its permissions."
+            raise RunFolderError(str(folder), found, expected, mend) from error
         yield
     finally:
         with suppress(OSError):
@@ -70,7 +71,6 @@ def _made(folder: Path) -> Iterator[None]:
 @contextmanager
 def sole_use(folder: Path) -> Iterator[None]:
     """Make a run folder and keep other processes from running into it; if it was new and stays empty, it goes again."""
-    require_place(folder)
     with _made(folder):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -147,8 +147,8 @@ def parquet(table: pa.Table) -> bytes:
 def write_part(folder: Path, shards: Sequence[Tables], first: int, n: int) -> Part:
     """Write tables of consecutive tests, a file for each that has rows; they count once a manifest lists them."""
     files = {}
-    for name in shards[0]:
-        if kept := [table for shard in shards if (table := shard[name]) is not None and table.num_rows]:
+    for name in sorted({name for shard in shards for name in shard}):
+        if kept := [shard[name] for shard in shards if name in shard and shard[name].num_rows]:
             path = f"{name}/{first:09d}-{first + n:09d}.parquet"
             content = parquet(concatenated(kept, folder))
             write_bytes(folder / path, content)

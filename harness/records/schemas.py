@@ -7,13 +7,14 @@ first, then the surrogates; for the others the surrogates alone. Values are from
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from harness.families.protocol import Chosen, Column, Family
 from harness.loop.loop import Shard
+from harness.records.folder import Tables
 from harness.vocabulary import CRASH, OUTCOMES, FloatArray, Int8Array, IntArray, RecordArray
 
 _F8, _I1, _I2, _I8 = pa.float64(), pa.int8(), pa.int16(), pa.int64()
@@ -159,22 +160,14 @@ def baseline_schema(columns: Sequence[Column]) -> pa.Schema:
     )
 
 
-class ShardTables(NamedTuple):
-    """The tables of a shard; ``moments`` and ``traces`` are None when the campaign keeps none."""
-
-    episodes: pa.Table
-    moments: pa.Table | None
-    traces: pa.Table | None
-
-
-def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> ShardTables:
+def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> Tables:
     """Tables of a shard, sorted by episode, step and vehicle."""
-    drawn = shard.traffic.drawn
-    return ShardTables(
-        episodes_table(shard, seed),
-        moments_table(shard) if drawn is not None and drawn.moment_limit else None,
-        traces_table(shard) if keep_traces else None,
-    )
+    tables, drawn = {"episodes": episodes_table(shard, seed)}, shard.traffic.drawn
+    if drawn is not None and drawn.moment_limit:
+        tables["moments"] = moments_table(shard)
+    if keep_traces:
+        tables["traces"] = traces_table(shard)
+    return tables
 
 
 def _table(schema: pa.Schema, columns: dict[str, Any], records: RecordArray | None = None) -> pa.Table:

@@ -12,7 +12,7 @@ import platform
 import time
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib import metadata
@@ -31,9 +31,9 @@ from harness.records.folder import (
     MANIFEST,
     SHADOW,
     SHELLS,
-    TABLES,
     Part,
     Repeated,
+    Tables,
     read_as,
     read_kept,
     read_manifest,
@@ -43,7 +43,6 @@ from harness.records.folder import (
     write_sealed,
 )
 from harness.records.reader import ShownTests, by_kind, signature
-from harness.records.schemas import ShardTables
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult
 from harness.sampling.baseline import BaselineResult
@@ -66,9 +65,9 @@ class Earlier:
         self._folder = folder
         self.parts: list[Part] = manifest["parts"]
         self.n_episodes: int = manifest["n_episodes"]
-        self._read: tuple[Part, dict[str, pa.Table] | None] | None = None
+        self._read: tuple[Part, Tables | None] | None = None
 
-    def tables(self, first: int, n: int) -> ShardTables | None:
+    def tables(self, first: int, n: int) -> Tables | None:
         """Tables of consecutive tests; None where there are not so many, or one of their files is gone.
 
         Raises `RunFolderError`: one of the files is damaged.
@@ -76,14 +75,14 @@ class Earlier:
         found = [self._tables(part) for part in self.parts if part.first_episode < first + n and part.end > first]
         if first + n > self.n_episodes or not found or None in found:
             return None
-        rows: dict[str, list[pa.Table]] = {name: [] for name in TABLES}
+        rows: dict[str, list[pa.Table]] = {}
         for part in found:
             for name, table in (part or {}).items():
-                low, high = np.searchsorted(table.column("episode").to_numpy(), (first, first + n)).tolist()
-                rows[name].append(table.slice(low, high - low))
-        return ShardTables(*(pa.concat_tables(rows[name]) if rows[name] else None for name in TABLES))
+                low, high = np.searchsorted(table["episode"].to_numpy(), (first, first + n)).tolist()
+                rows.setdefault(name, []).append(table.slice(low, high - low))
+        return {name: pa.concat_tables(tables) for name, tables in rows.items()}
 
-    def _tables(self, part: Part) -> dict[str, pa.Table] | None:
+    def _tables(self, part: Part) -> Tables | None:
         if self._read is None or self._read[0] is not part:
             there = all((self._folder / file.path).exists() for file in part.files.values())
             self._read = part, {name: read_kept(self._folder, part, name) for name in part.files} if there else None
@@ -134,7 +133,7 @@ class Run:
         Raises `RunFolderError`: one of its files is damaged.
         """
         tables = self.earlier.tables(request.first_episode, request.n_episodes)
-        if tables is None or not self.source.is_shard(request, tables.episodes):
+        if tables is None or not self.source.is_shard(request, tables["episodes"]):
             return None
         return ShardResult(request, tables, self.source.block(tables), is_new=False)
 
@@ -149,11 +148,11 @@ class Run:
             self,
             open=(*self.open, shard),
             blocks=(*self.blocks, replace(shard.block, drawn=drawn)),
-            shown=(*self.shown, ShownTests.of(shard.tables.episodes, self.resolved.family)),
+            shown=(*self.shown, ShownTests.of(shard.tables["episodes"], self.resolved.family)),
             repeated=shard.repeated or self.repeated,
         )
         run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
-        n_rows = sum(table.num_rows for each in run.open for table in each.tables if table is not None)
+        n_rows = sum(table.num_rows for each in run.open for table in each.tables.values())
         if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or n_rows >= PART_ROWS:
             n = len(run.open)  # small tables cost more than their rows
             shown = (*run.shown[:-n], ShownTests.joined(run.shown[-n:], run.folder))
@@ -199,9 +198,7 @@ class Run:
         first = self.open[0].request.first_episode
         listed = [part for part in self.earlier.parts if (part.first_episode, part.end) == (first, self.n_episodes)]
         if any(shard.is_new for shard in self.open) or not listed:
-            listed = [
-                write_part(self.folder, [each.tables._asdict() for each in self.open], first, self.n_episodes - first)
-            ]
+            listed = [write_part(self.folder, [each.tables for each in self.open], first, self.n_episodes - first)]
         parts = (*(part for part in self.parts if part.first_episode < first), *listed)
         return replace(self, parts=parts, parts_before=parts_before)
 
@@ -227,14 +224,15 @@ class Run:
 
     def content(self, status: str, **of_the_end: Any) -> dict[str, Any]:
         """What the manifest says."""
-        repeated, campaign = self.repeated, self.resolved.campaign
+        repeated, campaign, shadow = self.repeated, self.resolved.campaign, self.before.get(SHADOW, ())
+        n_failed = sum(len(table) - table["failure"].null_count for table in shadow)
         return {
             **self.facts,
             "status": status, "stopped_by": None, "unmet": [], "wall_time_s": self.took_s, **of_the_end,
             "reproducible": campaign.av.reproducible and not (repeated and repeated.differing),
             "repeated": None if repeated is None else asdict(repeated),
             "n_episodes": self.n_episodes, "parts": self.parts, "before": self.parts_before,
-            **({"shadow_runs": _counted(self.before[SHADOW])} if SHADOW in self.before else {}),
+            **({"shadow_runs": {"n_runs": sum(map(len, shadow)), "n_failed": n_failed}} if shadow else {}),
         }  # fmt: skip
 
 
@@ -258,11 +256,6 @@ def take_over(
     repeated = Repeated(**known) if (known := earlier.get("repeated")) else None
     held = Earlier(folder, earlier)
     return Run(folder, resolved, source, held, began, of_run, repeated=repeated, parts_before=there).written()
-
-
-def _counted(tables: Sequence[pa.Table]) -> dict[str, int]:
-    failed = [len(table) - table.column("failure").null_count for table in tables]
-    return {"n_runs": sum(map(len, tables)), "n_failed": sum(failed)}
 
 
 def versions() -> dict[str, str]:

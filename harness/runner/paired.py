@@ -132,7 +132,7 @@ def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:
         tables = earlier.tables(part.first_episode, part.n_episodes)
         if tables is None:  # what is gone is driven anew, and so is all that follows
             return
-        stratum = tables.episodes.column("component").to_numpy()
+        stratum = tables["episodes"]["component"].to_numpy()
         edges = [0, *(np.flatnonzero(np.diff(stratum)) + 1).tolist(), stratum.size]
         draws = []
         for first, end in pairwise(edges):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -200,23 +201,16 @@ def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False
     if "traces" not in tables or not tables["traces"].num_rows:
         mend = "Simulate it again (without --stored), or run with --set records.traces=all, say."
         raise RunFolderError(str(folder), f"no stored motion of test {episode}", "a test that is traced", mend)
-    return _result(campaign, traffic_of(campaign, manifest), tables, None, ())
+    return _result(campaign, traffic_of(campaign, manifest), tables)
 
 
-def _result(
-    campaign: Campaign,
-    traffic: Environment | None,
-    tables: Mapping[str, pa.Table],
-    bit_equal: bool | None,
-    compared: tuple[str, ...],
-    changed: str | None = None,
-) -> ReplayResult:
+def _result(campaign: Campaign, traffic: Environment | None, tables: Mapping[str, pa.Table]) -> ReplayResult:
     from harness.report.player import ReplayResult, Scenes, with_lateral  # noqa: PLC0415 - `run` and `estimate` draw nothing
 
     (row,), traces = tables["episodes"].to_pylist(), tables["traces"]
     scene = Scenes(campaign, traffic).scene(tables["episodes"], traces)
     traces = with_lateral(tables["episodes"], traces, family_named(campaign.scenario), traffic)
-    return ReplayResult(str(row["outcome"]), row, traces, bit_equal, compared, scene, changed)
+    return ReplayResult(str(row["outcome"]), row, traces, None, (), scene)
 
 
 def _simulated(
@@ -230,7 +224,8 @@ def _simulated(
     compared = tuple(name for name in again if name in stored and stored[name].num_rows)
     bit_equal = all(_equal(again[name], stored[name]) for name in compared) if compared else None
     why = None if bit_equal is not False else changed_since(manifest, campaign)
-    return _result(campaign, resolved.environment, again, bit_equal, compared, why)
+    result = _result(campaign, resolved.environment, again)
+    return replace(result, bit_equal=bit_equal, compared=compared, changed=why)
 
 
 def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) -> dict[str, pa.Table]:
@@ -241,8 +236,7 @@ def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) ->
     require_same_pool(folder, source)
     with closing(build_world(resolved.campaign, 1)) as world:
         shard = source.run_again(source.loop(world, traces="all"), episode, stored)
-    tables = shard_tables(shard, resolved.campaign.seed, keep_traces=True)
-    return {"episodes": tables.episodes, "traces": tables.traces}
+    return shard_tables(shard, resolved.campaign.seed, keep_traces=True)
 
 
 def code_changed(manifest: Mapping[str, Any], campaign: Campaign) -> str:

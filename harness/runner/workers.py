@@ -25,8 +25,8 @@ from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.loop.loop import EpisodeLoop
 from harness.processes import Began, Child, SharedFile, WorkerDeath, first_to_answer, start_server, tell, usable_cpus
-from harness.records.folder import MILDER, Repeated, read_table
-from harness.records.schemas import ShardTables, shard_tables
+from harness.records.folder import MILDER, Repeated, Tables, read_table
+from harness.records.schemas import shard_tables
 from harness.resolved import Resolved
 from harness.runner.again import repeat
 from harness.sampling import prepare
@@ -50,7 +50,7 @@ class ShardResult:
     """A finished shard: its tables, and what the stop rule and estimates need of them; a new one is not on disk."""
 
     request: ShardRequest
-    tables: ShardTables
+    tables: Tables
     block: Block
     is_new: bool = True
     repeated: Repeated | None = None

@@ -30,7 +30,7 @@ from harness.pool.shells import Draw, Pool
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
 from harness.random_stream import INITIAL, uniforms
-from harness.records.schemas import ShardTables
+from harness.records.folder import Tables
 from harness.resolved import Resolved
 from harness.strata import ShellDesign
 from harness.worlds import World
@@ -161,7 +161,7 @@ class Source:
         """Whether stored episodes are those that are asked for, and not the last shard of a smaller budget."""
         return bool(episodes.num_rows == request.n_episodes)
 
-    def block(self, tables: ShardTables) -> Block:
+    def block(self, tables: Tables) -> Block:
         """What the stop rule and estimates read of a shard."""
-        steps = tables.moments if self.campaign.sampling.mixes_steps else None
-        return block_from_tables(self.campaign, tables.episodes, steps, self.design)
+        steps = tables.get("moments") if self.campaign.sampling.mixes_steps else None
+        return block_from_tables(self.campaign, tables["episodes"], steps, self.design)

@@ -48,7 +48,7 @@ def twin_episodes(campaign: Campaign, seed: int, estimators: Sequence[EstimatorN
 def _twin_block(campaign: Campaign, first: int, n: int) -> Block:
     prepared, loop = prepared_twin(campaign.model_dump_json())
     tables = shard_tables(loop.run(first, prepared.tests(first, n)), campaign.seed, keep_traces=False)
-    return block_from_tables(campaign, tables.episodes, None if campaign.records.moments == "none" else tables.moments)
+    return block_from_tables(campaign, tables["episodes"], tables.get("moments"))
 
 
 @cache

@@ -22,7 +22,6 @@ import pytest
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
 from harness.records.folder import parquet, write_json, write_part, write_together
-from harness.records.schemas import ShardTables
 from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
 from harness.runner.tables import read
@@ -32,9 +31,9 @@ from tests.stored_runs import copy_of, edit, golden, manifest, part_files, store
 
 
 @pytest.fixture
-def tables(stored_run) -> ShardTables:
+def tables(stored_run) -> dict:
     """A shard with all three."""
-    return ShardTables(*(stored_table(stored_run("mixture-twin"), name) for name in ShardTables._fields))
+    return {name: stored_table(stored_run("mixture-twin"), name) for name in TABLES}
 
 
 def files_below(path: Path) -> set[str]:
@@ -120,7 +119,7 @@ def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, tables):
     resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
     try:
         with pytest.raises(OSError, match=r"[Ff]ile too large") as raised:
-            write_part(tmp_path, [tables._asdict()], 0, 240)
+            write_part(tmp_path, [tables], 0, 240)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
@@ -129,7 +128,7 @@ def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, tables):
     assert raised.value.filename == str(tmp_path / name)
     sent = pickle.loads(pickle.dumps(raised.value))
     assert (sent.errno, sent.filename) == (errno.EFBIG, raised.value.filename)  # also from a worker
-    assert set(write_part(tmp_path, [tables._asdict()], 0, 240).files) == {"episodes", "moments", "traces"}
+    assert set(write_part(tmp_path, [tables], 0, 240).files) == {"episodes", "moments", "traces"}
 
 
 # -- a bit that flips, or a file of another run, changes no number without a word --
