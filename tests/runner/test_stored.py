@@ -23,9 +23,9 @@ from harness import cache
 from harness.cli import main
 from harness.estimators.block import joined
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
+from harness.records.folder import TABLES
 from harness.records.schemas import chosen_from
 from harness.resolved import resolve
-from harness.runner import kept
 from harness.runner.stored import estimate_run, even, replay_episode, stored_blocks, write_report
 from harness.vehicles import library
 from tests.golden.campaigns import BASE, RUNS
@@ -272,7 +272,7 @@ def test_what_an_earlier_run_has_left_is_read_once(tmp_path):
 def test_there_is_one_file_per_table_and_none_without_rows(stored_run, tmp_path):
     run_with_workers(golden("nde-twin"), tmp_path / "run", workers=2)
     n = manifest(tmp_path / "run")["n_episodes"]
-    for table in kept.TABLES:
+    for table in TABLES:
         files = part_files(tmp_path / "run", table)
         assert all(pq.read_metadata(path).num_rows for path in files)
         assert [path.name for path in files] in ([], [f"{0:09d}-{n:09d}.parquet"])
