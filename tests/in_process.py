@@ -71,9 +71,9 @@ def _work_here(_: Any, work: Callable[..., Any], *arguments: Any) -> Any:
 
 @contextmanager
 def controllers_here() -> Iterator[None]:
-    """Where a controller is tried, or tests are run again, it is here: for those that end no process."""
+    """Where a controller is tried, or tests run again, it is here: for those that end no process."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("controllers.find", "runner.again"):
+        for module in ("controllers.find", "runner.again", "runner.stored"):
             patch.setattr(f"harness.{module}.run_apart", _work_here)
         yield
 

@@ -77,15 +77,10 @@ RUN = "shells-twin"
     [
         (lambda _: harness.run(3, "out"), "harness.run(campaign=", "found 3; expected a campaign (harness.load"),
         (lambda _: harness.run("idm", ""), "harness.run(out=", "a name that the system refuses"),
-        (lambda _: harness.run("idm", "a" * 5000), "harness.run(out=", "too long"),
         (lambda _: harness.run("idm", "out", workers=0), "harness.run(workers=", "found 0; expected greater than"),
-        (lambda _: harness.run("idm", "out", workers=True), "harness.run(workers=", "a whole number"),
         (lambda _: harness.run("idm", "out", progress=print), "harness.run(progress=", "an instance of Progress"),
         (lambda _: harness.run("idm", "out", worker=2), "harness.run:", "Did you mean 'workers'?"),
-        (lambda _: harness.run("idm"), "harness.run:", "'out'"),
         (lambda _: harness.load_campaign("smoke.yaml", "stop.rhw=.1"), "(overrides=", "Write ['stop.rhw=.1']."),
-        (lambda _: harness.load_campaign("idm", av=3), "harness.load_campaign(av=", "expected text"),
-        (lambda run: harness.estimate(run, estimators=["snis"]), "(estimators=", "'nde', 'nade', 'mixture_cv'"),
         (lambda run: harness.estimate(run, confidence=math.nan), "(confidence=", "found nan"),
         (lambda run: harness.replay(run, np.int64(-1)), "harness.replay(episode=", "found -1"),
         (lambda run: harness.read(run / "no"), "no/manifest.json", "no run folder"),
@@ -96,8 +91,6 @@ RUN = "shells-twin"
             ".html, .csv, .xosc, .xml, .sumocfg",
         ),
         (lambda _: harness.compare("idm", "fvdm", "out", labels="ab"), "harness.compare(labels=", "a tuple"),
-        (lambda _: harness.av_check("idm", 10**9), "harness.av_check(n_episodes=", "found 1000000000"),
-        (lambda _: harness.fit(["no.csv"], "a.yaml", n_replicates=0), "harness.fit(n_replicates=", "found 0"),
     ],
 )
 def test_arguments_that_are_wrong_are_named(call, where, said, stored_run, tmp_path, monkeypatch):

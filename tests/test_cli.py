@@ -73,17 +73,13 @@ def test_an_estimator_that_the_records_do_not_allow_is_a_reason_and_no_row(folde
     "arguments",
     [
         ["run"],
-        ["nothing"],
         ["estimat"],
         ["export"],
         ["--nothing"],
         ["pool", SMOKE, "--quite"],
-        ["check", SMOKE, "--nothing"],
         ["estimate", ".", "--confidence", "1"],
-        ["estimate", ".", "--confidence", "1e-16"],
         ["run", SMOKE, "--junit", ""],
         ["run", SMOKE, "--workers", "9" * 20],
-        ["av-check", SMOKE, "--tests", "9" * 20],
         [],
     ],
 )

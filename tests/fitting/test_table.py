@@ -1,5 +1,6 @@
 """Files and mappings: what is read, and what is refused, by name."""
 
+import functools
 import gzip
 import os
 import random
@@ -19,6 +20,7 @@ from tests.fitting.trajectories import overtaking
 
 FEET = 1 / 0.3048
 ROWS = overtaking(2.5)
+as_csv = functools.cache(lambda: ROWS.to_csv(index=False).encode())
 
 
 def judged(file: Path, mapping: str | None = None, *others: Path, leave_out: tuple[str, ...] = ()) -> BesideCounts:
@@ -178,7 +180,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
 @pytest.mark.parametrize(("cut", "n"), [(0, 0), (3, 1)])
 def test_a_row_that_may_be_cut_is_told(cut, n, tmp_path, capsys):
     """One that has lost a value is refused; of a shorter last value nothing else tells."""
-    content = ROWS.to_csv(index=False).encode()
+    content = as_csv()
     (tmp_path / "rows.csv").write_bytes(content[: len(content) - cut])
     judged(tmp_path / "rows.csv")
     assert capsys.readouterr().err.count("rows.csv has no line end after its last row: is it complete?") == n
@@ -345,7 +347,7 @@ def test_a_mapping_is_checked(tmp_path):
         load_mapping("higd")
     (tmp_path / "classes.yaml").write_text("classes: [car]\n")
     (tmp_path / "lateral.yaml").write_text("columns: {lateral_m: laterl_m}\n")
-    ROWS.to_csv(tmp_path / "rows.csv", index=False)
+    (tmp_path / "rows.csv").write_bytes(as_csv())
     for name, words in (("classes", "no column class"), ("lateral", "Did you mean 'lateral_m'")):
         with pytest.raises(TrajectoryError, match=words):
             judged(tmp_path / "rows.csv", str(tmp_path / f"{name}.yaml"))

@@ -1,4 +1,4 @@
-"""Challenges and surrogates of one's own: tabulated, hashed, refused, run if trusted; the cache of tables."""
+"""Challenges and surrogates of one's own: tables, hashed, refused, run if trusted; what a table's name depends on."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,10 @@ import pytest
 import harness
 from harness.campaign.drivers import IDMParameters
 from harness.errors import CampaignError, RunFolderError
-from harness.families.cut_in.nade import tables as cache
 from harness.families.cut_in.nade.challenge import COLLIDED, LEVELS, LONG, transitions
 from harness.families.cut_in.nade.grid import AFTER, GridPoints, points_of
 from harness.families.cut_in.nade.own import own_challenge, own_surrogate, states_after
-from harness.families.cut_in.nade.tables import Tables, build_tables, tables_name
+from harness.families.cut_in.nade.tables import tables_name
 from harness.resolved import resolve
 from harness.vehicles.drivers import driver_records
 from harness.vocabulary import ACCELERATIONS_MPS2
@@ -146,46 +145,6 @@ def test_a_folder_from_elsewhere_runs_it_only_if_trusted(of, tmp_path):
 
 DEFAULT = driver_records([IDMParameters()])
 FIELDS = [name for name in DEFAULT.dtype.names if name != "max_jerk_mps3"]  # infinite
-
-
-@pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("HARNESS_CACHE_DIR", str(tmp_path))
-    return tmp_path / "tables"
-
-
-@pytest.fixture
-def built(monkeypatch):
-    """What has been built rather than read; small tables of the surrogate's numbers stand in for the real ones."""
-    arguments = []
-
-    def build_one(environment, driver, challenge):
-        arguments.append((driver, challenge))
-        numbers = np.array([driver[name][0] for name in FIELDS], np.float32)
-        return Tables(np.full((13, 9, 150, 12), numbers.sum(), np.float32), *[np.outer(numbers, numbers)] * 3)
-
-    monkeypatch.setattr(cache, "build_one", build_one)
-    return arguments
-
-
-def equal(one, other):
-    return all(a.tobytes() == b.tobytes() and a.shape == b.shape for a, b in zip(one, other, strict=True))
-
-
-def one_bit(content):
-    return content[:5000] + bytes([content[5000] ^ 1]) + content[5001:]
-
-
-@pytest.mark.parametrize("damage", [lambda _: b"", lambda content: content[:-5000], one_bit])
-def test_a_damaged_file_is_built_again(folder, built, damage):
-    first = build_tables(environment(), DEFAULT, "immediate")
-    path = folder.parent / tables_name(environment(), DEFAULT, "immediate")
-    content = path.read_bytes()
-    path.unlink()  # the tables are mapped: a file that shrinks under them would take this process down
-    path.write_bytes(damage(content))
-    assert equal(build_tables(environment(), DEFAULT, "immediate"), first)
-    assert equal(build_tables(environment(), DEFAULT, "immediate"), first)
-    assert len(built) == 2
 
 
 def test_what_the_hash_depends_on():

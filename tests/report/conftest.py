@@ -72,9 +72,3 @@ def crashing(made_once) -> dict[str, Path]:
         return made_once(scenario, lambda out: run_here(campaign, out))
 
     return OnDemand(make)
-
-
-@pytest.fixture
-def run_folder(folders: dict[str, Path], tmp_path: Path) -> Path:
-    """A copy of a full run without report, to be damaged."""
-    return copy_of(folders["weighted"], tmp_path / "run")

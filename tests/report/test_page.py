@@ -11,7 +11,6 @@ import pyarrow.parquet as pq
 import pytest
 from junitparser import JUnitXml
 
-from harness.errors import RunFolderError
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.report.drawing import PlotAxis, PlotPanel
 from harness.report.junit import difference_case, statement_case, write_junit
@@ -20,7 +19,7 @@ from harness.report.summary import summarise
 from harness.runner.stored import write_report
 from harness.vocabulary import CRASH, OUTCOMES
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
-from tests.stored_runs import copy_of, edit, estimates, truncate
+from tests.stored_runs import copy_of, edit, estimates
 
 SEEN = {
     "weighted": ({"severity"}, ["defensive_share: 0.1"]),
@@ -93,41 +92,6 @@ def test_a_report_made_again_has_the_same_bytes(reports, tmp_path):
         (folder / "plots" / name).write_text("left over")
     assert write_report(folder) == folder / "report.html"
     assert contents(folder) == before | {"plots/my-notes.svg": b"left over"}
-
-
-# -- what no run has written: one error that names the file, and nothing is written (more in runner/test_folders.py) --
-
-
-def rewritten(change):
-    return lambda path: pq.write_table(change(pq.read_table(path)), path)
-
-
-def edited(**changes):
-    return lambda path: edit(path.parent, path.name, **changes)
-
-
-EPISODES = "episodes/000001000-000002000.parquet"
-POINT_WITHOUT_RATE = {"n": 1, "ci_low": 0, "ci_high": 1, "rhw": 1}  # which must not be drawn as zero
-
-
-@pytest.mark.parametrize(
-    ("file", "damage", "said"),
-    [
-        (EPISODES, rewritten(lambda table: table.slice(0, 990)), "found 990 rows; expected 1000 rows"),
-        (EPISODES, rewritten(lambda table: table.drop_columns(["log_weight"])), "no column 'log_weight'"),
-        ("estimates.json", truncate, "estimates.json"),
-        ("estimates.json", edited(campaign_hash="feedfeedfeedfeed"), "feedfeedfeedfeed"),
-        ("estimates.json", edited(headline="oracle"), "oracle"),
-        ("estimates.json", edited(convergence=[POINT_WITHOUT_RATE]), r"convergence\.0\.crash_rate"),
-    ],
-)
-def test_what_no_run_has_written_is_named(run_folder, file, damage, said):
-    damage(run_folder / file)
-    (run_folder / "report.html").write_text("of an earlier report")
-    with pytest.raises(RunFolderError, match=said) as caught:
-        write_report(run_folder)
-    assert (caught.value.exit_code, caught.value.mend != "") == (2, True)
-    assert (run_folder / "report.html").read_text() == "of an earlier report"
 
 
 # -- JUnit XML as a CI system reads it --

@@ -28,6 +28,7 @@ from harness.runner.stored import write_report
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M
 from harness.vocabulary import VEHICLES
 from harness.worlds.sumo import sumo_program
+from tests.in_process import controllers_here
 from tests.stored_runs import copy_of, part_files, stored_table, truncate
 
 KINDS = ("shells-twin", "shells-lateral-sumo", "forced-lateral-twin", "shells-acting-twin", "forced-krauss", "nde-twin")
@@ -51,7 +52,8 @@ def test_a_page_holds_the_motion_to_the_last_bit(name, stored_run, tmp_path):
     """And that of those who end without a crash, or without a cut-in."""
     folder, file = stored_run(name), tmp_path / "crash.html"
     for episode in sorted({*crashed(folder, 2), 0, 1}):
-        result = harness.replay(folder, episode)
+        with controllers_here():
+            result = harness.replay(folder, episode)
         harness.write_motion(result, file)
         [scene] = scenes_in(file.read_text(encoding="utf-8"))
         first, n = scene["first"], result.row["n_steps"] + 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import pickle
-import time
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -15,7 +14,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from harness import estimate, sampling
+from harness import estimate
 from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import (
@@ -247,26 +246,6 @@ def test_errors_reach_the_parent(error, at, tmp_path, monkeypatch):
     assert type(found) is (RuntimeError if error is None else type(error))
     assert str(error or "ValueError: of a strange kind") in str(found)
     assert not isinstance(error, KeyError) or "in run\n" in found.__notes__[0]
-
-
-def test_an_interrupted_first_run_does_not_build_its_pool_to_the_end(monkeypatch):
-    def build(_resolved, progress):
-        for _ in range(6_000):
-            progress.advance(1)
-            time.sleep(0.01)
-
-    def interrupted(_resolved):
-        raise KeyboardInterrupt
-
-    build.kernel = None
-
-    monkeypatch.setattr(sampling, "source_of", lambda _campaign: build)
-    monkeypatch.setattr(sampling, "is_cached", lambda _kernel: False)
-    monkeypatch.setattr(sampling, "compile_kernels", interrupted)
-    began = time.monotonic()
-    with pytest.raises(KeyboardInterrupt):
-        sampling.prepare(SimpleNamespace(campaign=None))
-    assert time.monotonic() - began < 30.0
 
 
 def resident_mb() -> list[float]:

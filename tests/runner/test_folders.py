@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+import pyarrow.parquet as pq
 import pytest
 
 from harness.cli import main
@@ -148,6 +149,21 @@ def pipe(file: str):
     return lambda run: ((run / file).unlink(), os.mkfifo(run / file))
 
 
+def rewritten(change):
+    def damage(run):
+        path = part_files(unnoted(run))[1]
+        pq.write_table(change(pq.read_table(path, partitioning=None)), path)
+
+    return damage
+
+
+def told(**changes):
+    return lambda run: edit(run, "estimates.json", **changes)
+
+
+POINT_WITHOUT_RATE = {"n": 1, "ci_low": 0, "ci_high": 1, "rhw": 1}  # which must not be drawn as zero
+
+
 @pytest.mark.parametrize(
     ("damage", "commands", "said"),
     [
@@ -168,14 +184,23 @@ def pipe(file: str):
         *((pipe(file), READERS[:1], file) for file in ("manifest.json", "campaign.yaml", f"episodes/{SECOND}")),
         (pipe("estimates.json"), READERS[1:2], "estimates.json"),  # nobody would ever write into it
         (written("plots", ""), READERS[1:2], "plots found: a file expected: a folder"),
+        (rewritten(lambda table: table.slice(0, 70)), READERS[1:2], "found: 70 rows expected: 80 rows"),
+        (rewritten(lambda table: table.drop_columns(["log_weight"])), READERS[1:2], "no column 'log_weight'"),
+        (lambda run: truncate(run / "estimates.json"), READERS[1:2], "estimates.json"),
+        (told(campaign_hash="feedfeedfeedfeed"), READERS[1:2], "feedfeedfeedfeed"),
+        (told(headline="oracle"), READERS[1:2], "oracle"),
+        (told(convergence=[POINT_WITHOUT_RATE]), READERS[1:2], "convergence.0.crash_rate"),
     ],
 )
 def test_what_is_not_as_it_was_left(damage, commands, said, stored, complaint_of):
+    """An earlier report stays, but where all is known and its plots alone cannot be written."""
+    (stored / "report.html").write_text("of an earlier report")
     damage(stored)
     for name, *more in commands:
         complaint = complaint_of(name, stored, *more)
         assert str(stored) in complaint
         assert said in complaint
+    assert "plots" in said or not stored.exists() or (stored / "report.html").read_text() == "of an earlier report"
 
 
 def test_values_that_no_run_has_written_are_refused(stored):
