@@ -29,8 +29,7 @@ from harness.runner.workers import LocalWorkers, ShardResult
 from harness.sampling import prepare
 from harness.sampling.protocol import ShardRequest, Source
 from harness.worlds import World
-from harness.worlds.shim import shim_library
-from harness.worlds.sumo import SumoWorld, sumo_program
+from harness.worlds.sumo import SumoWorld, shim_library, sumo_program
 from harness.worlds.twin import TwinWorld
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"

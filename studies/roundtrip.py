@@ -241,7 +241,7 @@ def on_common_knots(rows: pd.DataFrame) -> dict[str, float]:
 
 def fit_data_set(traffic: ObservedTraffic, seed: int, n_replicates: int) -> pd.DataFrame:
     """Rows of numbers by kind (index): the estimate, standard errors (NaN where none), replicates."""
-    fit = fit_traffic(traffic, load_parameters(FITTED), FITTED.parameters, f"data set {seed}", Progress())
+    fit = fit_traffic(traffic, f"data set {seed}", Progress())
     drawn = replicates(fit, n_replicates, seed, Progress())
     numbers = fit.environment.values()
     errors = {key: value for law in fit.laws.values() for key, value in law.std_error.items() if value > 0.0}

@@ -150,12 +150,9 @@ class Campaign(Section):
         return (share, *((1.0 - share) * weight for weight in alpha))
 
     def content_hash(self, environment_parameters: str, challenge: str | None = None) -> str:
-        """Hash of everything that changes an episode's bits, that of the environment's parameters included.
+        """Hash of everything that changes an episode's bits; ``challenge`` is known of one of the user's own.
 
-        Of a challenge of the user's own, ``challenge`` says what is to be known.
-
-        Cells, workers, estimator, stop rule, trace policy and names are left out, so that a campaign can be continued
-        to a smaller RHW or with other resources.
+        Cells, workers, estimator, stop rule, trace policy and names are left out, so that a campaign can be continued.
         """
         others = {} if self.scenario == DEFAULT_FAMILY else {"scenario": self.scenario}
         unused = set() if self.av.acts_before_event else {"shadow_paths"}
@@ -182,10 +179,7 @@ Command = Literal["run", "compare", "av-check"]
 
 
 class Use(NamedTuple):
-    """What a campaign is for (no command while it is read), and what is known of its scenario by then.
-
-    That is whether its cut-ins take time, and whether the AV ``follows`` a vehicle from the start.
-    """
+    """The command (none while it is read), whether cut-ins take time, and the AV ``follows`` from the start."""
 
     command: Command | None = None
     shows: bool = False

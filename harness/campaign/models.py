@@ -116,10 +116,7 @@ def parse_override(text: str) -> Override:
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-    """Lay each override over ``data``, later ones over earlier ones; ``data`` itself stays as it is.
-
-    A path that leads through something that is not a section is a `CampaignError`.
-    """
+    """A copy of ``data`` with each override, later ones over earlier ones, or a `CampaignError`: of no section."""
     changed = dict(data)
     # A whole vehicle replaces what was said of one before. Of the rest the driver comes first: parameters are its own.
     whole = max((i for i, each in enumerate(overrides) if each.path == ("av",)), default=0)

@@ -50,8 +50,8 @@ class AvEndedProcessError(HarnessError):
 def own_code(name: str, where: str = "av.controller", what: str = _A_CONTROLLER) -> Callable[..., Any]:
     """The class, or function, that a name stands for: ``my_av.py:Class`` or ``package.module:Class``.
 
-    The folder that the harness was started in is importable, as it is for a script, and so is that of a file. Where
-    there is no such module or class, a `CampaignError` says so, of the key ``where`` and ``what`` it has to be.
+    Importable are this folder, as for a script, and that of a file. Raises `CampaignError`, of the key ``where`` and
+    ``what`` it has to be: there is no such module or class.
     """
     module_name, _, class_name = name.rpartition(":")
     is_file = module_name.endswith(".py")
@@ -110,9 +110,7 @@ def build_host(
     before_test: BeforeTest = lambda _: None,
     names: tuple[str, str] = ("LV", "BV"),
 ) -> ControllerHost | None:
-    """Host of the AV's controller, or None for an AV that needs none (built in, or driven by SUMO).
-
-    ``names`` are those of the vehicles that it sees as LV and BV.
+    """Host of the AV's controller, which sees vehicles of these ``names`` as LV and BV; None for an AV that needs none.
 
     Raises `CampaignError`: the controller cannot be found or made, or is of neither kind.
     """
@@ -131,9 +129,7 @@ def build_host(
     except HarnessError:
         raise
     except (Exception, SystemExit) as error:  # who looks for an attribute runs the user's code, too
-        found = f"{av.controller}, of which looking at its attributes fails ({cause_of(error)})"
-        mend = "Fix what is raised: a __getattr__ raises AttributeError for what is not there."
-        raise CampaignError("av.controller", found, _A_CONTROLLER, mend) from error
+        raise _not_made(str(av.controller), cause_of(error)) from error
     if is_batch:
         return BatchHost(*told, first, names=names)
     host = VehicleHost(*told, make, n_cells, first, names=names)
@@ -249,11 +245,15 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     with guard:
         controller, wrong = guard.call(make, makes=True)
     if wrong is not None:
-        mend = "Fix it, or give what it needs: --set av.parameters.NAME=… (files relative to the current folder)."
-        raise CampaignError("av.controller", f"{name}, which cannot be made: {wrong}", "a controller", mend)
+        raise _not_made(name, wrong)
     guard.require_untouched()
     _require_controller(controller, name)
     return controller
+
+
+def _not_made(name: str, why: str) -> CampaignError:
+    mend = "Fix it, or give what it needs: --set av.parameters.NAME=… (files relative to the current folder)."
+    return CampaignError("av.controller", f"{name}, which cannot be made: {why}", "a controller", mend)
 
 
 def has_foreign_code(av: AutomatedVehicle) -> bool:
@@ -284,8 +284,7 @@ def require_controller(av: AutomatedVehicle) -> str | None:
     """Find and make an AV's controller once, before anything is written, in a process of its own.
 
     Returns a SHA-256 of what it is made of: its file, modules of the user's that this imports, and files that
-    ``av.parameters`` names; None for an AV without a source. Raises a `CampaignError` if it cannot be found or made, or
-    is of neither kind.
+    ``av.parameters`` names; None for an AV without a source. Raises `CampaignError` as `build_host`.
     """
     if not has_foreign_code(av):
         return None

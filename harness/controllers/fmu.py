@@ -49,8 +49,7 @@ class Wiring(NamedTuple):
 def fmu_maker(fmu: FmuController) -> Callable[[], VehicleController]:
     """What makes a controller for a cell.
 
-    A `CampaignError` says that fmpy is not installed, the file is no FMI 2.0 co-simulation FMU, or ``av.fmu`` does not
-    fit its variables.
+    Raises `CampaignError`: no fmpy, no FMI 2.0 co-simulation FMU, or an ``av.fmu`` that does not fit its variables.
     """
     fmpy = _fmpy()
     try:

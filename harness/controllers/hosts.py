@@ -1,8 +1,6 @@
 """Hosts: what stands between the episode loop and a user's controller, and turns its faults into failed episodes.
 
-The episode loop calls `start`, `act` and `close`, and knows nothing else of a controller. Whatever goes wrong in a call
-ends the episode as ``failed``, with its cause in the row (docs/controllers.md). A controller that failed is dropped; of
-a batch only the cells fail. A call that takes too long meets an exception, or the end of the process.
+The cause stands in the row (docs/controllers.md). A controller that failed is dropped; of a batch only the cells fail.
 """
 
 from __future__ import annotations
@@ -101,10 +99,7 @@ def _place_of(error: BaseException) -> str:
 
 
 class StepTimeoutError(BaseException):
-    """A controller took longer than ``av.limits`` allows.
-
-    Not an `Exception`, so that ``except Exception`` in the user's code does not swallow it.
-    """
+    """A controller took too long; no `Exception`, which an ``except Exception`` in the user's code would swallow."""
 
 
 class Guard:
@@ -240,10 +235,7 @@ def optional(name: str, *arguments: Any) -> Callable[[Any], None]:
 
 @dataclass
 class Host:
-    """What both hosts are told: the vehicle, the campaign's seed, who makes the calls, and who is told of tests.
-
-    ``names`` are those of the vehicles that controllers see as LV and BV.
-    """
+    """What both hosts are told; ``names`` are those of the vehicles that controllers see as LV and BV."""
 
     av: AutomatedVehicle
     seed: int

@@ -26,7 +26,7 @@ from harness.campaign.python_files import TRACI_MODULES, FromSource, file_and_fu
 from harness.controllers.protocol import EpisodeStart, Observation
 from harness.controllers.traci_refused import Domain, FatalTraCIError, RefusedError
 from harness.controllers.traci_style import SimulationDomain, Traci
-from harness.controllers.traci_vehicle import DECEL, LOOSE, VehicleDomain
+from harness.controllers.traci_vehicle import DECEL, LOOSE, VehicleDomain, known_variables
 from harness.files import real_path
 from harness.vehicles.kinematics import STEP_S
 
@@ -61,10 +61,7 @@ class _Simulation(SimulationDomain):
 
     def subscribe(self, varIDs: Sequence[int] = (0x74,), *_when: float) -> None:
         """Ask for variables, for the whole test; by default who departs."""
-        if unknown := [hex(number) for number in varIDs if number not in _OF_SIMULATION]:
-            known = ", ".join(map(hex, _OF_SIMULATION))
-            raise RefusedError(f"Variable {unknown[0]} of the simulation is not known here: it has {known}.")
-        self._subscribed = tuple(varIDs)
+        self._subscribed = known_variables(varIDs, _OF_SIMULATION, "the simulation")
 
     def getSubscriptionResults(self) -> dict[int, Any]:
         return {number: getattr(self, _OF_SIMULATION[number])() for number in self._subscribed}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NoReturn
 
@@ -24,7 +24,7 @@ _SUMOS_OWN = 31
 """The speed mode of a script that sets none."""
 _CHANGES_LANE = 0b1100_1111_1111
 """Bits of a lane change mode that let SUMO change lanes, but for how much room it leaves."""
-_DEFAULT_VARIABLES, _VEHICLES, _LEADER = (0x50, 0x56), 0xA4, 0x68
+_ROAD_AND_POSITION, _VEHICLES, _LEADER = (0x50, 0x56), 0xA4, 0x68
 
 
 class SeenVehicle:
@@ -173,7 +173,7 @@ class VehicleDomain(Domain):
     def subscribe(self, objectID: str, varIDs: Sequence[int] | None = None, *_when: float) -> None:
         """Ask for variables (numbers of ``traci.constants``), for the whole test; by default road and position."""
         self._of(objectID)
-        self._subscribed[objectID] = _variables(varIDs)
+        self._subscribed[objectID] = known_variables(varIDs, _VARIABLES, "vehicles")
 
     def subscribeLeader(self, vehID: str, *_when: float) -> None:
         """Ask for the vehicle ahead, beside what has been asked for."""
@@ -202,7 +202,7 @@ class VehicleDomain(Domain):
         self._of(objectID)
         if domain != _VEHICLES:
             raise RefusedError(f"vehicle.subscribeContext of domain {domain:#x} is refused: there are vehicles alone.")
-        self._around[objectID] = dist, _variables(varIDs)
+        self._around[objectID] = dist, known_variables(varIDs, _VARIABLES, "vehicles")
 
     def getContextSubscriptionResults(self, objectID: str) -> dict[str, dict[int, Any]]:
         """Values of what has been subscribed to around a vehicle, by its and their names; none without."""
@@ -322,11 +322,11 @@ class VehicleDomain(Domain):
             raise RefusedError(f"vehicle.{name}('{vehID}') is refused: {why}. Commands are for '{self._ego}' only.")
 
 
-def _variables(asked: Sequence[int] | None) -> tuple[int, ...]:
-    wanted = tuple(_DEFAULT_VARIABLES if asked is None else asked)
-    if unknown := [hex(number) for number in wanted if number not in _VARIABLES]:
-        known = ", ".join(map(hex, _VARIABLES))
-        raise RefusedError(f"Variable {unknown[0]} of vehicles is not known here: it has {known}.")
+def known_variables(asked: Sequence[int] | None, known: Mapping[int, str], what: str) -> tuple[int, ...]:
+    """Variables to subscribe to, by default road and position; refused where one is not among the ``known``."""
+    wanted = _ROAD_AND_POSITION if asked is None else tuple(asked)
+    if unknown := [hex(number) for number in wanted if number not in known]:
+        raise RefusedError(f"Variable {unknown[0]} of {what} is not known here: it has {', '.join(map(hex, known))}.")
     return wanted
 
 

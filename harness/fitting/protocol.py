@@ -13,10 +13,7 @@ from harness.progress import Progress
 
 
 class Asked(NamedTuple):
-    """What is fitted: ``files`` read by a mapping, and the environment file ``out`` that others are named by.
-
-    ``n_replicates`` environments are drawn by the ``seed``.
-    """
+    """What is fitted: ``files`` read by a mapping, to a file ``out`` and ``n_replicates`` drawn by the ``seed``."""
 
     files: Sequence[Path]
     mapping: str | None

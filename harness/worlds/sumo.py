@@ -3,7 +3,8 @@
 SUMO is told the speed of every vehicle in every step; a speed that it has been told already it keeps until the next
 command. A finished cell is refilled by moving its three vehicles back: nothing is removed or added. After each step
 every position is read back from SUMO and compared, bit for bit, with what was commanded, and every speed too: with the
-shim after each step, without it after every tenth. A difference stops the run.
+optional compiled shim (`shim.cpp`, built when the package is installed, where there is a C++ compiler) after each step,
+without it, or with ``HARNESS_SHIM=0``, after every tenth. A difference stops the run.
 
 Roads are the committed networks', whose ``vehicles.add.xml`` holds the vehicle types.
 """
@@ -11,6 +12,8 @@ Roads are the committed networks', whose ``vehicles.add.xml`` holds the vehicle 
 from __future__ import annotations
 
 import atexit
+import ctypes
+import os
 import struct
 import sys
 from collections import deque
@@ -28,7 +31,6 @@ from harness.errors import CampaignError, WorldDisagreementError
 from harness.processes import SharedFile
 from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import MOST_SUMO_CELLS, World
-from harness.worlds.shim import Shim, open_shim
 from harness.worlds.system_libraries import SUMO_VERSION, not_importable
 from harness.worlds.twin import advance
 
@@ -124,11 +126,7 @@ class SumoCells(World):
         to.setActionStepLength(name, seconds, True)
 
     def _contacts(self, get_collisions: Callable[[], Iterable[Any]]) -> BoolArray:
-        """Cells with a collision in this step.
-
-        SUMO's shorter list of colliding vehicles names a pair only when its collision is new. A pair that collided at
-        the end of one episode and again in the first step of the next would be missed.
-        """
+        """Cells with a collision in this step; SUMO's list of colliding vehicles has those that are new alone."""
         self._contact[:] = False
         for collision in get_collisions():
             self._contact[self._cell_of[collision.collider]] = True
@@ -155,6 +153,80 @@ def sumo_program(name: str, where: str) -> Path:
             return path
     mend = "Install it, in the harness's folder: pip install -c requirements.lock -e '.[sumo]'."
     raise CampaignError(where, f"no {name}", "the extra 'sumo'", mend)
+
+
+_POINTER = ctypes.c_void_p
+_OBEYED, _FAILED = 0, 1
+
+
+def shim_library() -> Path | None:
+    """The compiled shim, or None where there is none or it is switched off."""
+    if os.environ.get("HARNESS_SHIM") == "0":
+        return None
+    return next(iter(sorted(Path(__file__).parent.glob("_shim*.so"))), None)
+
+
+def open_shim(names: Sequence[str], told: FloatArray, x: FloatArray, v: FloatArray) -> Shim | None:
+    """Shim for the given vehicles, or None: not built, switched off, or another libsumo than it knows."""
+    if (path := shim_library()) is None:
+        return None
+    import libsumo  # noqa: PLC0415 - takes half a second, and only worlds need it
+
+    try:
+        library = ctypes.CDLL(str(path))
+        library.shim_open.restype = _POINTER
+        library.shim_find_vehicles.argtypes = [_POINTER]
+        library.shim_step.argtypes = [_POINTER] * 7
+        library.shim_error.restype = ctypes.c_char_p
+        library.shim_error.argtypes = library.shim_close.argtypes = [_POINTER]
+    except (OSError, AttributeError):
+        return None  # built for another machine, or by an earlier version
+    encoded = (ctypes.c_char_p * len(names))(*map(str.encode, names))
+    handle = library.shim_open(libsumo._libsumo.__file__.encode(), encoded, ctypes.c_long(len(names)))
+    return Shim(library, handle, told, x, v) if handle else None
+
+
+class Shim:
+    """Vehicles of one simulation, told, read and compared in one call: in arrays (n,) that stay where they are.
+
+    ``told`` are the speeds (m/s) that they were last told, ``x`` and ``v`` where they should be after the coming step,
+    ``position`` (m) and ``speed`` where SUMO says they are.
+    """
+
+    def __init__(self, library: ctypes.CDLL, handle: int, told: FloatArray, x: FloatArray, v: FloatArray) -> None:
+        self.told, self.x, self.v, self.position, self.speed = told, x, v, np.zeros(x.size), np.zeros(x.size)
+        self._library = library
+        self._handle: int | None = handle
+        self._wanted = np.zeros_like(told)
+        arrays = self._wanted, told, x, v, self.position, self.speed
+        self._addresses = [array.ctypes.data for array in arrays]  # to ask for them takes longer than the call
+        self.find_vehicles()
+
+    def find_vehicles(self) -> None:
+        """Look the vehicles up again (`RuntimeError`: one is not there): those of an earlier simulation are gone."""
+        if self._library.shim_find_vehicles(self._handle):
+            raise self._error()
+
+    def step(self, wanted: FloatArray) -> bool:
+        """Tell the speeds that differ from ``told`` (noting them there), simulate one step, read all vehicles.
+
+        Returns whether every position and speed is that of ``x`` and ``v``, in every bit. Raises `RuntimeError`: SUMO
+        raised an error, or a vehicle has left the road.
+        """
+        self._wanted[:] = wanted
+        answer: int = self._library.shim_step(self._handle, *self._addresses)
+        if answer == _FAILED:
+            raise self._error()
+        return answer == _OBEYED
+
+    def _error(self) -> RuntimeError:
+        return RuntimeError(self._library.shim_error(self._handle).decode())
+
+    def close(self) -> None:
+        """Forget the vehicles."""
+        if self._handle is not None:
+            self._library.shim_close(self._handle)
+            self._handle = None
 
 
 SPEED_CHECK_STEPS = 10

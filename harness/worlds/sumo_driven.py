@@ -53,12 +53,6 @@ MODELS = (
     "BKerner", "Wiedemann", "W99", "ACC", "CACC",
 )  # fmt: skip
 
-_VEHICLE = (
-    "carFollowModel", "length", "minGap", "maxSpeed", "desiredMaxSpeed", "speedFactor", "speedDev", "accel", "decel",
-    "emergencyDecel", "apparentDecel", "maxAccelProfile", "desAccelProfile", "tau", "sigma", "sigmaStep",
-    "startupDelay", "actionStepLength", "collisionMinGapFactor", "applyDriverState", "vClass", "emissionClass", "color",
-    "width", "height", "mass", "impatience", "speedFactorPremature",
-)  # fmt: skip
 _MODEL = (
     "delta", "stepping", "adaptTime", "adaptFactor", "security", "estimation", "k", "phi",
     "tmp1", "tmp2", "tmp3", "tmp4", "tmp5",
@@ -71,11 +65,15 @@ _MODEL = (
     "gapControlGainGapDot", "collisionAvoidanceGainGap", "collisionAvoidanceGainGapDot", "tauCACCToACC",
     "speedControlMinGap",
 )  # fmt: skip
-_LANE_CHANGE = (
+ATTRIBUTES = (
+    "carFollowModel", "length", "minGap", "maxSpeed", "desiredMaxSpeed", "speedFactor", "speedDev", "accel", "decel",
+    "emergencyDecel", "apparentDecel", "maxAccelProfile", "desAccelProfile", "tau", "sigma", "sigmaStep",
+    "startupDelay", "actionStepLength", "collisionMinGapFactor", "applyDriverState", "vClass", "emissionClass", "color",
+    "width", "height", "mass", "impatience", "speedFactorPremature",
+    *_MODEL,
     "laneChangeModel", "lcStrategic", "lcCooperative", "lcSpeedGain", "lcKeepRight", "lcOvertakeRight",
     "lcSpeedGainRight", "lcOvertakeDeltaSpeedFactor", "lcAssertive", "lcLookaheadLeft", "lcSigma",
 )  # fmt: skip
-ATTRIBUTES = (*_VEHICLE, *_MODEL, *_LANE_CHANGE)
 """Those that can matter to a vehicle on a straight road. SUMO ignores names that it does not know without a word."""
 
 RECYCLABLE_MODELS = ("Krauss", "IDM", "ACC", "CACC")

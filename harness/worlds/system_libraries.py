@@ -96,10 +96,7 @@ def _require_version() -> None:
 
 
 def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
-    """Commands that install the packages of missing libraries here; all but the last prepare the last.
-
-    Raises `HarnessError`: no package manager that is known, or neither root nor sudo.
-    """
+    """Commands that install missing libraries here, or a `HarnessError`: no known package manager, or no right to."""
     manager = next((name for name, commands in _INSTALL.items() if shutil.which(commands[0].split()[0])), None)
     if manager is None:
         raise _cannot_load(missing, "None of apt-get, dnf and apk is here: install them as this system does")
@@ -114,9 +111,9 @@ def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
 
 
 def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]]) -> None:
-    """Run the commands of `install_commands`, silently unless the last fails.
+    """Run the commands of `install_commands`, of which the last counts, silently.
 
-    Raises `HarnessError`: the packages could not be installed; it repeats what the package manager complained about.
+    Raises `HarnessError`: it failed, with what the package manager complained about.
     """
     said: list[str] = []
     for command in commands:

@@ -183,7 +183,7 @@ def test_traffic_is_fitted_whose_speed_differences_are_as_wide_as_on_motorways_a
     numbers["free_driving__brake_logit"] = -12.0
     write(simulate(environment._replace(numbers=numbers), 5.0, 1), tmp_path / "wide.parquet")
     traffic = ObservedTraffic.of(map(observe, recordings([tmp_path / "wide.parquet"], load_mapping())))
-    fit = fit_traffic(traffic, load_parameters(roundtrip.FITTED), roundtrip.FITTED.parameters, "wide", Progress())
+    fit = fit_traffic(traffic, "wide", Progress())
     found = fit.environment.values()
     assert (
         found["free_driving__brake_logit"]

@@ -16,7 +16,7 @@ from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.vocabulary import BV, CONTACT, CRASH, LV, STATE_DTYPE, TIMEOUT, VEHICLES
 from harness.worlds import sumo
-from harness.worlds.shim import open_shim, shim_library
+from harness.worlds.sumo import open_shim, shim_library
 from harness.worlds.twin import TwinWorld
 from tests.episode.test_path import BESIDE, at_once, beside
 from tests.worlds.running import smoke

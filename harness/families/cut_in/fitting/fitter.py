@@ -23,7 +23,7 @@ from harness.campaign.yaml_text import yaml_text
 from harness.errors import CampaignError, TrajectoryError
 from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.fitting.hazard import FREE_TTC_S, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
-from harness.families.cut_in.fitting.laws import LAWS, FittedLaw, ObservedTraffic, fit_rate
+from harness.families.cut_in.fitting.laws import BASE, LAWS, FittedLaw, ObservedTraffic, fit_rate
 from harness.families.cut_in.fitting.observations import BesideCounts, Observations, observe, require_enough
 from harness.families.cut_in.fitting.page import CONFIDENCE, page
 from harness.families.cut_in.loading import load_environment, require_sound_laws
@@ -41,8 +41,6 @@ from harness.report.rows import too_few
 from harness.vocabulary import FloatArray
 
 OF_PAGE = b"Traffic fitted to trajectories"
-BASE = "ndd-overtaking-2"
-"""Numbers that are not fitted are taken from it."""
 HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)
 """Degrees of freedom of R1dot: fitted (None), then tried until LV's speed is one that SUMO's lanes allow."""
 DIGITS = 6
@@ -54,13 +52,11 @@ MOST_DRAWS = 5
 class Fit:
     """Fitted traffic: ``environment`` is the result, ``laws`` has the hazard's, too.
 
-    Numbers that are not fitted are those of ``base``, an environment called ``base_name``; ``kept`` says why a law is
-    kept from it, by its subject.
+    Numbers that are not fitted are those of ``base``; ``kept`` says why a law is kept from it, by its subject.
     """
 
     traffic: ObservedTraffic
     base: EnvironmentParameters
-    base_name: str
     laws: dict[str, FittedLaw]
     kept: dict[str, str]
     hazard: Hazard
@@ -68,14 +64,12 @@ class Fit:
     environment: EnvironmentParameters
 
 
-def fit_traffic(
-    traffic: ObservedTraffic, base: EnvironmentParameters, base_name: str, where: str, progress: Progress
-) -> Fit:
-    """Fit all laws.
+def fit_traffic(traffic: ObservedTraffic, where: str, progress: Progress) -> Fit:
+    """Fit all laws; ``where`` names the files.
 
-    Raises `TrajectoryError`: no hazard can be fitted, or tests cannot be drawn from the laws; ``where`` names the
-    files.
+    Raises `TrajectoryError`: no hazard can be fitted, or tests cannot be drawn from the laws.
     """
+    base = read_model(SHIPPED_FOLDER / f"{BASE}.yaml", EnvironmentParameters)
     numbers = base.values()
     progress.stage("fitting laws", len(LAWS) + 1)
     if (hazard := fit_hazard(traffic)) is None:
@@ -101,7 +95,7 @@ def fit_traffic(
         kept = {LAWS[name][1]: why for name, law in found.items() if law is None}
         if df is not None:
             kept["degrees of freedom of R1dot"] = f"{df:g}: with heavier tails LV would exceed 100 m/s"
-        return Fit(traffic, base, base_name, laws, kept, hazard, acceptance, environment)
+        return Fit(traffic, base, laws, kept, hazard, acceptance, environment)
     words = f"laws that tests cannot be drawn from: {problem.where}, {problem.found}"
     mend = f"The data do not look like motorway traffic; see docs/fit.md. {problem.mend}"
     raise TrajectoryError(where, words, problem.expected, mend)
@@ -191,7 +185,6 @@ class CutInFitter:
     """See `harness.fitting.protocol.Fitter`."""
 
     def __init__(self) -> None:
-        self._base = read_model(SHIPPED_FOLDER / f"{BASE}.yaml", EnvironmentParameters)
         self._seen = list[Observations]()
 
     def marks(self, out: Path) -> dict[Path, bytes]:
@@ -204,7 +197,7 @@ class CutInFitter:
     def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:
         where = places(asked.files)
         tally = require_enough(self._seen, where, asked.read)
-        fit = fit_traffic(ObservedTraffic.of(self._seen), self._base, BASE, where, asked.progress)
+        fit = fit_traffic(ObservedTraffic.of(self._seen), where, asked.progress)
         rows = replicates(fit, asked.n_replicates, asked.seed, asked.progress)
         noise_mps2 = math.sqrt(math.fsum(each.noise_mps2**2 for each in self._seen) / len(self._seen))
         out, shown, beside = self.marks(asked.out)
@@ -223,7 +216,7 @@ def _text(fit: Fit, tally: BesideCounts, asked: Asked) -> str:
         f"{fit.traffic.n_recordings} recordings: "
         f"{tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the target lane,",
         f"{tally.used} lane changes to it. Standard errors (se) and replicates are by {clusters}.",
-        f"Numbers that are not fitted are those of {fit.base_name}. Use lane_change_level 1 with this traffic.",
+        f"Numbers that are not fitted are those of {BASE}. Use lane_change_level 1 with this traffic.",
         *asked.provenance(),
     ]
     return environment_text(head, fit.environment.model_dump(exclude_defaults=True))
@@ -237,7 +230,7 @@ def _told(fit: Fit, tally: BesideCounts, n_replicates: int) -> tuple[str, ...]:
         f"target lane; {tally.used:,} lane changes used of {tally.changes:,}",
         f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
         f"{steps.exposure[:-1].sum():.1f} expected if nobody minded it",
-        *(f"kept as in {fit.base_name}: {what} ({why})" for what, why in fit.kept.items()),
+        *(f"kept as in {BASE}: {what} ({why})" for what, why in fit.kept.items()),
         *([limited] if unseen else []),
         *(f"! {words}" for words in too_few(n_replicates, CONFIDENCE)),
     )

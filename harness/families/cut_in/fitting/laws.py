@@ -2,8 +2,6 @@
 
 Initial states and accelerations are fitted in the shipped families, the former as densities, the latter by the
 probabilities of the 31 accelerations, so that a law is fitted as it is drawn from. Lane changes are in `hazard`.
-
-Numbers that the data do not determine keep the value of the ``base``, a shipped environment.
 """
 
 from __future__ import annotations
@@ -21,8 +19,10 @@ from harness.families.cut_in.fitting.observations import KINDS, Observations
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, BoolArray, FloatArray, IntArray, RecordArray
 
+BASE = "ndd-overtaking-2"
+"""Shipped environment whose numbers are kept where they are not fitted, or the data do not determine them."""
 Base = Mapping[str, float]
-"""Numbers of an environment by ``section__name``."""
+"""Its numbers by ``section__name``."""
 FEWEST = {"initial": 100, "free": 500, "following": 500, "leads": 20}
 """Fewest rows for which a law is fitted [assumed]."""
 FEWEST_RECORDINGS = 10

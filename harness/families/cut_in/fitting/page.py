@@ -15,7 +15,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.errors import printable
 from harness.estimators.limits import garwood
 from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
-from harness.families.cut_in.fitting.laws import bins
+from harness.families.cut_in.fitting.laws import BASE, bins
 from harness.families.cut_in.fitting.observations import BesideCounts
 from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws, load_environment
@@ -39,11 +39,7 @@ _SEED = 1
 
 
 def page(fit: Fit, tally: BesideCounts, noise_mps2: float, asked: Asked, others: Sequence[str]) -> str:
-    """The page, self-contained.
-
-    ``noise_mps2`` is the standard deviation of accelerations by measurement noise; ``others`` say what was found for
-    other families.
-    """
+    """The page; ``noise_mps2`` is the sd of accelerations by measurement, ``others`` is what other families found."""
     template = templates(__package__).get_template("fit.html.j2")
     shown = template.render(
         fit=fit,
@@ -54,6 +50,7 @@ def page(fit: Fit, tally: BesideCounts, noise_mps2: float, asked: Asked, others:
         numbers=list(_numbers(fit)),
         noise_mps2=noise_mps2,
         others=others,
+        base=BASE,
     )
     return printable(shown)
 
