@@ -197,7 +197,7 @@ REFUSED = [
         (_of("Always", SHORT_MADE, where="constructor", how=how), "av.controller", words)
         for how, words in IN_CONSTRUCTOR.items()
     ),
-    (_of("RaisesForOtherNames"), "av.controller", "fails (RuntimeError: step_batch (misbehaving.py:"),
+    (_of("RaisesForOtherNames"), "av.controller", "cannot be made: RuntimeError: step_batch (misbehaving.py:"),
     (_of("says_nothing"), "av.controller", "without step"),
     (POPEN, "av.controller", "Popen without step"),
 ]
