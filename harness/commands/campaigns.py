@@ -308,7 +308,7 @@ def av_check(
 
     Exit code 3: tests failed, were not reproduced, or ended the process; 2: campaign or controller are wrong.
     """
-    campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario, "av-check"), *overrides], av=av)
+    campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario), *overrides], av=av)
     from harness.controllers.find import run_apart
     from harness.report.av_check import rows, verdict
     from harness.runner.look import check_av
@@ -338,7 +338,7 @@ def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str],
     surrogates from careful to careless, with their crash rates and the probabilities of their shells: the events on
     which a surrogate crashes and no more careful one does. A pool is built once and kept; `harness run` builds it, too.
     """
-    campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario, "pool"), *overrides])
+    campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario), *overrides])
     with progress_bar() as bar:
         from harness.pool.build import campaign_pool
         from harness.resolved import resolve

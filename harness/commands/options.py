@@ -76,8 +76,8 @@ quiet_option = click.option(
 """Common to all commands: `progress_bar` asks for it."""
 
 
-def of_scenario(text: str | None, alone: str = "") -> list[str]:
-    """What ``--scenario`` sets; ``alone`` is a command that is about one of them."""
+def of_scenario(text: str | None) -> list[str]:
+    """What ``--scenario`` sets."""
     from harness.families import R157, family_named
 
     if text is None:
@@ -87,9 +87,6 @@ def of_scenario(text: str | None, alone: str = "") -> list[str]:
         family_named(name, f"--scenario {text}", more=("all",))
     if len(names) == 1:
         return [f"scenario={names[0]}", "scenarios=null"]
-    if alone:
-        found, expected = f"several scenarios ({text})", f"one, as `harness {alone}` looks at one pool of events"
-        raise HarnessError("--scenario", found, expected, "Name one of them, and ask again for each of the others.")
     return [f"scenarios=[{', '.join(names)}]"]
 
 

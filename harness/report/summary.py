@@ -44,11 +44,6 @@ class ShownShells(ShellDetails):
     design: ShellDesign
 
     @property
-    def described(self) -> dict[str, str]:
-        """Reference drivers in plain words, by name."""
-        return {each.name: each.described for each in self.design.references}
-
-    @property
     def pool_half_width(self) -> float:
         """What the pool's own error leaves open of the rate."""
         return self.rhw_from_pool * self.rate
