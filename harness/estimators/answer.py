@@ -123,11 +123,12 @@ def estimate_blocks(
     best = done.headline_estimate
     level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
     distance_km = None if distance_m is None else distance_m / 1000.0
+    rates = ("rate", best.crash_rate), ("ci_low", best.ci_low), ("ci_high", best.ci_high)
     told = Estimates(
         campaign=campaign.name, campaign_hash=manifest["campaign_hash"], lane_change_level=level,
         confidence=best.confidence, n_episodes=best.n_episodes, n_crashes=best.n_crashes, headline=done.headline,
         distance_per_test_km=distance_km,
-        crash_rate_per_1e6_km=None if distance_km is None else _per_1e6_km(best, distance_km),
+        crash_rate_per_1e6_km=None if distance_km is None else {key: 1e6 / distance_km * rate for key, rate in rates},
         estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in done.estimates.items()},
         diagnostics=done.diagnostics.result(), convergence=tuple(done.convergence),
         severity=done.severity, cut_off=done.cut_off,
@@ -147,11 +148,6 @@ def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
         rates = of_strata @ share if best.n_crashes else weight_of_a_test(of_strata, n.astype(np.int64)).max(1)
         times = float(rates[1] / rates[0]), float(rates[2] / rates[0])
     return AssumedOfRate(assumed.where, assumed.highest, times, assumed.share)
-
-
-def _per_1e6_km(estimate: Estimate, distance_per_test_km: float) -> dict[str, float]:
-    scale = 1e6 / distance_per_test_km
-    return {"rate": estimate.crash_rate * scale, "ci_low": estimate.ci_low * scale, "ci_high": estimate.ci_high * scale}
 
 
 def before_event(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> dict[str, Any]:

@@ -74,13 +74,6 @@ class SamplingPlan:
         """What is to be known of the method."""
         return SAMPLING[self.method]
 
-    @property
-    def forced_share(self) -> float:
-        """Share of forced events among what the method draws from."""
-        if not self.sampling.forces:
-            return 0.0
-        return float(self.alpha[0]) if self.sampling.mixes else 1.0  # the defensive component is the first
-
 
 @dataclass(frozen=True, eq=False)
 class Block:
@@ -151,9 +144,13 @@ class Block:
         Of forced events it is P(event | path)/share, the largest. The step mixture draws each maneuver with ε times
         its exposure at least: after l control steps, no more than the longest test has steps, W ≤ ε^-l.
         """
-        if self.drawn.sampling.mixes_steps and self.drawn.epsilon > 0.0 and "n_steps" in self.columns:
-            return -math.log(self.drawn.epsilon) * int(self.n_steps.max())
-        if "log_p_event" not in self.columns or not (share := self.drawn.forced_share):
+        drawn, sampling = self.drawn, self.drawn.sampling
+        if sampling.mixes_steps and drawn.epsilon > 0.0 and "n_steps" in self.columns:
+            return -math.log(drawn.epsilon) * int(self.n_steps.max())
+        if "log_p_event" not in self.columns or not sampling.forces:
+            return math.inf
+        share = float(drawn.alpha[0]) if sampling.mixes else 1.0  # of forced events: the defensive component is first
+        if share == 0.0:
             return math.inf
         return float(np.max(self.log_p_event, initial=-math.inf)) - math.log(share)
 

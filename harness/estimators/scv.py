@@ -2,8 +2,8 @@
 
 `mixture_cv`. Under q_alpha(x) = Σ_j alpha_j q_j(x) over whole episodes, h_j(x) = q_j(x)/q_alpha(x) - 1 has mean exactly
 0, whatever the AV does. Regressing Y on [1, h_1 … h_M], with the columns *not* centred by their sample means, makes the
-intercept the estimate: it moves away from the plain mean by what the sample means of the h_j show to be luck. Its
-variance is at most min_j σ²_j/(n alpha_j) up to the estimation of β ([paper] Lemma 1, Theorem 2 of Owen and Zhou).
+intercept the estimate. Its variance is at most min_j σ²_j/(n alpha_j) up to the estimation of β ([paper] Lemma 1,
+Theorem 2 of Owen and Zhou).
 
 `scv` ([paper] Algorithm 1), with the warning that it needs. Episodes are stratified by their number of control steps l;
 within each stratum Y is regressed by SVD on the products vec(Π_t q_{j_t}(a_t|s_t)/q_alpha(a_t|s_t)), centred by the
@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -31,7 +31,7 @@ import numpy as np
 from numba.extending import get_cython_function_address
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
-from harness.estimators.estimate import Estimate, Note, note
+from harness.estimators.estimate import Estimate, note
 from harness.estimators.weighted import FEW_FOR_RESIDUALS, Nade
 from harness.processes import side_by_side
 from harness.vocabulary import FloatArray
@@ -155,9 +155,13 @@ class Scv(Nade):
             {"n_control_steps": level, "n": fit.n, "columns": fit.n_columns, "rank": fit.rank}
             for level, fit in zip(levels, fits, strict=True)
         ]
+        saturated = []
+        if gain["saturated"]:  # a gain is claimed there whatever the results are
+            of = {"n": len(gain["saturated"]), "of": len(strata), "levels": gain["saturated"]}
+            saturated = [note("saturated", **of, claimed=gain["claimed"], corrected=gain["degrees_of_freedom"])]
         return self.estimate(
             rate, math.sqrt(var_z / n), None, confidence, cautions=[note("published_scv")],
-            warnings=_saturated(gain), details={**details, "strata": strata},
+            warnings=saturated, details={**details, "strata": strata},
         )  # fmt: skip
 
     def _gain(self, levels: Sequence[int], fits: Sequence[StratumFit], between: float) -> dict[str, Any]:
@@ -227,14 +231,6 @@ class StratumFit(NamedTuple):
 def _ratio(before: float, after: float) -> float | None:
     """A gain, None where nothing varies before or after."""
     return before / after if before > 0.0 and after > 0.0 else None
-
-
-def _saturated(gain: Mapping[str, Any]) -> list[Note]:
-    """Warn of strata in which a gain is claimed whatever the results are."""
-    if not (levels := gain["saturated"]):
-        return []
-    gains = {"claimed": gain["claimed"], "corrected": gain["degrees_of_freedom"]}
-    return [note("saturated", n=len(levels), of=len(gain["strata"]), levels=levels, **gains)]
 
 
 class Stratum:

@@ -1,18 +1,15 @@
 """When tests are enough: a precision asked for beforehand, looked for at places fixed beforehand; or a decision.
 
-A run ends (`harness.runner.underway`) when a rule of this file says so; or when no test is left to be asked for:
-``stop.episodes`` are spent or, of shells, what the pool keeps (`harness.sampling.shells`). Which of these it was
-says `harness.vocabulary.StoppedBy`.
-
 Whatever the tests were drawn from, a rule looks at them now and then, leaves what it has found in ``look``, and says
-whether to go on. Looking after every test and stopping at the first narrow interval favours runs that were narrow by
-luck; and while the rare crashes of large weight have not occurred, mean, standard error and largest weight seen are all
-too small. So looks at weighted tests (`StopRule`) follow from the campaign alone, two in a row must pass, and one more
-crash of the largest weight that the design allows may move the estimate by no more than the half-width asked for:
-cap/(n·rate) ≤ RHW. Tests drawn from shells (`RoundRule`) and pairs of tests of two vehicles (`PairRule`) are looked at
-after each round, and once is enough. That limits hold at a fixed number of tests says nothing about the number at which
-a rule stops: that intervals cover there, how far rates are biased, and how often decisions are wrong, is measured
-(docs/estimators.md, docs/compare.md, docs/gate.md).
+whether to go on, while there are tests left to be asked for (`harness.vocabulary.StoppedBy`). Looking after every test
+and stopping at the first narrow interval favours runs that were narrow by luck; and while the rare crashes of large
+weight have not occurred, mean, standard error and largest weight seen are all too small. So looks at weighted tests
+(`StopRule`) follow from the campaign alone, two in a row must pass, and one more crash of the largest weight that the
+design allows may move the estimate by no more than the half-width asked for: cap/(n·rate) ≤ RHW. Tests drawn from
+shells (`RoundRule`) and pairs of tests of two vehicles (`PairRule`) are looked at after each round, and once is enough.
+That limits hold at a fixed number of tests says nothing about the number at which a rule stops: that intervals cover
+there, how far rates are biased, and how often decisions are wrong, is measured (docs/estimators.md, docs/compare.md,
+docs/gate.md).
 """
 
 from __future__ import annotations

@@ -77,17 +77,9 @@ class Candidates(BaselinePaths):
         arrays = (values[chosen] for values in (self.index, self.start, self.weight))
         return BaselinePaths(self.key, self.seed, self.order, *arrays)
 
-    def content(self) -> memoryview:
-        """All of them as a file."""
-        np.savez(file := BytesIO(), **vars(self))
-        return file.getbuffer()
 
-
-def walk_candidates(
-    resolved: Resolved, key: str, progress: Progress | None = None, candidates: int = CANDIDATES
-) -> Candidates:
+def walk_candidates(resolved: Resolved, key: str, progress: Progress, candidates: int = CANDIDATES) -> Candidates:
     """Walk so many paths beside an AV that holds its speed."""
-    progress = progress or Progress()
     aim = take_aim(resolved, progress)
     progress.stage("paths for baseline runs", candidates)
     n_surrogates = len(resolved.library.surrogates)
@@ -120,17 +112,18 @@ def baseline_paths_name(resolved: Resolved) -> str:
     return f"pools/baseline-{_candidates_key(resolved)}.npz"
 
 
-def campaign_baseline_paths(resolved: Resolved, progress: Progress | None = None) -> BaselinePaths:
+def campaign_baseline_paths(resolved: Resolved, progress: Progress) -> BaselinePaths:
     """The paths that a campaign's vehicle is to walk, of candidates from the cache, or walked and cached."""
-    key, name, settings = _candidates_key(resolved), baseline_paths_name(resolved), resolved.campaign.pool
+    key, name = _candidates_key(resolved), baseline_paths_name(resolved)
     if (content := cache.read(name)) is not None:
         with np.load(BytesIO(content)) as stored:
             columns = {name: stored[name] for name in ("order", "index", "start", "weight", "chance")}
             candidates = Candidates(key, int(stored["seed"]), **columns)
     else:
         candidates = walk_candidates(resolved, key, progress)
-        cache.keep(name, candidates.content())
-    return candidates.draw(settings.shadow_paths)
+        np.savez(file := BytesIO(), **vars(candidates))
+        cache.keep(name, file.getbuffer())
+    return candidates.draw(resolved.campaign.pool.shadow_paths)
 
 
 def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded) -> Pool:

@@ -30,7 +30,7 @@ from harness.families.protocol import Environment, Family
 from harness.records.folder import read_as, read_manifest
 from harness.records.reader import ShownTests, by_kind, read_campaign, read_traces, traffic_of
 from harness.records.schemas import LEAD
-from harness.sampling.shells import Shells
+from harness.sampling.shells import stored_design
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH, FAILED, OUTCOMES, TIMEOUT, FloatArray
@@ -106,7 +106,7 @@ def read_run_folder(path: Path, told: dict[str, Any] | None = None) -> RunFolder
     estimates = STORED_ESTIMATES.validate_python(told or _read_estimates(path, manifest["campaign_hash"]))
     campaign = read_campaign(path, manifest)
     tests = ShownTests.stored(path, manifest, family_named(campaign.scenario))
-    design = Shells.stored_design(path) if campaign.sampling.strata else None
+    design = stored_design(path) if campaign.sampling.strata else None
     return RunFolder(path, campaign, manifest, estimates, design, tests, traffic_of(campaign, manifest))
 
 

@@ -35,6 +35,7 @@ from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.runner.run import exposure_of, hour_answer
 from harness.sampling import prepare, source_of
 from harness.sampling.baseline import begin, read_stored
+from harness.sampling.shells import stored_design
 from harness.shown import ShownInPython
 from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 from harness.worlds import build_world
@@ -128,7 +129,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     if not (n_counted := int(manifest["n_episodes"])):
         raise no_episodes(folder)
     source = source_of(campaign)
-    design, needed = source.stored_design(folder), list(source.columns)
+    design, needed = stored_design(folder) if campaign.sampling.strata else None, list(source.columns)
     needed += BASELINE_COLUMNS if design is not None and design.candidates else ()
     ratios = list(MOMENT_COLUMNS) if moments and campaign.sampling.mixes_steps else []
     keeps = ratios and campaign.records.moments != "none"

@@ -31,7 +31,7 @@ from harness.records.folder import read_manifest
 from harness.records.reader import read_campaign
 from harness.resolved import Resolved, resolve
 from harness.runner.stored import stored_blocks
-from harness.sampling.shells import Shells
+from harness.sampling.shells import stored_design
 from harness.strata import ShellDesign
 from harness.vocabulary import FloatArray
 
@@ -79,7 +79,7 @@ class StoredShells:
             expected = "tests of shells, of a vehicle that holds its speed until the event"
             raise CampaignError(option, found, expected, ELSEWHERE)
         here = resolve(campaign)
-        design, pool = Shells.stored_design(folder), campaign_pool(here, progress)
+        design, pool = stored_design(folder), campaign_pool(here, progress)
         rebuilt = design_shells(pool, acceleration_limit(campaign.av))
         if design.strata != rebuilt.strata or not np.allclose(design.p, rebuilt.p, rtol=SAME_POOL):
             expected = f"shells as those of pool {pool.key}"

@@ -14,7 +14,7 @@ from harness.random_stream import uniforms
 from harness.resolved import Resolved
 from harness.sampling.protocol import ShardRequest, Source
 from harness.vehicles.drivers import Followers, driver_records
-from harness.vocabulary import FAILED, FloatArray, IntArray
+from harness.vocabulary import FAILED
 
 EVENT_DRAW = 1
 """Index within the event's stream."""
@@ -24,21 +24,16 @@ AT_ONCE = 1000
 ALL_MOTION = RecordPolicy("all", 0.0)
 
 
-def chosen_by(u: FloatArray, probability: FloatArray) -> IntArray:
-    """Events (n,) of paths whose events have the ``probability`` (n, E), by uniforms (n,); -1 beyond their sum."""
-    cumulative = np.cumsum(probability, axis=1)
-    return np.where(u < cumulative[:, -1], (cumulative <= u[:, None]).sum(1), -1)
-
-
 class Naturalistic(Source):
     """At most one event, by its probability, from one uniform: each test weighs 1."""
 
     def tests(self, first_episode: int, n_episodes: int) -> Traffic:
         resolved, paths = self.resolved, self.paths(first_episode, n_episodes)
         family, environment, seed = resolved.family, resolved.environment, self.campaign.seed
-        events = family.events(environment, seed, paths, NOBODY)
+        cumulative = np.cumsum(family.events(environment, seed, paths, NOBODY).probability, axis=1)
         u = uniforms(seed, first_episode, n_episodes, EVENT, EVENT_DRAW + 1)[:, EVENT_DRAW]
-        chosen = family.choose(environment, seed, paths, chosen_by(u, events.probability), of_pool=False)
+        event = np.where(u < cumulative[:, -1], (cumulative <= u[:, None]).sum(1), -1)
+        chosen = family.choose(environment, seed, paths, event, of_pool=False)
         return Traffic(family.script(environment, chosen), chosen.facts)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, pairwise
-from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -68,11 +67,13 @@ class Rounds(Protocol):
 class KnownRounds(Rounds):
     """All tests are known beforehand, in one round; a stop rule looks at the end of some of their shards."""
 
+    rule: StopRule
+
     def __init__(self, campaign: Campaign) -> None:
         self._total, self._confidence = campaign.stop.episodes, campaign.stop.confidence
         self._ends = campaign.run.shard_ends(self._total)
         least = LEAST_TESTS.get(campaign.testing.estimator or "", 0)
-        self.rule = self._rule = StopRule(campaign.stop, [end for end in self._ends if end >= least])
+        self.rule = StopRule(campaign.stop, [end for end in self._ends if end >= least])
         self._sums, self._n_episodes = accumulator(headline_of(campaign)), 0
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
@@ -82,9 +83,9 @@ class KnownRounds(Rounds):
     def enough(self, block: Block) -> bool:
         self._sums.add(block)
         self._n_episodes += len(block)
-        if not self._rule.due(self._n_episodes):
+        if not self.rule.due(self._n_episodes):
             return False
-        return self._rule.observe(self._n_episodes, self._sums.result(self._confidence))
+        return self.rule.observe(self._n_episodes, self._sums.result(self._confidence))
 
 
 class Source:
@@ -110,11 +111,6 @@ class Source:
     def cached_files(cls, resolved: Resolved) -> list[str]:  # noqa: ARG003 - here nothing is built
         """What building leaves in the cache, or has found there, by names: with it another machine builds nothing."""
         return []
-
-    @classmethod
-    def stored_design(cls, folder: Path) -> ShellDesign | None:  # noqa: ARG003 - there is none
-        """Strata of a stored run."""
-        return None
 
     def begin_after(self, runs: Recorded) -> None:  # noqa: ARG002 - there are none
         """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`.
@@ -145,7 +141,7 @@ class Source:
         kept = self.campaign.records
         return RecordPolicy(traces or kept.traces, kept.trace_share)
 
-    def rounds(self, held: int = 0) -> Rounds:  # noqa: ARG002 - only rounds that give up ask for it
+    def rounds(self, held: int) -> Rounds:  # noqa: ARG002 - only rounds that give up ask for it
         """Rounds of tests, for a folder that holds so many already."""
         return KnownRounds(self.campaign)
 

@@ -63,7 +63,6 @@ USED_UP_SHARE = 0.95
 """Share of the squared widths that must lie in exhausted strata for the allocation to end."""
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
-_FINISH = "Run `harness run` with --resume, which makes what is missing."
 
 _IN_USE: WeakValueDictionary[str, Pool] = WeakValueDictionary()
 
@@ -74,6 +73,12 @@ def pool_of(resolved: Resolved, progress: Progress) -> Pool:
     if (pool := _IN_USE.get(key)) is None or pool.library != resolved.library:
         pool = _IN_USE[key] = campaign_pool(resolved, progress)
     return pool
+
+
+def stored_design(folder: Path) -> ShellDesign:
+    """Strata of a stored run; a `RunFolderError` where they are missing, damaged, or of a too early version."""
+    mend = "Run `harness run` with --resume, which makes what is missing."
+    return read_as(StoredDesign, folder / SHELLS, mend=mend)
 
 
 class Shells(Source):
@@ -100,17 +105,12 @@ class Shells(Source):
         own = resolved.campaign.has_baseline_runs
         return [baseline_paths_name(resolved) if own else pool_name(campaign_pool_key(resolved))]
 
-    @classmethod
-    def stored_design(cls, folder: Path) -> ShellDesign:
-        """Strata of a stored run; a `RunFolderError` where they are missing, damaged, or of a too early version."""
-        return read_as(StoredDesign, folder / SHELLS, mend=_FINISH)
-
     def begin_after(self, runs: Recorded) -> None:
         if self.baseline_paths is None:
             raise ValueError("this campaign has no baseline runs")
         self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs))
 
-    def rounds(self, held: int = 0) -> ShellRounds:
+    def rounds(self, held: int) -> ShellRounds:
         return ShellRounds(self.campaign, self.prescribed.design, self.prescribed.available, held)
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:

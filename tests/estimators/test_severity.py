@@ -18,7 +18,7 @@ from harness.pool.build import campaign_pool
 from harness.resolved import resolve
 from harness.runner.stored import stored_blocks
 from harness.sampling import prepare
-from harness.sampling.shells import ShellRounds, Shells
+from harness.sampling.shells import ShellRounds, stored_design
 from harness.vocabulary import CRASH, FAILED, SAMPLING, TIMEOUT
 from harness.worlds.twin import TwinWorld
 from tests.in_process import run_here
@@ -55,7 +55,7 @@ def test_it_is_the_rate_of_harder_crashes_by_the_same_estimator(name, stored_run
 
 def test_what_nobody_avoids_is_what_the_most_careful_driver_crashes_on(stored_run):
     folder = stored_run("shells-twin")
-    rows, design = stored_table(folder, "episodes").to_pandas(), Shells.stored_design(folder)
+    rows, design = stored_table(folder, "episodes").to_pandas(), stored_design(folder)
     by_cell = design.cell_p * (rows.outcome == "crash").groupby(rows.cell).mean().reindex(range(design.cell_p.size))
     found = estimates(folder)["severity"]["unavoidable"]
     assert found["driver"] == design.strata[0] == "brakes-8"
