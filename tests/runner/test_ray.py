@@ -19,7 +19,7 @@ from benchmarks.kills import descendants, orphans, started_by
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from tests.in_process import run_here, run_with_workers, workers_alive
 from tests.runner.conftest import SHELLS, TWIN, campaign
-from tests.runner.test_shadow_runs import FORCED, SHADOWS, of
+from tests.runner.test_shells_runs import FORCED, SHADOWS, of
 from tests.stored_runs import manifest, part_files, unlike_columns
 
 ray = pytest.importorskip("ray")
