@@ -1,10 +1,7 @@
 """What a campaign is: frozen, validated models, one class per YAML section, and the rules between sections.
 
-A campaign says which traffic (``environment``) meets which vehicle (``av``), how critical moments are found and
-sampled (``surrogates``, ``testing``), where it is simulated (``world``), what is kept (``records``) and when it is
-enough (``stop``). Units are in the field names. What does not go together is one table, `REFUSED`: it is asked while a
-campaign is read, so that the error names file and line, and once more where it is resolved for a command, and is known
-whether its cut-ins take time (`lateral` of the environment).
+Units are in the field names. What does not go together is one table, `REFUSED`: it is asked while a campaign is read,
+so that the error names file and line, and once more where it is resolved for a command, and its traffic is known.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Files of YAML as models: read, overridden (``--set``), checked with every problem named by its place.
-
-So are campaigns, and the files that they name: of traffic, surrogates and vehicles.
-"""
+"""Files of YAML as models: read, overridden (``--set``), checked with every problem named by its place."""
 
 from __future__ import annotations
 

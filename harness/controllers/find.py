@@ -132,10 +132,8 @@ def build_host(
         raise _not_made(str(av.controller), cause_of(error)) from error
     if is_batch:
         return BatchHost(*told, first, names=names)
-    host = VehicleHost(*told, make, n_cells, first, names=names)
-    if is_script(str(av.controller)):
-        host.told_at = methodcaller("told_at")
-    return host
+    told_at = methodcaller("told_at") if is_script(str(av.controller)) else lambda _: ""
+    return VehicleHost(*told, make, n_cells, first, told_at, names=names)
 
 
 def _script(av: AutomatedVehicle, guard: Guard) -> Callable[[], Any] | None:

@@ -8,7 +8,6 @@ controller's first step, and each step is ``doStep`` over 0.1 s between setting 
 from __future__ import annotations
 
 import errno
-import hashlib
 import re
 import shutil
 import uuid
@@ -24,7 +23,7 @@ from harness import cache
 from harness.campaign.vehicle import FmuController
 from harness.controllers.protocol import BatchObservation, EpisodeStart, Observation, VehicleController
 from harness.errors import OF_THE_DISK, CampaignError, HarnessError, writing
-from harness.files import checksum
+from harness.files import checksum, content_hash
 from harness.problems import did_you_mean
 from harness.vehicles.kinematics import STEP_S
 
@@ -90,7 +89,7 @@ def _fmpy() -> Any:
 
 def _unpacked(file: Path) -> Path:
     """Folder with the FMU's content, in the cache, by its hash: workers share it."""
-    name = f"fmu/{hashlib.sha256(file.read_bytes()).hexdigest()[:16]}"
+    name = f"fmu/{content_hash(file.read_bytes())}"
     with zipfile.ZipFile(file) as archive:
         whole = (folder for folder in cache.places(name) if _is_whole(folder, archive))
         return next(whole, None) or cache.put(name, partial(_unpack, archive))

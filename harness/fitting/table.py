@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
@@ -63,10 +63,7 @@ SHIPPED_FOLDER = Path(__file__).parent
 
 
 def load_mapping(name: str | None = None, *, mirror: bool | None = None, leave_out: Sequence[str] = ()) -> Mapping:
-    """A shipped mapping (``highd``, ``ngsim``), that of a YAML file, or by default that of the input table itself.
-
-    Raises `CampaignError`: there is no such mapping, or it is wrong.
-    """
+    """A shipped mapping (``highd``, ``ngsim``) or that of a YAML file (or `CampaignError`); else the input table's."""
     mapping = Mapping() if name is None else read_model(shipped_or_own(name, SHIPPED_FOLDER, "--mapping"), Mapping)
     mapping = mapping.replaced(("leave_out",), [*mapping.leave_out, *leave_out])
     return mapping if mirror is None else mapping.replaced(("mirror",), mirror)
@@ -137,64 +134,57 @@ def _read(path: Path, mapping: Mapping) -> pd.DataFrame:
     with _reading(path):
         if path.suffix in (".parquet", ".pq"):
             with pq.ParquetFile(path, page_checksum_verification=True) as file:
-                columns, text = _columns(path, file.schema_arrow.names, mapping), None
+                columns, first = _columns(path, file.schema_arrow.names, mapping), 1
                 table = file.read(list(columns.values()))
         else:
-            text = _Text.of(path, mapping)
-            columns = _columns(path, text.names, mapping)
+            content, names, delimiter, decimal_point, first = _text(path, mapping)
+            columns = _columns(path, names, mapping)
             types = {name: pa.string() if column in NAMES else pa.float64() for column, name in columns.items()}
-            read = pa.csv.ReadOptions(column_names=text.names, skip_rows=text.row - 1, block_size=1 << 22)
-            wanted = {"column_types": types, "include_columns": list(types), "decimal_point": text.decimal_point}
-            parse, convert = pa.csv.ParseOptions(delimiter=text.delimiter), pa.csv.ConvertOptions(**wanted)
-            table = pa.csv.read_csv(text.content, read, parse, convert)
+            read = pa.csv.ReadOptions(column_names=names, skip_rows=first - 1, block_size=1 << 22)
+            wanted = {"column_types": types, "include_columns": list(types), "decimal_point": decimal_point}
+            parse, convert = pa.csv.ParseOptions(delimiter=delimiter), pa.csv.ConvertOptions(**wanted)
+            table = pa.csv.read_csv(content, read, parse, convert)
         if not len(table):
             raise TrajectoryError(str(path), "no rows", "one row per vehicle and time", "Is it the right file?")
-        return _renamed(table, columns, path, mapping, text.row if text else 1)
+        return _renamed(table, columns, path, mapping, first)
 
 
-class _Text(NamedTuple):
-    """A text file: its ``content`` in UTF-8; ``row`` is that of its first values."""
+def _text(path: Path, mapping: Mapping) -> tuple[Any, list[str], str, str, int]:
+    """How a text file is written: content in UTF-8, names, delimiter, decimal sign, and the row of its first values.
 
-    content: Any
-    names: list[str]
-    delimiter: str
-    decimal_point: str
-    row: int
-
-    @classmethod
-    def of(cls, path: Path, mapping: Mapping) -> _Text:
-        """Find out how a file is written; what is packed is unpacked as it is read."""
-        sample = pa.input_stream(str(path)).read(SAMPLE)
-        if b"\0" in sample:
-            found = "zero bytes, as in an Excel workbook, in what is packed, or in text that is not UTF-8"
-            mend = "Write it as CSV in UTF-8 (packed by gzip: .csv.gz), or as Parquet (.parquet)."
-            raise TrajectoryError(str(path), found, "a CSV or Parquet file", mend)
-        content = pa.input_stream(str(path))
-        text = sample.decode("utf-8-sig", errors="replace")
-        below = text.lstrip("\r\n")
-        head = below.partition("\n")[0].strip()
-        if not head:
-            raise TrajectoryError(str(path), "an empty file", "a header and rows", "Is it the right file?")
-        if isinstance(content, pa.OSFile):  # of what is packed the end is known
-            content.seek(content.size() - 1)
-            if content.read() not in (b"\n", b"\r"):
-                sys.stderr.write(f"note: {printable(str(path))} has no line end after its last row: is it complete?\n")
-            content.seek(0)
-        delimiter = max(",;\t", key=head.count)
-        if delimiter not in head and " " in head:  # columns of a fixed width, as NGSIM's
-            delimiter, lines = " ", re.sub(rb"(?m)^ +| +(?=\r?$)", b"", content.read())
-            content = pa.BufferReader(re.sub(rb" +", b" ", lines))
-            head = re.sub(" +", " ", head)
-        names = [name.strip() for name in next(csv.reader([head], delimiter=delimiter))]
-        marks = [len(re.findall(rf"\d{sign}\d", text)) for sign in (",", r"\.")]
-        headed = any(re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?", name, re.IGNORECASE) is None for name in names)
-        if not headed and len(names) != len(mapping.header):
-            found = f"numbers in place of a header: {len(names)} columns"
-            mend = "Add a header; or list the names in a mapping (header: [vehicle_id, time_s, …])."
-            raise TrajectoryError(str(path), found, "names of columns in the first row", mend)
-        decimal_point = "," if delimiter != "," and marks[0] > marks[1] else "."
-        first = 1 + headed + text[: len(text) - len(below)].count("\n")
-        return cls(content, names if headed else mapping.header, delimiter, decimal_point, first)
+    What is packed is unpacked as it is read.
+    """
+    sample = pa.input_stream(str(path)).read(SAMPLE)
+    if b"\0" in sample:
+        found = "zero bytes, as in an Excel workbook, in what is packed, or in text that is not UTF-8"
+        mend = "Write it as CSV in UTF-8 (packed by gzip: .csv.gz), or as Parquet (.parquet)."
+        raise TrajectoryError(str(path), found, "a CSV or Parquet file", mend)
+    content = pa.input_stream(str(path))
+    text = sample.decode("utf-8-sig", errors="replace")
+    below = text.lstrip("\r\n")
+    head = below.partition("\n")[0].strip()
+    if not head:
+        raise TrajectoryError(str(path), "an empty file", "a header and rows", "Is it the right file?")
+    if isinstance(content, pa.OSFile):  # of what is packed the end is known
+        content.seek(content.size() - 1)
+        if content.read() not in (b"\n", b"\r"):
+            sys.stderr.write(f"note: {printable(str(path))} has no line end after its last row: is it complete?\n")
+        content.seek(0)
+    delimiter = max(",;\t", key=head.count)
+    if delimiter not in head and " " in head:  # columns of a fixed width, as NGSIM's
+        delimiter, lines = " ", re.sub(rb"(?m)^ +| +(?=\r?$)", b"", content.read())
+        content = pa.BufferReader(re.sub(rb" +", b" ", lines))
+        head = re.sub(" +", " ", head)
+    names = [name.strip() for name in next(csv.reader([head], delimiter=delimiter))]
+    marks = [len(re.findall(rf"\d{sign}\d", text)) for sign in (",", r"\.")]
+    headed = any(re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?", name, re.IGNORECASE) is None for name in names)
+    if not headed and len(names) != len(mapping.header):
+        found = f"numbers in place of a header: {len(names)} columns"
+        mend = "Add a header; or list the names in a mapping (header: [vehicle_id, time_s, …])."
+        raise TrajectoryError(str(path), found, "names of columns in the first row", mend)
+    decimal_point = "," if delimiter != "," and marks[0] > marks[1] else "."
+    first = 1 + headed + text[: len(text) - len(below)].count("\n")
+    return content, names if headed else mapping.header, delimiter, decimal_point, first
 
 
 def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, str]:

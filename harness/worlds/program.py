@@ -5,9 +5,8 @@ harness last. So whatever the program commands to an AV that must hold its speed
 is overruled in the same step. From the step after the cut-in on the harness leaves the AV alone: its position and speed
 are read. LV and BV are compared in every bit, in every step.
 
-SUMO 1.28 binds its server to INADDR_ANY and has no option for another address (its options about TraCI are
-``--remote-port`` and ``--num-clients``). It serves the first clients that come, so that who is faster than the user's
-program would be taken for it: hence `require_private` and `require_neighbour`.
+SUMO 1.28 binds its server to INADDR_ANY, has no option for another address, and takes the first clients that come for
+the user's program: hence `require_private` and `require_neighbour`.
 """
 
 from __future__ import annotations
@@ -194,11 +193,7 @@ class ConnectedProgram:
         return len(clients)
 
     def _n_sockets(self) -> int:
-        """Sockets that SUMO has open; 0 where the system does not say.
-
-        SUMO goes on without a word when a client takes its leave. The table of connections would say so too, but
-        reading it takes longer than a step.
-        """
+        """Sockets that SUMO has open, one less when a client has left without a word; 0 where nobody says."""
         try:
             with os.scandir(f"/proc/{self._server.pid}/fd") as found:
                 return sum(os.readlink(file).startswith("socket:") for file in found)  # noqa: PTH115 - once per step
@@ -293,8 +288,7 @@ class TraciWorld(SumoCells):
     def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
         """Speeds of released AVs are ignored.
 
-        Raises an `AVLostError` where the program did not take part in this step, a `WorldDisagreementError` where a
-        vehicle that the harness commands is not where it should be.
+        Raises `AVLostError`: the program took no part; `WorldDisagreementError`: it moved what the harness commands.
         """
         program = self._running()
         api = program.connection

@@ -1,12 +1,10 @@
 """K cells in one libsumo simulation: told every speed, and every position compared with it after each step.
 
-SUMO is told the speed of every vehicle in every step; a speed that it has been told already it keeps until the next
-command. A finished cell is refilled by moving its three vehicles back: nothing is removed or added. After each step
-every position is read back from SUMO and compared, bit for bit, with what was commanded, and every speed too: with the
-optional compiled shim (`shim.cpp`, built when the package is installed, where there is a C++ compiler) after each step,
-without it, or with ``HARNESS_SHIM=0``, after every tenth. A difference stops the run.
-
-Roads are the committed networks', whose ``vehicles.add.xml`` holds the vehicle types.
+SUMO keeps a speed that it has been told until the next command. A finished cell is refilled by moving its vehicles
+back: nothing is removed or added. After each step every position is read back and compared, bit for bit, with what was
+commanded, and every speed too: with the optional compiled shim (`shim.cpp`, built when the package is installed, where
+there is a C++ compiler) after each step, without it, or with ``HARNESS_SHIM=0``, after every tenth. A difference stops
+the run.
 """
 
 from __future__ import annotations

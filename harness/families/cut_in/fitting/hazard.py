@@ -132,11 +132,6 @@ class Acceptance:
         design = _design(hazard.knots, rows[near])
         return cls(events, exposure, design, at[near].astype(np.int64), rows["duration_s"][near])
 
-    def exposures(self, theta: FloatArray) -> FloatArray:
-        """Expected lane changes (b, 5) in all bins but the last, by coefficients (b, p) of the hazard."""
-        hazard = np.exp(self.design @ theta.T) * self.duration_s[:, None]
-        return np.asarray(np.stack([hazard[self.bin == j].sum(axis=0) for j in range(TTC_EDGES_S.size)], axis=1))
-
     @property
     def shares(self) -> FloatArray:
         """Estimates (6,), at most 1. Without an event half of one is counted, up to the shares of longer times."""
@@ -152,8 +147,10 @@ class Acceptance:
         Drivers accept a shorter time no more often than a longer one, but draws are not ordered like that. Where shares
         are equal, as for drivers who do not look, ordered draws would be too small at the shortest times.
         """
-        counts = random.gamma(self.events[:-1] + 0.5, size=(len(theta), TTC_EDGES_S.size))
-        return np.clip(counts / np.maximum(self.exposures(theta), 1e-12), SMALLEST_SHARE, 1.0)
+        hazard = np.exp(self.design @ theta.T) * self.duration_s[:, None]
+        expected = np.stack([hazard[self.bin == j].sum(axis=0) for j in range(TTC_EDGES_S.size)], axis=1)
+        counts = random.gamma(self.events[:-1] + 0.5, size=expected.shape)
+        return np.clip(counts / np.maximum(expected, 1e-12), SMALLEST_SHARE, 1.0)
 
     @property
     def std_errors(self) -> FloatArray:
