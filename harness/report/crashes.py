@@ -183,7 +183,6 @@ def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) 
 
 def scenes_of(runs: Sequence[RunFolder], pairs: CrashPairs, replay: Replay) -> Iterator[Scene]:
     """The hardest crashes of B alone, then of A alone, beside the other vehicle on the same event."""
-    family = runs[0].family
     for side, other in ((1, 0), (0, 1)):
         name, impact = "AB"[side], pairs.impact_mps[side]
         places = np.flatnonzero((pairs.who == 1 + side) & (pairs.episode[other] >= 0))
@@ -194,7 +193,7 @@ def scenes_of(runs: Sequence[RunFolder], pairs: CrashPairs, replay: Replay) -> I
             if trace is None:
                 continue
             scene = Scenes(runs[side].campaign, None).scene(row, trace)
-            scene = beside_other(scene, name, "AB"[other], motion_of(runs[other], episodes[other], replay)[1], family)
+            scene = beside_other(scene, name, "AB"[other], motion_of(runs[other], episodes[other], replay)[1])
             where = " and ".join(f"test {count(n)} of {of}" for n, of in zip(episodes, "AB", strict=True))
             yield {**scene, "episode": f"only {name}, {told}", "title": f"Only {name} crashes, at {told} ({where})"}
 

@@ -107,11 +107,8 @@ class Scenes:
         """One episode, given its row and its trace, from shortly before the event on; all of one without."""
         trace = with_lateral(row, trace, self._family, self._environment)
         episode, outcome, cut = (row.column(name)[0].as_py() for name in ("episode", "outcome", "event_step"))
-        tracks = [
-            {"name": name, **_states(of), "crash": None, "over": share_over(of)}
-            for name in self._family.vehicles
-            for of in [_of(trace, name)]
-        ]
+        rows = [(name, _of(trace, name)) for name in self._family.vehicles]
+        tracks = [{"name": name, **_states(of), "crash": None, "over": share_over(of)} for name, of in rows]
         bv, av = tracks[self._family.principal], tracks[-1]
         last = av["x"].size - 1
         av["crash"] = last if outcome == "crash" else None
@@ -144,7 +141,7 @@ class Scenes:
             "moments": sorted(each for each in moments if each[0] is not None),
         }  # fmt: skip
         told = self._family.told(row.to_pylist()[0]) if onset is not None else ""
-        return {**scene, "facts": _facts(scene, bv, av, self._family, told)}
+        return {**scene, "facts": _facts(scene, told)}
 
     def _ghosts(
         self, environment: Environment, row: pa.Table, trace: pa.Table, onset: int, bv: Scene, av: Scene
@@ -169,13 +166,13 @@ class Scenes:
         return ghosts
 
 
-def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None, family: Family) -> Scene:
+def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None) -> Scene:
     """The scene of a crash of the vehicle ``label``, and who met the same event without a crash, if it was traced.
 
     The scene is one without ghosts. The vehicle ahead goes on after the crash as in the other's test.
     """
     first, av, ghosts = scene["first"], scene["tracks"][-1], list[Scene]()
-    bv = scene["tracks"][family.principal]
+    bv = scene["tracks"][family_named(scene["scenario"]).principal]
     told = {other: "does not crash; its motion is not on record, and it cannot be run again"}
     if trace is not None:
         ghost, goes_on = (_states(_of(trace, name)) for name in ("AV", bv["name"]))
@@ -185,7 +182,7 @@ def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None, f
             bv[key] = np.append(bv[key], goes_on[key][crash + 1 : shown])
             ghost[key] = ghost[key][first:shown]
         ghosts.append(ghost | {"name": other, "crash": None, "brakes": _brakes(ghost["v"], first)})
-        told[other] = _ending(ghosts[0], bv, scene, family)
+        told[other] = _ending(ghosts[0], scene)
     facts = [(name.replace("AV", label), phrase) for name, phrase in scene["facts"]]
     moments = [(step, name.replace("AV", label)) for step, name in scene["moments"]]
     av["label"] = label
@@ -256,9 +253,11 @@ def _brakes(v: FloatArray, first: int) -> int | None:
     return first + int(braking[0]) if braking.size else None
 
 
-def _facts(scene: Scene, bv: Scene, av: Scene, family: Family, event: str) -> list[tuple[str, str]]:
-    """What happens, as pairs of a name and a phrase."""
-    first, onset, cut, words = scene["first"], scene["onset"], scene["event"], family.words
+def _facts(scene: Scene, event: str) -> list[tuple[str, str]]:
+    """What happens, as pairs of a name and a phrase; the ``event`` is told by its columns."""
+    family = family_named(scene["scenario"])
+    bv, av, words = scene["tracks"][family.principal], scene["tracks"][-1], family.words
+    first, onset, cut = scene["first"], scene["onset"], scene["event"]
     if onset is None:
         return [(words.shows[0], words.none)]
     rate, hardest = _closing(av, bv, cut - first), tenths(-float(np.diff(av["v"]).min()) / STEP_S)
@@ -273,19 +272,21 @@ def _facts(scene: Scene, bv: Scene, av: Scene, family: Family, event: str) -> li
     moments = [(step, name) for step, name in scene["moments"] if name in told]
     facts = [(name, f"{_when(step, cut, words.since)}: {told[name]}") for step, name in moments]
     facts += [("AV brakes", "never")] if av["brakes"] is None else []
-    facts.append(("AV", _ending(av, bv, scene, family)))
+    facts.append(("AV", _ending(av, scene)))
     for each in scene["ghosts"]:
         who, at = family.stand_ins[each["name"]][0], onset - first
         if family.follows:  # how it ends may hang on nothing else
             ahead = min(_gap(each, other, at) for other in scene["tracks"][:-1])
             who += f", {tenths(ahead / each['v'][at])} s behind at the onset"
-        facts.append((each["name"], f"{who}: {_ending(each, bv, scene, family)}"))
+        facts.append((each["name"], f"{who}: {_ending(each, scene)}"))
     return facts
 
 
-def _ending(track: Scene, bv: Scene, scene: Scene, family: Family) -> str:
+def _ending(track: Scene, scene: Scene) -> str:
     """How it ends for one who follows the principal vehicle from its event on."""
-    first, cut, crash, name = scene["first"], scene["event"], track["crash"], bv["name"]
+    family = family_named(scene["scenario"])
+    bv, name = scene["tracks"][family.principal], scene["principal"]
+    first, cut, crash = scene["first"], scene["event"], track["crash"]
     if crash is None:
         places = range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
         closest, end = min(_gap(track, bv, place) for place in places), places[-1]

@@ -302,11 +302,9 @@ def run_lines(
 def estimate_lines(content: Mapping[str, Any]) -> list[str]:
     """The estimators of ``estimates.json``, a line each; those that its records do not allow are not named."""
     head = f"{content['campaign']}: {count(content['n_crashes'])} crashes in {count(content['n_episodes'])} tests"
-    found = {name: each for name, each in content["estimates"].items() if each["crash_rate"] is not None}
-    rows = [
-        (name, interval(each.get("ci_low"), each.get("ci_high"), each["crash_rate"])) for name, each in found.items()
-    ]
-    return [f"{head}; crash rate per test ({share(content['confidence'])})", *(columns(rows) if rows else ())]
+    found = [(name, each) for name, each in content["estimates"].items() if each["crash_rate"] is not None]
+    rows = [(name, interval(each.get("ci_low"), each.get("ci_high"), each["crash_rate"])) for name, each in found]
+    return [f"{head}; crash rate per test ({share(content['confidence'])})", *columns(rows)]
 
 
 def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:

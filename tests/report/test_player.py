@@ -17,7 +17,6 @@ import harness
 from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.errors import CampaignError
-from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.words import STAND_INS
 from harness.report import crashes, player
 from harness.report.motion import gui_program, write_sumo
@@ -140,7 +139,8 @@ def test_a_test_that_ends_while_the_vehicle_closes_in_has_avoided_nothing(speed,
     time_s = np.arange(6) / 10
     bv = {"name": "BV", "x": ahead + 20.0 * time_s, "v": np.full(6, 20.0)}
     av = {"x": speed * time_s, "v": np.full(6, speed), "crash": None}
-    assert player._ending(av, bv, {"first": 0, "event": 0, "onset": onset}, CUT_IN) == said
+    scene = {"scenario": "cut_in", "principal": "BV", "tracks": [{}, bv, av], "first": 0, "event": 0, "onset": onset}
+    assert player._ending(av, scene) == said
 
 
 @pytest.mark.parametrize("scenario", ["lead_brakes", "cut_out"])
