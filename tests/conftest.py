@@ -43,7 +43,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files that take long come first, so that workers end together: they are handed out whole."""
-    items.sort(key=lambda item: item.path.parent.name not in {"worlds", "controllers", "runner", "golden"})
+    long = ("golden", "controllers", "runner", "worlds", "chains", "fitting", "families", "report")
+    items.sort(key=lambda item: long.index(of) if (of := item.path.parent.name) in long else len(long))
 
 
 @pytest.fixture(scope="session")

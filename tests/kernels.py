@@ -32,8 +32,10 @@ def environment(level=1.0, hold_s=1.0):
 
 
 @compiled_threads
-def _bv(states, follows, env, u, pmf, cap, drawn):
-    for i in range(states.shape[0]):
+def _bv(states, follows, env, u):
+    n = states.shape[0]
+    pmf, cap, drawn = np.empty((n, 31)), np.empty(n, np.int64), np.empty((n, u.size), np.int64)
+    for i in range(n):
         if follows:
             law = laws.car_following(State(states[i, 0], states[i, 1], states[i, 2], 0.0, 0.0), env)
         else:
@@ -42,21 +44,26 @@ def _bv(states, follows, env, u, pmf, cap, drawn):
         cap[i] = law.cap
         for j in range(u.size):
             drawn[i, j] = laws.draw_acceleration(u[j], law, env)
+    return pmf, cap, drawn
 
 
 @compiled_threads
-def _cut_in(states, env, out):
+def _cut_in(states, env):
+    out = np.empty((states.shape[0], 3))
     for i in range(states.shape[0]):
         v, r1, r1dot, r2, r2dot = states[i]
         out[i, 0] = laws.opportunity(State(v, r1, r1dot, r2, r2dot), env)
         out[i, 1] = laws.acceptance(r2, r2dot, env)
         out[i, 2] = laws.cut_in_hazard(out[i, 0], out[i, 1], env)
+    return out
 
 
 @compiled_threads
-def _t_cdf(z, table, out):
+def t_distribution(z, table):
+    out = np.empty(z.size)
     for i in range(z.size):
         out[i] = laws.t_cdf(z[i], table)
+    return out
 
 
 def bv_accelerations(states, u=(), *, follows):
@@ -64,38 +71,28 @@ def bv_accelerations(states, u=(), *, follows):
 
     Of BV behind LV, or of one that drives freely; states have columns v_BV, R1, R1dot.
     """
-    states, u = np.atleast_2d(np.asarray(states, float)), np.asarray(u, float)
-    pmf, cap = np.empty((len(states), 31)), np.empty(len(states), np.int64)
-    drawn = np.empty((len(states), u.size), np.int64)
-    _bv(states, follows, environment(), u, pmf, cap, drawn)
-    return pmf, cap, drawn
+    return _bv(np.atleast_2d(np.asarray(states, float)), follows, environment(), np.asarray(u, float))
 
 
 def cut_in_terms(states, level=1.0, env=None):
     """Opportunity, acceptance and hazard of one step; states have all five columns: (n, 3)."""
-    states = np.atleast_2d(np.asarray(states, float))
-    out = np.empty((len(states), 3))
-    _cut_in(states, env or environment(level), out)
-    return out
-
-
-def t_distribution(z, table):
-    out = np.empty(z.size)
-    _t_cdf(z, table, out)
-    return out
+    return _cut_in(np.atleast_2d(np.asarray(states, float)), env or environment(level))
 
 
 # -- vehicles --
 
 
 @compiled_threads
-def _accelerations(driver, situations, out):
-    for i in range(situations.shape[0]):
+def _accelerations(driver, situations):
+    out = np.empty(situations.shape[0])
+    for i in range(out.size):
         out[i] = drivers.driver_acceleration(driver[0], situations[i, 0], situations[i, 1], situations[i, 2])
+    return out
 
 
 @compiled_threads
-def _follow(driver, seed, episode, situations, out):
+def _follow(driver, seed, episode, situations):
+    out = np.empty(situations.shape[0])
     late = references.reaction_steps(driver[0], seed, episode)
     memory = references.Memory(0.0, np.inf, driver[0].used_up_steps)
     for i in range(situations.shape[0]):
@@ -103,39 +100,35 @@ def _follow(driver, seed, episode, situations, out):
             v, v_lead, gap = situations[i]
             memory = references.react(driver[0], memory, i - late - 1, v, v_lead, gap)
         out[i] = memory.acceleration
+    return out
 
 
 @compiled_threads
-def _late(driver, seed, first, out):
-    for i in range(out.size):
+def _late(driver, seed, first, n):
+    out = np.empty(n, np.int64)
+    for i in range(n):
         out[i] = references.reaction_steps(driver[0], seed, first + i)
+    return out
 
 
 def accelerations(parameters, situations):
     """Accelerations (n,) at speed, leader's speed and gap: (n, 3)."""
-    situations = np.atleast_2d(np.asarray(situations, float))
-    out = np.empty(len(situations))
-    _accelerations(drivers.driver_records([parameters]), situations, out)
-    return out
+    return _accelerations(drivers.driver_records([parameters]), np.atleast_2d(np.asarray(situations, float)))
 
 
 def follow(parameters, reflexes, situations, *, seed=0, episode=0):
     """Accelerations (n,) from the cut-in on, at speed, leader's speed and gap in each step: (n, 3)."""
-    situations = np.asarray(situations, float)
-    out = np.empty(len(situations))
-    _follow(drivers.driver_records([parameters], [reflexes]), seed, episode, situations, out)
-    return out
+    return _follow(drivers.driver_records([parameters], [reflexes]), seed, episode, np.asarray(situations, float))
 
 
 def steps_late(reflexes, n, *, seed=0, first=0):
     """Steps between cut-in and reaction in consecutive episodes (n,)."""
-    out = np.empty(n, np.int64)
-    _late(drivers.driver_records([IDMParameters()], [reflexes]), seed, first, out)
-    return out
+    return _late(drivers.driver_records([IDMParameters()], [reflexes]), seed, first, n)
 
 
 @compiled_threads
-def _approach(driver, v, v_lead, gaps, steps, out):
+def _approach(driver, v, v_lead, gaps, steps):
+    out = np.empty(gaps.size)
     for k in range(gaps.size):
         gap, speed, out[k] = gaps[k], v, gaps[k]
         memory = references.Memory(0.0, np.inf, driver[0].used_up_steps)
@@ -145,30 +138,27 @@ def _approach(driver, v, v_lead, gaps, steps, out):
             gap += (v_lead - 0.5 * (speed + after)) * kinematics.STEP_S
             speed = after
             out[k] = min(out[k], gap)
+    return out
 
 
 def smallest_gaps(parameters, v, v_lead, gaps, *, steps=150):
     """Smallest gap (n,) within some steps behind a vehicle that keeps its speed, from the gaps (n,) after a cut-in."""
-    gaps = np.asarray(gaps, float)
-    out = np.empty(gaps.size)
-    _approach(drivers.driver_records([parameters]), v, v_lead, gaps, steps, out)
-    return out
+    return _approach(drivers.driver_records([parameters]), v, v_lead, np.asarray(gaps, float), steps)
 
 
 @compiled_threads
-def _fuzzy_metrics(driver, situations, out):
+def _fuzzy_metrics(driver, situations):
+    out = np.empty((situations.shape[0], 2))
     for i in range(situations.shape[0]):
         v, v_lead, gap, a = situations[i]
         out[i, 0] = references.proactive_metric(driver[0], v, v_lead, gap)
         out[i, 1] = references.critical_metric(driver[0], v, v_lead, gap, a)
+    return out
 
 
 def fuzzy_metrics(parameters, situations):
     """PFS and CFS (n, 2) at speed, leader's speed, gap and acceleration: (n, 4)."""
-    situations = np.atleast_2d(np.asarray(situations, float))
-    out = np.empty((len(situations), 2))
-    _fuzzy_metrics(drivers.driver_records([parameters]), situations, out)
-    return out
+    return _fuzzy_metrics(drivers.driver_records([parameters]), np.atleast_2d(np.asarray(situations, float)))
 
 
 # -- importance functions --
@@ -210,9 +200,12 @@ def _before(states, maneuvers, steps, environment, importance, cut, stay, p, q, 
 
 
 @compiled_threads
-def _draws(u, component, alpha, q, out):
+def drawn(u, component, alpha, q):
+    """Indices (n,) that uniforms are turned into, under importance functions q (J, 31)."""
+    out = np.empty(u.size, np.int64)
     for i in range(u.size):
         out[i] = draw_from(u[i], component, alpha, q)
+    return out
 
 
 @compiled_threads
@@ -242,13 +235,6 @@ def before_event(states, maneuvers, steps, environment, importance) -> Proposals
     return Proposals(np.stack([p, 1.0 - p], axis=-1), np.stack([q, 1.0 - q], axis=-1), v, critical)
 
 
-def drawn(u, component, alpha, q):
-    """Indices (n,) that uniforms are turned into, under importance functions q (J, 31)."""
-    out = np.empty(u.size, np.int64)
-    _draws(u, component, alpha, np.ascontiguousarray(q), out)
-    return out
-
-
 def accumulated(of_episodes, alpha, ratios, v):
     """Take in ratios q_j/p (steps, M) with V (steps, J): log ratios (M,), martingale sums (J,), q_α/p (steps,).
 
@@ -262,13 +248,9 @@ def accumulated(of_episodes, alpha, ratios, v):
 
 
 @compiled_threads
-def _interpolate(table, states, out):
-    for i in range(states.shape[0]):
-        out[i] = interpolate(table, locate(AFTER, states[i, 0], states[i, 1], states[i, 2]))
-
-
 def tabulated(table, states):
     """Table (v, R2, R2dot) at states (n, 3) after the cut-in."""
-    out = np.empty(len(states))
-    _interpolate(np.ascontiguousarray(table), np.asarray(states, float), out)
+    out = np.empty(states.shape[0])
+    for i in range(out.size):
+        out[i] = interpolate(table, locate(AFTER, states[i, 0], states[i, 1], states[i, 2]))
     return out

@@ -169,7 +169,7 @@ def moved(draw, name):
 
 @pytest.mark.parametrize("name", LADDERS)
 @given(data=st.data())
-@settings(max_examples=60)
+@settings(max_examples=40)
 def test_probabilities_sum_to_one_wherever_numbers_may_lie(name, data):
     """C2; and every event is one that can be driven: in SUMO's road, without a contact of the others."""
     parameters = data.draw(moved(name))

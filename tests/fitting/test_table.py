@@ -242,6 +242,7 @@ def test_ngsim(tmp_path):
         assert (recording.lane == expected.lane.to_numpy()).all()
 
 
+@pytest.mark.slow
 def test_sites_need_not_be_sorted(tmp_path):
     """Also in a file of several of the blocks in which it is read."""
     ROWS.to_parquet(tmp_path / "rows.parquet", index=False)
@@ -370,6 +371,7 @@ def test_a_mapping_that_does_not_suit_the_file(case, tmp_path):
         judged(tmp_path / "rows.parquet", str(tmp_path / "own.yaml"))
 
 
+@pytest.mark.slow
 def test_classes_and_mirror(tmp_path):
     """Only named classes are fitted, others are neighbours still; a mirror's picture in a mirror is the road."""
     rows = ROWS.assign(**{"class": np.where(ROWS.recording_id % 2 == 0, "car", "truck")})
