@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from harness.report.motion import write_motion
     from harness.runner.compare import compare_campaigns as compare
     from harness.runner.look import check_av as av_check
-    from harness.runner.other_traffic import estimate_in_other_traffic
+    from harness.runner.other_traffic import estimate_in_other_traffic, sensitivity
     from harness.runner.run import run_campaign as run
-    from harness.runner.sensitivity import sensitivity
     from harness.runner.stored import estimate_families, write_report
     from harness.runner.stored import estimate_run as estimate
     from harness.runner.stored import replay_episode as replay
@@ -47,7 +46,7 @@ _PLACES = {
     "read": ("harness.runner.tables", "read"),
     "replay": ("harness.runner.stored", "replay_episode"),
     "run": ("harness.runner.run", "run_campaign"),
-    "sensitivity": ("harness.runner.sensitivity", "sensitivity"),
+    "sensitivity": ("harness.runner.other_traffic", "sensitivity"),
     "write_motion": ("harness.report.motion", "write_motion"),
     "write_report": ("harness.runner.stored", "write_report"),  # not "report", as that package is called
 }

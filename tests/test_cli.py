@@ -250,7 +250,7 @@ def test_a_file_that_cannot_be_written_is_refused_first(raising, capsys, tmp_pat
 @pytest.mark.parametrize(
     ("command", "work"),
     [
-        (["sensitivity"], "harness.runner.sensitivity.StoredShells.of"),
+        (["sensitivity"], "harness.runner.other_traffic.StoredShells.of"),
         (["estimate", "--write"], "harness.estimate"),
         (["estimate", "--write", "--environment", "ndd-overtaking-1"], "harness.estimate_in_other_traffic"),
     ],

@@ -1,4 +1,4 @@
-"""What a stored run says of other traffic, of traffic that was fitted, and of what is assumed about its own.
+"""What a stored run says of other traffic, of traffic that was fitted, and how it depends on what is known of its own.
 
 Traffic that was fitted names replicates: environments that other trajectories of the same kind would have given. Each
 is answered by the same tests, from few paths that are the same in all of them (`harness.runner.stored_shells`).
@@ -7,10 +7,11 @@ is answered by the same tests, from few paths that are the same in all of them (
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,15 +21,31 @@ from harness.errors import CampaignError
 from harness.estimators.answer import CARRIES, Elsewhere, estimate_blocks
 from harness.estimators.estimate import finite_json
 from harness.estimators.pairs import PairedShells, paired_estimate
-from harness.estimators.traffic import ONE_LAW, Ends, TrafficError, Uncertain, Unseen, uncertain
+from harness.estimators.traffic import (
+    ONE_LAW,
+    Bar,
+    Ends,
+    Sensitivity,
+    TrafficError,
+    Uncertain,
+    Unseen,
+    tests_of_sum,
+    uncertain,
+)
 from harness.families.protocol import Parameters
 from harness.pool.moved import assumed
 from harness.progress import Progress
-from harness.records.reader import read_replicates
+from harness.records.folder import SENSITIVITY, read_manifest, require_place, write_sealed
+from harness.records.reader import read_campaign, read_replicates
 from harness.resolved import resolve
-from harness.runner.stored import StoredEstimates
+from harness.runner.stored import StoredEstimates, read_families
 from harness.runner.stored_shells import ELSEWHERE, OPTION, Nearby, StoredShells, moved_to, require_shares
-from harness.vocabulary import EstimatorName, FloatArray
+from harness.strata import ShellDesign
+from harness.vocabulary import FAMILIES, EstimatorName, FloatArray
+
+N_REPLICATES = 50
+CONFIDENCE, QUANTILE = 0.9, 1.645
+_OPTION = "harness sensitivity"
 
 
 @checked("harness.estimate_in_other_traffic")
@@ -204,3 +221,160 @@ def _unseen(moved: StoredShells, parameters: Parameters, progress: Progress) -> 
 
 def _ends(of: Mapping[str, Any]) -> Ends:
     return of["ratio_low"] or 0.0, math.inf if of["ratio_high"] is None else of["ratio_high"]
+
+
+# -- what the answer depends on: fitted numbers move by their standard errors or, where there are replicates, in blocks,
+# as those of a block were fitted together; assumed numbers over the range that is stated for them. Crash shares within
+# shells stay as they were: of numbers that change what happens after a cut-in they tell nothing but what the reference
+# drivers show, by how much their rates, which are known there, would come out wrong --
+
+
+@dataclass(frozen=True)
+class Move:
+    """Environments of a `Bar`, by the numbers that are other in each."""
+
+    what: str
+    known: Literal["fitted", "assumed"]
+    values: tuple[float, float] | None
+    settings: Sequence[Mapping[str, float]]
+
+
+@checked("harness.sensitivity")
+def sensitivity(
+    folder: str | Path, *, ranges: Mapping[str, tuple[float, float]] | None = None, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Write ``sensitivity.json`` into the folder of a run of shells, and return its content (`Sensitivity`).
+
+    Parameters
+    ----------
+    folder : str or Path
+        Run folder, or the folder of several scenarios: each is asked, and by its share the sum.
+    ranges : mapping, optional
+        Lowest and highest value of numbers, by ``section.name``, besides those that the environment states.
+    progress : Progress, optional
+        Who is told how far it is.
+
+    Raises `HarnessError`: the folder is no run of shells, a number is not there, or nothing is said to be uncertain.
+    """
+    folder, progress = Path(folder), progress or Progress()
+    require_place(folder)
+    found = (_of_sum if (folder / FAMILIES).is_file() else _of_one)(folder, ranges or {}, progress)
+    content = finite_json(found)
+    write_sealed(folder / SENSITIVITY, content)
+    return content
+
+
+def _of_one(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: Progress) -> Sensitivity:
+    tested = StoredShells.of(folder, progress, _OPTION)
+    require_shares(tested)
+    settings, parameters = tested.here.campaign.environment, tested.here.parameters
+    asked = list(moves(settings.parameters, parameters, tested.here.family.shipped, ranges))
+    if not asked:
+        found = f"{settings.parameters}, of which no number has a standard error (se) or a range"
+        number = next(reversed(parameters.numbers()), "section__name").replace("__", ".")
+        mend = f"State one, e.g. --range {number}=LOW:HIGH."
+        raise CampaignError(_OPTION, found, "numbers that are said to be uncertain", mend)
+    results = tested.nearby([each for move in asked for each in move.settings], progress)
+    bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
+    driver = next((each.name for each in tested.design.references), "")
+    bars += bar_of_readings(tested.design)
+    return Sensitivity(tested.manifest["campaign_hash"], Path(settings.parameters).stem, driver, _longest_first(bars))
+
+
+def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: Progress) -> Sensitivity:
+    """Bars of each scenario, by its share of the sum's rates, and of the exposures; one that refuses is left out."""
+    stored, bars, of_numbers = read_families(folder), list[Bar](), dict[str, Mapping[str, tuple[float, float]]]()
+    for name in stored["families"]:
+        campaign = read_campaign(folder / name, read_manifest(folder / name), check_files=True)
+        of_file = {each.replace("__", ".") for each in resolve(campaign).parameters.numbers()}
+        of_numbers[name] = {key: ends for key, ends in ranges.items() if key in of_file}
+    if unknown := sorted(set(ranges).difference(*of_numbers.values())):
+        mend = f"Ask {folder / next(iter(of_numbers))} alone, say: its table names its numbers."
+        raise CampaignError("--range", unknown[0], "a number of one of these scenarios", mend)
+    hour = stored["beside"]["rate_per_hour"] or math.nan
+    for name, of in stored["families"].items():
+        shares, exposure = (of["share"] or 0.0, of["reference_rate_per_hour"] / hour), of["exposure"]
+        ends = float(f"{exposure['low']:.4g}"), float(f"{exposure['high']:.4g}")
+        if ends[0] < ends[1]:
+            low, high = (end / exposure["per_hour"] for end in ends)
+            known: Literal["counted", "assumed"] = "counted" if exposure["counted"] else "assumed"
+            bars.append(_part(Bar(f"exposure {name}", known, ends, (low, high), (1.0, 1.0), (0.0, 0.0)), *shares))
+        try:
+            found = _of_one(folder / name, of_numbers[name], progress)
+        except CampaignError as refused:
+            sys.stderr.write(f"note: {name} alone moves by nothing here: {refused.found}\n")
+        else:
+            bars += [_part(replace(bar, what=f"{name} {bar.what}"), *shares) for bar in found.bars]
+    return Sensitivity(tests_of_sum(stored), "crashes per hour", stored["beside"]["reference"], _longest_first(bars))
+
+
+def _part(bar: Bar, share: float, of_driver: float) -> Bar:
+    """What a scenario's bar is of the sum, of whose rate the scenario has a ``share``, and of the driver's another."""
+    rate, ratio = np.array(bar.rate), np.array(bar.ratio)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        moved = 1.0 + share * (rate - 1.0)
+        beside = moved / (1.0 + of_driver * (rate / ratio - 1.0))
+    (low, high), (lower, upper) = moved.tolist(), beside.tolist()
+    return replace(bar, rate=(low, high), ratio=(lower, upper), off=(share * bar.off[0], share * bar.off[1]))
+
+
+def _longest_first(bars: Sequence[Bar]) -> tuple[Bar, ...]:
+    return tuple(sorted(bars, key=lambda bar: -bar.span))
+
+
+def moves(
+    name: str, parameters: Parameters, shipped: Path, ranges: Mapping[str, tuple[float, float]]
+) -> Iterator[Move]:
+    """What is said to be uncertain of an environment, a shipped name or a file, and numbers with stated ``ranges``."""
+    known = parameters.numbers()
+    stated = {key.replace(".", "__"): ends for key, ends in ranges.items()}
+    if unknown := sorted(set(stated) - set(known)):
+        mend = f"Its numbers are named section.name, such as {next(reversed(known)).replace('__', '.')}."
+        raise CampaignError("--range", unknown[0].replace("__", "."), f"a number of {name}", mend)
+    for key, (low, high) in ranges.items():
+        if not -math.inf < low < high < math.inf:
+            expected = "two finite numbers, the lower first"
+            raise CampaignError(f"--range {key}", f"{low:g}:{high:g}", expected, "Correct them, or change places.")
+    blocks = {section: block for block, sections in parameters.blocks.items() for section in sections}
+    if parameters.replicates is not None:
+        rows = [parameters.as_if_unseen(row) for row in read_replicates(name, parameters, shipped)[:N_REPLICATES]]
+        for block in parameters.blocks:
+            columns = [key for key in rows[0] if blocks.get(key.split("__")[0]) == block]
+            if columns:
+                yield Move(block, "fitted", None, [{key: row[key] for key in columns} for row in rows])
+    for key, number in known.items():
+        if key.startswith("exposure__"):  # moves no rate per test
+            continue
+        what, value, se, ends = key.replace("__", "."), number.value, number.se, stated.get(key, number.range)
+        if ends is not None:
+            yield Move(what, "assumed", (ends[0], ends[1]), [{key: end} for end in ends])
+        elif se is not None and parameters.replicates is None:
+            ends = value - QUANTILE * se, value + QUANTILE * se
+            yield Move(what, "fitted", ends, [{key: end} for end in ends])
+
+
+def bar_of_readings(design: ShellDesign) -> list[Bar]:
+    """By how much the ratio moves where the regulation's driver is read otherwise; none where only one reading is."""
+    rates = dict(zip((each.name for each in design.references), design.reference_rate.tolist(), strict=True))
+    first, *others = [rates[name] for name in design.readings] or [0.0]
+    ends = [first / rate for rate in others if min(first, rate) > 0.0]
+    known: Literal["assumed"] = "assumed"
+    whole = (1.0, 1.0), (min([*ends, 1.0]), max([*ends, 1.0])), (0.0, 0.0)
+    return [Bar(f"readings of {next(iter(rates))}", known, None, *whole, n=len(ends))] if ends else []
+
+
+def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:
+    """What traffic moved to some ``results`` says; a block's ends are those of what can be answered, half at least."""
+    nowhere = np.full((2, 2), np.nan)
+    ends = np.array([nowhere[0] if each is None or each.refused else (each.rate, each.ratio) for each in results])
+    off = np.array([np.nan if each is None else each.off for each in results])
+    no_laws, unlike = results.count(None), sum(each is not None and each.refused for each in results)
+    if move.values is None:
+        tail, told = (1.0 - CONFIDENCE) / 2.0, ~np.isnan(ends[:, 0])
+        known, enough = ends[told], 2 * np.count_nonzero(told) >= len(results)
+        ends = np.quantile(known, [tail, 1.0 - tail], axis=0) if enough else nowhere
+        nearest = [int(np.argmin(np.abs(known[:, 0] - end))) for end in ends[:, 0]] if enough else []
+        off = off[told][nearest] if enough else nowhere[0]
+    rate, ratio, most_off = ((float(low), float(high)) for low, high in (*ends.T, off))
+    told_by = {"n": len(results), "no_laws": no_laws, "unlike": unlike}
+    return Bar(move.what, move.known, move.values, rate, ratio, most_off, **told_by)

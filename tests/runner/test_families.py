@@ -235,7 +235,7 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
         assert ranges == ({"braking.stop_share": (0.0, 0.1)} if where.name == "lead_brakes" else {})
         return Sensitivity("", "", "r157-cc", (Bar("twice", "assumed", None, (2.0, 1.0), (4.0, 1.0), (0.1, 0.0)),))
 
-    monkeypatch.setattr("harness.runner.sensitivity._of_one", of_one)
+    monkeypatch.setattr("harness.runner.other_traffic._of_one", of_one)
     assert main(["sensitivity", str(folder), "--range", "braking.stop_share=0:0.1"]) == 0
     assert "note: cut_out alone moves by nothing here: no number" in capsys.readouterr().err
     bars = {bar["what"]: bar for bar in json.loads((folder / "sensitivity.json").read_text())["bars"]}

@@ -25,8 +25,7 @@ from harness.report.rows import bar_note
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.compare import compare_campaigns
-from harness.runner.other_traffic import estimate_in_other_traffic
-from harness.runner.sensitivity import Move, bar_of, bar_of_readings, moves, sensitivity
+from harness.runner.other_traffic import Move, bar_of, bar_of_readings, estimate_in_other_traffic, moves, sensitivity
 from harness.runner.stored_shells import Nearby, StoredShells
 from harness.strata import Reference
 from tests.golden.campaigns import COMPARED, LATERAL_FILE
