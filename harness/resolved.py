@@ -117,13 +117,11 @@ def resolve(campaign: Campaign, command: Command = "run") -> Resolved:
     challenge = campaign.testing.challenge
     if campaign.testing.own_challenge is not None:
         challenge = source_of_own(challenge, "testing.challenge")
-    own = [source_of_own(code, f"surrogates.{name}") for name, code in campaign.own_surrogates.items()]
-    challenge = " ".join([challenge, *own])
+    for name, code in campaign.own_surrogates.items():
+        challenge += " " + source_of_own(code, f"surrogates.{name}")
     campaign = campaign.replaced(("pool", "library"), campaign.pool.library or family.ladders[shows])
-    named = campaign.environment.named(family.default_parameters)
-    campaign = campaign.replaced(("environment", "parameters"), named)
-    error = campaign.pool.relative_error or family.pool_error
-    campaign = campaign.replaced(("pool", "relative_error"), error)
+    campaign = campaign.replaced(("pool", "relative_error"), campaign.pool.relative_error or family.pool_error)
+    campaign = campaign.replaced(("environment", "parameters"), campaign.environment.named(family.default_parameters))
     return Resolved(
         campaign,
         parameters,

@@ -34,13 +34,8 @@ Of a vehicle that is random in one of four tests, ten miss all with a probabilit
 """
 
 Bits = tuple[bytes, bytes, str | None]
-
-
-class DrawnTests(NamedTuple):
-    """Consecutive tests from the ``first`` on, and what the others do in them."""
-
-    first: int
-    traffic: Traffic
+DrawnTests = tuple[int, Traffic]
+"""Consecutive tests: which is the first, and what the others do in them."""
 
 
 class Again(NamedTuple):
@@ -82,7 +77,7 @@ def _run_here(
 def repeat(loop: EpisodeLoop, source: Source, shard: Shard) -> Repeated:
     """Run some tests of a loop's shard again, each alone: a user's code elsewhere, what SUMO drives after the shard."""
     rows = _rows_to_repeat(shard, source.campaign)
-    tests = [DrawnTests(shard.first_episode + row, shard.traffic.rows(slice(row, row + 1))) for row in rows]
+    tests = [(shard.first_episode + row, shard.traffic.rows(slice(row, row + 1))) for row in rows]
     if has_foreign_code(source.campaign.av):
         again = _each_elsewhere(source, tests)
     else:

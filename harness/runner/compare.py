@@ -19,11 +19,11 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.campaign.sections import MOST_EVENTS
 from harness.campaign.vehicle import Limits
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
+from harness.errors import CampaignError
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.likelihood import Level
-from harness.estimators.pairs import PairDecision, Pairs, PairVerdict, contrast, paired_estimate
+from harness.estimators.pairs import PairDecision, Pairs, contrast, paired_estimate
 from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
@@ -38,6 +38,7 @@ from harness.resolved import require_ready
 from harness.runner.paired import SIDES, Both, PairedScenario, copy_stored, drive_pairs, together
 from harness.runner.run import hour_answer, require_no_other
 from harness.runner.stored import MEND, read_families, replay_episode
+from harness.runner.underway import exit_code
 from harness.sampling.shells import PairRounds
 from harness.shown import ShownInPython
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from harness.report.summary import RunFolder
 
 MAY_DIFFER = frozenset({"av", "name", "description"})
-EXIT_OF: Mapping[PairVerdict, int] = {"proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT}
 
 
 @dataclass(frozen=True, repr=False)
@@ -160,9 +160,8 @@ def compare_campaigns(
     rule = PairRule(a, margin, rhw)
     rounds, scenarios = drive_pairs(a, ready, rule, workers, progress or Progress())
     pairs = together(scenarios, a)
-    code, decision = EXIT_DONE if rule.look.stopped else EXIT_BUDGET_SPENT, _decided(rule, scenarios)
-    if margin is not None:
-        code = EXIT_OF[decision.verdict]
+    decision = _decided(rule, scenarios)
+    code = exit_code(None if margin is None else decision, missed=not rule.look.stopped)
     ended = {
         "decision": decision.to_json(), "to_decide": _to_decide(a, rounds, pairs),
         "ended": ended_by(a, rule, int(pairs.tests.sum())),
@@ -283,20 +282,14 @@ def require_same_shells(sides: Both, stored: str | Path | None = None) -> None:
     if (limits[0] > envelope) != (limits[1] > envelope):
         found = f"a hardest acceleration of {limits[0]:g} m/s² in A and {limits[1]:g} m/s² in B"
         expected = f"both up to {envelope:g} m/s², the envelope of the surrogate library, or both above"
-        raise CampaignError("av", found, expected, _limit_both(sides, int(limits[1] > envelope), stored))
-
-
-def _limit_both(sides: Both, harder: int, stored: str | Path | None) -> str:
-    """How to compare vehicles of which the ``harder`` side accelerates beyond the envelope of the library."""
-    av, envelope = sides[harder].campaign.av, sides[harder].library.envelope_mps2
-    if av.source in ("sumo", "traci"):
-        return "Nothing in the harness limits a vehicle that SUMO or a program drives: compare it with another such."
-    section, default = "parameters", ""
-    if av.model is None:
-        section, default = "limits", f" (by default {Limits().max_acceleration_mps2:g})"
-    limit = f"av.{section}.max_acceleration_mps2={envelope:g}"
-    if stored is None:
-        return f"Add --set {limit}, which limits both{default}."
-    if harder:
-        return f"Add --against {limit}, which limits B."
-    return f"Name A's vehicle or campaign, not {stored}, so that it is run again with --set {limit}."
+        av = sides[of_b := limits[1] > envelope].campaign.av
+        section = "limits" if av.model is None else "parameters"
+        limit = f"av.{section}.max_acceleration_mps2={envelope:g}"
+        mend = f"Add --set {limit}, which limits both (by default {Limits().max_acceleration_mps2:g})."
+        if av.source in ("sumo", "traci"):
+            mend = "Nothing in the harness limits what SUMO or a program drives: compare it with another such vehicle."
+        elif stored is not None and of_b:
+            mend = f"Add --against {limit}, which limits B."
+        elif stored is not None:
+            mend = f"Name A's vehicle or campaign, not {stored}, so that it is run again with --set {limit}."
+        raise CampaignError("av", found, expected, mend)

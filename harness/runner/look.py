@@ -25,7 +25,7 @@ from harness.loop.loop import EpisodeLoop, Shard
 from harness.records.reader import by_kind
 from harness.report.av_check import AvCheck, Behaviour, Cause, Follows, Speed
 from harness.resolved import require_world, resolve
-from harness.runner.again import Bits, DrawnTests, bits_of, run_elsewhere
+from harness.runner.again import Bits, bits_of, run_elsewhere
 from harness.sampling import prepare
 from harness.sampling.protocol import Source
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -147,7 +147,7 @@ def _run_in_another_order(source: Source, n_episodes: int) -> dict[int, Bits]:
     half = n_episodes // 2
     order = [*range(half, n_episodes), *range(half)]
     parts = order[: n_episodes - half], order[n_episodes - half :]
-    halves = [DrawnTests(part[0], source.tests(part[0], len(part))) for part in parts]
+    halves = [(part[0], source.tests(part[0], len(part))) for part in parts]
     if has_foreign_code(source.campaign.av):
         return dict(zip(order, run_elsewhere(source, halves, OTHER_CELLS).bits, strict=True))
     with _opened(source, OTHER_CELLS) as loop:
@@ -189,7 +189,7 @@ def _likely_cause(source: Source, episode: int) -> tuple[Cause | None, Sequence[
             return bits_of(loop.run(episode, source.tests(episode, 1)), 0)
 
     if has_foreign_code(source.campaign.av):
-        test = [DrawnTests(episode, source.tests(episode, 1))]
+        test = [(episode, source.tests(episode, 1))]
         one, other, later = (run_elsewhere(source, test, held=held) for held in (True, True, False))
         if one.bits != other.bits:
             return "process", ()

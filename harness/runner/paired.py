@@ -7,6 +7,7 @@ folder holds already, from an earlier call or because it is the copy of a stored
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from itertools import pairwise
@@ -127,7 +128,7 @@ def together(scenarios: list[PairedScenario], campaign: Campaign) -> Pairs:
 
 def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:
     """Tests that a folder holds, as they were asked for."""
-    taken: dict[int, int] = {}
+    taken = Counter[int]()
     for index, part in enumerate(earlier.parts):
         tables = earlier.tables(part.first_episode, part.n_episodes)
         if tables is None:  # what is gone is driven anew, and so is all that follows
@@ -137,8 +138,8 @@ def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:
         draws = []
         for first, end in pairwise(edges):
             s, n = int(stratum[first]), end - first
-            draws.append(Draw(s, taken.get(s, 0), n))
-            taken[s] = taken.get(s, 0) + n
+            draws.append(Draw(s, taken[s], n))
+            taken[s] += n
         yield ShardRequest(index, part.first_episode, part.n_episodes, tuple(draws))
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of, dump_campaign
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, CampaignError, RunFolderError
+from harness.errors import CampaignError, RunFolderError
 from harness.estimators.answer import Estimates, ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
@@ -33,7 +33,7 @@ from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, SENSITIVITY, sole_use, write_bytes, write_sealed
 from harness.report.words import doubts_of, vehicle_words
 from harness.resolved import Resolved, require_ready
-from harness.runner.underway import EXIT_OF, Places, RunResult, Underway, begun, doubted, taken
+from harness.runner.underway import Places, RunResult, Underway, begun, doubted, exit_code, taken
 from harness.sampling.shells import HourRounds
 from harness.shown import ShownInPython
 from harness.vocabulary import FAMILIES
@@ -127,11 +127,8 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
         write_bytes(out / CAMPAIGN, yaml)
         hour, results, decision = _run(campaign, places, rule, workers, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
-    code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
     told = {name: (each.shown.estimates, each.shown.manifest) for name, each in results.items()}
     answer = hour_answer(hour, ready, told, campaign.stop.confidence)
-    if decision is not None:
-        code = EXIT_OF[decision.verdict]
     from harness.report.page import write_hours  # noqa: PLC0415 - draws
 
     vehicle, parameters = vehicle_words(campaign.av, script=next(iter(ready.values())).script)
@@ -144,7 +141,7 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     }  # fmt: skip
     content = finite_json({**asked, **answer})
     write_sealed(out / FAMILIES, content)
-    return Hours(out, content, write_hours(out, content), results, code)
+    return Hours(out, content, write_hours(out, content), results, exit_code(decision, missed=missed))
 
 
 def _run(

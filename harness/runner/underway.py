@@ -18,6 +18,7 @@ import pyarrow as pa
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
 from harness.estimators.answer import STORED_ESTIMATES, ended_by, estimate_blocks, expected_for, pool_remedy
 from harness.estimators.one_pass import even
+from harness.estimators.pairs import PairDecision, PairVerdict
 from harness.estimators.stopping import Decision, Rule, Verdict
 from harness.files import remove_unfinished
 from harness.pool.moved import assumed
@@ -51,7 +52,15 @@ if TYPE_CHECKING:
     from harness.report.drawing import Plot
     from harness.report.summary import RunFolder
 
-EXIT_OF: Mapping[Verdict, int] = {"accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT}
+_EXIT_OF: Mapping[Verdict | PairVerdict, int] = {
+    "accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT,
+    "proven": EXIT_DONE, "refuted": EXIT_REFUTED, "open": EXIT_BUDGET_SPENT,
+}  # fmt: skip
+
+
+def exit_code(decision: Decision | PairDecision | None, *, missed: bool) -> int:
+    """By what was decided or, where no decision was asked for, by whether something else was ``missed``."""
+    return _EXIT_OF[decision.verdict] if decision else EXIT_BUDGET_SPENT if missed else EXIT_DONE
 
 
 @dataclass(frozen=True, repr=False)
@@ -190,10 +199,8 @@ class Underway:
         run, campaign, decided = self.run, self.run.resolved.campaign, dict[str, Any]()
         stopped_by: StoppedBy = "sum" if of_sum else ended_by(campaign, rule, run.n_episodes)
         missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
-        code = EXIT_BUDGET_SPENT if missed else EXIT_DONE
-        if (decision := rule.look.decision) is not None and not of_sum:
+        if (decision := None if of_sum else rule.look.decision) is not None:
             decision = doubted(decision, [self])
-            code = EXIT_OF[decision.verdict]
             decided["decision"] = decision.to_json()
         decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
         decided["remedy"] = pool_remedy(rule, campaign, stopped_by) or None
@@ -212,6 +219,7 @@ class Underway:
         tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
         told = STORED_ESTIMATES.validate_python(estimates)
         shown = RunFolder(run.folder, campaign, manifest, told, run.source.design, tests, traffic)
+        code = exit_code(decision, missed=missed)
         return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
 
 
