@@ -194,7 +194,6 @@ class Combination(NamedTuple):
 
 
 _FOLLOWS = "in {scenario}, where the AV follows a vehicle from the start"
-_TAKES_TIME = "where cut-ins take time (`lateral` of the environment)"
 
 REFUSED = (
     # -- limits --
@@ -300,19 +299,12 @@ REFUSED = (
         "none, with testing.estimator scv", "first_9 or all: its control variates are of control steps",
         "Write first_9, or delete testing.estimator.",
     ),
-    # -- cut-ins that take time --
+    # -- cut-ins that take time, and scenarios in which the AV follows --
     Combination(
-        "testing.method", lambda c, use: use.shows and c.sampling.mixes,
-        "{testing.method}, " + _TAKES_TIME,
-        "shells, forced or nde: the tables of criticality are for cut-ins of one step, and would aim at those that an "
-        "attentive vehicle avoids",
-        "Choose shells, or add --set environment.parameters=ndd-overtaking-1.",
-    ),
-    # -- scenarios in which the AV follows --
-    Combination(
-        "testing.method", lambda c, use: use.follows and c.sampling.mixes,
-        "{testing.method}, " + _FOLLOWS, "shells, forced or nde: importance functions are those of cut-ins",
-        "Choose shells, or scenario: cut_in.",
+        "testing.method", lambda c, use: (use.shows or use.follows) and c.sampling.mixes,
+        "{testing.method}, in {scenario}: cut-ins take time (`lateral` of the environment), or the AV follows",
+        "shells, forced or nde: importance functions are those of cut-ins of one step",
+        "Choose shells; or, of cut_in, add --set environment.parameters=ndd-overtaking-1.",
     ),
     Combination(
         "av.before_event", lambda c, use: use.follows and c.av.acts_before_event,

@@ -11,8 +11,6 @@ from harness.campaign.sections import Positive, Probability, Section, StepTime
 from harness.problems import broken_rule
 
 MAX_CONFIGURED_SPEED_MPS = 60.0
-PERCEIVES_LATERAL_M = 0.375
-RISK_EVALUATION_S = 0.4
 NATURAL = "natural"
 """Headway that people keep."""
 
@@ -86,7 +84,7 @@ class ReferenceParameters(Following):
     """of BV, where the cut-in is one step [JRC-FSM: 0.72 m in 0.4 s]"""
     evaluated_at_m: float = Field(0.505, ge=0.0, le=5.0)
     """lateral distance when the risk has been evaluated [JRC-FSM: CC_calc_dist_to_react]"""
-    risk_evaluation_s: StepTime = Field(RISK_EVALUATION_S, ge=0.0, le=5.0)
+    risk_evaluation_s: StepTime = Field(0.4, ge=0.0, le=5.0)
     """from seeing a cut-in that takes time to the evaluated risk [JRC-FSM: 0.4 s]"""
     time_headway_s: Delay | Literal["natural"] = 1.0  # type: ignore[assignment]
     """T; natural: as people keep it, where the vehicle follows from the start [cutin]"""
@@ -185,7 +183,7 @@ class Reflexes(Section):
     """time after it has perceived an event in which it does what it did [assumed]"""
     max_jerk_mps3: Annotated[float, Field(ge=0.1, le=1000.0)] | None = None
     """fastest change of acceleration; none: unlimited [assumed]"""
-    perceives_lateral_m: float = Field(PERCEIVES_LATERAL_M, ge=0.0, le=10.0)
+    perceives_lateral_m: float = Field(0.375, ge=0.0, le=10.0)
     """how far BV has come over when it is seen, where cut-ins take time [JRC-FSM: 0.375 of wandering]"""
 
 

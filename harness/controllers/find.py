@@ -38,16 +38,15 @@ from harness.vehicles.kinematics import STEP_S
 _Answer = TypeVar("_Answer")
 
 
-_A_CONTROLLER = "a controller (see docs/controllers.md)"
-
-
 class AvEndedProcessError(HarnessError):
     """The AV's controller ended the process that it ran in."""
 
     exit_code = EXIT_TOO_MANY_FAILED
 
 
-def own_code(name: str, where: str = "av.controller", what: str = _A_CONTROLLER) -> Callable[..., Any]:
+def own_code(
+    name: str, where: str = "av.controller", what: str = "a controller (see docs/controllers.md)"
+) -> Callable[..., Any]:
     """The class, or function, that a name stands for: ``my_av.py:Class`` or ``package.module:Class``.
 
     Importable are this folder, as for a script, and that of a file. Raises `CampaignError`, of the key ``where`` and

@@ -19,7 +19,7 @@ MOST_SUMO_CELLS = 256
 
 
 class World:
-    """K cells, each with V ``vehicles``, the AV last, on a two-lane road of its own.
+    """K = ``n_cells`` cells, each with V ``vehicles``, the AV last, on a two-lane road of its own.
 
     ``x``, ``v``, ``lane`` (K, V) are front bumpers' positions (m), speeds (m/s) and lanes (0 right, 1 left), as the
     world reports them. One that ``drives_av`` itself (SUMO's own models, or a program connected to SUMO) does so from
@@ -30,16 +30,11 @@ class World:
     lent: Collection[str] = ()  # what others in this process have used of the simulation's own interface
 
     def __init__(self, n_cells: int, vehicles: Sequence[str] = VEHICLES) -> None:
-        self.vehicles = tuple(vehicles)
+        self.n_cells, self.vehicles = n_cells, tuple(vehicles)
         self.x: FloatArray = np.zeros((n_cells, len(vehicles)))
         self.v: FloatArray = np.zeros((n_cells, len(vehicles)))
         self.lane: Int8Array = np.zeros((n_cells, len(vehicles)), np.int8)
         self._contact: BoolArray = np.zeros(n_cells, np.bool_)
-
-    @property
-    def n_cells(self) -> int:
-        """K."""
-        return len(self.x)
 
     def announce(self, cells: IntArray, episodes: IntArray) -> None:
         """Episodes (n,) of the given cells (n,), told before they are placed."""
