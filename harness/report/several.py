@@ -248,7 +248,7 @@ def pair_lines(
     if asked is not content:
         given = f"A / B and A − B assume that both crash only where {asked['boundary']} of the library does"
         remarks.insert(0, given)
-    scope = words.scope_words(content["confidence"], words.ENDED.get(content.get("ended", ""), "interrupted"))
+    scope = words.scope_words(content["confidence"], words.ended_words(content.get("ended"), None))
     counted = f" above {plain(above)} m/s" if (above := campaign.crash.counts_above_mps) else ""
     scenarios, unit = (scenarios_words(families), "hour") if families else (called(campaign.scenario), "test")
     pairs = f"{count(content['n_pairs'])} pairs of tests, {scenarios}"

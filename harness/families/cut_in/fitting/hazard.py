@@ -150,7 +150,7 @@ class Acceptance:
         hazard = np.exp(self.design @ theta.T) * self.duration_s[:, None]
         expected = np.stack([hazard[self.bin == j].sum(axis=0) for j in range(TTC_EDGES_S.size)], axis=1)
         counts = random.gamma(self.events[:-1] + 0.5, size=expected.shape)
-        return np.clip(counts / np.maximum(expected, 1e-12), SMALLEST_SHARE, 1.0)
+        return np.asarray(np.clip(counts / np.maximum(expected, 1e-12), SMALLEST_SHARE, 1.0), np.float64)
 
     @property
     def std_errors(self) -> FloatArray:
