@@ -53,7 +53,7 @@ def rounds_of(campaign: Campaign, pool: DrawnPool, rng: np.random.Generator) -> 
     planner = ShellRounds(campaign, pool.design, available)
     rounds, enough = [], False
     while not enough and (added := planner.next_round()).any():
-        tests = planner.tally.tests
+        tests = planner.seen.tally.tests
         specs = round_requests(tests, added, 0, int(tests.sum()), campaign.run.smallest_shard)
         rounds.append([spec.n_episodes for spec in specs])
         pool.count(added, planner.seen, rng)

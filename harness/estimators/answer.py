@@ -66,7 +66,7 @@ class Estimates:
     """Content of ``estimates.json``, as it is written here and the page reads it; without a crash no severity.
 
     ``unmet`` are the conditions of the stop rule that were met last, or not at all; ``traffic`` is what replicates
-    leave open, ``milder`` see `harness.sampling.baseline.milder_of`; ``cut_off`` is the rate of tests that ended with
+    leave open, ``milder`` see `harness.sampling.paths.milder_of`; ``cut_off`` is the rate of tests that ended with
     the AV about to crash (`Block`).
     """
 

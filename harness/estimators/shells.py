@@ -117,10 +117,13 @@ class ShellDetails:
 class SeenShells:
     """Tests of a shells campaign, counted within the ``cells`` of strata; ``tally`` has the counts by stratum."""
 
-    design: ShellDesign  # of the first tests
+    design: ShellDesign
+    """If not given, that of the first tests."""
 
-    def __init__(self) -> None:
+    def __init__(self, design: ShellDesign | None = None) -> None:
         self.tally = self.cells = empty_tally(0)
+        if design is not None:
+            self.design, self.cells, self.tally = design, empty_tally(design.cell_p.size), empty_tally(design.p.size)
         self._known: dict[tuple[int, Level], RateLimits] = {}  # of so many first strata
         self._on_runs: list[CrashedTests] = []
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed

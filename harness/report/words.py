@@ -22,7 +22,7 @@ from harness.families import family_named
 from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, share, words
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, held_back, rows_of, too_few, with_traffic
-from harness.sampling.baseline import n_left_out
+from harness.sampling.paths import n_left_out
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
 

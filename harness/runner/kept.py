@@ -45,7 +45,7 @@ from harness.records.folder import (
 from harness.records.reader import ShownTests, by_kind, signature
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult
-from harness.sampling.baseline import BaselineResult
+from harness.sampling.paths import BaselineResult
 from harness.sampling.protocol import ShardRequest, Source
 
 SMALLEST_FAILED_SAMPLE = 200

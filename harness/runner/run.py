@@ -26,14 +26,13 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Decision, RoundRule
-from harness.estimators.tally import empty_tally
 from harness.families.protocol import Exposure
 from harness.printed import PRINTED
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, SENSITIVITY, sole_use, write_bytes, write_sealed
 from harness.report.words import doubts_of, vehicle_words
 from harness.resolved import Resolved, require_ready
-from harness.runner.underway import Places, RunResult, Underway, begun, doubted, exit_code, taken
+from harness.runner.underway import Places, RunResult, begun, doubted, exit_code, taken
 from harness.sampling.shells import HourRounds
 from harness.shown import ShownInPython
 from harness.vocabulary import FAMILIES
@@ -149,7 +148,9 @@ def _run(
 ) -> tuple[PerHour, dict[str, RunResult], Decision | None]:
     with begun(places, workers, progress) as each_run:
         runs = dict(zip(campaign.scenarios or [], each_run, strict=True))
-        hour = PerHour([_no_test_yet(underway, campaign.exposure) for underway in runs.values()])
+        seen = {name: SeenShells(underway.prescribed.design) for name, underway in runs.items()}
+        exposures = {name: exposure_of(underway.run.resolved, campaign.exposure) for name, underway in runs.items()}
+        hour = PerHour([OfFamily(name, exposures[name], of) for name, of in seen.items()])
         rounds = HourRounds(campaign, hour, [underway.prescribed.available for underway in runs.values()], rule)
         n_held = sum(underway.run.earlier.n_episodes for underway in runs.values())
         progress.stage("tests of all scenarios", None, done=n_held)
@@ -169,12 +170,6 @@ def _run(
         hour = PerHour([of._replace(seen=seen[of.family]) for of in hour.families])
     decision = rule.look.decision and doubted(rule.look.decision, runs.values())
     return hour, results, decision
-
-
-def _no_test_yet(underway: Underway, exposures: Mapping[str, float]) -> OfFamily:
-    resolved, design, seen = underway.run.resolved, underway.prescribed.design, SeenShells()
-    seen.count(design, empty_tally(design.cell_p.size))
-    return OfFamily(resolved.campaign.scenario, exposure_of(resolved, exposures), seen)
 
 
 def hour_answer(

@@ -34,7 +34,7 @@ from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.runner.run import exposure_of, hour_answer
 from harness.sampling import prepare, source_of
-from harness.sampling.baseline import begin, read_stored
+from harness.sampling.paths import begin, read_stored
 from harness.sampling.shells import stored_design
 from harness.shown import ShownInPython
 from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES

@@ -30,7 +30,7 @@ from harness.resolved import Resolved
 from harness.runner.kept import Run, cpu_name, require_few_failed, require_own_folder, require_same_pool, take_over
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
-from harness.sampling.baseline import (
+from harness.sampling.paths import (
     IN_WORDS,
     N_MILDER,
     begin,

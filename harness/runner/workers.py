@@ -30,7 +30,7 @@ from harness.records.schemas import shard_tables
 from harness.resolved import Resolved
 from harness.runner.again import repeat
 from harness.sampling import prepare
-from harness.sampling.baseline import BaselineResult, as_recorded, run_baseline, run_milder
+from harness.sampling.paths import BaselineResult, as_recorded, run_baseline, run_milder
 from harness.sampling.protocol import ShardRequest
 from harness.worlds import build_world
 

@@ -2,7 +2,7 @@
 
 Where the event of a test is drawn, and its weight made:
 
-- `own_path`, naturalistic and forced: from all events of the test's own path;
+- naturalistic and forced (`paths`): from all events of the test's own path;
 - `shells`: from the pool, by `harness.pool.shells.PrescribedEpisodes`, which also has the weight, log p_s; how many
   from which shell says `shells.Allocation`;
 - methods of a family's own draw it in the loop (`Family.sources`), as NADE's mixtures do.
@@ -24,7 +24,7 @@ from harness.loop.judge import judge
 from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.progress import Progress
 from harness.resolved import Resolved
-from harness.sampling.own_path import Forced, Naturalistic
+from harness.sampling.paths import Forced, Naturalistic
 from harness.sampling.protocol import Source
 from harness.sampling.shells import Shells
 from harness.vocabulary import Method

@@ -48,6 +48,11 @@ class ShardRequest:
     draws: tuple[Draw, ...] = ()
     before: str = ""
 
+    @property
+    def rows(self) -> slice:
+        """Places of its episodes among all."""
+        return slice(self.first_episode, self.first_episode + self.n_episodes)
+
 
 class Rounds(Protocol):
     """Requests in rounds; the next round is asked for when all of the last one have been added.

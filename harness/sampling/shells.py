@@ -28,7 +28,7 @@ from harness.estimators.pairs import FAILED, Pairs
 from harness.estimators.per_hour import PerHour
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule, RoundRule
-from harness.estimators.tally import Tally, combined, empty_tally
+from harness.estimators.tally import Tally, combined
 from harness.families.protocol import Recorded
 from harness.loop.loop import EpisodeLoop, Shard
 from harness.numbers import plain
@@ -251,24 +251,19 @@ class ShellRounds(Rounds):
         self.rule = RoundRule(campaign, held)
         self._campaign = campaign
         self._allocation = Allocation.of(campaign.testing.shells, design, available)
-        self.seen = SeenShells()
+        self.seen = SeenShells(design)
         self._n_episodes = self._look = 0
-
-    @property
-    def tally(self) -> Tally:
-        """What the tests of each stratum have come to so far."""
-        return self.seen.tally if self._n_episodes else empty_tally(self._allocation.available.size)
 
     def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
         n_shards, size = 0, self._campaign.run.smallest_shard
         while (added := self.next_round()).any():
-            requests = round_requests(self.tally.tests, added, n_shards, self._n_episodes, size)
+            requests = round_requests(self.seen.tally.tests, added, n_shards, self._n_episodes, size)
             n_shards += len(requests)
             yield iter(requests)
 
     def next_round(self) -> IntArray:
         """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
-        tally = self.tally
+        tally = self.seen.tally
         added = self._allocation.next_round(tally, self._campaign.stop.episodes - self._n_episodes)
         self.rule.of_first_tests = self._allocation.is_first(tally.tests, added)
         self._look = self._n_episodes + int(added.sum())

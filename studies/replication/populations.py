@@ -37,7 +37,7 @@ from harness.pool.shells import CANDIDATES, acceleration_limit, onset_steps
 from harness.pool.vehicle_pool import BaselinePaths, walk_candidates
 from harness.progress import Progress
 from harness.resolved import resolve
-from harness.sampling.own_path import recorded, without_event
+from harness.sampling.paths import recorded, without_event
 from harness.vehicles.drivers import Followers, av_records
 from harness.vehicles.library import Library
 from harness.vocabulary import CRASH, BoolArray, FloatArray, IntArray, RecordArray

@@ -187,7 +187,7 @@ def looks(
     planner = ShellRounds(campaign, drawn.design, available)
     allocation = Allocation.of(campaign.testing.shells, drawn.design, available)
     while (added := planner.next_round()).any():
-        before, left = planner.tally, added
+        before, left = planner.seen.tally, added
         n = int(before.tests.sum())
         for budget in budgets:
             if n < budget < n + added.sum():
@@ -296,7 +296,7 @@ class ShellCampaign(_Drawn):
         design = drawn.design
         rule, within = RoundRule(self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT)), None
         for _, planner, enough in looks(self.campaign, drawn, rng):
-            pending = within is None and planner.seen.tally.tests.size
+            pending = within is None and planner.seen.tally.tests.any()
             if pending and rule.observe(planner.seen) and rule.look.stopped:
                 within = self._statement_row(planner.seen, replication, reached=True)
             if enough:
@@ -314,7 +314,7 @@ class ShellCampaign(_Drawn):
             beyond = replace(row, result=name, crash_rate=rate, std_error=error, ci_low=0.0, ci_high=bound)
             yield beyond
             if self.siblings:
-                part = planner.tally.part(slice(first, None))
+                part = planner.seen.tally.part(slice(first, None))
                 former = former_bound(design.p[first:], part, self.campaign.stop.confidence)
                 yield replace(beyond, result=name + FORMER, ci_high=former)
         yield within or self._statement_row(planner.seen, replication, reached=False)

@@ -113,7 +113,7 @@ def campaign_of(source, crashed, impact, rows, rng):
         }  # fmt: skip
         outcome = np.where(crash, CRASH, TIMEOUT).astype(np.int8)
         block = Block(
-            int(rounds.tally.tests.sum()), outcome, np.zeros(n), columns, SamplingPlan("shells", shells=design)
+            int(rounds.seen.tally.tests.sum()), outcome, np.zeros(n), columns, SamplingPlan("shells", shells=design)
         )
         sums.add(block)
         if rounds.enough(block):

@@ -18,7 +18,7 @@ from harness.families.protocol import Paths
 from harness.numbers import number
 from harness.records.folder import read_manifest
 from harness.runner.stored import estimate_run
-from harness.sampling.baseline import beyond_scope, n_left_out
+from harness.sampling.paths import beyond_scope, n_left_out
 from tests.families.roads import SETTINGS, traffic_of
 from tests.families.test_same_bits import SMALL
 from tests.in_process import controllers_here, one_process, run_here, without_page

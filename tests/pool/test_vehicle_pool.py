@@ -17,8 +17,7 @@ from harness.pool.vehicle_pool import EVENLY, chances, vehicle_pool
 from harness.records.folder import SHADOW
 from harness.resolved import resolve
 from harness.sampling import prepare
-from harness.sampling.baseline import as_recorded, requests_before, run_baseline
-from harness.sampling.own_path import without_event
+from harness.sampling.paths import as_recorded, requests_before, run_baseline, without_event
 from harness.strata import weight_of_a_test
 from harness.vehicles.drivers import Followers, driver_records
 from harness.vocabulary import CRASH

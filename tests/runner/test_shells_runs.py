@@ -19,7 +19,7 @@ from harness.families.cut_in.family import CUT_IN
 from harness.records.schemas import baseline_schema
 from harness.report.notes import note_words
 from harness.runner.kept import Run
-from harness.sampling.baseline import run_baseline
+from harness.sampling.paths import run_baseline
 from harness.sampling.shells import Allocation, ShellRounds, first_tests
 from tests.estimators.small_blocks import RARE as DESIGN
 from tests.estimators.small_blocks import SHELLS as SAFE

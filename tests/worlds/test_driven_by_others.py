@@ -14,7 +14,7 @@ from harness.records.folder import SHADOW
 from harness.resolved import require_ready, resolve
 from harness.runner.stored import replay_episode
 from harness.sampling import prepare
-from harness.sampling.baseline import as_recorded, requests_before, run_baseline
+from harness.sampling.paths import as_recorded, requests_before, run_baseline
 from harness.vocabulary import AV, BV, CRASH, FAILED, LV
 from harness.worlds import build_world, sumo_driven
 from harness.worlds.program import TraciWorld, own_addresses, require_neighbour
