@@ -56,10 +56,7 @@ def temporary_folder() -> str:
 
 
 def _spare_folder(*, make: bool = False) -> Path:
-    """Folder of this user for what cannot be written to the cache.
-
-    Raises `HarnessError`: others may write there, and what they have put there may be anything; or an `OSError`.
-    """
+    """Folder for what cannot be written to the cache; a `HarnessError` where others may write there."""
     folder = Path(temporary_folder()) / f"harness-{os.geteuid()}"
     if make:
         with suppress(FileExistsError):
@@ -178,10 +175,7 @@ def _holder(path: Path) -> str:
 
 
 def put(name: str, write: Callable[[Path], object]) -> Path:
-    """Let ``write`` put something under a name, where it can; returns where.
-
-    Where that is not in the cache, it is said, once in a command.
-    """
+    """Let ``write`` put something under a name; returns where, and says once if that is not in the cache."""
     why = "there is no home folder"
     if (own := own_folder()) is not None:
         try:

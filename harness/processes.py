@@ -330,10 +330,10 @@ def _quotas() -> Iterator[float]:
 
 
 @cache
-def _shared_threads() -> tuple[ThreadPoolExecutor, ThreadpoolController]:
+def _libraries() -> ThreadpoolController:
     from threadpoolctl import ThreadpoolController  # noqa: PLC0415 - keeps --help fast
 
-    return ThreadPoolExecutor(usable_cpus(), thread_name_prefix="estimators"), ThreadpoolController()
+    return ThreadpoolController()
 
 
 def side_by_side(
@@ -343,19 +343,14 @@ def side_by_side(
 
     Without threads where that is not ``worthwhile``: handing over a trifle costs more than doing it.
     """
-    threads, libraries = _shared_threads()
-    with libraries.limit(limits=1, user_api="blas"):  # BLAS's own threads would wait for each other in busy loops
-        return list(threads.map(function, items)) if worthwhile else [function(item) for item in items]
+    with _libraries().limit(limits=1, user_api="blas"):  # BLAS's own threads would wait for each other in busy loops
+        return list(made_ahead(function, items)) if worthwhile else [function(item) for item in items]
 
 
 def made_ahead(
     make: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: int | None = None
 ) -> Iterator[_Result]:
-    """What is made of each item, in order; the next ones are being made in threads while the present one is in use.
-
-    ``n_threads`` (as many as there are CPUs by default) of them at a time: one where ``make`` is not to be called by
-    two threads at once.
-    """
+    """What is made of each item, in order; ``n_threads`` (one per CPU) make the next while one is in use."""
     n_threads = n_threads or usable_cpus()
     with ThreadPoolExecutor(n_threads, thread_name_prefix="made-ahead") as threads:
         coming: deque[Future[_Result]] = deque()

@@ -59,10 +59,7 @@ class Resolved:
 
     @cached_property
     def library(self) -> Library:
-        """The surrogates of pools; read when they are first asked for, as most campaigns never do.
-
-        Raises `CampaignError`: the library's file is missing or wrong.
-        """
+        """The surrogates of pools, read when first asked for; a `CampaignError` if their file is missing or wrong."""
         library = load_library(self.campaign.pool.library)
         library.require_drivers(follows=self.family.follows)
         return library.counting_above(self.campaign.crash.counts_above_mps)

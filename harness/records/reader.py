@@ -88,10 +88,7 @@ def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) 
 
 
 def read_replicates(name: str, parameters: ParameterFile, shipped: Path) -> list[dict[str, float]]:
-    """Numbers that vary, of each replicate that an environment, a name of a file that is ``shipped`` or a path, names.
-
-    Raises `HarnessError`: the file is missing or damaged, or is not of these numbers.
-    """
+    """Numbers that vary, by replicate, of an environment, a ``shipped`` name or a path; refused if of others."""
     file, tied = shipped_or_own(name, shipped, "environment.parameters"), parameters.replicates
     if tied is None:
         return []

@@ -53,10 +53,7 @@ def bits_of(shard: Shard, row: int) -> Bits:
 
 
 def run_elsewhere(source: Source, tests: Sequence[DrawnTests], n_cells: int = 1, *, held: bool = False) -> Again:
-    """Run tests one after the other in a fresh process, by a clock of its own (`harness.controllers.clock`).
-
-    Raises `AvEndedProcessError`: the controller ended the process.
-    """
+    """Run tests one after the other in a fresh process, by a clock of its own (`harness.controllers.clock`)."""
     drawn = source.campaign.av, source.scenario, source.records(), tests, n_cells
     return run_apart(source.campaign.av, _run_here, *drawn, held)
 

@@ -68,10 +68,7 @@ class Earlier:
         self._read: tuple[Part, Tables | None] | None = None
 
     def tables(self, first: int, n: int) -> Tables | None:
-        """Tables of consecutive tests; None where there are not so many, or one of their files is gone.
-
-        Raises `RunFolderError`: one of the files is damaged.
-        """
+        """Tables of consecutive tests; None where there are too few, or a file is gone; refused if one is damaged."""
         found = [self._tables(part) for part in self.parts if part.first_episode < first + n and part.end > first]
         if first + n > self.n_episodes or not found or None in found:
             return None
@@ -128,10 +125,7 @@ class Run:
         return self.n_episodes < self.earlier.n_episodes
 
     def known(self, request: ShardRequest) -> ShardResult | None:
-        """A shard that needs not be run again, or None: as many tests and, of shells, the events that are drawn now.
-
-        Raises `RunFolderError`: one of its files is damaged.
-        """
+        """A shard that needs not be run again, or None: as many tests and, of shells, the events that are drawn now."""
         tables = self.earlier.tables(request.first_episode, request.n_episodes)
         if tables is None or not self.source.is_shard(request, tables["episodes"]):
             return None
@@ -321,10 +315,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
 
 
 def require_same_pool(folder: Path, source: Source) -> None:
-    """Refuse (`RunFolderError`) to go on with a run whose events came from another pool.
-
-    Its library, or the harness itself, has changed since.
-    """
+    """Refuse (`RunFolderError`) to go on with a run whose events came from another pool, as of another library."""
     path, design = folder / SHELLS, source.design
     if design is None or not path.exists():
         return

@@ -104,10 +104,7 @@ def estimate_in_other_traffic(
 
 
 def traffic_error(moved: StoredShells, content: Mapping[str, Any], progress: Progress) -> TrafficError | None:
-    """What the replicates of its traffic leave open of an answer; None where it has none.
-
-    Raises `HarnessError`: their file is missing or wrong.
-    """
+    """What the replicates of its traffic leave open of an answer; None where it has none."""
     estimate = content["estimates"]["shells"]
     if (found := _replicated([moved], content["confidence"], progress)) is None:
         return None
@@ -207,10 +204,7 @@ def _replicated(sides: Sequence[StoredShells], confidence: float, progress: Prog
 
 
 def _unseen(moved: StoredShells, parameters: Parameters, progress: Progress) -> Unseen | None:
-    """Steps in which no event was seen, of those that carry a notable part of the rate.
-
-    What a step carries is what its share of the events moves: a rate is linear in it.
-    """
+    """Steps in which no event was seen that carry a notable part of the rate, which is linear in each one's share."""
     halved = parameters.without_half()
     found = moved.nearby(list(halved.values()), progress)
     carried = {step: 2.0 * (1.0 - near.rate) for step, near in zip(halved, found, strict=True) if near is not None}

@@ -90,10 +90,7 @@ class PairedScenario:
 def drive_pairs(
     campaign: Campaign, ready: Mapping[Path, Both], rule: PairRule, workers: int | None, progress: Progress
 ) -> tuple[PairRounds, list[PairedScenario]]:
-    """Rounds of pairs until the rule is content; returns them, and what there is of each scenario.
-
-    ``ready`` are A and B, ready to be run in ``a`` and ``b`` of the folder of each.
-    """
+    """Rounds of pairs of A and B in folders until the rule is content; returns them, and what there is of each."""
     folders = {folder / side: own for folder, both in ready.items() for side, own in zip(SIDES, both, strict=True)}
     with taken(folders, resume=True) as places:
         with begun(places, workers, progress) as runs:

@@ -180,10 +180,7 @@ def hour_answer(
     *,
     counts: bool = False,
 ) -> dict[str, Any]:
-    """The sum, with what estimates and manifest of each have ``told``.
-
-    Hours are kilometres by the mean speed of a vehicle that follows, where it does.
-    """
+    """The sum, with what estimates and manifest of each have ``told``; hours are kilometres as followers drive."""
     follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
     speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
     found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)

@@ -239,10 +239,7 @@ def require_shares(tested: StoredShells) -> None:
 
 
 def moved_design(tested: ShellDesign, new: ShellDesign, environment: str) -> ShellDesign:
-    """The strata ``tested`` with the probabilities of a ``new`` design.
-
-    Its cells are those of the old one by stratum and reference drivers; a `CampaignError` if not.
-    """
+    """The strata ``tested`` with the probabilities of a ``new`` design, by stratum and drivers; refused if unlike."""
     places, unknown = _keys(tested), _keys(new)
     p = np.zeros(len(places))
     for (stratum, drivers), of_cell in zip(unknown, new.cell_p.tolist(), strict=True):

@@ -114,10 +114,7 @@ class Underway:
             write_sealed(self.run.folder / SHELLS, STORED_DESIGN.dump_python(self.run.source.design, mode="json"))
 
     def drive_before_tests(self) -> None:
-        """Drive the vehicle along all paths without an event, if tests follow from some.
-
-        Where there are events too mild to count, it meets a few of them.
-        """
+        """Drive the vehicle along paths without an event, if tests follow from some, and to a few that are too mild."""
         self.keep_design()
         resolved, source = self.run.resolved, self.run.source
         self.run = self.run.noting(assumed=assumed(resolved, source.pool, source.design, self.progress))
@@ -270,10 +267,7 @@ def begun(places: Places, workers: int | None, progress: Progress) -> Iterator[l
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:
-    """Where a campaign's shards are run; ``n_runs`` campaigns share it and take turns.
-
-    Raises `HarnessError`: the package, the cluster or room in it is missing.
-    """
+    """Where a campaign's shards are run, by turns if there are ``n_runs``; a `HarnessError` where there is no room."""
     if resolved.campaign.run.executor == "local":
         return LocalWorkers(resolved, n_workers)
     try:

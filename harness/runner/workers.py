@@ -63,10 +63,7 @@ _Result = TypeVar("_Result", bound=Result)
 
 
 def serve(connection: Connection, resolved: Resolved, baseline: Path) -> None:
-    """Prepare with the first shard, run shards until the parent has no more.
-
-    The file ``baseline`` holds the baseline runs that tests follow from, once there are any.
-    """
+    """Run shards until the parent has no more; the file ``baseline`` holds what tests follow from, if anything."""
     runner: ShardRunner | None = None
 
     def run(request: ShardRequest, fatal: Mapping[int, str], alone: bool) -> Result:
