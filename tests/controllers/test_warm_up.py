@@ -154,4 +154,7 @@ def test_a_command_of_the_warm_up_begins_anew_at_the_hand_over():
         onset = int(runs[0].episode["onset_step"][row])
         assert trace[onset + 1, 2, 2] == pytest.approx(-0.3)
     assert [run.failures for run in runs] == [{}] * 3
+    assert [run.episode["braked_before"].any() for run in runs] == [False, True, True]  # what it was shown before
+    for run in runs:
+        run.episode["braked_before"] = 0
     assert all(run.episode.tobytes() == runs[0].episode.tobytes() for run in runs[1:])
