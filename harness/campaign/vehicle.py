@@ -196,15 +196,11 @@ class AutomatedVehicle(Section):
         return {**data, "model": "idm"}
 
     @model_validator(mode="after")
-    def _one_source(self) -> Self:
+    def _one_source_reads_all_of_it(self) -> Self:
         named = [name for name in AV_SOURCES if getattr(self, name) is not None]
         if len(named) > 1:
             mend = "An AV has one driver: delete the others, or set them to null."
             raise broken_rule("", " and ".join(named), f"one of {', '.join(AV_SOURCES)}", mend)
-        return self
-
-    @model_validator(mode="after")
-    def _all_of_it_is_read(self) -> Self:
         beside = f"beside av.{self.source}"
         if self.source in READS_NO_PARAMETERS and self.parameters:
             found = f"{listed(dict(self.parameters))}, which nothing reads"

@@ -58,15 +58,13 @@ _QUOTED = 2
 
 def missing_libraries() -> list[SystemLibrary]:
     """Those that the dynamic loader does not find (it takes 40 ms to ask); none where SUMO's wheels are not Linux's."""
-    return [library for library in LIBRARIES if sys.platform.startswith("linux") and not _loads(library.soname)]
-
-
-def _loads(soname: str) -> bool:
-    try:
-        ctypes.CDLL(soname)
-    except OSError:
-        return False
-    return True
+    missing = []
+    for library in LIBRARIES if sys.platform.startswith("linux") else ():
+        try:
+            ctypes.CDLL(library.soname)
+        except OSError:
+            missing.append(library)
+    return missing
 
 
 def require_libraries() -> None:
