@@ -34,16 +34,16 @@ def start_up(name: str, cache: Path) -> Start:
         with (Path(scratch) / "log").open("w+") as log:
             started = time.perf_counter()
             process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
-            first_s = _wait_for_first_shard(process, out, started)
+            first_s = _wait_for_first_tests(process, out, started)
             if process.wait() != 0 or first_s is None:
                 log.seek(0)
                 raise RuntimeError(f"harness run {name} failed: {log.read()}")
             return Start(first_s, time.perf_counter() - started)
 
 
-def _wait_for_first_shard(process: subprocess.Popen[bytes], out: Path, started: float) -> float | None:
+def _wait_for_first_tests(process: subprocess.Popen[bytes], out: Path, started: float) -> float | None:
     while process.poll() is None:
-        if any((out / "episodes").glob("shard-*.parquet")):
+        if any((out / "episodes").glob("*.parquet")):
             return time.perf_counter() - started
         time.sleep(_POLL_S)
     return None

@@ -12,6 +12,7 @@ import click
 import pytest
 
 from benchmarks.contenders import CONTENDERS, missing
+from benchmarks.speed import STARTUP
 from docs import generate
 from harness.cli import cli
 
@@ -104,6 +105,8 @@ def test_generated_parts_are_current():
 @pytest.mark.slow
 def test_all_contenders_run():
     names = [name for name in CONTENDERS if not missing(name) and name != "traci"]
-    command = [sys.executable, "-m", "benchmarks.speed", "--quick", "--repetitions", "1", "--only", ",".join(names)]
+    wanted = ",".join([*names, STARTUP])
+    command = [sys.executable, "-m", "benchmarks.speed", "--quick", "--repetitions", "1", "--only", wanted]
     found = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "Start-up of `harness run overtaking_nade.yaml`" in found
     assert all(f"\n{name}  " in found for name in names)
