@@ -41,12 +41,12 @@ def compile_kernels(progress: Progress | None = None) -> bool:
         controller = Path(folder) / "holds.py"
         controller.write_text(_CONTROLLER)
         campaigns = [(f"{controller}:Holds", *_SMALL), ("idm", *_SHORT)]
-        progress.stage("compiling", len(campaigns) + 1)
+        progress.stage("compiling, and building a pool of cut-ins", None)
+        progress.tell()
         beside = Child(tell, partial(_run_all, _OTHERS, Path(folder) / "others"))
         try:
-            _run_all(campaigns, Path(folder), progress)
+            _run_all(campaigns, Path(folder))
             died = isinstance(first_to_answer([beside]).answer(), WorkerDeath)
-            progress.advance(1)
         finally:
             beside.kill()
     if not died:  # as for want of memory: the next call tries again
@@ -54,7 +54,6 @@ def compile_kernels(progress: Progress | None = None) -> bool:
     return True
 
 
-def _run_all(campaigns: Sequence[tuple[str, ...]], folder: Path, progress: Progress | None = None) -> None:
+def _run_all(campaigns: Sequence[tuple[str, ...]], folder: Path) -> None:
     for number, (vehicle, *settings) in enumerate(campaigns):
         run_campaign(load_campaign(vehicle, settings), folder / str(number), workers=1)
-        (progress or Progress()).advance(1)
