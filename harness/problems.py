@@ -41,10 +41,7 @@ MOST_SHOWN = 20
 
 
 def broken_rule(key: str, found: str, expected: str, mend: str) -> PydanticCustomError:
-    """Error of a section in the parts of a `harness.errors.HarnessError`.
-
-    ``key`` is the dotted path of the value to blame, seen from the section; empty for the section itself.
-    """
+    """Parts of a `HarnessError` about a section; ``key`` is the dotted path within, empty for the section itself."""
     parts = {"key": key, "found": found, "expected": expected, "mend": mend}
     where = "{key}: " if key else ""
     return PydanticCustomError("broken_rule", where + "found {found}; expected {expected}. {mend}", parts)

@@ -167,11 +167,7 @@ def remove_unlisted(folder: Path, parts: Iterable[Part]) -> None:
 def read_table(
     path: Path, columns: list[str] | None = None, *, crc32: int | None = None, mend: str = MEND_PART
 ) -> pa.Table:
-    """Read one Parquet file of a run.
-
-    It must have the checksum ``crc32``; where there is none yet its pages are held against their own. It is opened
-    once: what is decoded is what the checksum is of.
-    """
+    """Read one Parquet file of a run, opened once: what is decoded has the checksum ``crc32``, or its pages theirs."""
     try:
         content = read_bytes(path)
         require_sum(path, crc32, content, mend)

@@ -171,10 +171,7 @@ def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> Tables:
 
 
 def _table(schema: pa.Schema, columns: dict[str, Any], records: RecordArray | None = None) -> pa.Table:
-    """A table of ``columns``, and of fields of ``records`` where there is no column of the name.
-
-    Null stands for «there is none»: for NaN and infinity where a number may be null, and for a step below zero.
-    """
+    """A table of ``columns``, else of fields of ``records``; null for NaN, infinity, a step below 0."""
     arrays = []
     for field in schema:
         values = columns[field.name] if records is None or field.name in columns else records[field.name]

@@ -60,10 +60,7 @@ def this_machine(resolved: Resolved, controller_sha256: str | None) -> tuple[dic
 
 
 class OnMachine:
-    """What an actor is: it runs shards in a worker process beside it, and tells how that ended if it did.
-
-    Whatever goes wrong is handed to the run, which judges it.
-    """
+    """An actor: it runs shards in a worker process beside it; whatever goes wrong is the run's to judge."""
 
     def __init__(self, resolved: Resolved) -> None:
         self._resolved = resolved

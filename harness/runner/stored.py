@@ -48,10 +48,7 @@ _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
 class StoredEstimates(ShownInPython, dict[str, Any]):
-    """Content of ``estimates.json``, of the run in a folder, or of ``families.json``; shown, it is the short answer.
-
-    One that was asked for ``by_estimator`` has a line each.
-    """
+    """Content of ``estimates.json`` or ``families.json``; shown, the short answer, or a line each ``by_estimator``."""
 
     def __init__(self, content: Mapping[str, Any], folder: Path, *, by_estimator: bool = False) -> None:
         super().__init__(content)
@@ -120,9 +117,8 @@ def estimate_run(
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     """Blocks of the tests that are reported, in index order from 0; a gap or too few of them is an error.
 
-    With ``moments`` ratios of control steps are read, which `scv` needs, where there are any on record.
-
-    Raises `HarnessError`: if the folder is not a run, or its records are damaged or incomplete.
+    With ``moments`` ratios of control steps are read, which `scv` needs, where there are any on record. Raises
+    `HarnessError`: if the folder is not a run, or its records are damaged or incomplete.
     """
     manifest = read_manifest(folder)
     campaign = read_campaign(folder, manifest)

@@ -100,10 +100,7 @@ class StoredShells:
 
     @property
     def mean_share(self) -> float:
-        """Share of tests that crash, in the mean over what crashes add to the rate.
-
-        1 without a crash, where the answer is a limit that rests on what was tested, not on what crashed.
-        """
+        """Share of tests that crash, in the mean over what crashes add to the rate; 1 where nothing has crashed."""
         share, p = self.seen.tally.share, self.tested.p
         return float(p @ share**2 / (p @ share)) if share.any() else 1.0
 

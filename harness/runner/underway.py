@@ -65,9 +65,7 @@ def exit_code(decision: Decision | PairDecision | None, *, missed: bool) -> int:
 
 @dataclass(frozen=True, repr=False)
 class RunResult(ShownInPython):
-    """What a finished campaign left in its folder, ``estimates.json`` and the page ``report.html`` among it.
-
-    Shown, it is the short answer.
+    """What a finished campaign left in its folder, ``estimates.json`` and ``report.html``; shown, the short answer.
 
     ``stopped_by`` is explained at `harness.vocabulary.StoppedBy`. The exit code is 0, or 4 when the budget or the
     pool was spent before the asked precision or decision, or 5 where the crash rate is above the limit that was to be
@@ -189,10 +187,7 @@ class Underway:
         return n_milder, len(run.repeated.differing) if run.repeated else 0
 
     def finish(self, rule: Rule, *, of_sum: bool = False) -> RunResult:
-        """Write manifest, estimates and report once the rule has seen enough; no test beyond the stop is left.
-
-        Of one of several scenarios the rule, and so its decision, is about their sum.
-        """
+        """Write manifest, estimates and report; ``of_sum`` the rule, and its decision, is about several scenarios."""
         run, campaign, decided = self.run, self.run.resolved.campaign, dict[str, Any]()
         stopped_by: StoppedBy = "sum" if of_sum else ended_by(campaign, rule, run.n_episodes)
         missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")

@@ -82,10 +82,7 @@ def serve(connection: Connection, resolved: Resolved, baseline: Path) -> None:
 
 
 class ShardRunner:
-    """Runs shards of one campaign in one world. It writes nothing: the process that runs the campaign does.
-
-    With a ``connection`` it runs tests one at a time, and says of each that it has begun: it may end the process.
-    """
+    """Runs shards of one campaign in one world; with a ``connection`` test by test, each told as it begins."""
 
     def __init__(self, resolved: Resolved, baseline: Path, connection: Connection | None = None) -> None:
         self._connection, self.alone, self._fatal = connection, connection is not None, dict[int, str]()
