@@ -203,16 +203,17 @@ def rows(found: AvCheck) -> list[dict[str, Any]]:
     own, idm = ({**told[f"{who}behaviour"], **told[f"{who}speed"]} for who in ("", "idm_"))
     kind = f"{found.events} that take time" if found.shows else f"{found.events} of one step"
     kind = found.events if found.follows is not None else kind
+    where = "twin (the motion that SUMO would compute)" if found.engine == "twin" else "SUMO"
     shown = [
-        ("kind of vehicle, engine, method", f"{found.source}, {found.engine}, {found.method}, {kind}", ""),
+        ("kind of vehicle; where tested; on what", f"{found.source}; {where}; {kind}, {found.method}", ""),
         ("tests", found.n_episodes, ""),
-        *((f"failed: {why}", n, "") for why, n in (told["failures"] or {"none": 0}).items()),
+        *([(f"failed: {why}", n, "") for why, n in told["failures"].items()] or [("tests that failed", "none", "")]),
         ("tests that differed when run again", told["differing"] or "none", ""),
         ("accelerations allowed, m/s²", [*told["limits_mps2"]], ""),
         *((text.format(events=found.events), own[name], idm[name]) for name, text in IN_WORDS.items()),
         *((text, told["follows"][name], told["idm_follows"][name]) for name, text in of_following.items()),
         *(
-            (f"change of its first answer by a warm-up of {s:g} s, at most, m/s²", moved, "")
+            (f"how much its first answer moves with a warm-up of {s:g} s, at most, m/s²", moved, "")
             for s, moved in found.moved_mps2.items()
         ),
     ]

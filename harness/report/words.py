@@ -19,6 +19,7 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.answer import STORED_ESTIMATES, Elsewhere, Estimates, before_event
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
+from harness.loop.cells import FAR_BEHIND_S
 from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, share, words
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, held_back, rows_of, too_few, with_traffic
@@ -200,7 +201,7 @@ def _acts(of: Mapping[str, Any] | None) -> Iterator[str]:
     """What the vehicle did before the event (`before_event`), a line each."""
     if of is not None and (n := of["n_fell_behind"]) > FEW_BEHIND * of["n_events"] and not of["built_in"]:
         why = "which makes the event milder: let it keep up"
-        yield f"in {count(n)} tests it was over 5 s behind the vehicle ahead when the event began, {why}"
+        yield f"in {count(n)} tests it was over {FAR_BEHIND_S:g} s behind the vehicle ahead when the event began, {why}"
     if of is None or not of["waits"]:
         return
     if of["source"] in ("sumo", "traci"):
