@@ -80,7 +80,7 @@ def schema() -> None:
 )
 @click.option("--dry-run", is_flag=True, help="Print the commands that would be run, and run none.")
 def setup(*, dry_run: bool) -> None:
-    """Install the system libraries that SUMO needs, if any are missing, and compile what runs need (a minute).
+    """Install the system libraries that SUMO needs, if any are missing; compile, and build a pool (a minute).
 
     pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get, dnf or apk, as root or
     with sudo, which may ask for your password at a terminal. A campaign with world.engine twin needs none.
