@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +21,10 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.yaml_text import yaml_text
 from harness.errors import CampaignError, TrajectoryError
 from harness.families.cut_in.family import CUT_IN
-from harness.families.cut_in.fitting.hazard import FREE_TTC_S, TTC_EDGES_S, Acceptance, Hazard, fit_hazard
+from harness.families.cut_in.fitting.hazard import FREE_TTC_S, TTC_EDGES_S, Acceptance, fit_hazard
 from harness.families.cut_in.fitting.laws import BASE, LAWS, FittedLaw, ObservedTraffic, fit_rate
 from harness.families.cut_in.fitting.observations import BesideCounts, Observations, observe, require_enough
-from harness.families.cut_in.fitting.page import CONFIDENCE, page
+from harness.families.cut_in.fitting.page import CONFIDENCE, Fit, page
 from harness.families.cut_in.loading import load_environment, require_sound_laws
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.sections import HAZARD_OF, REPLACED
@@ -46,22 +45,6 @@ HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)
 DIGITS = 6
 MOST_DRAWS = 5
 """At most this many times the replicates asked for are drawn, as tests cannot be drawn from some."""
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """Fitted traffic: ``environment`` is the result, ``laws`` has the hazard's, too.
-
-    Numbers that are not fitted are those of ``base``; ``kept`` says why a law is kept from it, by its subject.
-    """
-
-    traffic: ObservedTraffic
-    base: EnvironmentParameters
-    laws: dict[str, FittedLaw]
-    kept: dict[str, str]
-    hazard: Hazard
-    acceptance: Acceptance
-    environment: EnvironmentParameters
 
 
 def fit_traffic(traffic: ObservedTraffic, where: str, progress: Progress) -> Fit:

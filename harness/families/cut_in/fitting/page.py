@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import special, stats
@@ -14,8 +14,8 @@ from harness.campaign.models import read_model
 from harness.campaign.sections import EnvironmentSettings
 from harness.errors import printable
 from harness.estimators.limits import garwood
-from harness.families.cut_in.fitting.hazard import TTC_EDGES_S
-from harness.families.cut_in.fitting.laws import BASE, bins
+from harness.families.cut_in.fitting.hazard import TTC_EDGES_S, Acceptance, Hazard
+from harness.families.cut_in.fitting.laws import BASE, FittedLaw, ObservedTraffic, bins
 from harness.families.cut_in.fitting.observations import BesideCounts
 from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws, load_environment
@@ -27,15 +27,28 @@ from harness.report.drawing import Plot, PlotAxis, PlotPanel
 from harness.report.templates import templates
 from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, IntArray, RecordArray
 
-if TYPE_CHECKING:
-    from harness.families.cut_in.fitting.fitter import Fit
-
 CONFIDENCE = 0.9
 SHIPPED = {"ndd-overtaking-1": "muted", "ndd-overtaking-2": "vermillion"}
 """Environments drawn for comparison, and their colours."""
 BIN_NAMES = ("0–1", "1–2", "2–3", "3–5", "5–8", "> 8")
 MOST_ROWS = 20_000
 _SEED = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Fitted traffic: ``environment`` is the result, ``laws`` has the hazard's, too.
+
+    Numbers that are not fitted are those of ``base``; ``kept`` says why a law is kept from it, by its subject.
+    """
+
+    traffic: ObservedTraffic
+    base: EnvironmentParameters
+    laws: dict[str, FittedLaw]
+    kept: dict[str, str]
+    hazard: Hazard
+    acceptance: Acceptance
+    environment: EnvironmentParameters
 
 
 def page(fit: Fit, tally: BesideCounts, noise_mps2: float, asked: Asked, others: Sequence[str]) -> str:
