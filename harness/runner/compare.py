@@ -128,7 +128,7 @@ def compare_campaigns(
     B crashes more often than A · 1,054 pairs of tests, cut-in · crashes per test
       A idm         1.32 × 10⁻⁷   (0.99 to 2.04) × 10⁻⁷    17 crashes
       B late-600ms  2.38 × 10⁻⁷   (2.03 to 3.11) × 10⁻⁷    57 crashes
-      A / B         0.56          0.41 to 0.86
+      A / B         0.56          0.41 to 0.86             verdict: confidence 0.95 over all looks
       A − B         −1.06 × 10⁻⁷  (−1.79 to −0.33) × 10⁻⁷  crashes of A alone 0, B 40
       90 % intervals cover sampling error in this simulated traffic only; stopped: verdict reached
       report  runs/late/report.html
