@@ -164,20 +164,24 @@ def pair_words(decision: Mapping[str, Any]) -> str:
 
 
 def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
-    """What changes the meaning of a comparison (``compare.json``)."""
-    sides = {name: content[name.lower()] for name in "AB"}
-    if "families" in content:
-        for name, of in sides.items():
-            yield from (f"{name}, {text}" for text in sum_warnings(of))
-        return
-    elsewhere = ["failed"] if content["asked"] == LIBRARY_STATEMENT else ["failed", "refuted"]
-    for name, of in sides.items():
-        rates = {**of, "rate": of["crash_rate"], "n_failed": of["details"]["n_failed"]}
-        told = words.warnings_of(content["scenario"], rates, " per test")
-        more = [each for each in of["warnings"] if each["key"] not in elsewhere and each not in of["cautions"]]
-        yield from (f"{name}: {text}" for text in (*told, *map(note_words, more)))
+    """What changes the meaning of a comparison (``compare.json``): what is so of both once, of A and B."""
+    told: dict[str, list[str]] = {}
+    for name in "AB":
+        of = content[name.lower()]
+        for text in sum_warnings(of) if "families" in content else _warnings_of_side(content, of):
+            told.setdefault(text, []).append(name)
+    yield from (f"{' and '.join(who)}{',' if 'families' in content else ':'} {text}" for text, who in told.items())
     if where := content.get("unseen"):
         yield words.unseen_words(where)
+
+
+def _warnings_of_side(content: Mapping[str, Any], of: Mapping[str, Any]) -> Iterator[str]:
+    elsewhere = ["failed"] if content["asked"] == LIBRARY_STATEMENT else ["failed", "refuted"]
+    rates = {**of, "rate": of["crash_rate"], "n_failed": of["details"]["n_failed"]}
+    yield from words.warnings_of(content["scenario"], rates, " per test")
+    yield from (
+        note_words(each) for each in of["warnings"] if each["key"] not in elsewhere and each not in of["cautions"]
+    )
 
 
 def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) -> str | None:

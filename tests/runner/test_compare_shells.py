@@ -107,6 +107,9 @@ def test_what_makes_a_rate_doubtful_is_told_of_each_vehicle(done):
     assert [text[:6] for text in told if "tests FAILED; had they all crashed, the rate would be" in text] == ["B: 5 o"]
     assert [text[:7] for text in told if "MILDER cut-outs end in a crash, too" in text] == ["B: 3 of"]
     assert all(": no test in outside" in text for text in pair_warnings(done.content))
+    both = {side: {**done.content[side], **doubts["a"]} for side in "ab"}
+    told = [text for text in pair_warnings({**done.content, **both}) if "NOT REPRODUCIBLE" in text]
+    assert [text[:13] for text in told] == ["A and B: NOT "]
 
 
 def test_a_stored_run_of_a_is_taken_over(done, campaigns, tmp_path, driven):
