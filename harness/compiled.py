@@ -34,6 +34,7 @@ _PACKAGE = Path(__file__).parent
 
 WORLD_SOURCES = (
     "compiled.py",
+    "elementary.py",
     "random_stream.py",
     "vocabulary.py",
     "vehicles/*.py",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
+from harness import elementary
 from harness.errors import CampaignError
 from harness.vocabulary import BoolArray, FloatArray, Record
 
@@ -42,11 +43,11 @@ class Flow:
         u = self.u_of(v)
         shift = n["initial_state__r1_shift_m"] + n["initial_state__r1_shift_u_m"] * u
         mean = n["initial_state__r1_log_mean"] + n["initial_state__r1_log_mean_u"] * u
-        sd = np.exp(n["initial_state__r1_log_sd"] + n["initial_state__r1_log_sd_u"] * u)
+        sd = elementary.exp(n["initial_state__r1_log_sd"] + n["initial_state__r1_log_sd_u"] * u)
         with np.errstate(divide="ignore", invalid="ignore"):
-            below = special.ndtr((np.log(np.maximum(n["fit_range__r1_min_m"] - shift, 0.0)) - mean) / sd)
-            upto = special.ndtr((np.log(n["fit_range__r1_max_m"] - shift) - mean) / sd)
-        return np.asarray(shift + np.exp(mean + sd * special.ndtri(below + probability * (upto - below))))
+            below = special.ndtr((elementary.log(np.maximum(n["fit_range__r1_min_m"] - shift, 0.0)) - mean) / sd)
+            upto = special.ndtr((elementary.log(n["fit_range__r1_max_m"] - shift) - mean) / sd)
+        return np.asarray(shift + elementary.exp(mean + sd * special.ndtri(below + probability * (upto - below))))
 
     def require_sound(self, file: str) -> None:
         """Refuse laws (`CampaignError`, naming a parameter ``file``) of which nothing is left in the fit range."""

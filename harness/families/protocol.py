@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 import pyarrow as pa
 
+from harness import elementary
 from harness.campaign.drivers import Surrogate
 from harness.campaign.models import read_model, shipped_or_own
 from harness.campaign.sections import EnvironmentSettings
@@ -109,8 +110,7 @@ def every_event(probability: FloatArray, crashes: IntArray, stride: int = 1, off
     n, n_events = probability.shape
     asked = np.arange(n_events) % stride == (np.zeros(n, np.int64) if offset is None else offset)[:, None]
     total = probability.sum(axis=1)
-    with np.errstate(divide="ignore"):
-        return Events(np.where(asked, stride * probability, 0.0), np.where(asked, crashes, 0), np.log(total), total)
+    return Events(np.where(asked, stride * probability, 0.0), np.where(asked, crashes, 0), elementary.log(total), total)
 
 
 class Chosen(NamedTuple):

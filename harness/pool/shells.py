@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from harness import elementary
 from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.families.protocol import Chosen
@@ -335,7 +336,7 @@ class PrescribedEpisodes:
         c, resolved = self._kept, self._resolved
         chosen = Chosen(c.facts[rows], c.at[rows], c.lead[rows])
         script = resolved.family.script(resolved.environment, chosen)
-        log_weight = np.log(self.design.p[stratum])
+        log_weight = elementary.log(self.design.p[stratum])
         script = script._replace(stratum=stratum.astype(np.int64), log_weight=log_weight)
         if c.acts:
             script = script._replace(announced_index=c.row[rows], motion_hash=c.motion[rows])

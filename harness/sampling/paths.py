@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from harness import elementary
 from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError
 from harness.families import family_named
@@ -104,7 +105,7 @@ def forced(resolved: Resolved, paths: Paths, runs: Recorded = HOLDING) -> Traffi
     total, log_weight = cumulative[:, -1], events.log_any
     event = np.minimum((cumulative <= (u * total)[:, None]).sum(1), (cumulative < total[:, None]).sum(1))
     if runs.failed.size:
-        event[runs.failed], log_weight = -1, np.log(total + events.after_failure)
+        event[runs.failed], log_weight = -1, elementary.log(total + events.after_failure)
     chosen = family.choose(environment, seed, paths, event, of_pool=False)
     script = family.script(environment, chosen)._replace(log_weight=log_weight, log_p_event=log_weight)
     if runs.failed.size:

@@ -1,7 +1,7 @@
 """Golden runs give the bits that they gave when they were recorded (see record.py).
 
-Estimates may differ in the last digits from one CPU family to another; ``python -m tests.golden.record --only …`` on
-the family that recorded them asks for all.
+Estimates may differ in the last digits from one processor to another; ``python -m tests.golden.record --only …`` on
+one like that which recorded them asks for all.
 """
 
 import json

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
+from harness import elementary
 from harness.compiled import compiled_inline
 from harness.random_stream import LATERAL, uniform
 from harness.vehicles.kinematics import STEP_S
@@ -44,7 +45,7 @@ def constant_lead(lead_s: float = 0.0, distance_m: float = TO_OVERLAP_M) -> Late
 def log_normal_speed(distance_m: float, median_mps: float, log_sd: float, longest_s: float) -> LateralMotion:
     """Leads of a log-normal lateral speed; longer ones count as the longest."""
     upto_s = STEP_S * (np.arange(round(longest_s / STEP_S) + 1) + 0.5)
-    cumulative = special.ndtr((np.log(median_mps) - np.log(distance_m / upto_s)) / log_sd)
+    cumulative = special.ndtr((elementary.log(median_mps) - elementary.log(distance_m / upto_s)) / log_sd)
     cumulative[-1] = 1.0
     return LateralMotion(distance_m, cumulative)
 

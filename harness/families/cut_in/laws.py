@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
+from harness import elementary
 from harness.compiled import compiled_inline
 from harness.families.cut_in.lateral import LateralMotion
 from harness.families.flow import Flow
@@ -90,7 +91,7 @@ class AccelerationLaw(NamedTuple):
 
 def build_environment(numbers: Record, lateral: LateralMotion, wish: Wish, accepted: FloatArray) -> Environment:
     """Tables of an environment from its parameter record."""
-    powers = np.exp(numbers["free_driving__brake_slope_s2pm"] * ACCELERATIONS_MPS2)
+    powers = elementary.exp(numbers["free_driving__brake_slope_s2pm"] * ACCELERATIONS_MPS2)
     braking = np.where(numbers["free_driving__brake_max_mps2"] + 1e-9 >= ACCELERATIONS_MPS2, powers, 0.0)
     cumulative = np.cumsum(braking) / braking.sum()
     cumulative[-1] = 1.0
@@ -102,7 +103,7 @@ def t_table(df: float) -> FloatArray:
     """Distribution function of Student's t on [-64, 64], and its derivative times the grid step: shape (4097, 2)."""
     z = np.arange(-_T_LIMIT * _T_PER_UNIT, _T_LIMIT * _T_PER_UNIT + 1) / _T_PER_UNIT
     peak = special.poch(0.5 * df, 0.5) / np.sqrt(df * np.pi)
-    density = peak * np.exp(-0.5 * (df + 1.0) * np.log1p(z * z / df))
+    density = peak * elementary.exp(-0.5 * (df + 1.0) * elementary.log1p(z * z / df))
     return np.column_stack([special.stdtr(df, z), density / _T_PER_UNIT])
 
 
@@ -340,7 +341,9 @@ class InitialStates(Flow):
 
         location = c("location_mps") + c("location_u") * u + c("location_w") * w + c("location_uw") * (u * w)
         location = location + c("location_uu") * (u * u)
-        scale = np.exp(c("log_scale") + c("log_scale_u") * u + c("log_scale_w") * w + c("log_scale_ww") * (w * w))
+        scale = elementary.exp(
+            c("log_scale") + c("log_scale_u") * u + c("log_scale_w") * w + c("log_scale_ww") * (w * w)
+        )
         df = float(n["initial_state__r1dot_df"])
         slowest = special.stdtr(df, (-r1 / n["initial_state__r1dot_min_ttc_s"] - location) / scale)
         below = np.minimum(slowest + probability * (1.0 - slowest), _BELOW_ONE)  # at 1 it is inf

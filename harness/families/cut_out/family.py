@@ -11,6 +11,7 @@ import pyarrow as pa
 from pydantic import model_validator
 from scipy.special import ndtr, ndtri
 
+from harness import elementary
 from harness.campaign.sections import Section
 from harness.families.cut_out.words import CLOSING, TTC, WORDS
 from harness.families.following.approach import FollowingTraffic
@@ -52,7 +53,7 @@ class Leaving(Section):
     def lateral_mps(self) -> FloatArray:
         """Speeds of leaving (m/s), equally probable ones."""
         quantiles = (np.arange(N_LATERAL) + 0.5) / N_LATERAL
-        return np.asarray(self.lateral_median_mps.value * np.exp(self.lateral_log_sd.value * ndtri(quantiles)))
+        return np.asarray(self.lateral_median_mps.value * elementary.exp(self.lateral_log_sd.value * ndtri(quantiles)))
 
 
 class CutOutParameters(FollowingParameters):
@@ -80,10 +81,10 @@ class CutOutParameters(FollowingParameters):
         """Speeds exponentially below the leader's, or standing; log-normal or careless times; log-normal leaving."""
         law = self.leaving
         edges, mean, standing = np.linspace(0.0, 1.0, N_DROPS + 1), law.drop_mean.value, law.standing_share.value
-        below = -np.expm1(-edges / mean) / -np.expm1(-1.0 / mean)
+        below = -elementary.expm1(-edges / mean) / -elementary.expm1(-1.0 / mean)
         ratio = np.append(1.0 - 0.5 * (edges[:-1] + edges[1:]), 0.0)
         of_ratio = np.append((1.0 - standing) * np.diff(below), standing)
-        upto = ndtr((np.log(TTC_EDGES_S[1:-1]) - np.log(law.ttc_median_s.value)) / law.ttc_log_sd.value)
+        upto = ndtr((elementary.log(TTC_EDGES_S[1:-1]) - elementary.log(law.ttc_median_s.value)) / law.ttc_log_sd.value)
         careful = np.diff(np.concatenate([[0.0], upto, [1.0]]))  # what lies beyond is in the outermost bins
         least, most = law.careless_least_s.value, law.careless_most_s.value
         careless = np.diff(np.clip((TTC_EDGES_S - least) / (most - least), 0.0, 1.0))

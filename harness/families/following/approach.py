@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
+from harness import elementary
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.flow import Flow
 from harness.families.script import NEVER
@@ -69,7 +70,7 @@ def drawn_accelerations(numbers: Record, seed: int, number: IntArray, speed_mps:
         ahead = np.clip(v, numbers["fit_range__v_min_mps"], numbers["fit_range__v_max_mps"])
         w = (ahead - numbers["fit_range__v_centre_mps"]) / numbers["fit_range__v_scale_mps"]
         log_scale = numbers["free_driving__log_scale"] + numbers["free_driving__log_scale_u"] * w
-        scale = np.exp(log_scale + numbers["free_driving__log_scale_uu"] * (w * w))
+        scale = elementary.exp(log_scale + numbers["free_driving__log_scale_uu"] * (w * w))
         wanted = numbers["free_driving__location_mps2"] + scale * t[:, second]
         a = np.clip(wanted, numbers["free_driving__lowest_mps2"], numbers["free_driving__highest_mps2"])
         drawn[:, second] = np.rint(a / _GRID_MPS2)

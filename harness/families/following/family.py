@@ -10,6 +10,7 @@ import math
 import numpy as np
 import pyarrow as pa
 
+from harness import elementary
 from harness.campaign.sections import EnvironmentSettings
 from harness.compiled import unboxed
 from harness.families.flow import Flow
@@ -80,7 +81,7 @@ class FollowingFamily(Family):
     def share_in_scope(self, traffic: FollowingTraffic) -> float:
         """Share of events that are in scope."""
         found = self.events(traffic, 0, _usual_paths(traffic), Followers(driver_records([])))
-        return float(np.exp(found.log_any).mean())
+        return float(elementary.exp(found.log_any).mean())
 
     def exposure(self, traffic: FollowingTraffic, parameters: FollowingParameters) -> Exposure:
         given, share = parameters.counted(), self.share_in_scope(traffic)

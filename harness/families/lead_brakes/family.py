@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from scipy.special import ndtri
 
+from harness import elementary
 from harness.campaign.sections import Section
 from harness.families.following.family import START_FACTS, FollowingFamily
 from harness.families.following.parameters import FollowingParameters, grid_of
@@ -55,10 +56,10 @@ class LeadBrakesParameters(FollowingParameters):
         low, high, scale = b.lowest_peak_mps2.value, b.highest_peak_mps2.value, b.peak_scale_mps2.value
         n_bins = max(round((high - low) / PEAK_BIN_MPS2), 1)
         edges = np.asarray(low + PEAK_BIN_MPS2 * np.arange(n_bins + 1), np.float64)
-        beyond = np.append(np.exp(-(edges[:-1] - low) / scale), 0.0)
+        beyond = np.append(elementary.exp(-(edges[:-1] - low) / scale), 0.0)
         peaks, of_peak = edges[:-1] + 0.5 * PEAK_BIN_MPS2, -np.diff(beyond)
         quantiles = (np.arange(N_HELD) + 0.5) / N_HELD
-        held = np.append(b.held_median_s.value * np.exp(b.held_log_sd.value * ndtri(quantiles)), math.inf)
+        held = np.append(b.held_median_s.value * elementary.exp(b.held_log_sd.value * ndtri(quantiles)), math.inf)
         of_held = np.append(np.full(N_HELD, (1.0 - b.stop_share.value) / N_HELD), b.stop_share.value)
         jerks = np.array([b.gentle_jerk_mps3.value, b.abrupt_jerk_mps3.value])
         return grid_of(peak_mps2=(peaks, of_peak), held_s=(held, of_held), jerk_mps3=(jerks, np.full(2, 0.5)))
