@@ -138,13 +138,13 @@ def _words(task: Task) -> str:
         for name, figure in task.fields["figures"].items()
         if not isinstance(figure, float) or figure < 1.0
     ]
-    done = task.completed - task.fields["before"]
-    if done <= 0 or not task.elapsed:
-        return " · ".join(figures)
-    s_each = task.elapsed / done
+    done, took_s = task.completed - task.fields["before"], task.elapsed or 0.0
+    if done <= 0 or not took_s:
+        return " · ".join([*figures, *([] if took_s < 1.0 else [f"since {duration(took_s)}"])])
+    s_each = took_s / done
     rate = f"{count(1.0 / s_each)}/s" if s_each < 1.0 else f"{duration(s_each)} each"
-    left = [] if task.total is None else [f"{duration(max(task.total - task.completed, 0.0) * s_each)} left"]
-    return " · ".join([rate, *figures, *left])
+    missing = 0.0 if task.total is None else task.total - task.completed
+    return " · ".join([rate, *figures, *([f"{duration(missing * s_each)} left"] if missing > 0.0 else [])])
 
 
 def shown_progress(*, quiet: bool = False) -> Progress:

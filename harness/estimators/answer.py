@@ -12,10 +12,10 @@ from pydantic import TypeAdapter
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import LEAST_POOL_ERROR, MOST_EVENTS
-from harness.estimators.block import Block
+from harness.estimators.block import ACTS, Block
 from harness.estimators.estimate import Estimate, Note, Number, Point, Unavailable, finite_json
 from harness.estimators.likelihood import Level
-from harness.estimators.one_pass import BEFORE_EVENT, Asked, headline_of, one_pass
+from harness.estimators.one_pass import Asked, headline_of, one_pass
 from harness.estimators.severity import Severity
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Rule
@@ -151,11 +151,21 @@ def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
 
 
 def before_event(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> dict[str, Any]:
-    """What a vehicle did before the event, by number of tests; ``waits`` where it holds its speed while BV comes."""
+    """What a vehicle did, by number of tests (`ACTS`); ``waits`` where it holds its speed while BV comes."""
     waits = bool(manifest.get("events_show")) and not campaign.av.acts_before_event
-    counted = {name: counts.get(name, 0) for name in ("n_events", *(f"n_{each}" for each in BEFORE_EVENT))}
+    counted = {name: counts.get(name, 0) for name in ("n_events", *(f"n_{each}" for each in ACTS))}
     built_in, script = campaign.av.model is not None, bool(manifest.get("script"))
     return {"source": campaign.av.source, "built_in": built_in, "script": script, "waits": waits, **counted}
+
+
+MANY = 0.1
+"""Share of tests from which on a vehicle itself makes events milder [assumed]."""
+
+
+def n_softened(acts: Mapping[str, Any]) -> int:
+    """Tests whose event a vehicle (`before_event`) made milder, by falling behind or braking before; 0 if few."""
+    n = max(acts["n_fell_behind"], acts["n_braked_before"] if acts["waits"] else 0)
+    return n if n > MANY * acts["n_events"] and not acts["built_in"] else 0
 
 
 def ended_by(campaign: Campaign, rule: Rule, n_episodes: int) -> StoppedBy:

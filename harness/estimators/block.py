@@ -38,10 +38,15 @@ MAX_CONTROL_STEPS = 9
 EPISODE_COLUMNS = (
     "episode", "outcome", "event_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_event",
     "n_steps", "end_ttc_s", "took_over_step", "asked_to_speed_up", "braked_before", "fell_behind",
+    "hardest_braking_mps2",
 )  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass")
 BASELINE_COLUMNS = ("shadow", "event_mass")
 """Of vehicles that act before the event, where `ShellDesign.candidates` says that they are on record."""
+ACTS = "took_over_early", "asked_to_speed_up", "braked_before", "fell_behind", "braked"
+"""What AVs do, or ask for in vain, before the event, and whether they brake after its onset; columns of blocks."""
+BRAKED_MPS2 = 1.0
+"""Who never brakes so hard, in many tests, seems not to see the other vehicle [assumed]."""
 DANGER_TTC_S = 2.0
 """A test whose time was up with less to a collision (s), had the AV kept its acceleration, was cut off [assumed].
 
@@ -83,9 +88,10 @@ class Block:
     ``log_weight`` (n,) is log p(x_c) - log q_sampled(x_c), exactly 0 without control. ``columns``, also as attributes,
     are what else the method records, a row for each episode: bool (n,) ``happened``, ``cut_off`` (`DANGER_TTC_S`),
     ``took_over_early`` (the AV did something before BV was on its lane), ``asked_to_speed_up`` (or that in vain) and
-    ``braked_before`` (it asked to brake before anything happened), ``fell_behind`` (it did not keep up till then);
-    ``impact_mps`` (n,), closing speed at contact, NaN without a crash; ``n_control_steps`` (n,). ``log_q`` (n, M) is,
-    per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode;
+    ``braked_before`` (it asked to brake before anything happened), ``fell_behind`` (it did not keep up till then),
+    ``braked`` (`BRAKED_MPS2`); ``impact_mps`` (n,), closing speed at contact, NaN without a crash; ``n_control_steps``
+    (n,). ``log_q`` (n, M) is, per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot
+    draw the episode;
     ``martingale`` (n, J) the D_j of `harness.estimators.doubly_robust`;
     ``first_ratios`` (n, 9, J) q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one;
     ``log_p_event`` (n,) log P(event | path), where the path is drawn ahead: it bounds Y of that episode alone. Of
@@ -121,6 +127,11 @@ class Block:
     def n_crashes_before_event(self) -> int:
         """How many episodes ended in a crash before their event."""
         return int(np.count_nonzero(self.crash & ~self.happened))
+
+    def acts(self) -> dict[str, int]:
+        """In how many episodes there was an event, and in how many the AV did each of `ACTS`."""
+        counted = {"n_events": self.happened} | {f"n_{of}": self.columns[of] for of in ACTS if of in self.columns}
+        return {name: int(np.count_nonzero(rows)) for name, rows in counted.items()}
 
     def weights(self) -> FloatArray:
         """Likelihood ratios p/q_sampled, shape (n,); infinite where they overflow."""
@@ -225,6 +236,7 @@ def block_from_tables(
         "cut_off": (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy(),
         "took_over_early": pc.fill_null(early, fill_value=False).to_numpy(),
         **{name: episodes[name].to_numpy() for name in ("asked_to_speed_up", "braked_before", "fell_behind")},
+        "braked": episodes["hardest_braking_mps2"].to_numpy() >= BRAKED_MPS2,
     }
     if sampling.mixes:
         columns["log_q"] = _nested(episodes, "log_q", len(alpha))

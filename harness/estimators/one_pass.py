@@ -48,8 +48,6 @@ SPACING = 1.01
 FEWEST_TOGETHER, MOST_TOGETHER = 64, 5_000
 """Tests of a block: as many as `one_pass` waits for until it looks again, within these."""
 UNKNOWN_MEAN = {"mean": math.nan, "std_error": math.inf}
-BEFORE_EVENT = ("took_over_early", "asked_to_speed_up", "braked_before", "fell_behind")
-"""What AVs do, or ask for in vain, before the event; columns of blocks."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +112,8 @@ class Diagnostics:
         weights, contact = block.weights(), block.outcome == CONTACT
         self._drawn = block.drawn
         self.n += len(block)
-        counted = {"n_events": block.happened, "n_bv_lv_contacts": contact, "n_failed": block.failed}
-        counted |= {f"n_{name}": block.columns[name] for name in BEFORE_EVENT if name in block.columns}
-        self.counts.update({name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
+        counted = {"n_bv_lv_contacts": contact, "n_failed": block.failed}
+        self.counts.update(block.acts(), **{name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
         if n_early := block.n_crashes_before_event:
             self.counts["n_crashes_before_event"] += n_early
         self._weight += Moments.of(weights)

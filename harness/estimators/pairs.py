@@ -45,8 +45,8 @@ class PairDecision:
 
     It holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
     ``ratio`` are the ends of B/A by which a margin was decided, None without one.
-    No margin is kept by a B with ``n_milder`` crashes that its rate leaves out, nor where ``n_differing`` tests of
-    either were not the same when they ran twice.
+    No margin is kept by a B with ``n_milder`` tests of which its rate says too little, nor where ``n_differing``
+    of either were not the same when they ran twice.
     """
 
     margin: float

@@ -72,8 +72,8 @@ class Decision:
     ``limit`` is in crashes per test, or in crash rates of a reference ``driver``, as are ``low`` and ``high``, between
     which the rate lies after ``n_episodes`` tests. Even where the limit is the rate itself, at most 1 - ``confidence``
     of campaigns take the wrong side, whatever the budget.
-    With ``n_milder`` crashes on events too mild to count, or before events, nothing is accepted; nor with
-    ``n_differing`` tests that were not the same when they ran twice.
+    With ``n_milder`` crashes on events too mild to count, or before events, or events that the vehicle itself made
+    milder, nothing is accepted; nor with ``n_differing`` tests that were not the same when they ran twice.
     """
 
     limit: float

@@ -31,17 +31,19 @@ CELL_DTYPE = np.dtype(
         ("acts_from", _i8),  # first step in which the AV may act
         ("cruises", _i8),  # whether the AV still keeps its speed, whatever it asks for but to brake
         ("set_speed", _f8),  # at which the AV cruises
+        ("av_speed", _f8),  # of the AV before the step
         ("danger", _f8),  # what a built-in AV remembers beside its acceleration
     ]
 )
 
 _STEPS = "n_steps", "event_step", "lead_steps", "onset_step", "took_over_step", "n_control_steps"
 _AT_EVENT = "event_gap_m", "event_rate_mps", "onset_gap_m", "onset_rate_mps"
-_AT_END = "crash_time_s", "impact_speed_mps", "min_ttc_s", "end_ttc_s", "av_distance_m", "log_weight", "log_p_event"
+_AT_END = "crash_time_s", "impact_speed_mps", "min_ttc_s", "end_ttc_s", "hardest_braking_mps2", "av_distance_m"
+_DRAWN = "log_weight", "log_p_event"
 EPISODE_DTYPE = np.dtype(
     [(name, np.int8) for name in ("outcome", "component", "asked_to_speed_up", "braked_before", "fell_behind")]
     + [(name, np.int16) for name in _STEPS]
-    + [(name, _f8) for name in (*_AT_EVENT, *_AT_END)]
+    + [(name, _f8) for name in (*_AT_EVENT, *_AT_END, *_DRAWN)]
 )
 """What becomes of a test. ``component`` is the stratum or importance function that it was drawn from, -1 for none;
 ``took_over_step`` the first in which the AV did what it asked for, -1 for none, ``asked_to_speed_up`` whether it

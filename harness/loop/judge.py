@@ -35,17 +35,19 @@ def judge(kernel: KernelState, contact: BoolArray) -> int:
 
     Returns how many have ended (``cells.ended`` receives which); -1 - k if flag and crash criterion differ in cell k.
     """
-    cells = kernel.cells
+    cells, av = kernel.cells, kernel.x.shape[1] - 1
     ended = 0
     for k in range(cells.cell.size):
         cell = cells.cell[k]
         if cell.row < 0:
             continue
         cell.step += 1
+        test, before, cell.av_speed = kernel.episode[cell.row], cell.av_speed, kernel.v[k, av]
+        if 0 <= cell.onset_step < cell.step:
+            test.hardest_braking_mps2 = max(test.hardest_braking_mps2, (before - cell.av_speed) / STEP_S)
         if is_ahead(k, kernel):
             left, rate = gap_and_rate(k, kernel)
             if rate < 0.0 and left >= 0.0:
-                test = kernel.episode[cell.row]
                 test.min_ttc_s = min(test.min_ttc_s, left / -rate)
         outcome = outcome_of(k, kernel)
         if contact[k] != (outcome in (CRASH, CONTACT)):

@@ -80,7 +80,8 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     cell.event_step = cell.planned = cell.onset_step = -1
     cell.acts_from = 0 if kernel.acts_early else script.acts_from[row]
     cell.cruises, told = kernel.av_cruises if cell.acts_from > 0 else 0, script.set_speed_mps[row]
-    cell.set_speed = kernel.v[k, av] if math.isnan(told) else told
+    cell.av_speed = kernel.v[k, av]
+    cell.set_speed = cell.av_speed if math.isnan(told) else told
     cell.announced_index = script.announced_index[row] if script.announced_index[row] >= 0 else episode
     cell.danger = test.min_ttc_s = test.end_ttc_s = math.inf
     test.took_over_step, test.component = -1, script.stratum[row]

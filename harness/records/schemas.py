@@ -81,6 +81,9 @@ def episodes_schema(
             _or_null("impact_speed_mps", _F8, "m/s", "v_AV - v_BV at the crash"),
             _or_null("min_ttc_s", _F8, "s", "smallest R2/-R2dot after the cut-in while closing"),
             _or_null("end_ttc_s", _F8, "s", "of a timeout: to a collision as it accelerates (a program: at its speed)"),
+            _field(
+                "hardest_braking_mps2", _F8, "m/s2", "largest deceleration of the AV after the onset, 0 without any"
+            ),
             _field("av_distance_m", _F8, "m", "distance that the AV drove in the test"),
             _field("n_control_steps", _I2, "1", "stratum l: steps drawn from an importance function"),
             _field("component", _I1, "1", "importance function drawn (episode mixture), or shell, else -1"),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from harness.campaign.campaign import Campaign
-from harness.estimators.answer import AssumedOfRate, Estimates
+from harness.estimators.answer import AssumedOfRate, Estimates, before_event, n_softened
 from harness.estimators.estimate import Estimate
 from harness.estimators.severity import HARD_MPS, TOUCH_MPS, Severity
 from harness.estimators.traffic import TrafficError, Uncertain
@@ -68,8 +68,9 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) ->
     so_far = " so far" if best.untested and best.n_crashes else ""
     rows = [Row("rate", f"{counted}{so_far}", f"{less}{number(shown)} per test", ends, remark)]
     beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
-    acts = campaign.av.acts_before_event
-    rows += [_beside(each, acts=acts, wide=wide, from_below=from_below) for each in beside]
+    how = {"wide": wide, "from_below": from_below}
+    how["softened"] = n_softened(before_event(campaign, manifest, told.diagnostics)) > 0
+    rows += [_beside(each, acts=campaign.av.acts_before_event, **how) for each in beside]
     # Where little else is known of the rate than a limit, what is known comes first: the ratio.
     yield from reversed(rows) if unseen or (wide and beside and end(beside[0]["ratio_high"]) < 1.0) else rows
     if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
@@ -135,9 +136,8 @@ def held_back(decision: Mapping[str, Any]) -> bool:
 
 def decided(decision: Mapping[str, Any]) -> Row:
     """The verdict on a limit, of one scenario or of several."""
-    driver, verdict = decision.get("driver"), decision["verdict"]
-    limit = limit_words(decision)
-    low, high = (ratio(decision[end]) if driver else number(decision[end]) for end in ("low", "high"))
+    limit, verdict = limit_words(decision), decision["verdict"]
+    low, high = (number(decision[end]) for end in ("low", "high"))
     value, ends = {
         "accepted": (f"rate below {limit}", f"at most {high}"),
         "rejected": (f"rate above {limit}", f"at least {low}"),
@@ -150,25 +150,29 @@ def decided(decision: Mapping[str, Any]) -> Row:
     )
 
 
-def _beside(found: Mapping[str, Any], *, acts: bool, wide: bool, from_below: bool) -> Row:
+def _beside(found: Mapping[str, Any], *, acts: bool, **how: bool) -> Row:
     who = {"r157-cc": "r157-cc, UN R157’s driver"}.get(found["reference"], found["reference"])
     if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
         who = f"{found['reference']}, from the same state"
-    return Row("ratio", "× competent driver", *ratio_texts(found, wide=wide, from_below=from_below), who)
+    return Row("ratio", "× competent driver", *ratio_texts(found, **how), who)
 
 
-def ratio_texts(found: Mapping[str, Any], *, wide: bool, from_below: bool) -> tuple[str, str]:
-    """A ratio to a reference, and its interval, of which a ``wide`` one says what it says with one end alone."""
+def ratio_texts(found: Mapping[str, Any], *, wide: bool, from_below: bool, softened: bool) -> tuple[str, str]:
+    """A ratio to a reference, and its interval, of which a ``wide`` one says what it says with one end alone.
+
+    That a vehicle crashes less is said with a reserve where it has ``softened`` the events (`n_softened`).
+    """
+    less = "crashes less, but see !" if softened else "crashes less"
     low, high, seen = found["ratio_low"], end(found["ratio_high"]), found["ratio"]
     most = "no limit" if math.isinf(high) else ratio(high)
     if not seen:
         return f"< {most}", "no crash seen"
     if wide and (high < 1.0 or (low <= 1.0 and not from_below and high < math.inf)):  # as the row of the rate
-        apart = "crashes less" if high < 1.0 else "not told apart"
+        apart = less if high < 1.0 else "not told apart"
         return f"< {most} ({apart})", f"estimate {ratio(seen)}, ≥ {ratio(low)}"
     if from_below and low > 1.0:
         return f"> {ratio(low)} (crashes more)", f"estimate {ratio(seen)}"
-    apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else "crashes less"
+    apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else less
     return f"{ratio(seen)} ({apart})", f"≥ {ratio(low)}" if from_below else f"{ratio(low)} to {most}"
 
 

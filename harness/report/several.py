@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.campaign.campaign import Campaign
-from harness.estimators.answer import AssumedOfRate
+from harness.estimators.answer import AssumedOfRate, n_softened
 from harness.estimators.estimate import WIDE_RHW
 from harness.families import family_named
 from harness.families.words import EXCLUDED
@@ -70,18 +70,22 @@ def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
         yield Row("rate", "crashes", f"{number(hour['rate'])} per hour", ends, per_km)
     else:
         yield Row("rate", "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen")
-    yield beside_row("× competent driver", content["beside"], seen=seen, from_below=from_below)
+    softened = any(n_softened(of["before_event"]) for of in content["families"].values())
+    how = {"seen": seen, "from_below": from_below, "softened": softened}
+    yield beside_row("× competent driver", content["beside"], **how)
     for each in content["readings"] if readings else ():
-        yield beside_row(f"× {each['reference']}", each, seen=seen, from_below=from_below)
+        yield beside_row(f"× {each['reference']}", each, **how)
 
 
-def beside_row(name: str, beside: Mapping[str, Any], *, seen: bool, from_below: bool = False) -> Row:
-    """The rate beside a reading of that driver, where crashes were ``seen`` or none."""
+def beside_row(
+    name: str, beside: Mapping[str, Any], *, seen: bool, from_below: bool = False, softened: bool = False
+) -> Row:
+    """The rate beside a reading of that driver, where crashes were ``seen`` or none; see `ratio_texts`."""
     if beside["ratio"] is None:
         return Row("ratio", name, "no ratio", "", "such a driver never crashes here")
     found, ends = (beside if seen else {**beside, "ratio": 0.0}), beside["over_assumed"]
     over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed ranges"
-    return Row("ratio", name, *ratio_texts(found, wide=from_below, from_below=from_below), over)
+    return Row("ratio", name, *ratio_texts(found, wide=from_below, from_below=from_below, softened=softened), over)
 
 
 def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -193,12 +197,14 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
         return None
     if (needed := content["to_decide"]) is None:
         return "how many pairs would decide is not known: so far the two are too alike"
-    where, done = (" and a new --out", 0) if needed["new_folder"] else ("", content["n_pairs"])
+    where, pairs, done = (
+        (" and a new --out", "pairs", 0) if needed["new_folder"] else ("", "more pairs", content["n_pairs"])
+    )
     n = two_digits_up(needed["pairs"] - done)
     cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
     settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
     options = f"--margin {decision['margin']:g}{settings}"
-    return f"to decide, repeat the command with {options}{where}: some {count(n)} more pairs{cost}"
+    return f"to decide, repeat the command with {options}{where}: some {count(n)} {pairs}{cost}"
 
 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -16,7 +16,8 @@ from pydantic import BaseModel
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.estimators.answer import STORED_ESTIMATES, Elsewhere, Estimates, before_event
+from harness.estimators.answer import MANY, STORED_ESTIMATES, Elsewhere, Estimates, before_event
+from harness.estimators.block import BRAKED_MPS2
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.loop.cells import FAR_BEHIND_S
@@ -181,10 +182,6 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
         yield from too_few(traffic.n_replicates, traffic.confidence)
 
 
-FEW_BEHIND = 0.1
-"""Share of tests in which who follows may be far behind the vehicle ahead [assumed]."""
-
-
 def late_words(*, script: bool) -> str:
     """That a vehicle does nothing before BV is in its lane, and what would show it."""
     what = "getLateralLanePosition" if script else "bv_lateral_m"
@@ -198,8 +195,10 @@ def brakes_before_words(n: int, *, script: bool) -> str:
 
 
 def _acts(of: Mapping[str, Any] | None) -> Iterator[str]:
-    """What the vehicle did before the event (`before_event`), a line each."""
-    if of is not None and (n := of["n_fell_behind"]) > FEW_BEHIND * of["n_events"] and not of["built_in"]:
+    """What the vehicle did before the event, or did not after it (`before_event`), a line each."""
+    if of is not None and of["n_events"] and not of["n_braked"] and not of["built_in"]:
+        yield f"it never braked with {plain(BRAKED_MPS2)} m/s² or more: does it see the other vehicle?"
+    if of is not None and (n := of["n_fell_behind"]) > MANY * of["n_events"] and not of["built_in"]:
         why = "which makes the event milder: let it keep up"
         yield f"in {count(n)} tests it was over {FAR_BEHIND_S:g} s behind the vehicle ahead when the event began, {why}"
     if of is None or not of["waits"]:

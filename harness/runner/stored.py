@@ -316,7 +316,7 @@ def read_families(folder: Path) -> dict[str, Any]:
 @checked("harness.estimate_families")
 def estimate_families(
     folder: str | Path,
-    exposures: Mapping[str, EventsPerHour] | None = None,
+    exposure: Mapping[str, EventsPerHour] | None = None,
     confidence: Confidence | None = None,
     *,
     counts: bool = False,
@@ -327,7 +327,7 @@ def estimate_families(
     ----------
     folder : str or Path
         Folder of several scenarios; nothing is run or written.
-    exposures : mapping of str to float, optional
+    exposure : mapping of str to float, optional
         Events per hour of driving, by scenario, in place of the campaign's.
     confidence : float, optional
         Level of the intervals, by default the campaign's.
@@ -336,13 +336,13 @@ def estimate_families(
 
     Raises `HarnessError`: a run is missing or damaged, or an exposure is of no scenario in it.
     """
-    folder, exposures = Path(folder), exposures or {}
+    folder, exposure = Path(folder), exposure or {}
     stored, families, ready, told = read_families(folder), [], {}, {}
     names = list(stored["families"])
-    if unknown := sorted(set(exposures) - set(names)):
+    if unknown := sorted(set(exposure) - set(names)):
         found = f"an exposure of {', '.join(unknown)}"
         raise HarnessError("--exposure", found, f"one of {', '.join(names)}", "Name a scenario of this folder.")
-    given = {**stored["exposure"], **exposures}
+    given = {**stored["exposure"], **exposure}
     for name in names:
         of = folder / name
         manifest, seen = read_manifest(of), SeenShells.of_blocks(stored_blocks(of, moments=False))

@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
-from harness.estimators.answer import STORED_ESTIMATES, ended_by, estimate_blocks, expected_for, pool_remedy
+from harness.estimators.answer import (
+    STORED_ESTIMATES,
+    before_event,
+    ended_by,
+    estimate_blocks,
+    expected_for,
+    n_softened,
+    pool_remedy,
+)
 from harness.estimators.one_pass import even
 from harness.estimators.pairs import PairDecision, PairVerdict
 from harness.estimators.stopping import Decision, Rule, Verdict
@@ -161,7 +169,8 @@ class Underway:
                 self.run = self.run.with_shard(shard)
             n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
             self.progress.advance(min(n_new, shard.request.n_episodes), crashes=int(shard.block.crash.sum()))
-            self.progress.status(rhw=rule.look.rhw, asked=rule.target or math.inf)
+            asked = None if self.run.resolved.campaign.accept else rule.target
+            self.progress.status(rhw=rule.look.rhw, asked=asked or math.inf)
             yield shard
 
     def drive_added(self, tested: IntArray, added: IntArray, rule: Rule) -> Iterator[ShardResult]:
@@ -180,10 +189,13 @@ class Underway:
         self.run.require_few_failed()
 
     def doubted(self) -> tuple[int, int]:
-        """What keeps a limit from being accepted: crashes that the rate leaves out, tests that were not the same."""
-        run = self.run
+        """What keeps a limit from being accepted, by number of tests: see `Decision`."""
+        run, campaign, counts = self.run, self.run.resolved.campaign, Counter[str]()
+        for each in run.blocks:
+            counts.update(each.acts())
         n_early = sum(each.n_crashes_before_event for each in run.blocks)
-        n_milder = n_left_out(run.resolved.campaign, n_early) + beyond_scope(run.facts.get("milder"))
+        n_milder = n_left_out(campaign, n_early) + beyond_scope(run.facts.get("milder"))
+        n_milder += n_softened(before_event(campaign, run.facts, counts))
         return n_milder, len(run.repeated.differing) if run.repeated else 0
 
     def finish(self, rule: Rule, *, of_sum: bool = False) -> RunResult:

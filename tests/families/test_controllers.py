@@ -11,6 +11,7 @@ import pytest
 from examples import idm_traci_style
 from examples.idm import IDM
 from harness.sampling import prepare
+from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
 from tests.families.test_same_bits import LADDERS, require_same, resolved_of, run, source_of
@@ -60,6 +61,11 @@ def test_one_that_does_not_keep_up_is_seen_when_the_event_begins(name):
         drive(name, each, traffic) for each in ("tests.families.test_controllers:Lags", "examples.idm:IDM")
     )
     assert (lags.episode["fell_behind"].sum(), follows.episode["fell_behind"].sum()) == (20, 0)
+    for row, trace in follows.traces.items():
+        slower = -np.diff(trace[int(follows.episode["onset_step"][row]) + 1 :, -1, 1]) / STEP_S
+        hardest = follows.episode["hardest_braking_mps2"][row]
+        assert hardest == pytest.approx(max(slower.max(initial=0.0), 0.0), rel=1e-12)
+    assert follows.episode["hardest_braking_mps2"].max() > 3.0
 
 
 def ahead_on_lane(trace, step, visible):

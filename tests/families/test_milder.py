@@ -11,12 +11,14 @@ import pytest
 
 import harness
 from harness.cli import main
+from harness.estimators.answer import n_softened
 from harness.families import family_named
 from harness.families.following.approach import starts_from
 from harness.families.following.family import MILDEST_MPS2, N_SPEEDS
 from harness.families.protocol import Paths
 from harness.numbers import number
 from harness.records.folder import read_manifest
+from harness.report.rows import ratio_texts
 from harness.runner.stored import estimate_run
 from harness.sampling.paths import beyond_scope, n_left_out
 from tests.families.roads import SETTINGS, traffic_of
@@ -146,6 +148,35 @@ def test_one_that_crashes_without_an_event_is_told_so_and_not_accepted(tmp_path,
     assert f"{n} tests crashed BEFORE the event" in " ".join(capsys.readouterr().out.split())
     assert (code, estimates["decision"]["verdict"]) == (4, "undecided")
     assert estimates["decision"]["high"] < 0.9
+
+
+def test_one_that_makes_the_events_milder_itself_is_told_so_and_not_accepted(tmp_path, capsys):
+    """By falling behind the vehicle ahead: beside the competent driver, too, that is said at once."""
+    out, _, code = gate(tmp_path, "tests.families.test_controllers:Lags", "lead_brakes")
+    estimates = json.loads((out / "estimates.json").read_text())
+    assert (code, estimates["decision"]["verdict"]) == (4, "undecided")
+    assert estimates["decision"]["n_milder"] == estimates["diagnostics"]["n_fell_behind"] > 100
+    told = " ".join(capsys.readouterr().out.split())
+    assert "yet not accepted, see !" in told
+    assert "it never braked with 1 m/s² or more: does it see the other vehicle?" in told
+
+
+@pytest.mark.parametrize(
+    ("behind", "braked", "waits", "built_in", "n"),
+    [
+        (11, 0, False, False, 11),
+        (10, 0, False, False, 0),
+        (0, 50, True, False, 50),
+        (0, 50, False, False, 0),
+        (90, 90, True, True, 0),
+    ],
+)
+def test_many_events_that_it_made_milder_are_more_than_a_tenth(behind, braked, waits, built_in, n):
+    acts = {"n_fell_behind": behind, "n_braked_before": braked, "waits": waits, "built_in": built_in, "n_events": 100}
+    assert n_softened(acts) == n
+    reference = {"ratio": 0.5, "ratio_low": 0.4, "ratio_high": 0.6}
+    less, _ = ratio_texts(reference, wide=False, from_below=False, softened=n > 0)
+    assert less == ("0.50 (crashes less, but see !)" if n else "0.50 (crashes less)")
 
 
 def test_where_somebody_changes_lanes_it_is_not_known_what_came_first():

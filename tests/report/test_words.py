@@ -80,12 +80,13 @@ def test_what_ended_a_run_is_said_with_what_it_rests_on(name, given, stored_run)
 )
 def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(name, shows, blind, held, stored_run):
     run = read_run_folder(stored_run(name))
-    counts = dict.fromkeys(("n_asked_to_speed_up", "n_braked_before"), 1234 * (name != "forced-krauss"))
+    counts = dict.fromkeys(("n_asked_to_speed_up", "n_braked_before", "n_braked"), 1234 * (name != "forced-krauss"))
     asked = {**run.estimates.diagnostics, **counts}
     warnings = "".join(said(run, manifest={"events_show": shows}, diagnostics=asked).warnings)
     assert ("cannot see the other car (BV)" in warnings) == blind
     assert ("1,234 tests it asked to speed up" in warnings) == held
     assert ("1,234 tests it braked with nobody ahead" in warnings) == (name != "forced-krauss")
+    assert ("it never braked with 1 m/s² or more" in warnings) == (name == "forced-krauss")
 
 
 @pytest.mark.parametrize(
