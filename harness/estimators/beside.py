@@ -23,7 +23,7 @@ import numpy as np
 
 from harness.estimators.estimate import Number
 from harness.estimators.likelihood import CRASH, Counts, Level, ratio_limits
-from harness.estimators.tally import Tally, crash_square, pool_variance
+from harness.estimators.tally import FEWEST_PATHS, Tally, crash_square, paths_that_count, pool_variance
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vocabulary import BoolArray, FloatArray
 
@@ -83,16 +83,17 @@ def unavoidable(design: ShellDesign, cells: Tally, level: Level) -> Unavoidable 
 
 
 def beside(design: ShellDesign, cells: Tally, r: int, n_strata: int, level: Level) -> tuple[float, float]:
-    """Limits of the rate of the first strata over that of a reference."""
+    """Limits of the rate of the first strata over that of a reference; any where crashes lie on too few paths."""
     p, strata = design.p[:n_strata], slice(0, n_strata)
 
     def limits(tests: Tally) -> tuple[float, float]:
-        outcomes = tests.joined(design.joined).part(strata).outcomes
-        errors = path_errors(design, tests, r, n_strata)
-        return limits_over(float(design.reference_rate[r]), p, outcomes, errors, level)
+        tally, errors = tests.joined(design.joined).part(strata), path_errors(design, tests, r, n_strata)
+        if paths_that_count(p, tally) < FEWEST_PATHS:
+            return 0.0, math.inf
+        return limits_over(float(design.reference_rate[r]), p, tally.outcomes, errors, level)
 
     low, high = limits(cells)
-    return low, high if (worst := cells.failed_as_crashes()) is cells else limits(worst)[1]
+    return low, high if (worst := cells.failed_as_crashes()) is cells else max(high, limits(worst)[1])
 
 
 def limits_over(

@@ -140,15 +140,11 @@ class Accumulator(Protocol):
 
 
 class FailureBounds:
-    """An estimator that is fed twice from the first failed test on: failed tests as no crash, and as crashes.
+    """An empty estimator that is fed twice from the first failed test on: these as no crash, and as crashes."""
 
-    ``seen`` is empty, unless ``worst`` and the number of failed tests are given, too.
-    """
-
-    def __init__(self, seen: Accumulator, worst: Accumulator | None = None, n_failed: int = 0) -> None:
-        self.seen = seen
-        self._worst = worst  # until a test fails it would be the same
-        self._n_failed = n_failed
+    def __init__(self, seen: Accumulator) -> None:
+        self.seen, self._n_failed = seen, 0
+        self._worst: Accumulator | None = None  # until a test fails it would be the same
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""

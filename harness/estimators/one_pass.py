@@ -193,9 +193,10 @@ def refusal(block: Block, estimator: Asked) -> Note | None:
     return note("needs_moments") if estimator == "scv" and "first_ratios" not in block.columns else None
 
 
-def accumulator(asked: Asked) -> FailureBounds:
+def accumulator(asked: Asked) -> Accumulator:
     """Empty state of an estimator, for those who feed it themselves (the runner does, for stopping)."""
-    return FailureBounds(OwnState(asked) if isinstance(asked, OwnEstimator) else ACCUMULATORS[asked]())
+    state = OwnState(asked) if isinstance(asked, OwnEstimator) else ACCUMULATORS[asked]()
+    return state if isinstance(state, SeenShells) else FailureBounds(state)  # which bounds them itself
 
 
 @dataclass(frozen=True)
@@ -247,7 +248,7 @@ def one_pass(
     asked, own = {str(each): each for each in (*names, best)}, str(best)
     refusals = {name: refusal(first, asked[name]) for name in (own, *asked)}
     states = {name: accumulator(asked[name]) for name, why in refusals.items() if why is None}
-    empty = SeenShells if own == "shells" else partial(accumulator, best)
+    empty = partial(accumulator, best)
     impacts = Impacts(empty, first.drawn.counts_above_mps) if "impact_mps" in first.columns else None
     diagnostics, convergence, n = Diagnostics(), list[Point](), 0
     for block in chain((first,), blocks):

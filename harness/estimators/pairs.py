@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from harness.estimators.block import Block
-from harness.estimators.estimate import Estimate, FailureBounds, finite_json
+from harness.estimators.estimate import finite_json
 from harness.estimators.likelihood import Counts, Level, contrast_limit, ratio_limits, spread
 from harness.estimators.shells import SeenShells
 from harness.estimators.tally import Tally, mean_square
@@ -326,7 +326,7 @@ def paired_estimate(pairs: Pairs, confidence: float) -> dict[str, Any]:
     """
     level, inside, (own,) = Level.two_sided(confidence), pairs.within(), pairs.each
     design, tallies = own.design, [own.tally(side) for side in (0, 1)]
-    a, b = (_own(design, tally, confidence).shown for tally in tallies)
+    a, b = (SeenShells.of(design, tally).result(confidence).shown for tally in tallies)
     counts = "n_both", "n_only_a", "n_only_b", "n_neither"
     shells = [
         {
@@ -347,8 +347,3 @@ def paired_estimate(pairs: Pairs, confidence: float) -> dict[str, Any]:
     }
     more = {"confidence": confidence, "conditional": conditional, "shells": shells}
     return finite_json({"a": a, "b": b, **contrast(pairs, level), **more})
-
-
-def _own(design: ShellDesign, tally: Tally, confidence: float) -> Estimate:
-    worst = SeenShells.of(design, tally.failed_as_crashes())
-    return FailureBounds(SeenShells.of(design, tally), worst, int(tally.failed.sum())).result(confidence)

@@ -104,14 +104,13 @@ class PerHour:
         tallies = [of.tally.part(strata) for of, strata in parts]
         p = np.concatenate([of.p[strata] for of, strata in parts])
         rate = math.fsum(float(of.p[strata] @ tally.share) for (of, strata), tally in zip(parts, tallies, strict=True))
-        for (of, strata), tally in zip(parts, tallies, strict=True):
-            if tally.crashes.any() and paths_that_count(of.seen.design.p[strata], tally) < FEWEST_PATHS:
-                return RateLimits(rate, 0.0, math.inf, math.inf, 0.0)
 
         def limit(side: float, *, worst: bool) -> tuple[float, float]:
             each = [tally.failed_as_crashes() if worst else tally for tally in tallies]
             variance = 0.0
             for (of, strata), tally in zip(parts, each, strict=True):  # masses are per test, as a design's p is
+                if paths_that_count(of.seen.design.p[strata], tally) < FEWEST_PATHS:
+                    return math.inf, math.inf
                 own = pool_variance(of.seen.design.p[strata], tally, of.seen.design.n_independent)
                 variance += of.per_hour**2 * own + (of.seen.design.p_event_error * of.rate) ** 2
             crashes, tests = (
@@ -120,6 +119,8 @@ class PerHour:
             return likelihood_limit(p, crashes, tests, level, side, variance), variance
 
         (low, variance), (high, _) = limit(-1.0, worst=False), limit(1.0, worst=True)
+        if math.isinf(variance):
+            return RateLimits(rate, 0.0, math.inf, math.inf, 0.0)
         from_pool = level.z * math.sqrt(variance)
         return RateLimits(rate, max(low, 0.0), high, from_pool, from_pool)
 

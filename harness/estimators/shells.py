@@ -104,6 +104,8 @@ class Within:
 class ShellDetails:
     """``details`` of the estimate: shells from conservative to aggressive, and the pool that they come from."""
 
+    n_failed: int
+    crash_rate_if_failed_had_crashed: float
     pool: str
     rhw_from_pool: Number
     rhw_from_pool_at_least: Number
@@ -187,13 +189,13 @@ class SeenShells:
     def result(self, confidence: float) -> Estimate:
         """Assumption-free estimate; that within the boundary is among its details."""
         tally, design, level = self.tally, self.design, Level.two_sided(confidence)
-        n, n_crashes, _ = tally.totals
+        n, n_crashes, n_failed = tally.totals
         free, y, cautions = self._limits(design.p.size, level), self.weight_of_a_crash(), self._cautions()
         squares = float((tally.crashes * y * y).sum())
         details = ShellDetails(
-            design.pool, *free.from_pool_relative(), design.p_event, design.p_unreachable,
-            references=() if cautions else compared(design, self.cells, level), within=self.within(confidence),
-            shells=self._shells((1.0 - confidence) / 2.0),
+            n_failed, tally.failed_as_crashes().rate(design.p), design.pool, *free.from_pool_relative(),
+            design.p_event, design.p_unreachable, () if cautions else compared(design, self.cells, level),
+            self.within(confidence), self._shells((1.0 - confidence) / 2.0),
         )  # fmt: skip
         return Estimate(
             crash_rate=free.rate, std_error=self.std_error(), ci_low=free.low, ci_high=free.high,
@@ -244,7 +246,7 @@ class SeenShells:
     def beside(self, driver: str, statement: str, level: Level) -> tuple[float, float]:
         """Limits of a statement's rate over that of a reference driver; any where crashes lie on too few paths."""
         design, r = self.design, self._reference(driver)
-        if design.reference_rate[r] <= 0.0 or paths_that_count(design.p, self.tally) < FEWEST_PATHS:
+        if design.reference_rate[r] <= 0.0:
             return 0.0, math.inf
         return beside(design, self.cells, r, design.n_within(statement), level)
 
@@ -282,6 +284,8 @@ class SeenShells:
             found = RateLimits(tally.rate(p), 0.0, 1.0, math.inf, math.inf)
             if not (few := paths_that_count(p, tally) < FEWEST_PATHS):
                 found = combined(p, tally, self.design.n_independent, level)
+                if paths_that_count(p, tally.failed_as_crashes()) < FEWEST_PATHS:
+                    found = found._replace(high=1.0)
             testable = np.resize(self.design.available[:n_strata] or 1, p.size) > 0
             # Crashes of strata that are still to be tested may lie on other paths.
             to_come = tally.runs is not None and bool((tally.tests[testable] == 0).any())
@@ -330,16 +334,18 @@ class SeenShells:
         return tuple(shell(s, name) for s, name in enumerate(design.strata))
 
     def _warnings(self, free: RateLimits) -> list[Note]:
-        design, tally, found = self.design, self.tally, []
+        design, tally, found = self.design, self.tally, list[Note]()
         if empty := [name for name, n in zip(design.strata, tally.tests, strict=True) if n == 0]:
             found.append(note("untested", shells=empty))
-        n_crashes, outside = int(tally.crashes.sum()), int(tally.crashes[design.n_inside :].sum())
+        (n, n_crashes, n_failed), outside = tally.totals, int(tally.crashes[design.n_inside :].sum())
         if design.shadow_runs and n_crashes and free.low <= 0.0 and free.from_pool < math.inf:
             alone = free.from_pool_relative()[0]
             found.append(note("runs_leave_nothing", n=n_crashes, runs=design.n_paths, alone=alone))
         kept = zip(design.strata, tally.tests, design.available, strict=False)
-        if used_up := [name for name, n, available in kept if n >= available > 0]:
+        if used_up := [name for name, tests, available in kept if tests >= available > 0]:
             found.append(note("used_up", shells=used_up))
         if outside:
             found.append(note("refuted", n=outside, boundary=design.boundary))
+        if n_failed:
+            found.append(note("failed", n=n_failed, of=n))
         return found

@@ -12,6 +12,7 @@ from harness.estimators.block import SamplingPlan
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
+from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.shells import SeenShells
 from harness.estimators.tally import (
     FEWEST_PATHS,
@@ -26,7 +27,8 @@ from harness.estimators.tally import (
     paths_that_count,
     pool_variance,
 )
-from harness.strata import Reference
+from harness.families.protocol import Exposure
+from harness.strata import ASSUMPTION_FREE, Reference
 from tests.estimators.small_blocks import EXACT, SHELLS, in_shells, tally
 
 P, LEVEL = SHELLS.p, Level.two_sided(0.9)
@@ -270,6 +272,26 @@ def test_it_is_the_number_of_equal_paths_and_the_guard_tells_few_from_many(n_pat
     numbers = np.array([paths_that_count(np.ones(2), each) for each in drawn])
     assert np.mean(1.0 / numbers) == pytest.approx(1.0 / n_paths, rel=0.05)
     assert np.all((numbers < FEWEST_PATHS) == (n_paths < FEWEST_PATHS))
+
+
+@pytest.mark.parametrize("on", [1, 100])
+def test_a_run_ends_on_the_interval_that_is_written_also_where_failed_tests_lie_on_few_paths(on):
+    """400 crashes, each on a path of its own, and 100 failed tests, on one path or on 100."""
+    n, k = 4000, np.arange(4000)
+    crash, failed, reference = k < 400, (k >= 400) & (k < 500), (Reference("r157-cc", "a driver"),)
+    design = replace(SHELLS, strata=("careful",), cell_stratum=(0,), cell_references=(0,), cell_p=P[:1], n_inside=1)
+    design = replace(design, n_paths=2000, candidates=10**9, references=reference, reference_rate=np.array([1e-5]))
+    block = in_shells([0] * n, crash, failed)
+    walked = {"shadow": np.where(crash, k, 1000 + k % on), "step": k, "event_mass": np.full(n, 1e-4)}
+    columns = {**block.columns, **walked, "cell_mass": block.columns["cell_mass"][:, :1]}
+    design = replace(design, reference_square=np.array([1e-9]))
+    block = replace(block, columns=columns, drawn=SamplingPlan("shells", shells=design))
+    seen, written = SeenShells.of_blocks([block]), one_pass([block], ("shells",)).headline_estimate
+    assert seen.limits(LEVEL)[1:3] == (written.ci_low, written.ci_high)
+    assert seen.limits(LEVEL).rhw == written.rhw
+    hour = PerHour([OfFamily("cut_in", Exposure(1.0, 1.0, 1.0, None, ""), seen)])
+    highs = written.ci_high == 1.0, seen.beside("r157-cc", ASSUMPTION_FREE, LEVEL)[1] == math.inf
+    assert (*highs, hour.limits(LEVEL).high == math.inf) == (on == 1,) * 3
 
 
 def test_plain_means_do_not_know_what_to_do_with_shells():
