@@ -268,8 +268,8 @@ def begun(places: Places, workers: int | None, progress: Progress) -> Iterator[l
             progress.remark = ""
             yield runs
         except BaseException:
-            for each in runs:
-                each.run.written("interrupted")
+            for run in [each.run for each in runs if not each.run.is_behind]:  # else a file that no manifest lists
+                run.written("interrupted")
             raise
 
 

@@ -109,6 +109,17 @@ def test_a_resumption_that_would_give_up_tests_is_refused_and_costs_nothing(runs
         assert files(folder) == before
 
 
+def test_a_resumption_that_is_interrupted_before_it_has_caught_up_leaves_no_file(runs, tmp_path):
+    """Nor what it had read by then, in a file beside the one that the manifest lists."""
+    interrupted = Progress()
+    interrupted.advance = Mock(side_effect=[None, None, KeyboardInterrupt])
+    out = copy_of(runs / "loose", tmp_path / "run")
+    before = files(out)
+    with pytest.raises(KeyboardInterrupt):
+        run_here(campaign(*COMMON, TIGHT), out, resume=True, progress=interrupted)
+    assert files(out) == before
+
+
 def test_a_spent_budget_is_exit_code_4_and_can_be_enlarged(runs, tmp_path):
     out = tmp_path / "run"
     result = run_here(campaign(*COMMON, "stop.episodes=130", "stop.rhw=0.01"), out)
