@@ -162,8 +162,6 @@ def _run(
                 break
         for underway in runs.values():
             underway.require_tests()
-    for underway in runs.values():
-        underway.run.require_no_fewer()
     results = {name: underway.finish(rule, of_sum=True) for name, underway in runs.items()}
     if campaign.accept is not None:  # tests that were cut off count as crashes in its decision alone
         seen = {name: SeenShells.of_blocks(underway.run.blocks) for name, underway in runs.items()}

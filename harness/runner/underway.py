@@ -180,13 +180,14 @@ class Underway:
         return self.drive(round_requests(tested, added, *places) if added.any() else (), rule)
 
     def require_tests(self) -> None:
-        """Refuse a run of few tests that did not fail, or without any (`HarnessError`)."""
+        """Refuse a run of few tests that did not fail, without any, or of fewer than were there (`HarnessError`)."""
         if not self.run.n_episodes:
             campaign = self.run.resolved.campaign
             found = f"{campaign.stop.episodes}, spent before a test of {campaign.scenario}"
             mend = "Raise it and go on with --resume, or lower testing.shells.first_tests."
             raise CampaignError("stop.episodes", found, "some tests of each scenario", mend)
         self.run.require_few_failed()
+        self.run.require_no_fewer()
 
     def doubted(self) -> tuple[int, int]:
         """What keeps a limit from being accepted, by number of tests: see `Decision`."""

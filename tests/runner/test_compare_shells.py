@@ -22,7 +22,7 @@ from harness.runner.workers import ShardRunner, Workers
 from tests.in_process import one_process, run_here, without_page
 from tests.pool.conftest import SMALL_POOL
 from tests.runner.conftest import campaign
-from tests.stored_runs import manifest
+from tests.stored_runs import copy_of, manifest
 
 SHELLS = (
     *("testing.method=shells", "testing.shells.statement=library", "stop.rhw=0.15", "stop.episodes=3000"),
@@ -122,6 +122,17 @@ def test_a_stored_run_of_a_is_taken_over(done, campaigns, tmp_path, driven):
     assert sum(driven) == manifest(tmp_path / "out" / "a")["n_episodes"] + done.content["n_pairs"]
     with pytest.raises(RunFolderError, match="a run of campaign"):
         compare_campaigns(*campaigns, tmp_path / "other", stored=done.folder / "b")
+
+
+def test_no_test_that_is_there_is_thrown_away_where_a_file_is_gone(done, campaigns, tmp_path):
+    """As none is by a run: what follows the gone ones is driven anew, or stays where less is asked for."""
+    out = copy_of(done.folder, tmp_path / "out")
+    next((out / "b" / "episodes").iterdir()).unlink()
+    before = manifest(out / "b")
+    with pytest.raises(RunFolderError, match="finished tests, of which the campaign as it is asked for now would keep"):
+        compare_campaigns(*campaigns, out, workers=1, rhw=0.5)
+    assert manifest(out / "b") == before
+    assert compare_campaigns(*campaigns, out, workers=1, rhw=0.15).content == done.content
 
 
 @pytest.mark.slow
