@@ -292,22 +292,20 @@ def require_controller(av: AutomatedVehicle) -> str | None:
 
 
 def script_step_s(av: AutomatedVehicle) -> float:
-    """How often a TraCI script is asked (s), as far as its text says; 0 of any other controller."""
-    name = str(av.controller)
-    return _step_length(file_and_function(name)[0]) if is_script(name) else 0.0
+    """How often a TraCI script is asked (s), as it asks for when it is tried; 0 of any other controller."""
+    if not is_script(name := str(av.controller)):
+        return 0.0
+    from harness.controllers.traci_ego import steps_asked  # noqa: PLC0415 - few campaigns have one
+
+    if not (every := run_apart(av, steps_asked, av)):
+        _tell_no_step_length(real_path(file_and_function(name)[0]).name)
+    return STEP_S * (every or 1)
 
 
 @cache
-def _step_length(file: str) -> float:
-    """What a script or the .sumocfg that it names says (s); where neither does, a note: SUMO would ask less often."""
-    script = real_path(file)
-    named = filter(Path.is_file, map(Path, re.findall(r"[\w./-]+cfg\b", script.read_text("utf-8", errors="replace"))))
-    text = "\n".join(each.read_text("utf-8", errors="replace") for each in (script, *named))
-    if "step-length" not in text:
-        told = "names no --step-length, nor does a .sumocfg of its: it is asked every 0.1 s; SUMO's default is 1 s"
-        sys.stderr.write(f"note: {script.name} {told}.\n")
-    found = re.search(r"step-length\W+(?:value\W+)?(\d*\.?\d+)", text)
-    return float(found[1]) if found else STEP_S
+def _tell_no_step_length(script: str) -> None:
+    told = "names no --step-length, nor does a .sumocfg of its: it is asked every 0.1 s; SUMO's default is 1 s"
+    sys.stderr.write(f"note: {script} {told}.\n")
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:

@@ -64,7 +64,8 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
 class _AnyName(str):
     """The AV's name as long as nobody knows it: whatever a script holds it against, which is ``asked``."""
 
-    asked: dict[str, None]
+    def __init__(self, _name: str) -> None:
+        self.asked = dict[str, None]()
 
     def __eq__(self, other: object) -> bool:
         if type(other) is str and other not in OTHERS:
@@ -111,7 +112,6 @@ def _found(script: TraciScript) -> tuple[str | None, str]:
     Names are first taken as they come, each for the AV; those that came are then tried, one after the other.
     """
     anybody = _AnyName(VEH_ID)
-    anybody.asked = {}
     commanded, wrong = _commanded(script, anybody)
     named = [name for name in commanded if name is not anybody]
     for name in dict.fromkeys((named + list(anybody.asked)) or [VEH_ID] * bool(commanded)):
@@ -136,12 +136,21 @@ def _commanded(script: TraciScript, ego: str) -> tuple[list[str], str]:
     return list(tried.commanded), ""
 
 
-def _drive(controller: ScriptController) -> None:
-    """Ten seconds, in which a car that is 10 m/s slower cuts in 12 m ahead."""
+def steps_asked(av: AutomatedVehicle) -> int:
+    """Of how many of the harness's steps one of a script's is, as it asks for before its first; 0 where it does not."""
+    tried = _Tried(av.traci_style.ego or _AnyName(VEH_ID))
+    controller = ScriptController(TraciScript(str(av.controller), dict(av.parameters)), lambda *_: tried)
+    with (guard := Guard(av.limits)):
+        guard.call(_drive, controller, 1, makes=True)
+    return controller.traci.every
+
+
+def _drive(controller: ScriptController, n_steps: int = 100) -> None:
+    """By default ten seconds, in which a car that is 10 m/s slower cuts in 12 m ahead."""
     controller.start(EpisodeStart(0, STEP_S, np.random.default_rng(0), SPEED_MPS))
     position = acceleration = 0.0
     speed, bv_position, cut_in = SPEED_MPS, 60.0, False
-    for step in range(100):
+    for step in range(n_steps):
         gap = bv_position - VEHICLE_LENGTH_M - position
         cut_in = cut_in or gap < 12.0 or step > 60
         ahead = (gap, 15.0) if cut_in and gap > -10.0 else (math.inf, math.nan)

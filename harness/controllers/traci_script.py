@@ -34,6 +34,7 @@ _ROUNDING = 1e-9
 _PATIENCE = 100
 """Steps that a script may ask for when its simulation has ended; a loop that no error ends is left where it is."""
 _LEFT = list[greenlet]()
+_OF_LIBSUMO = "FatalTraCIError", "StepListener", "TraCIException", "setLegacyGetLeader"
 _VERSION = 22, "SUMO 1.28.0"
 _OF_SIMULATION = {
     0x66: "getTime", 0x71: "getLoadedNumber", 0x72: "getLoadedIDList", 0x73: "getDepartedNumber",
@@ -115,8 +116,8 @@ class ScriptTraci(Traci):
         self._listeners: dict[int, Any] = {}
         self._n_listeners = self._n_after = 0
         self.importing = False
-        self.every = 1
-        """Steps of the harness in one of the script's."""
+        self.every = 0
+        """Steps of the harness in one of the script's; 0 where it asks for none, and they are the same."""
 
     @property
     def StepListener(self) -> type:
@@ -124,7 +125,7 @@ class ScriptTraci(Traci):
 
     @property
     def __all__(self) -> list[str]:
-        return [name for name in dir(self) if name[0] != "_" and name not in ("see", "end")]
+        return [name for name in dir(self) if name in {*importlib.import_module("traci").__all__, *_OF_LIBSUMO}]
 
     def see(self, now: Observation) -> None:
         """Take in what is there before a step."""
@@ -333,7 +334,7 @@ class TraciScript:
 class ScriptController:
     """Runs a script once a test; see `harness.controllers.VehicleController`."""
 
-    _traci: ScriptTraci
+    traci: ScriptTraci
 
     def __init__(self, script: TraciScript, vehicle: Callable[[float, str, str], VehicleDomain]) -> None:
         self._script, self._vehicle = script, vehicle
@@ -345,22 +346,22 @@ class ScriptController:
         """See `harness.controllers.VehicleController`."""
         with suppress(ScriptError):  # the last test's
             self.close()
-        self._traci = ScriptTraci(self._vehicle(episode.set_speed_mps, episode.lv_name, episode.bv_name))
+        self.traci = ScriptTraci(self._vehicle(episode.set_speed_mps, episode.lv_name, episode.bv_name))
         self._left, seed = 0, partial(episode.random.integers, 2**63)
-        self._run = greenlet(partial(self._script.run, self._traci, lambda: int(seed())))
+        self._run = greenlet(partial(self._script.run, self.traci, lambda: int(seed())))
 
     def step(self, observation: Observation) -> float:
         """See `harness.controllers.VehicleController`."""
         if not self._left:
-            self._traci.see(observation)
+            self.traci.see(observation)
             self._turn()
-            self._held, self._left = self._traci.vehicle.next_acceleration(), self._traci.every
+            self._held, self._left = self.traci.vehicle.next_acceleration(), self.traci.every or 1
         self._left -= 1
         return self._held
 
     def told_at(self) -> str:
         """`` (my_script.py:12)``: where the script gave its last command; and if ``decel`` did not bound it, why."""
-        file, line, mode = self._traci.vehicle.told_at
+        file, line, mode = self.traci.vehicle.told_at
         return f" ({Path(file).name}:{line}){'' if mode & DECEL else LOOSE.format(mode)}"
 
     def _turn(self) -> None:
@@ -373,14 +374,14 @@ class ScriptController:
             sys.argv = argv
         if RefusedError.last is not None:
             raise RefusedError.last
-        self._traci.require_unfinished(dead=self._run.dead)
+        self.traci.require_unfinished(dead=self._run.dead)
 
     def close(self) -> None:
         """Let the last run meet the end of its simulation; what it raises then is nobody's concern."""
         run, self._run = self._run, None
         if not run or run.dead:  # a greenlet is true while it runs
             return
-        self._traci.end()
+        self.traci.end()
         with suppress(Exception, SystemExit):
             run.switch()
         if not run.dead:

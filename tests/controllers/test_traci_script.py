@@ -215,7 +215,7 @@ def test_a_step_of_the_script_is_as_long_as_it_asks_for(tmp_path):
     assert hardest == pytest.approx([-3.0, -4.5, -4.5, -4.5], abs=1e-9)
 
 
-def test_one_that_names_none_is_told_so_once(tmp_path, capsys):
+def test_how_often_it_is_asked_is_what_it_asks_for_and_one_that_names_none_is_told_so_once(tmp_path, capsys):
     body, folder = text("traci.vehicle.setSpeed('ego', 20.0)"), tmp_path / "my.pyenv"
     folder.mkdir()
     (tmp_path / "my.sumocfg").write_text('<c><time><step-length value="0.2"/></time></c>', "utf-8")
@@ -223,11 +223,16 @@ def test_one_that_names_none_is_told_so_once(tmp_path, capsys):
         "none.py": body,
         "some.py": body.replace('"sumo"', '"sumo", "--step-length=0.1"'),
         "cfg.py": body.replace('"sumo"', f'"sumo", "-c", "{tmp_path}/my.sumocfg"'),
+        "named.py": "STEP = .2\n" + body.replace('"sumo"', '"sumo", "--step-length", str(STEP)'),
+        "remark.py": "# --step-length 0.2\n" + body.replace('"sumo"', '"sumo", "--step-length=.1"'),
+        "action.py": body.replace('"sumo"', '"sumo", "--default.action-step-length", "0.2", "--step-length", "0.1"'),
     }
     for name, script in scripts.items():
         (folder / name).write_text(script, "utf-8")
         for _ in range(2):
-            assert script_step_s(load_campaign(str(folder / name)).av) == (0.2 if name == "cfg.py" else 0.1)
+            assert script_step_s(load_campaign(str(folder / name)).av) == (
+                0.2 if name in ("cfg.py", "named.py") else 0.1
+            )
     (note,) = capsys.readouterr().err.splitlines()
     assert note.startswith("note: none.py names no --step-length")
 

@@ -1,8 +1,10 @@
 """Names of the module in the script's own, a server that is joined, steps by their time."""
 
+every = importing = step = "the script's own"
 from traci import *
 from traci.exceptions import FatalTraCIError, TraCIException
 
+assert every is importing is step
 assert issubclass(StepListener, object)
 init(8813, label="a")
 setOrder(1)
