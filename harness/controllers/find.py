@@ -36,6 +36,7 @@ from harness.processes import Child, WorkerDeath, first_to_answer, tell
 from harness.vehicles.kinematics import STEP_S
 
 _Answer = TypeVar("_Answer")
+_tell_once = cache(lambda note: sys.stderr.write(f"note: {note}.\n"))
 
 
 class AvEndedProcessError(HarnessError):
@@ -298,14 +299,9 @@ def script_step_s(av: AutomatedVehicle) -> float:
     from harness.controllers.traci_ego import steps_asked  # noqa: PLC0415 - few campaigns have one
 
     if not (every := run_apart(av, steps_asked, av)):
-        _tell_no_step_length(real_path(file_and_function(name)[0]).name)
+        told = "names no --step-length, nor does a .sumocfg of its: it is asked every 0.1 s; SUMO's default is 1 s"
+        _tell_once(f"{real_path(file_and_function(name)[0]).name} {told}")
     return STEP_S * (every or 1)
-
-
-@cache
-def _tell_no_step_length(script: str) -> None:
-    told = "names no --step-length, nor does a .sumocfg of its: it is asked every 0.1 s; SUMO's default is 1 s"
-    sys.stderr.write(f"note: {script} {told}.\n")
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:

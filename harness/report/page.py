@@ -31,7 +31,8 @@ def write_page_of(run: RunFolder) -> Path:
     plots = _plots(run, summary)
     gallery, scenes = crash_gallery(run, summary)
     answer = short_answer(run.campaign, run.manifest, run.estimates)
-    page = write_page(
+    _write_plots(folder / "plots", plots)
+    return write_page(
         folder / "report.html", "report.html.j2",
         run=run, answer=answer, summary=summary, gallery=gallery, scenes=scenes, lateral=lateral_facts(run),
         figures={plot.name: plot for plot in plots}, family=family, words=family.words, shown=shown_of(family),
@@ -40,8 +41,6 @@ def write_page_of(run: RunFolder) -> Path:
         warnings=[*answer.warnings, *uncovered(run, summary)], diagnostics=diagnostics(run),
         settings=dump_campaign(run.campaign), folder=run.typed,
     )  # fmt: skip
-    _write_plots(folder / "plots", plots)
-    return page
 
 
 def write_hours(folder: Path, content: dict[str, Any]) -> Path:

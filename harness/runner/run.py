@@ -88,7 +88,6 @@ def run_campaign(
     with taken({out: resolved}, resume=resume) as places:
         with begun(places, workers, progress) as (underway,):
             rule = underway.drive_tests()
-        underway.run.require_no_fewer()
         return underway.finish(rule)
 
 

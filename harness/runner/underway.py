@@ -159,7 +159,7 @@ class Underway:
         for shard in chain.from_iterable(self.drive(requests, rounds.rule) for requests in rounds):
             if rounds.enough(shard.block):
                 break
-        self.run.require_few_failed()
+        self.require_tests()
         return rounds.rule
 
     def drive(self, requests: Iterable[ShardRequest], rule: Rule) -> Iterator[ShardResult]:
