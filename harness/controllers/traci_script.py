@@ -127,10 +127,6 @@ class ScriptTraci(Traci):
     def __all__(self) -> list[str]:
         return [name for name in dir(self) if name in {*importlib.import_module("traci").__all__, *_OF_LIBSUMO}]
 
-    def see(self, now: Observation) -> None:
-        """Take in what is there before a step."""
-        self.vehicle.see(now)
-
     def end(self) -> None:
         """Nobody is left."""
         self.simulation.over, self.simulation.arrived = True, self.vehicle.getIDList()
@@ -237,7 +233,8 @@ def _step_length(options: Sequence[str]) -> tuple[str, str] | None:
 
 def _hand_over() -> None:
     harness = getcurrent().parent
-    assert harness is not None
+    if harness is None:
+        raise RefusedError("traci.simulationStep is refused in a thread: call it where the script begins.")
     harness.switch()
 
 
@@ -353,7 +350,7 @@ class ScriptController:
     def step(self, observation: Observation) -> float:
         """See `harness.controllers.VehicleController`."""
         if not self._left:
-            self.traci.see(observation)
+            self.traci.vehicle.see(observation)
             self._turn()
             self._held, self._left = self.traci.vehicle.next_acceleration(), self.traci.every or 1
         self._left -= 1
@@ -366,7 +363,6 @@ class ScriptController:
 
     def _turn(self) -> None:
         assert self._run is not None
-        RefusedError.last = None
         argv, sys.argv = sys.argv, self._script.argv
         try:
             self._run.switch()

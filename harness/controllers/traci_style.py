@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from harness.controllers.protocol import EpisodeStart, Observation
-from harness.controllers.traci_refused import Domain, FatalTraCIError, TraCIException
+from harness.controllers.traci_refused import Domain, FatalTraCIError, RefusedError, TraCIException
 from harness.controllers.traci_vehicle import VEH_ID, VehicleDomain
 from harness.vehicles.kinematics import STEP_S
 
@@ -95,6 +95,8 @@ class TraciStyleController:
         traci = self._traci
         traci.see(observation)
         self.on_step(traci, VEH_ID, observation.time_s)
+        if RefusedError.last is not None:
+            raise RefusedError.last
         return traci.vehicle.next_acceleration()
 
 

@@ -115,7 +115,8 @@ class VehicleDomain(Domain):
         """How often the script is asked, whose commands hold until then."""
 
     def see(self, now: Observation) -> None:
-        """Take in what is there before a step."""
+        """Take in what is there before a step; what was refused before it is forgotten."""
+        RefusedError.last = None
         for other, there in ((self._lv, now.lv), (self._bv, now.bv)):
             change = there.speed_mps - other.speed if self._begun else math.nan  # also where it was not seen before
             other.acceleration = 0.0 if math.isnan(change) else change / self.step_s
@@ -260,8 +261,6 @@ class VehicleDomain(Domain):
     def setAcceleration(self, vehID: str, acceleration: float, duration: float) -> None:
         """Accelerate (m/s²) for a duration (s)."""
         self._require_own(vehID, "setAcceleration")
-        if not duration >= 0.0:  # nan is not, either
-            raise TraCIException("Duration must not be negative.")
         self._begin(partial(self._accelerate, _finite(acceleration), duration), duration)
 
     def slowDown(self, vehID: str, speed: float, duration: float) -> None:
@@ -269,11 +268,11 @@ class VehicleDomain(Domain):
         self._require_own(vehID, "slowDown")
         if not speed >= 0.0:
             raise TraCIException("Speed must not be negative.")
-        if not duration >= 0.0:  # nan is not, either
-            raise TraCIException("Invalid time interval.")
         self._begin(partial(self._approach, _finite(speed), duration), duration)
 
     def _begin(self, command: Callable[[], Iterator[float]] | None, duration: float) -> None:
+        if not duration >= 0.0:  # nan is not, either
+            raise TraCIException("Duration must not be negative.")
         caller = sys._getframe(2)
         self.told_at = caller.f_code.co_filename, caller.f_lineno, self._speed_mode
         self._plan = iter(()) if command is None else command()
@@ -301,12 +300,12 @@ class VehicleDomain(Domain):
     def setAccel(self, vehID: str, accel: float) -> None:
         """Bound the acceleration (m/s²) that later commands lead to."""
         self._require_own(vehID, "setAccel")
-        self._accel = accel
+        self._accel = _finite(accel, 0.0)
 
     def setDecel(self, vehID: str, decel: float) -> None:
         """Bound the braking (m/s², positive) that later commands lead to."""
         self._require_own(vehID, "setDecel")
-        self._decel = decel
+        self._decel = _finite(decel, 0.0)
 
     def setSpeedMode(self, vehID: str, speedMode: int) -> None:
         """Whether `setAccel` (bit 2) and `setDecel` (bit 4) bound commands."""
@@ -361,11 +360,12 @@ _FROM_TABLES: dict[str, Callable[..., Any]] = {
     **{name: _neighbours(mode) for mode, name in enumerate(_NEIGHBOURS)},
     **{name: _accepted(name, *row) for name, row in _ACCEPTED.items()},
 }
-for _name, _method in (*_FROM_TABLES.items(), ("getAllowedSpeed", _FROM_TABLES["getMaxSpeed"])):
+for _name, _method in (("getAllowedSpeed", _FROM_TABLES["getMaxSpeed"]), *_FROM_TABLES.items()):
+    _method.__qualname__ = f"vehicle.{_name}"  # which a TypeError names
     setattr(VehicleDomain, _name, _method)
 
 
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise TraCIException(f"{value} is no command for a vehicle.")
+def _finite(value: float, least: float = -math.inf) -> float:
+    if not math.isfinite(value) or value < least:
+        raise RefusedError(f"{value} is no command for a vehicle.")  # TraCI takes it: a script must not hide this
     return value

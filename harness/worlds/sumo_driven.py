@@ -97,8 +97,8 @@ def av_type(sumo: Mapping[str, str | float]) -> dict[str, str | float]:
             mend = did_you_mean(name, ATTRIBUTES) or "SUMO's documentation of vType lists them."
             expected = "an attribute of SUMO's vType that matters to a vehicle on a straight road"
             raise _wrong(name, f"the unknown attribute '{name}'", expected, mend)
-        if isinstance(value, bool):
-            raise _wrong(name, value, "a number or a text", "SUMO writes 1 and 0.")
+        if isinstance(value, bool) or str(value).lower().lstrip("+-") in ("nan", "inf", "infinity"):
+            raise _wrong(name, value, "a finite number or a text", "SUMO writes true and false as 1 and 0.")
     model = sumo.get("carFollowModel", DEFAULTS["carFollowModel"])
     if model not in MODELS:
         mend = did_you_mean(model, MODELS) or "Choose one of them."

@@ -115,6 +115,10 @@ AT_THE_DOOR = {
     "never calls simulationStep": NEVER_STEPS,
     r"ZeroDivisionError: division by zero \(my.py:7\)": text("traci.vehicle.setSpeed('ego', 1 / 0)"),
     r"SystemExit: no more \(my.py:7\)": text("sys.exit('no more')"),
+    "simulationStep is refused in a thread": (
+        "import concurrent.futures, traci\ntraci.simulationStep()\n"
+        "with concurrent.futures.ThreadPoolExecutor() as threads:\n    threads.submit(traci.simulationStep)\n"
+    ),
     "goes on when its simulation has ended": f"{ENDLESS}    except Exception:\n        pass\n",
     r"no answer within 0.2 s .*construction_time_s\) \(my.py:8\)": text(
         "traci.vehicle.setSpeed('ego', 9.0)\n    while True: pass"

@@ -1,5 +1,6 @@
 """The facade answers as TraCI 1.28 does (numbers below were read from a SUMO), and commands only the AV."""
 
+from contextlib import suppress
 from operator import attrgetter
 
 import numpy as np
@@ -133,6 +134,7 @@ REFUSED = [
     ),
     *((f"stays on its lane|no model of SUMO|{RATIOS}", f"vehicle.{name}", "AV", 1, 2) for name in MOVES),
     *(("the harness itself", name) for name in ("simulationStep", "close")),
+    *(("is no command", f"vehicle.{name}", "AV", bound) for name in ("setAccel", "setDecel") for bound in (NAN, -3.0)),
     ("as under speed mode 32", "vehicle.setSpeedMode", "AV", 7),
     ("stays on its lane", "vehicle.setLaneChangeMode", "AV", 1621),
     ("bumper to bumper", "vehicle.setMinGap", "AV", 2.5),
@@ -165,6 +167,23 @@ def test_an_episode_forgets_the_last_ones_command():
     assert [controller.step(seen(0.0)), controller.step(seen(0.1))] == [-1.0, -1.0]
     controller.start(start(1))
     assert controller.step(seen(0.2)) == 0.0
+
+
+def test_a_hook_that_catches_what_is_refused_fails_its_test_all_the_same():
+    class Catches(TraciStyleController):
+        def on_step(self, traci, veh_id, time):
+            with suppress(traci.TraCIException):
+                traci.vehicle.setSpeed(veh_id, NAN)
+
+    controller = Catches()
+    controller.start(start())
+    with pytest.raises(traci_vehicle.RefusedError, match="nan is no command"):
+        controller.step(seen(0.0))
+
+
+def test_a_question_without_a_vehicle_is_named(traci):
+    with pytest.raises(TypeError, match=r"vehicle.getSpeed\(\) missing 1 .* 'vehID'"):
+        traci.vehicle.getSpeed()
 
 
 def test_before_the_first_step_what_moves_is_not_known_and_all_else_is():

@@ -86,9 +86,10 @@ def test_collision_flag_and_formula_agree_for_an_av_that_keeps_a_gap_but_hardly_
     [
         ({"tao": 1.0}, "av.sumo.tao", "Did you mean 'tau'"),
         ({"tau": "short"}, "av.sumo.tau", "Cannot be parsed"),
+        ({"tau": "nan"}, "av.sumo.tau", "a finite number"),
         ({"length": 4.0}, "av.sumo.length", "Delete"),
     ],
-    ids=["misspelt", "no number", "the harness's own"],
+    ids=["misspelt", "no number", "not a number", "the harness's own"],
 )
 def test_wrong_attributes_are_named_with_what_sumo_says(attributes, where, words, capfd):
     with pytest.raises(CampaignError) as caught:
