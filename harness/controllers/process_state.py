@@ -11,6 +11,7 @@ import os
 import platform
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -80,9 +81,10 @@ class OtherModules:
         if lost := [finder for finder in self._finders if finder not in (sys.meta_path or ())]:
             sys.meta_path = [*(sys.meta_path or ()), *lost]
             changed.append("sys.meta_path")
-        if not callable(sys.excepthook):
-            sys.excepthook = sys.__excepthook__
-            changed.append("sys.excepthook")
+        for module in (sys, threading):
+            if not callable(module.excepthook):
+                module.excepthook = module.__excepthook__  # type: ignore[attr-defined]
+                changed.append(f"{module.__name__}.excepthook")
         if sys.getrecursionlimit() < self._depth:
             sys.setrecursionlimit(self._depth)
             changed.append("sys.setrecursionlimit")

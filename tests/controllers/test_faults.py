@@ -231,6 +231,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "harness.controllers.hosts.Guard",
         "harness.loop.loop.judge",
         "sys.excepthook",
+        "threading.excepthook",
         "sys.meta_path",
     ],
 )
