@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 WATCHED = (
-    *("builtins", "math", "json", "os", "pickle", "signal", "struct", "time"),
+    *("builtins", "functools", "io", "math", "json", "os", "pickle", "signal", "struct", "time"),
     *("numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
 )
 OURS = "harness", "numba", "llvmlite", "numpy"

@@ -232,6 +232,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "harness.loop.loop.judge",
         "sys.excepthook",
         "threading.excepthook",
+        "io.BytesIO",
         "sys.meta_path",
     ],
 )
