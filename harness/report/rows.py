@@ -162,7 +162,7 @@ def ratio_texts(found: Mapping[str, Any], *, wide: bool, from_below: bool, softe
 
     That a vehicle crashes less is said with a reserve where it has ``softened`` the events (`n_softened`).
     """
-    less = "crashes less, but see !" if softened else "crashes less"
+    less = "crashes less, see !" if softened else "crashes less"
     low, high, seen = found["ratio_low"], end(found["ratio_high"]), found["ratio"]
     most = "no limit" if math.isinf(high) else ratio(high)
     if not seen:

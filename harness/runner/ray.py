@@ -29,7 +29,6 @@ from harness.controllers.find import require_controller
 from harness.errors import CampaignError, HarnessError
 from harness.processes import Child, WorkerDeath, fit_to_travel, usable_cpus
 from harness.resolved import Resolved
-from harness.runner.kept import cpu_name
 from harness.runner.workers import CLOSING_S, LocalWorkers, Result, WorkerLostError, Workers
 from harness.sampling import source_of
 from harness.signals import handlers_restored
@@ -51,12 +50,12 @@ Files = Mapping[str, ray.ObjectRef]
 # -- on another machine --
 
 
-def this_machine(resolved: Resolved, controller_sha256: str | None) -> tuple[dict[str, str | None], str]:
-    """What must be equal on all machines, and the name of this one's processor."""
+def this_machine(resolved: Resolved, controller_sha256: str | None) -> dict[str, str | None]:
+    """What must be equal on all machines."""
     packages = ["harness", *(["libsumo"] if resolved.campaign.world.engine == "sumo" else [])]
     versions = {package: metadata.version(package) for package in packages}
     sources = {"sources of its kernels": source_hash(), "source of the controller": controller_sha256}
-    return {**versions, **sources}, cpu_name()
+    return {**versions, **sources}
 
 
 class OnMachine:
@@ -68,7 +67,7 @@ class OnMachine:
         self._worker: Child | None = None
         self._follows = False
 
-    def begin(self, cached: Files) -> tuple[dict[str, str | None], str] | Exception:
+    def begin(self, cached: Files) -> dict[str, str | None] | Exception:
         """Fill the cache, and say what there is."""
         try:
             for name, content in cached.items():
@@ -168,8 +167,7 @@ class RayWorkers(Workers):
         self.where = f" on {n_machines} machine{'s' * (n_machines > 1)} at {address}"
         self.ready: list[RayWorker] = []
         self._starting: list[RayWorker] = []
-        self._here = this_machine(resolved, resolved.controller_sha256)[0]
-        self._cpus: set[str] = set()
+        self._here = this_machine(resolved, resolved.controller_sha256)
         self._lost_at_start, self._patient_until = 0, time.monotonic() + PATIENCE_S
         self.baseline: list[ray.ObjectRef[bytes]] = []
         """Baseline runs, once they have all been made."""
@@ -185,9 +183,6 @@ class RayWorkers(Workers):
             num_gpus=settings.resources.gpus / n_runs,
             runtime_env=None if is_ours else environment,  # of ours it is the whole job's
         )
-
-    def cpus(self) -> set[str]:
-        return self._cpus
 
     def follow_from(self, baseline: bytes) -> None:
         self.baseline = [ray.put(baseline)]
@@ -213,17 +208,16 @@ class RayWorkers(Workers):
     def _admit(self, worker: RayWorker) -> None:
         """Let a worker in that is ready, if it is one of ours."""
         try:
-            machine = worker.result()
+            made_of = worker.result()
         except RuntimeEnvSetupError as error:
             raise _wrong_environment(error) from error
-        if machine is None:
+        if made_of is None:
             self._lost_at_start += 1
             if self._lost_at_start == STARTS:
                 found, expected = f"{STARTS} workers in a row, lost while they began", "machines on which it starts"
                 mend = "Install the same harness on all of them, and look at Ray's logs there (/tmp/ray)."
                 raise WorkerLostError("run.executor", found, expected, mend)
             return
-        made_of, cpu = machine
         for what, here in self._here.items():
             if (there := made_of.get(what)) != here:
                 expected = f"{here}, as here: all must run the same code"
@@ -231,7 +225,6 @@ class RayWorkers(Workers):
                 mend += "(working_dir), or install its package on all machines."
                 raise HarnessError("run.executor", f"a machine with {what} {there}", expected, mend)
         self._lost_at_start = 0
-        self._cpus.add(cpu)
         self.ready.append(worker)
 
     def _tell_of_waiting(self) -> None:

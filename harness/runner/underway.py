@@ -35,7 +35,7 @@ from harness.progress import Progress
 from harness.records.folder import ESTIMATES, MILDER, SHELLS, parquet, sole_use, write_sealed
 from harness.records.reader import ShownTests
 from harness.resolved import Resolved
-from harness.runner.kept import Run, cpu_name, require_few_failed, require_own_folder, require_same_pool, take_over
+from harness.runner.kept import Run, require_few_failed, require_own_folder, require_same_pool, take_over
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
 from harness.sampling.paths import (
@@ -209,8 +209,6 @@ class Underway:
             decided["decision"] = decision.to_json()
         decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
         decided["remedy"] = pool_remedy(rule, campaign, stopped_by) or None
-        if cpus := self.crew.cpus():  # bits may have come from any of them
-            run = run.noting(cpu=", ".join(sorted({cpu_name(), *cpus})))
         ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
         ended["wall_time_s"] = run.took_s  # told as it is written
         run = run.written("done", **ended)

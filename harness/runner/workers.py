@@ -163,10 +163,6 @@ class Workers:
         """Hand over all baseline runs, as a Parquet file, before the first test that follows from them."""
         raise NotImplementedError
 
-    def cpus(self) -> set[str]:
-        """Names of the processors of other machines that have worked: bits are promised for one family."""
-        return set()
-
     def close(self) -> None:
         """Stop all workers, finished or not; those that are idle may release their controllers first."""
         for worker in self._busy:

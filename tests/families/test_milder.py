@@ -176,7 +176,7 @@ def test_many_events_that_it_made_milder_are_more_than_a_tenth(behind, braked, w
     assert n_softened(acts) == n
     reference = {"ratio": 0.5, "ratio_low": 0.4, "ratio_high": 0.6}
     less, _ = ratio_texts(reference, wide=False, from_below=False, softened=n > 0)
-    assert less == ("0.50 (crashes less, but see !)" if n else "0.50 (crashes less)")
+    assert less == ("0.50 (crashes less, see !)" if n else "0.50 (crashes less)")
 
 
 def test_where_somebody_changes_lanes_it_is_not_known_what_came_first():
