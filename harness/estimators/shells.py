@@ -339,9 +339,8 @@ class SeenShells:
             found.append(note("untested", shells=empty))
         (n, n_crashes, n_failed), outside = tally.totals, int(tally.crashes[design.n_inside :].sum())
         if design.shadow_runs and n_crashes and free.low <= 0.0 and free.from_pool < math.inf:
-            found.append(
-                note("runs_leave_nothing", n=n_crashes, runs=design.n_paths, alone=free.from_pool_relative()[0])
-            )
+            alone, _ = free.from_pool_relative()
+            found.append(note("runs_leave_nothing", n=n_crashes, runs=design.n_paths, alone=alone))
         kept = zip(design.strata, tally.tests, design.available, strict=False)
         if used_up := [name for name, tests, available in kept if tests >= available > 0]:
             found.append(note("used_up", shells=used_up))
