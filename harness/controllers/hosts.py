@@ -150,8 +150,8 @@ class Guard:
         Guard.n_calls += 1
         self._makes = makes
         self._since = since = monotonic()
-        signal.setitimer(signal.ITIMER_REAL, self._limits[makes][0])
         try:
+            signal.setitimer(signal.ITIMER_REAL, self._limits[makes][0])
             answer = function(*arguments)
             if self.modes.restored():
                 return answer, CHANGED_MODES

@@ -13,9 +13,10 @@ import pytest
 
 from benchmarks.kills import orphans
 from harness.campaign.campaign import Campaign
+from harness.campaign.vehicle import Limits
 from harness.cli import main
 from harness.controllers.find import build_host
-from harness.controllers.hosts import _numbers
+from harness.controllers.hosts import Guard, _numbers
 from harness.controllers.process_state import OtherModules
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED, TooManyFailedError
 from harness.printed import PRINTED
@@ -260,6 +261,13 @@ def test_what_the_process_itself_is_told_is_as_it_was():
     assert others.restored() == ["sys.setrecursionlimit", "signal.pthread_sigmask"]
     assert sys.getrecursionlimit() == depth
     assert not others.restored()
+
+
+def test_a_call_whose_time_is_over_at_once_has_failed_like_any_that_is_late(monkeypatch):
+    monkeypatch.setattr(signal, "setitimer", lambda *_: signal.raise_signal(signal.SIGALRM))
+    with Guard(Limits()) as guard:
+        _, wrong = guard.call(int)
+    assert without_place(wrong) == "StepTimeoutError: no answer within 10 s (av.limits.step_time_s)"
 
 
 def test_one_after_which_no_file_can_be_opened_is_told_so(tmp_path, capsys):
