@@ -112,8 +112,7 @@ class ConnectedProgram:
 
     def __init__(self, av: TraciProcess, n_cells: int, sumo_arguments: Sequence[str], step_time_s: float) -> None:
         self._av, self._step_time_s = av, step_time_s
-        self._port = getFreeSocketPort()
-        self._n_watched = 0
+        self._port, self._n_watched = getFreeSocketPort(), 0
         server = [str(sumo_program("sumo", "av.traci")), *sumo_arguments]
         server += ["--remote-port", str(self._port), "--num-clients", "2"]
         quiet = subprocess.DEVNULL
@@ -152,8 +151,7 @@ class ConnectedProgram:
 
         An `AVLostError` says: no answer in time (default: that of a step), or the program has ended or taken its leave.
         """
-        limit = seconds or self._step_time_s
-        began = time.monotonic()
+        limit, began = seconds or self._step_time_s, time.monotonic()
         try:
             self.connection.limit(limit)
             return ask()
@@ -321,6 +319,8 @@ class TraciWorld(SumoCells):
         """Compare what was commanded with where it is, and take over where the program's AVs are."""
         x, v = self.x.copy(), self.v.copy()
         advance(x, v, speed)
+        if gone := [name for name in self._flat if name not in found]:
+            raise _meddled(gone[0], "a vehicle that has left the road", "a vehicle that is there")
         read = np.array([[found[name][variable] for variable in _SUBSCRIBED] for name in self._flat])
         position, speed_read, lane = read.reshape(*self.x.shape, len(_SUBSCRIBED)).transpose(2, 0, 1)
         for quantity, here, wanted in (("position, m", position, x), ("speed, m/s", speed_read, v)):

@@ -25,6 +25,7 @@ FAULTS = {
     "closes": lambda traci: (traci.close(), time.sleep(600)),
     "moves_bv": lambda traci: traci.vehicle.moveTo("BV1", "cell1_1", 500.0),
     "changes_lane": changes_lane,
+    "removes_av": lambda traci: (traci.vehicle.remove("AV1"), [traci.simulationStep() for _ in range(9)]),
 }
 
 

@@ -188,6 +188,12 @@ def test_moving_what_is_not_the_clients_stops_the_run(fault, vehicle):
     assert "may only command AVs" in str(caught.value)
 
 
+def test_an_av_that_is_not_there_any_more_stops_it_too():
+    av = program(MISBEHAVING, "removes_av")
+    with pytest.raises(WorldDisagreementError, match="SUMO, AV1: found a vehicle that has left the road"):
+        run_in(TraciWorld(4, av.traci, 9.0, acts_before_event=True), av, [(0, 8)])
+
+
 def load(command, more=""):
     return smoke(f"av={{traci: {{command: '{command}'{more}}}}}")
 
