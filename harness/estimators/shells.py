@@ -126,7 +126,7 @@ class SeenShells:
         self.tally = self.cells = empty_tally(0)
         if design is not None:
             self.design, self.cells, self.tally = design, empty_tally(design.cell_p.size), empty_tally(design.p.size)
-        self._known: dict[tuple[int, Level], RateLimits] = {}  # of so many first strata
+        self._known: dict[tuple[int, int, Level], RateLimits] = {}  # of strata between two numbers
         self._on_runs: list[CrashedTests] = []
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
 
@@ -277,22 +277,22 @@ class SeenShells:
         kept = np.array(self.design.available or [math.inf])
         return max(float(np.max(self.tally.tests[kept > 0] * times / kept[kept > 0], initial=1.0)), 1.0)
 
-    def _limits(self, n_strata: int, level: Level) -> RateLimits:
-        """Of the first strata; anything is possible where crashes lie on too few paths."""
-        if (n_strata, level) not in self._known:
-            p, tally = self.design.p[:n_strata], self.tally.part(slice(0, n_strata))
+    def _limits(self, end: int, level: Level, begin: int = 0) -> RateLimits:
+        """Of strata ``begin … end - 1``; anything is possible where crashes lie on too few paths."""
+        if (key := (begin, end, level)) not in self._known:
+            p, tally = self.design.p[begin:end], self.tally.part(slice(begin, end))
             found = RateLimits(tally.rate(p), 0.0, 1.0, math.inf, math.inf)
             if not (few := paths_that_count(p, tally) < FEWEST_PATHS):
                 found = combined(p, tally, self.design.n_independent, level)
                 if paths_that_count(p, tally.failed_as_crashes()) < FEWEST_PATHS:
                     found = found._replace(high=1.0)
-            testable = np.resize(self.design.available[:n_strata] or 1, p.size) > 0
+            testable = np.resize(self.design.available[begin:end] or 1, p.size) > 0
             # Crashes of strata that are still to be tested may lie on other paths.
             to_come = tally.runs is not None and bool((tally.tests[testable] == 0).any())
             if to_come or (few and paths_that_count(p, tally, -ROOM) >= FEWEST_PATHS):
                 found = found._replace(from_pool_at_least=0.0)
-            self._known[n_strata, level] = found
-        return self._known[n_strata, level]
+            self._known[key] = found
+        return self._known[key]
 
     def _cautions(self) -> tuple[Note, ...]:
         n_paths, n = self.design.n_paths, paths_that_count(self.design.p, self.tally)
@@ -316,7 +316,7 @@ class SeenShells:
             rhw_from_pool_at_least=limits.from_pool_relative()[1],
             crash_rate_if_failed_had_crashed=inside.failed_as_crashes().rate(design.p[:n]),
             refuted=outside.totals[1] > 0, refuted_by=tuple(crashed[:MOST_NAMED]),
-            upper_bound_outside=combined(design.p[n:], outside, design.n_independent, level).high, **counts,
+            upper_bound_outside=self._limits(design.p.size, level, n).high, **counts,
         )  # fmt: skip
 
     def _shells(self, tail: float) -> tuple[Shell, ...]:

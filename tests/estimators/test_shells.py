@@ -262,6 +262,8 @@ def test_few_paths_end_nothing_while_another_stratum_is_to_be_tested(untested, a
     seen.count(design, two, place)
     limits = seen.limits(LEVEL)
     assert (limits.from_pool, limits.from_pool_at_least) == (math.inf, math.inf if sure else 0.0)
+    seen.count(replace(design, n_inside=0), empty_tally(2))
+    assert seen.within(0.9).upper_bound_outside == 1.0  # they may be all on others there, too
 
 
 @pytest.mark.parametrize("n_paths", [8, 25, 150, 500])
