@@ -10,6 +10,7 @@ even the full-throttle envelope crashes is left out, with crash probability 0, i
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from io import BytesIO
@@ -201,9 +202,7 @@ def acceleration_limit(av: AutomatedVehicle) -> float:
     """Hardest acceleration (m/s²) that an AV can reach; infinite if nothing in the harness limits it."""
     if isinstance(av.parameters, BuiltInParameters):
         return av.parameters.max_acceleration_mps2
-    if av.controller is not None or av.fmu is not None:
-        return av.limits.max_acceleration_mps2
-    return float("inf")
+    return math.inf if av.sumo is not None else av.limits.max_acceleration_mps2
 
 
 def shells_in_strata(pool: Pool, limit_mps2: float) -> list[list[int]]:

@@ -286,8 +286,8 @@ def require_same_shells(sides: Both, stored: str | Path | None = None) -> None:
         section = "limits" if av.model is None else "parameters"
         limit = f"av.{section}.max_acceleration_mps2={envelope:g}"
         mend = f"Add --set {limit}, which limits both (by default {Limits().max_acceleration_mps2:g})."
-        if av.source in ("sumo", "traci"):
-            mend = "Nothing in the harness limits what SUMO or a program drives: compare it with another such vehicle."
+        if av.source == "sumo":
+            mend = "Nothing in the harness limits what SUMO drives: compare it with another such vehicle."
         elif stored is not None and of_b:
             mend = f"Add --against {limit}, which limits B."
         elif stored is not None:

@@ -80,7 +80,7 @@ def build_world(campaign: Campaign, n_cells: int | None = None) -> World:
     if av.traci is not None:
         from harness.worlds.program import TraciWorld  # noqa: PLC0415
 
-        return TraciWorld(cells, av.traci, av.limits.step_time_s, vehicles, acts_before_event=early)
+        return TraciWorld(cells, av.traci, av.limits, vehicles, acts_before_event=early)
     from harness.worlds.sumo import SumoWorld  # noqa: PLC0415
     from harness.worlds.sumo_driven import FreshWorld, SumoAvWorld, recyclable  # noqa: PLC0415
 

@@ -32,9 +32,10 @@ from sumolib.miscutils import getFreeSocketPort
 from traci.connection import Connection
 from traci.exceptions import FatalTraCIError, TraCIException
 
-from harness.campaign.vehicle import TraciProcess
+from harness.campaign.vehicle import Limits, TraciProcess
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.processes import end
+from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import VEHICLES, BoolArray, FloatArray, Int8Array, IntArray
 from harness.worlds import AVLostError
 from harness.worlds.sumo import NEVER_PLAN_S, OBEY, SumoCells, sumo_program
@@ -42,7 +43,7 @@ from harness.worlds.twin import advance
 
 HARNESS_ORDER = 2
 """SUMO serves its clients in this order within a step, and the program is 1: the harness has the last word."""
-_POLL_S = 0.02
+_POLL_S, _ROUNDING_MPS2 = 0.02, 1e-6
 _ESTABLISHED = "01"
 _TCP_TABLE = Path("/proc/net/tcp")
 
@@ -235,14 +236,14 @@ class TraciWorld(SumoCells):
         self,
         n_cells: int,
         av: TraciProcess,
-        step_time_s: float,
+        limits: Limits,
         vehicles: Sequence[str] = VEHICLES,
         *,
         acts_before_event: bool = False,
     ) -> None:
         super().__init__(n_cells, vehicles)
         self.acts_before_event = acts_before_event
-        self._av, self._step_time_s, self._restarts_left = av, step_time_s, av.restarts
+        self._av, self._limits, self._restarts_left = av, limits, av.restarts
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._program: ConnectedProgram | None = None
         self._given_up = ""
@@ -256,7 +257,7 @@ class TraciWorld(SumoCells):
         if self._given_up:
             raise AVLostError(self._given_up)
         if self._program is None:
-            self._program = ConnectedProgram(self._av, self.n_cells, self._arguments(), self._step_time_s)
+            self._program = ConnectedProgram(self._av, self.n_cells, self._arguments(), self._limits.step_time_s)
             self._program.answer(self._begin, self._av.connect_time_s)
             self._program.watch()
             self._park(np.setdiff1d(np.arange(self.n_cells), cells))  # a program begun again knows nothing of the last
@@ -286,7 +287,8 @@ class TraciWorld(SumoCells):
     def step(self, speed: FloatArray, lane: Int8Array) -> BoolArray:
         """Speeds of released AVs are ignored.
 
-        Raises `AVLostError`: the program took no part; `WorldDisagreementError`: it moved what the harness commands.
+        Raises `AVLostError`: the program took no part; `WorldDisagreementError`: it moved what the harness commands,
+        or an AV as no vehicle can.
         """
         program = self._running()
         api = program.connection
@@ -326,6 +328,14 @@ class TraciWorld(SumoCells):
         for quantity, here, wanted in (("position, m", position, x), ("speed, m/s", speed_read, v)):
             self._require(quantity, here, wanted, commanded)
         self._require("lane", lane, self.lane, np.ones_like(commanded))
+        change = np.where(commanded, 0.0, (speed_read - self.v) / STEP_S)[:, -1]
+        least, most = self._limits.min_acceleration_mps2, self._limits.max_acceleration_mps2
+        for k in np.flatnonzero((change < least - _ROUNDING_MPS2) | (change > most + _ROUNDING_MPS2)):
+            expected, mend = (
+                f"{least:g} to {most:g} m/s² (av.limits)",
+                "Command speeds that the vehicle can reach in 0.1 s.",
+            )
+            raise WorldDisagreementError(f"SUMO, {self._names[k][-1]}", f"{change[k]:.1f} m/s²", expected, mend)
         self.x[:], self.v[:] = position, speed_read
 
     def _require(self, quantity: str, found: FloatArray, wanted: Any, which: BoolArray) -> None:

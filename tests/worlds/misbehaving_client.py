@@ -25,6 +25,7 @@ FAULTS = {
     "closes": lambda traci: (traci.close(), time.sleep(600)),
     "moves_bv": lambda traci: traci.vehicle.moveTo("BV1", "cell1_1", 500.0),
     "changes_lane": changes_lane,
+    "stops_dead": lambda traci: traci.vehicle.setSpeed("AV0", 0.0),
     "removes_av": lambda traci: (traci.vehicle.remove("AV1"), [traci.simulationStep() for _ in range(9)]),
 }
 
@@ -43,7 +44,7 @@ class Faulty:
         if self._step == FAULT_STEP and self._fault in FAULTS:
             FAULTS[self._fault](self._connection)
         if self._fault == "pushes_held_avs" and self._step > 1:
-            self._connection.vehicle.setSpeed("AV0", 3.0)
+            self._connection.vehicle.setSpeed("AV0", max(self._connection.vehicle.getSpeed("AV0") - 1.0, 3.0))
         return self._connection.simulationStep()
 
 

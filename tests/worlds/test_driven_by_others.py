@@ -140,7 +140,7 @@ def test_commands_to_an_av_that_must_hold_its_speed_are_overruled():
 
 def test_with_before_cut_in_controller_the_program_drives_from_the_start():
     av = program(MISBEHAVING, "pushes_held_avs")
-    (shard,) = run_in(TraciWorld(2, av.traci, 60.0, acts_before_event=True), av, [(0, 2)])
+    (shard,) = run_in(TraciWorld(2, av.traci, av.limits, acts_before_event=True), av, [(0, 2)])
     assert not shard.failures
     assert shard.traces[0][3, AV, 1] < shard.traces[0][0, AV, 1] - 1.0
 
@@ -191,7 +191,13 @@ def test_moving_what_is_not_the_clients_stops_the_run(fault, vehicle):
 def test_an_av_that_is_not_there_any_more_stops_it_too():
     av = program(MISBEHAVING, "removes_av")
     with pytest.raises(WorldDisagreementError, match="SUMO, AV1: found a vehicle that has left the road"):
-        run_in(TraciWorld(4, av.traci, 9.0, acts_before_event=True), av, [(0, 8)])
+        run_in(TraciWorld(4, av.traci, av.limits, acts_before_event=True), av, [(0, 8)])
+
+
+def test_nor_may_it_brake_as_no_vehicle_can():
+    av = program(MISBEHAVING, "stops_dead")
+    with pytest.raises(WorldDisagreementError, match=r"SUMO, AV0: found -[0-9.]+ m/s²; expected -15 to 10 m/s²"):
+        run_in(TraciWorld(1, av.traci, av.limits, acts_before_event=True), av, [(0, 2)])
 
 
 def load(command, more=""):
