@@ -165,6 +165,7 @@ def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
         missing = re.findall(r"argument: '(\w+)'", str(error)) or ["NAME"]
         mend = f"Give what it needs: --set av.parameters.{missing[0]}=…; or correct its code."
         mend = f"Leave out av.parameters.{wrong}." if "unexpected" in str(error) else mend
+        mend = "Write @staticmethod above load." if missing[0] == "self" else mend
         expected = f"keyword arguments of the controller: {', '.join(takes) or 'it has none'}"
         raise CampaignError("av.parameters", what, expected, did_you_mean(wrong, takes) or mend) from error
     return lambda: make(**deepcopy(parameters))

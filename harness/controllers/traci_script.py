@@ -139,8 +139,9 @@ class ScriptTraci(Traci):
         if self.simulation.n_steps:
             raise RefusedError("traci.start is refused after a step: each test is one run of the script.")
         if isinstance(cmd, list | tuple) and (found := _step_length([*map(str, cmd)])) is not None:
-            asked, where = found
-            self.every = round(float(asked) / STEP_S)
+            (asked, where), self.every = found, 0
+            with suppress(ValueError, OverflowError):  # hours and minutes, nan, infinity
+                self.every = round(float(asked) / STEP_S)
             if self.every < 1 or abs(self.every * STEP_S - float(asked)) > _ROUNDING:
                 raise RefusedError(f"{where} {asked} is refused: steps here are 0.1 s; ask for a multiple of it.")
             self.vehicle.step_s = self.simulation.step_s = self.every * STEP_S

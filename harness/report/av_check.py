@@ -7,9 +7,10 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.estimators.block import BRAKED_MPS2
 from harness.estimators.estimate import finite_json
 from harness.loop.cells import FAR_BEHIND_S
-from harness.report.words import brakes_before_words, late_words
+from harness.report.words import NEVER_BRAKED, brakes_before_words, late_words
 from harness.shown import ShownInPython
 
 SLOW_S = 0.1
@@ -171,8 +172,8 @@ def verdict(found: AvCheck) -> str:
 def _doubts(found: AvCheck) -> Iterator[str]:
     """What makes tests of the vehicle say little, the worst first."""
     seen, follows = found.behaviour, found.follows
-    if not seen.n_events or not seen.braking_share > 0.0:
-        yield f"it braked after none of {seen.n_events} {found.events}. Does it see the other vehicle?"
+    if not (seen.n_events and seen.braking_share > 0.0 and seen.min_acceleration_mps2 <= -BRAKED_MPS2):
+        yield NEVER_BRAKED
     if follows is not None and follows.n_hit:
         yield f"in {follows.n_hit} of {found.n_episodes} tests it hit the vehicle ahead before anything happened."
     if found.shows and seen.n_braked_before:

@@ -182,6 +182,9 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
         yield from too_few(traffic.n_replicates, traffic.confidence)
 
 
+NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more: does it see the other vehicle?"
+
+
 def late_words(*, script: bool) -> str:
     """That a vehicle does nothing before BV is in its lane, and what would show it."""
     what = "getLateralLanePosition" if script else "bv_lateral_m"
@@ -197,7 +200,7 @@ def brakes_before_words(n: int, *, script: bool) -> str:
 def _acts(of: Mapping[str, Any] | None) -> Iterator[str]:
     """What the vehicle did before the event, or did not after it (`before_event`), a line each."""
     if of is not None and of["n_events"] and not of["n_braked"] and not of["built_in"]:
-        yield f"it never braked with {plain(BRAKED_MPS2)} m/s² or more: does it see the other vehicle?"
+        yield NEVER_BRAKED
     if of is not None and (n := of["n_fell_behind"]) > MANY * of["n_events"] and not of["built_in"]:
         why = "which makes the event milder: let it keep up"
         yield f"in {count(n)} tests it was over {FAR_BEHIND_S:g} s behind the vehicle ahead when the event began, {why}"

@@ -259,6 +259,12 @@ class Learned(IDM):
         self.made.append(self)
 
 
+class LoadsByItself(IDM):
+    def load(self): ...
+
+    def __init__(self, loaded): ...
+
+
 class ChangesItsProcess(IDM):
     def __init__(self):
         super().__init__()

@@ -194,6 +194,7 @@ REFUSED = [
     (_of("Misbehaving", badd="x"), "av.parameters", "Did you mean 'bad'?"),
     (_of("OnlyStep", ttc=3), "av.parameters", "fix:      Leave out av.parameters.ttc.\n"),
     (_of("only_a_function"), "av.parameters", "min_acceleration_mps2"),
+    (_of("LoadsByItself"), "av.parameters", "fix:      Write @staticmethod above load.\n"),
     *(
         (_of("Always", SHORT_MADE, where="constructor", how=how), "av.controller", words)
         for how, words in IN_CONSTRUCTOR.items()

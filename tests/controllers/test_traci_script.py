@@ -139,6 +139,9 @@ AT_THE_DOOR = {
     r"--step-length 0.25 is refused: steps here are 0.1 s.*\(my.py:3\)": text("").replace(
         '"sumo"', '"sumo", "--step-length", "0.25"'
     ),
+    r"--step-length 0:00:01 is refused: steps here are 0.1 s.*\(my.py:3\)": text("").replace(
+        '"sumo"', '"sumo", "--step-length=0:00:01"'
+    ),
     "does not import traci.*Name its class or function: .*my.py:Mine": "class Mine:\n    def step(self, seen): ...\n",
 }
 
