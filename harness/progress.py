@@ -124,8 +124,8 @@ class ShownProgress(Progress):
         for task in self._bars.tasks:
             of = f" of {count(task.total)}" if task.total is not None else ""
             so_far = task.completed if task.total is None else min(task.completed, task.total)  # rounds may go beyond
-            done = f" {count(so_far)}{of}" if so_far else ""
-            yield f"{time.strftime('%H:%M:%S')} {task.description}:{done} · {_words(task)}".rstrip(" ·:")
+            told = " · ".join(filter(None, (f"{count(so_far)}{of}" if so_far else "", _words(task))))
+            yield f"{time.strftime('%H:%M:%S')} {task.description}: {told}".rstrip(" :")
 
 
 def _words(task: Task) -> str:
