@@ -373,3 +373,11 @@ def test_estimate_writes_only_when_asked(folder, capsys):
     assert main([*command, "--write"]) == 0
     assert json.loads(capsys.readouterr().out) == estimates(folder)
     assert estimates(folder)["confidence"] == 0.5
+
+
+def test_an_earlier_verdict_does_not_outlive_a_run_that_comes_to_none(tmp_path, capsys):
+    (verdict := tmp_path / "gate.xml").write_text("<testsuites/>")
+    asked = ["--accept", "r157-cc", "--junit", str(verdict), "--out", str(tmp_path / "run")]
+    assert main(["run", "tests.controllers.misbehaving:OnlyStepp", *asked]) == 2
+    assert not verdict.exists()
+    assert "error: " in capsys.readouterr().err

@@ -42,6 +42,14 @@ def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
     return checked
 
 
+def _junit_file(ctx: click.Context, parameter: click.Parameter, value: Path | None) -> Path | None:
+    """Where the verdict goes; an earlier one does not outlive a run that comes to none."""
+    path = written_file(".xml")(ctx, parameter, value)
+    if path is not None and path.is_file():
+        path.unlink()
+    return path
+
+
 set_option = click.option(
     "--set", "overrides", multiple=True, metavar="A.B=C",
     help="Replace a value of the campaign, e.g. --set stop.rhw=0.3. May be given several times. A path is relative "
@@ -98,7 +106,7 @@ def progress_bar() -> Progress:
 
 
 junit_option = click.option(
-    "--junit", type=FILE, callback=written_file(".xml"), help="Also write the result as JUnit XML, with one test case."
+    "--junit", type=FILE, callback=_junit_file, help="Also write the result as JUnit XML, with one test case."
 )
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on stdout instead of text.")
