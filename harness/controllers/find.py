@@ -300,7 +300,7 @@ def script_step_s(av: AutomatedVehicle) -> float:
     from harness.controllers.traci_ego import steps_asked  # noqa: PLC0415 - few campaigns have one
 
     if not (every := run_apart(av, steps_asked, av)):
-        told = "names no --step-length, nor does a .sumocfg of its: it is asked every 0.1 s; SUMO's default is 1 s"
+        told = "names no --step-length, nor does its .sumocfg: it is asked every 0.1 s, where SUMO would ask every 1 s"
         _tell_once(f"{real_path(file_and_function(name)[0]).name} {told}")
     return STEP_S * (every or 1)
 

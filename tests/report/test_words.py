@@ -69,6 +69,13 @@ def test_what_ended_a_run_is_said_with_what_it_rests_on(name, given, stored_run)
     assert said(read_run_folder(stored_run(name))).scope.endswith("given the library" if given else "precise enough")
 
 
+def test_a_precision_just_missed_is_told_with_the_digit_that_it_misses_by(stored_run):
+    run = read_run_folder(stored_run("shells-twin"))
+    best = replace(run.estimates.best, rhw=0.3029)
+    scope = said(run, best, golden("shells-twin", "stop.rhw=0.3"), stopped_by="episodes").scope
+    assert "at ± 30.3 % (asked: ± 30 %)" in scope
+
+
 @pytest.mark.parametrize(
     ("name", "shows", "blind", "held"),
     [
