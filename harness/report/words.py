@@ -224,8 +224,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
     if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept", "sum"):
         within = campaign.testing.shells.statement != ASSUMPTION_FREE and best.details.get("within")
         asked = end(within["rhw"]) if within else best.precision
-        told = share(asked) if share(asked) != share(target) else f"{number(100.0 * asked)} %"  # where they differ
-        reached = f", at ± {told}" if asked <= WIDEST_RHW else f", at over ± {share(WIDEST_RHW)}"
+        width = share(asked) if share(asked) != share(target) else f"{number(100.0 * asked)} %"  # where they differ
+        reached = f", at ± {width}" if asked <= WIDEST_RHW else f", at over ± {share(WIDEST_RHW)}"
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
         more = GO_ON if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
