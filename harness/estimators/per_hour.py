@@ -20,7 +20,7 @@ from harness.estimators.likelihood import Counts, Level, likelihood_limit
 from harness.estimators.shells import SeenShells
 from harness.estimators.tally import FEWEST_PATHS, RateLimits, Tally, paths_that_count, pool_variance
 from harness.families.protocol import Exposure
-from harness.strata import ASSUMPTION_FREE
+from harness.strata import ASSUMPTION_FREE, Assumed
 from harness.vocabulary import FloatArray
 
 _GRID = 13
@@ -30,13 +30,15 @@ _GRID = 13
 class OfFamily(NamedTuple):
     """Tests of one family, how often its events are met, and by which ``reading`` the competent driver acts.
 
-    A reading is a reference driver of the library by name; where it has none so called, its first one.
+    A reading is a reference driver of the library by name; where it has none so called, its first one. What is
+    ``assumed`` of who cuts in moves the probabilities of strata.
     """
 
     family: str
     exposure: Exposure
     seen: SeenShells
     reading: str = ""
+    assumed: Assumed | None = None
 
     @property
     def per_hour(self) -> float:
@@ -69,6 +71,26 @@ class OfFamily(NamedTuple):
         """Crashes per hour of the competent driver; 0 where the library has none."""
         rates = self.seen.design.reference_rate
         return self.per_hour * float(rates[self.reference]) if rates.size else 0.0
+
+    def over_assumed(self) -> list[tuple[float, float]]:
+        """Rates of the vehicle and of the competent driver at the ends of what is assumed, events per hour as well."""
+        design, of, both = self.seen.design, self.exposure, (self.rate, self.reference_rate)
+        rates = [both]
+        if self.assumed is not None and self.assumed.highest is not None and self.assumed.times is not None:
+            cells = design.cell_p * design.crashes_too(self.reference) if design.references else np.zeros(0)
+            for times in np.array(self.assumed.times) / self.events_moved[:, None]:
+                told = float(self.p * times @ self.tally.share), both[1]
+                if cells.any():
+                    told = told[0], both[1] * float(cells @ times[np.array(design.cell_stratum)] / cells.sum())
+                rates.append(told)
+        ends = [1.0] if of.counted else [of.low / of.per_hour, of.high / of.per_hour]
+        return [(end * mine, end * theirs) for end in ends for mine, theirs in rates]
+
+    @property
+    def events_moved(self) -> FloatArray:
+        """By what the probability of an event moves at both ends of what is assumed (2,): an hour's events stay."""
+        times = None if self.assumed is None else self.assumed.times
+        return np.ones(2) if times is None else np.array(times) @ self.seen.design.p / self.seen.design.p.sum()
 
     def limits(self, level: Level) -> RateLimits:
         """Rate per hour of the family alone."""
@@ -199,18 +221,13 @@ class PerHour:
         return self.ratio(level)[1:]
 
     def over_assumed(self) -> tuple[float, float] | None:
-        """The least and the largest ratio over all ends of the assumed exposures; None where it has none."""
-        ends = [
-            [of.exposure.per_hour] if of.exposure.counted else [of.exposure.low, of.exposure.high]
-            for of in self.families
-        ]
+        """The least and the largest ratio over all ends of what is assumed; None where that driver never crashes."""
         ratios = []
-        for chosen in product(*ends):
-            times = [end / of.exposure.per_hour for end, of in zip(chosen, self.families, strict=True)]
-            reference = math.fsum(t * of.reference_rate for t, of in zip(times, self.families, strict=True))
-            if reference <= 0.0:
+        for rates in product(*(of.over_assumed() for of in self.families)):
+            mine, theirs = (math.fsum(each) for each in zip(*rates, strict=True))
+            if theirs <= 0.0:
                 return None
-            ratios.append(math.fsum(t * of.rate for t, of in zip(times, self.families, strict=True)) / reference)
+            ratios.append(mine / theirs)
         return min(ratios), max(ratios)
 
     def with_exposures(self, exposures: Mapping[str, float]) -> PerHour:

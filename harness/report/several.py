@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sized
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,11 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 
 def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
+    decision, ends = content.get("decision"), content["beside"]["over_assumed"]
+    asked = decision["limit"] if decision and decision["driver"] and decision["verdict"] != "undecided" else math.nan
+    if ends is not None and ends[0] <= asked <= ends[1]:
+        over = f"{ratio(ends[0])} to {ratio(ends[1])}"
+        yield f"this verdict rests on assumed numbers: over their ranges it is {over} times the competent driver"
     for name, of in content["families"].items():
         told = list(words.warnings_of(name, {**of, "rate": of["rate_per_hour"]}, " per hour"))
         if (left := of.get("assumed")) and (found := AssumedOfRate(**left)).no_lower_limit:

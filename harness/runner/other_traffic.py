@@ -258,7 +258,9 @@ def sensitivity(
     return content
 
 
-def _of_one(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: Progress) -> Sensitivity:
+def _of_one(
+    folder: Path, ranges: Mapping[str, tuple[float, float]], progress: Progress, *, per_event: bool = False
+) -> Sensitivity:
     tested = StoredShells.of(folder, progress, _OPTION)
     require_shares(tested)
     settings, parameters = tested.here.campaign.environment, tested.here.parameters
@@ -269,6 +271,8 @@ def _of_one(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: P
         mend = f"State one, e.g. --range {number}=LOW:HIGH."
         raise CampaignError(_OPTION, found, "numbers that are said to be uncertain", mend)
     results = tested.nearby([each for move in asked for each in move.settings], progress)
+    if per_event:
+        results = (of and of.per_event() for of in results)
     bars = [bar_of(move, [next(results) for _ in move.settings]) for move in asked]
     driver = next((each.name for each in tested.design.references), "")
     bars += bar_of_readings(tested.design)
@@ -294,9 +298,9 @@ def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: P
             known: Literal["counted", "assumed"] = "counted" if exposure["counted"] else "assumed"
             bars.append(_part(Bar(f"exposure {name}", known, ends, (low, high), (1.0, 1.0), (0.0, 0.0)), *shares))
         try:
-            found = _of_one(folder / name, of_numbers[name], progress)
+            found = _of_one(folder / name, of_numbers[name], progress, per_event=True)
         except CampaignError as refused:
-            sys.stderr.write(f"note: {name} alone moves by nothing here: {refused.found}\n")
+            sys.stderr.write(f"note: {name}: nothing moves it here: {refused.found}\n")
         else:
             bars += [_part(replace(bar, what=f"{name} {bar.what}"), *shares) for bar in found.bars]
     return Sensitivity(tests_of_sum(stored), "crashes per hour", stored["beside"]["reference"], _longest_first(bars))

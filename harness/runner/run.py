@@ -35,6 +35,7 @@ from harness.resolved import Resolved, require_ready
 from harness.runner.underway import Places, RunResult, begun, doubted, exit_code, taken
 from harness.sampling.shells import HourRounds
 from harness.shown import ShownInPython
+from harness.strata import Assumed
 from harness.vocabulary import FAMILIES
 
 FAR_ABOVE = 10.0
@@ -180,13 +181,15 @@ def hour_answer(
     """The sum, with what estimates and manifest of each have ``told``; hours are kilometres as followers drive."""
     follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
     speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
+    left_open = {name: Assumed(**of) for name, (_, manifest) in told.items() if (of := manifest.get("assumed"))}
+    hour = PerHour([of._replace(assumed=left_open.get(of.family)) for of in hour.families])
     found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
     for part, (name, (estimates, manifest)) in zip(hour.families, told.items(), strict=True):
-        of, p = found["families"][name], part.seen.design.p
+        of = found["families"][name]
         of["median_impact_mps"] = None if estimates.severity is None else estimates.severity.median_mps
         of |= doubts_of(ready[name].campaign, manifest, estimates, part.per_hour)
         if (left := estimates.assumed) and left.times:  # per event, of which there are more per test in other traffic
-            low, high = (p @ np.array(manifest["assumed"]["times"]).T / p.sum()).tolist()
+            low, high = part.events_moved.tolist()
             of["assumed"] = replace(left, times=(left.times[0] / low, left.times[1] / high))
     return found
 

@@ -166,7 +166,7 @@ class StoredShells:
             rate = self.rate(now) / self.rate(p)
             if not self.holds:
                 rate = self.limit(now, at_worst=True) / self.limit(p)
-            return Nearby(now, rate, references, float(np.max(off, initial=0.0)), beyond)
+            return Nearby(now, float(now.sum() / p.sum()), rate, references, float(np.max(off, initial=0.0)), beyond)
 
         for each in traffic:
             yield None if each is None else moved(next(found))
@@ -178,10 +178,11 @@ class Nearby:
 
     ``rate`` is the vehicle's factor, ``references`` (R,) are those of the drivers, which are known, ``off`` by how much
     one of these comes out too high or too low at most, and ``beyond`` the share of the crashes in events unlike any
-    tested.
+    tested. Events are ``events`` times as probable.
     """
 
     p: FloatArray
+    events: float
     rate: float
     references: FloatArray
     off: float
@@ -191,6 +192,10 @@ class Nearby:
     def ratio(self) -> float:
         """The factor of the ratio to the first reference driver."""
         return self.rate / float(self.references[0]) if self.references[:1].any() else math.nan
+
+    def per_event(self) -> Nearby:
+        """The same of rates per event, as where events per hour stay."""
+        return replace(self, rate=self.rate / self.events, references=self.references / self.events)
 
     @property
     def refused(self) -> bool:

@@ -16,7 +16,7 @@ from harness.estimators.stopping import RoundRule
 from harness.estimators.tally import Tally
 from harness.families.protocol import Exposure
 from harness.sampling.shells import HourRounds
-from harness.strata import Reference, ShellDesign
+from harness.strata import Assumed, Reference, ShellDesign
 
 LEVEL = Level.two_sided(0.9)
 COUNTED = Exposure(0.048, 0.013, 0.123, (3, 63.0), "counted")
@@ -105,6 +105,22 @@ def test_ratio_to_the_competent_driver_and_what_assumed_exposures_do_to_it():
             ends.append(moved.rate / moved.reference_rate)
     assert hour.over_assumed() == pytest.approx((min(ends), max(ends)))
     assert math.isnan(PerHour([family("a", [1.0, 1.0], [9, 9], [1, 0], ASSUMED)]).ratio(LEVEL)[0])
+
+
+def test_who_does_not_look_moves_the_ratio_of_the_sum_while_events_per_hour_stay():
+    """One event in 41 is 11 times as probable, alone: 51/41 times as many events of a test, each less of an hour."""
+    cut_in = THREE[0]._replace(assumed=Assumed("", 0.1, ((1.0, 1.0), (11.0, 1.0)), 0.01))
+    times = 51.0 / 41.0
+    assert cut_in.events_moved == pytest.approx([1.0, times])
+    by = 11.0 / times  # the driver crashes on those events alone, and so does the vehicle
+    rates = np.array([cut_in.rate, cut_in.reference_rate])
+    assert np.array(cut_in.over_assumed()) == pytest.approx(np.array([rates, rates, by * rates]))
+    both = [(cut_in.rate * x + y * THREE[1].rate, cut_in.reference_rate * x + y * THREE[1].reference_rate)
+            for x in (1.0, by) for y in (0.2, 5.0)]  # fmt: skip
+    ratios = [mine / theirs for mine, theirs in both]
+    assert PerHour([cut_in, THREE[1]]).over_assumed() == pytest.approx((min(ratios), max(ratios)))
+    unseen = cut_in._replace(assumed=Assumed("TTC < 3 s", None, ((0.0, 1.0), (11.0, 1.0))))
+    assert PerHour([unseen, THREE[1]]).over_assumed() == PerHour(THREE[:2]).over_assumed()  # it has a line of its own
 
 
 def test_a_verdict_stays_while_a_folder_holds_further_tests():

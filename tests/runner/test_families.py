@@ -19,9 +19,11 @@ from harness.families.words import EXCLUDED
 from harness.numbers import number, plain
 from harness.pool import moved
 from harness.printed import PRINTED
+from harness.progress import Progress
 from harness.records.folder import read_manifest, write_sealed
 from harness.report.several import hour_lines
 from harness.resolved import resolve
+from harness.runner import other_traffic
 from harness.runner.compare import compare_campaigns
 from harness.runner.stored import estimate_families
 from tests.in_process import one_process, run_here, run_with_workers, without_page
@@ -229,7 +231,8 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
     """And an exposure as an answer with that exposure; a scenario that says nothing of its own is named."""
     told, folder = run.content, copy_of(run.folder, tmp_path / "run")
 
-    def of_one(where, ranges, _):
+    def of_one(where, ranges, _, *, per_event):
+        assert per_event
         if where.name == "cut_out":
             raise CampaignError("harness sensitivity", "no number", "one", "Look for one.")
         assert ranges == ({"braking.stop_share": (0.0, 0.1)} if where.name == "lead_brakes" else {})
@@ -237,7 +240,7 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
 
     monkeypatch.setattr("harness.runner.other_traffic._of_one", of_one)
     assert main(["sensitivity", str(folder), "--range", "braking.stop_share=0:0.1"]) == 0
-    assert "note: cut_out alone moves by nothing here: no number" in capsys.readouterr().err
+    assert "note: cut_out: nothing moves it here: no number" in capsys.readouterr().err
     bars = {bar["what"]: bar for bar in json.loads((folder / "sensitivity.json").read_text())["bars"]}
     assert len(bars) == 3 + 2
     for name, of in told["families"].items():
@@ -258,6 +261,17 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
     assert 'id="plot-sensitivity"' in (folder / "report.html").read_text()
     assert main(["sensitivity", str(folder), "--range", "braking.stop_shar=0:0.1"]) == 2
     assert "found:    braking.stop_shar" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("times", "warned"), [(0.9, 0), (1.1, 1)])
+def test_a_verdict_that_assumed_numbers_may_turn_says_so(run, times, warned):
+    ratio, (low, high) = run.content["beside"]["ratio"], run.content["beside"]["over_assumed"]
+    assert 1.1 * low < ratio < high
+    verdict = Decision(times * low, "assumption_free", 0.95, 0.9 * ratio, 1.1 * ratio, driver="r157-cc").to_json()
+    told = " ".join(" ".join(hour_lines({**run.content, "decision": verdict})).split())
+    assert told.count("! this verdict rests on assumed numbers: over their ranges it is") == warned
+    own = {**run.content, "decision": {**verdict, "verdict": "undecided"}}
+    assert "rests on assumed" not in " ".join(hour_lines(own))
 
 
 def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_scenario(run):
@@ -326,6 +340,20 @@ def test_what_the_answer_of_one_scenario_depends_on(run, monkeypatch):
     assert 1.5 < rates["braking.peak_scale_mps2"][1] < 3.0
     assert 1.2 < rates["braking.held_log_sd"][1] < 3.0
     assert not [name for name in rates if name.startswith("exposure")]
+
+
+def test_who_does_not_look_moves_the_answer_of_the_sum_as_sensitivity_says(run, monkeypatch):
+    """Both of events per hour that stay, as counted: not of tests, of which more would have such an event."""
+    every = other_traffic.moves
+    monkeypatch.setattr(
+        other_traffic, "moves", lambda *given: [of for of in every(*given) if of.what == "cut_in.ignore_share"]
+    )
+    (bar,) = other_traffic._of_one(run.folder / "cut_in", {}, Progress(), per_event=True).bars
+    of = run.content["families"]["cut_in"]["assumed"]
+    assert bar.rate == pytest.approx(of["times"], rel=0.01)
+    (of_tests,) = other_traffic._of_one(run.folder / "cut_in", {}, Progress()).bars
+    assert of_tests.rate[1] > 1.2 * bar.rate[1]
+    assert of_tests.ratio == pytest.approx(bar.ratio, rel=1e-12)
 
 
 def test_a_run_that_goes_on_to_another_end_says_so(run, tmp_path, capsys):

@@ -370,8 +370,8 @@ def test_what_is_not_said_to_be_uncertain_is_refused(folder, capsys, option, fou
 @pytest.mark.parametrize(("n", "ends", "off"), [(1, [0.55, 1.45], [0.05, 0.15]), (3, [None, None], [None, None])])
 def test_a_block_shows_what_is_answered_and_how_much_is_not(n, ends, off):
     """Of five replicates, n in which the reference driver comes out wrong by a factor of 3."""
-    near = [Nearby(np.ones(1), rate, np.ones(1), rate / 10.0, 0.0) for rate in np.linspace(0.5, 1.5, 5 - n)]
-    wrong = [Nearby(np.ones(1), 9.0, np.ones(1), 2.0, 0.0)] * n
+    near = [Nearby(np.ones(1), 1.0, rate, np.ones(1), rate / 10.0, 0.0) for rate in np.linspace(0.5, 1.5, 5 - n)]
+    wrong = [Nearby(np.ones(1), 1.0, 9.0, np.ones(1), 2.0, 0.0)] * n
     bar = bar_of(Move("cut-in", "fitted", None, []), [*near, *wrong])
     assert [None if math.isnan(end) else pytest.approx(end) for end in bar.rate] == ends
     assert [None if math.isnan(end) else pytest.approx(end) for end in bar.off] == off
@@ -379,6 +379,6 @@ def test_a_block_shows_what_is_answered_and_how_much_is_not(n, ends, off):
 
 
 def test_each_end_of_a_number_is_off_by_its_own():
-    near = [Nearby(np.ones(1), rate, np.ones(1), off, 0.0) for rate, off in ((0.5, 0.048), (1.5, 0.21))]
+    near = [Nearby(np.ones(1), 1.0, rate, np.ones(1), off, 0.0) for rate, off in ((0.5, 0.048), (1.5, 0.21))]
     bar = bar_of(Move("cut_in.ignore_share", "assumed", (0.0, 1.0), []), near)
     assert (bar.rate, bar.off) == ((0.5, 1.5), (0.048, 0.21))
