@@ -46,7 +46,7 @@ class PairDecision:
     It holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
     ``ratio`` are the ends of B/A by which a margin was decided, None without one.
     No margin is kept by a B with ``n_milder`` tests of which its rate says too little, nor where ``n_differing``
-    of either were not the same when they ran twice.
+    of either were not the same when they ran twice. Where A has such tests, they are ``n_milder_a``.
     """
 
     margin: float
@@ -55,16 +55,17 @@ class PairDecision:
     given_the_library: bool
     n_milder: int = 0
     n_differing: int = 0
+    n_milder_a: int | None = None
     ratio: tuple[float, float] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """What there is of it."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
-    def doubted(self, n_milder: int, n_differing: int) -> PairDecision:
-        """The same after what was seen besides the crashes that count."""
-        lost = self.margin and self.verdict == "proven" and (n_milder or n_differing)
-        return replace(self, verdict="open" if lost else self.verdict, n_milder=n_milder, n_differing=n_differing)
+    def doubted(self, of_a: int, of_b: int, n_differing: int) -> PairDecision:
+        """The same after what was seen of A and B besides the crashes that count."""
+        verdict = "open" if self.margin and self.verdict == "proven" and (of_b or n_differing) else self.verdict
+        return replace(self, verdict=verdict, n_milder=of_b, n_milder_a=of_a or None, n_differing=n_differing)
 
 
 class Interval(NamedTuple):

@@ -244,8 +244,9 @@ def _sum_written(
 
 def _decided(rule: PairRule, scenarios: Sequence[PairedScenario]) -> PairDecision:
     """What a rule has found, after what was seen besides in these scenarios."""
-    of_a, of_b = ([of.runs[side].doubted() for of in scenarios] for side in (0, 1))
-    return rule.decision.doubted(sum(n for n, _ in of_b), sum(n for _, n in (*of_a, *of_b)))
+    doubts = (zip(*(of.runs[side].doubted() for of in scenarios), strict=True) for side in (0, 1))
+    of_a, of_b = (tuple(map(sum, each)) for each in doubts)
+    return rule.decision.doubted(of_a[0], of_b[0], of_a[1] + of_b[1])
 
 
 def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: Pairs) -> dict[str, Any] | None:
