@@ -258,8 +258,9 @@ def pair_lines(
     ends = interval(asked["ci_low"], asked["ci_high"], beside=asked["difference"])
     rows.append(("A − B", number(asked["difference"]), ends, alone_words(asked)))
     families = content.get("families", {})
+    ratios = {name: ratio_words(of) for name, of in families.items()}
     parts = words.columns(
-        [(called(name), f"A / B {' '.join(ratio_words(of))}", alone_words(of)) for name, of in families.items()]
+        [(called(name), f"A / B {of}", ends, alone_words(families[name])) for name, (of, ends) in ratios.items()]
     )
     remarks = [f"! {text}" for text in pair_warnings(content)]
     if asked is not content:
