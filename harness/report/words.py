@@ -101,9 +101,9 @@ def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple
     if av.sumo is not None:
         given |= av.sumo
         name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
-    elif script:  # SUMO would know its vehicle's type
-        style = av.traci_style
-        given |= {"accel": f"{plain(style.accel_mps2)} m/s²", "decel": f"{plain(style.decel_mps2)} m/s²"}
+    elif script:  # SUMO would know its vehicle's type, whose numbers hold until the script sets others
+        of_type = av.traci_style
+        given["type"] = f"accel {plain(of_type.accel_mps2)}, decel {plain(of_type.decel_mps2)} m/s²"
         given |= {} if script == STEP_S else {"step": f"{plain(script)} s"}
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
