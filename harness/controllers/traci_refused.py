@@ -40,7 +40,7 @@ class RefusedError(TraCIException):
 
 
 class Domain:
-    """Part of the facade: what it lacks is refused with the reason, or unknown with a list of what there is."""
+    """Part of the facade: what it lacks is refused with the reason, or unknown."""
 
     _path: ClassVar[str]
 
@@ -52,7 +52,8 @@ class Domain:
         if why is None:
             public = [entry for entry in dir(type(self)) if entry[0] != "_" and entry not in _NOT_TRACIS]
             domains = [entry for entry in vars(self) if isinstance(getattr(self, entry), Domain) and entry[0] != "_"]
-            there = "" if did_you_mean(name, public) else f"; it has {', '.join(domains or public)}"
+            there = f"; it has {', '.join(domains)}" if domains else ": delete the line, or put in a value of your own"
+            there = "" if did_you_mean(name, domains or public) else there
             raise AttributeError(f"{self._path} has no {name} here{there}", name=name, obj=self)
 
         def refused(*_arguments: Any, **_named: Any) -> NoReturn:

@@ -59,6 +59,7 @@ _QUESTIONS: dict[str, tuple[int, Callable[[SeenVehicle], Any]]] = {
     "getLaneIndex": (0x52, lambda of: of.lane),
     "getLanePosition": (0x56, lambda of: of.position),
     "getSpeedFactor": (0x5E, lambda _: 1.0),
+    "getDistance": (0x84, lambda of: of.position),  # as if it had departed where the road begins
     "getAcceleration": (0x72, lambda of: of.acceleration),
     "getLateralLanePosition": (0xB8, lambda of: of.sideways),
 }
@@ -76,6 +77,7 @@ _ACCEPTED: dict[str, tuple[Callable[[Any], bool], str]] = {
     "setActionStepLength": (lambda step: step == STEP_S, "the AV acts in every 0.1 s"),
     "setSpeedFactor": (lambda factor: factor == 1.0, "the speed factor is 1"),
     "setColor": (lambda _: True, "nobody sees a colour"),
+    "highlight": (lambda _: True, "nobody sees it"),
 }
 """Setters of the AV that change nothing: each is refused unless it asks for what holds anyway."""
 
@@ -346,7 +348,7 @@ def _neighbours(mode: int) -> Callable[..., tuple[tuple[str, float], ...]]:
 
 
 def _accepted(name: str, holds: Callable[[Any], bool], what_holds: str) -> Callable[..., None]:
-    def accept(self: VehicleDomain, vehID: str, value: Any, *_more: Any) -> None:
+    def accept(self: VehicleDomain, vehID: str, value: Any = None, *_more: Any, **_named: Any) -> None:
         self._require_own(vehID, name)
         if not holds(value):
             raise RefusedError(f"vehicle.{name}('{vehID}', {value}) is refused: {what_holds}.")

@@ -132,7 +132,7 @@ AT_THE_DOOR = {
     r"traci has no trafficlight here; it has .*\(my.py:7\)": text(
         "traci.vehicle.setSpeed('ego', 9.0); traci.trafficlight.getIDList()"
     ),
-    r"traci.vehicle has no getEmissionClass here; it has .* … \(my.py:7\)$": text(
+    r"traci.vehicle has no getEmissionClass here: delete the line, or put in a value of your own \(my.py:7\)$": text(
         "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.getEmissionClass('ego')"
     ),
     r"which is no Python.*invalid syntax in line 2": "import traci\ndef x(:\n",

@@ -14,6 +14,8 @@ def main(ego: str = "vehicle.1", hardest: float = 4.0) -> None:
     traci.start(["sumo-gui", "-c", "highway.sumocfg", "--start"])
     traci.gui.trackVehicle("View #0", ego)
     traci.vehicle.setColor(ego, (255, 0, 0))
+    traci.vehicle.highlight(ego)
+    assert traci.vehicle.getDistance(ego) == traci.vehicle.getLanePosition(ego)
     while traci.simulation.getMinExpectedNumber() > 0:
         traci.simulationStep()
         if (leader := traci.vehicle.getLeader(ego)) is not None:
