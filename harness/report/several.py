@@ -161,7 +161,7 @@ def pair_words(decision: Mapping[str, Any]) -> str:
     margin, verdict = decision["margin"], decision["verdict"]
     if not margin:
         told = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
-        of_safer = {"proven": decision["n_milder"], "refuted": decision.get("n_milder_a")}.get(verdict)
+        of_safer = {"proven": decision.get("n_milder"), "refuted": decision.get("n_milder_a")}.get(verdict)
         return told.get(verdict, "Not told apart") + ", see !" * bool(of_safer)
     most = share(margin)
     # Of B / A; told as all else, of A / B.
