@@ -295,29 +295,32 @@ def test_a_reader_that_has_gone_does_not_change_the_exit_code(monkeypatch):
         assert main([], click.Command("run", callback=rejected)) == EXIT_REFUTED
 
 
-def test_a_run_without_a_folder_gets_a_new_one_and_resumes_the_last(tmp_path, monkeypatch):
+def test_a_run_without_a_folder_gets_a_new_one_and_resumes_the_last_of_its_kind(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for held, fresh, resumed in ((None, "mine", "mine"), ("mine", "mine-2", "mine"), ("mine-2", "mine-3", "mine-2")):
-        if held is not None:
-            Path("runs", held).mkdir(parents=True)
-        folders = [run_folder("mine", ["cut_in"], resume=resume) for resume in (False, True)]
-        assert folders == [Path("runs", fresh), Path("runs", resumed)]
+    held = "scenario: cut_in", "scenario: lead_brakes", "scenarios: [cut_out, cut_in]", "av: {model: fvdm}", "seed: 2"
+    limit = "accept: {times_reference: {driver: r157-cc}}"
+    for i, content in enumerate([*held, "seed: 1", limit, None], 1):  # the last is a comparison's
+        folder = Path("runs", "mine" if i == 1 else f"mine-{i}")
+        folder.mkdir(parents=True)
+        if content is not None:
+            (folder / "campaign.yaml").write_text(f"name: mine\n{content}\n", "utf-8")
+    for text, resumed in zip([*held, "seed: 1", limit, "scenario: cut_out"], [1, 2, 3, 4, 5, 6, 7, 9], strict=True):
+        Path("asked.yaml").write_text(f"name: mine\n{text}\n", "utf-8")
+        campaign = load_campaign("asked.yaml")
+        found = [run_folder(campaign, resume=resume).name for resume in (True, False)]
+        assert found == [f"mine-{6 if resumed == 1 else resumed}", "mine-9"]  # 1 and 6 are the same
 
 
-def test_a_run_resumes_the_last_of_its_scenarios(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    several = ("mine-3", "scenarios: [cut_out, cut_in]")
-    for held, scenarios in (("mine", "scenario: cut_in"), ("mine-2", "scenario: lead_brakes"), several):
-        Path("runs", held).mkdir(parents=True)
-        Path("runs", held, "campaign.yaml").write_text(f"name: mine\n{scenarios}\n", "utf-8")
-    asked = (
-        (["cut_in"], "mine"),
-        (["lead_brakes"], "mine-2"),
-        (["cut_in", "cut_out"], "mine-3"),
-        (["cut_out"], "mine-3"),
-    )
-    for scenarios, resumed in asked:
-        assert run_folder("mine", scenarios, resume=True) == Path("runs", resumed)
+def test_what_resuming_does_not_find_or_ends_otherwise_is_noted(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("harness.run", Mock(side_effect=ZeroDivisionError))
+    asked = {
+        str(tmp_path / "mistyped"): "nothing to resume in",
+        str(folder): "accept.times_reference.driver is r157-cc",
+    }
+    for out, noted in asked.items():
+        with pytest.raises(ZeroDivisionError):
+            main(["run", *CAMPAIGN, "--accept", "r157-cc", "--resume", "--out", out])
+        assert noted in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("more", "noted"), [([], True), (["--quiet"], False), (["--out", "x"], False)])

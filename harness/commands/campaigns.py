@@ -14,7 +14,7 @@ import click
 import harness
 from harness.commands import options
 from harness.commands.options import CAMPAIGN, FOLDER, examples, progress_bar
-from harness.commands.printing import print_either, print_json, print_table, prints_kept_in, say
+from harness.commands.printing import holds_tests, print_either, print_json, print_table, prints_kept_in, say
 from harness.errors import HarnessError
 from harness.numbers import leaves, words
 from harness.processes import start_server
@@ -136,9 +136,11 @@ def run(
         campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)
-    scenarios, chosen = sorted(campaign.scenarios or [campaign.scenario]), folder is None
-    folder = folder or options.run_folder(campaign.name, scenarios, resume=resume)
-    if resume:
+    chosen = folder is None
+    folder = folder or options.run_folder(campaign, resume=resume)
+    if resume and not holds_tests(folder):
+        say(f"note: nothing to resume in {folder}: starts anew", err=True)
+    elif resume:
         _note_other_stop(folder, campaign)
     elif chosen and folder.name != campaign.name and not ctx.meta.get("quiet"):
         say(f"note: {options.RUNS / campaign.name} is there already: this run goes to {folder}", err=True)
@@ -161,10 +163,11 @@ def run(
 def _note_other_stop(folder: Path, campaign: Campaign) -> None:
     """Say where a run that goes on is to end otherwise than was asked before."""
     with suppress(HarnessError):  # a folder that cannot be gone on in is refused by the run
-        before = harness.load_campaign(folder / "campaign.yaml", check_files=False).stop.model_dump()
-        for key, value in campaign.stop.model_dump().items():
-            if value != before[key]:
-                say(f"note: stop.{key} is {words(value)} now; before it was {words(before[key])}", err=True)
+        held = harness.load_campaign(folder / "campaign.yaml", check_files=False)
+        now, before = (dict(leaves(each.model_dump(include={"stop", "accept"}))) for each in (campaign, held))
+        for key in {**before, **now}:
+            if (value := now.get(key)) != (was := before.get(key)):
+                say(f"note: {key} is {words(value)} now; before it was {words(was)}", err=True)
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import chain, count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ from harness.errors import HarnessError
 from harness.vocabulary import MOST_ASKED
 
 if TYPE_CHECKING:
+    from harness.campaign.campaign import Campaign
     from harness.progress import Progress
 
 
@@ -127,22 +128,28 @@ def accepting(limit: str) -> list[str]:
     return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
 
 
-def run_folder(name: str, scenarios: Sequence[str], *, resume: bool) -> Path:
-    """``runs/NAME``, or the first new ``runs/NAME-2``, ``-3``, …; to resume, the last of these scenarios."""
-    numbered = chain([RUNS / name], (RUNS / f"{name}-{number}" for number in count(2)))
+def run_folder(campaign: Campaign, *, resume: bool) -> Path:
+    """``runs/NAME``, or the first new ``runs/NAME-2``, ``-3``, …; to resume, the last that is most like it."""
+    numbered = chain([RUNS / campaign.name], (RUNS / f"{campaign.name}-{number}" for number in count(2)))
     there = list(takewhile(Path.exists, numbered))
-    if not resume or not there:
-        return RUNS / (f"{name}-{len(there) + 1}" if there else name)
-    return next((each for each in reversed(there) if _scenarios_of(each) == list(scenarios)), there[-1])
+    alike = [(_likeness(each, campaign), i) for i, each in enumerate(there) if resume]
+    if alike and any((best := max(alike))[0]):
+        return there[best[1]]
+    return RUNS / (f"{campaign.name}-{len(there) + 1}" if there else campaign.name)
 
 
-def _scenarios_of(folder: Path) -> list[str]:
-    """Which scenarios a run is of; none where that cannot be read."""
+def _likeness(folder: Path, campaign: Campaign) -> tuple[int, int]:
+    """How much of a campaign is that of the run in a folder, what ends it counted last; 0 of others' vehicles."""
     from harness.campaign.files import load_campaign
     from harness.records.folder import CAMPAIGN
 
     try:
-        campaign = load_campaign(folder / CAMPAIGN, check_files=False)
-        return sorted(campaign.scenarios or [campaign.scenario])
+        held = load_campaign(folder / CAMPAIGN, check_files=False)
     except HarnessError:
-        return []
+        return 0, 0
+    if sorted(held.scenarios or [held.scenario]) != sorted(campaign.scenarios or [campaign.scenario]):
+        return 0, 0
+    if held.av.identity() != campaign.av.identity():
+        return 0, 0
+    same = [key for key, value in campaign if getattr(held, key) == value]
+    return 1 + len({*same} - {"stop", "accept"}), len(same)
