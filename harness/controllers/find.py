@@ -130,6 +130,8 @@ def build_host(
         raise
     except (Exception, SystemExit) as error:  # who looks for an attribute runs the user's code, too
         raise _not_made(str(av.controller), cause_of(error)) from error
+    finally:
+        guard.require_untouched()
     if is_batch:
         return BatchHost(*told, first, names=names)
     told_at = methodcaller("told_at") if is_script(str(av.controller)) else lambda _: ""
@@ -245,7 +247,6 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
         controller, wrong = guard.call(make, makes=True)
     if wrong is not None:
         raise _not_made(name, wrong)
-    guard.require_untouched()
     _require_controller(controller, name)
     return controller
 

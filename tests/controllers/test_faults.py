@@ -246,6 +246,13 @@ def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, c
     assert (tmp_path / "run").exists() == (at == "step")
 
 
+def test_it_is_named_also_where_it_fails_over_that_when_it_is_made(tmp_path, capsys):
+    script = "import builtins, traci\nbuiltins.isinstance = lambda *_: True\nraise ValueError\n"
+    (tmp_path / "my.py").write_text(script, "utf-8")
+    assert _run(tmp_path, f"{{controller: '{tmp_path}/my.py'}}") == EXIT_BAD_INPUT
+    assert "found:    a vehicle that has replaced builtins.isinstance, which" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "call", ["close()", "simulationStep()", "vehicle.setSpeed('AV0', 3.0)", "vehicle.remove('LV0')"]
