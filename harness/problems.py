@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
@@ -70,6 +71,7 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         expected, mend = f"one of the keys {', '.join(known)}", did_you_mean(last, known)
     elif kind == "model_type":
         expected = f"a section with keys such as {', '.join(list(section.model_fields)[:4])}"
+        mend = _as_section(value, section) or mend
     elif last == "[key]" and kind != "literal_error":
         found, expected, mend = f"the name {found}", _pattern_in_words(context), "Choose another name."
     elif kind == "literal_error":
@@ -82,7 +84,24 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         unit = next((f" ({unit})" for suffix, unit in _UNITS.items() if last.endswith(suffix)), "")
         expected = KINDS.get(kind, details["msg"].removeprefix("Input should be ")) + unit
         expected += ", or null" if field and len(loc) == 1 and type(None) in get_args(field.annotation) else ""
+    if kind in ("list_type", "dict_type") and isinstance(value, str | int | float):
+        mend = f"[{value}]" if kind == "list_type" else f"{{NAME: {value}}}"
+    elif kind.startswith("less_than") and 0 in context.values():
+        mend = f"Write {last}: -{value}."
     return {"key": key, "found": found, "expected": expected, "mend": mend}
+
+
+def _as_section(value: Any, section: type[BaseModel]) -> str:
+    """``{key: value}`` with the first key under which a section, or one within, takes the value; empty if none does."""
+    for key, field in section.model_fields.items():
+        with suppress(ValidationError):
+            section.model_validate({key: value})
+            return f"{{{key}: {value}}}"
+        for inner in (field.annotation, *get_args(field.annotation)):
+            is_section = isinstance(inner, type) and issubclass(inner, BaseModel)
+            if is_section and (text := _as_section(value, inner)):
+                return f"{{{key}: {text}}}"
+    return ""
 
 
 def _pattern_in_words(context: Mapping[str, Any]) -> str:
@@ -101,7 +120,7 @@ def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:
     return f"Correct it; the key means: {about.rstrip('.')}." if about else "Correct the value."
 
 
-_ALSO_CALLED = {"nade": "step_mixture"}
+_ALSO_CALLED = {"nade": "step_mixture", "vehicle": "av"}
 
 
 def did_you_mean(word: object, words: Sequence[str]) -> str:
@@ -109,8 +128,16 @@ def did_you_mean(word: object, words: Sequence[str]) -> str:
     asked = str(word)[:_LONGEST]
     if (known := _ALSO_CALLED.get(asked)) in words:
         return f"{asked.upper()} is '{known}'."
-    cutoff = 0.75 if len(asked) > 4 else 0.6  # of three letters a wrong one leaves 0.67
-    return next((f"Did you mean '{close}'?" for close in difflib.get_close_matches(asked, words, 1, cutoff)), "")
+    return f"Did you mean '{meant}'?" if (meant := nearest(asked, words)) else ""
+
+
+def nearest(word: str, words: Sequence[str]) -> str:
+    """The closest of some words, whatever their case, - and _; empty if none is close."""
+    word = re.sub("max_(braking|decel|deceleration)(?=_|$)", "min_acceleration", word)
+    flat = {each.lower().replace("-", "_"): each for each in reversed(words)}
+    cutoff = 0.75 if len(word) > 4 else 0.6  # of three letters a wrong one leaves 0.67
+    close = difflib.get_close_matches(word.lower().replace("-", "_"), flat, 1, cutoff)
+    return flat[close[0]] if close else ""
 
 
 def listed(names: Iterable[str]) -> str:

@@ -97,15 +97,37 @@ def test_wrong_calls_end_with_2(capsys, arguments):
 
 
 @pytest.mark.parametrize(
+    ("asked", "fix"),
+    [
+        ("run --episodes 100", "Write --set stop.episodes=…"),
+        ("run --tests 100", "Write --set stop.episodes=…"),
+        ("run --seed 2", "Write --set seed=…"),
+        ("run --html page.html", "the page is DIR/report.html"),
+        ("compare --resume", "the same command with the same --out goes on"),
+        ("run --accept", "Write --accept RATE|DRIVER."),
+    ],
+)
+def test_what_is_no_option_or_has_no_value_is_told_with_what_to_write(asked, fix, tmp_path, capsys):
+    command, *options = asked.split()
+    assert main([command, "idm", *options, "--out", str(tmp_path / "out")]) == 2
+    assert fix in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ("run --scenario lead_brake", "Did you mean 'lead_brakes'?"),
-        ("run --scenario cut_in,lead_brake", "\n  found:    'lead_brake'\n"),
-        ("run --accept 0.5r157-cc", "fix:      Write --accept 0.5*r157-cc."),
+        ("run --scenario lead_brake", "fix:      Write --scenario lead_brakes."),
+        ("run --scenario cut-in,lead_brake", "fix:      Write --scenario cut_in,lead_brakes."),
+        *(
+            (f"run --accept {wrong}", "fix:      Write --accept 0.5*r157-cc.")
+            for wrong in ("0.5r157-cc", "0.5xr157-cc", "50%", "0,5*r157-cc", "r157-cc*0.5")
+        ),
+        ("run --accept 1e-7/h", "--accept 3e-7, which is per test, or --accept r157-cc"),
         ("run --accept r157cc", "fix:      Did you mean 'r157-cc'?"),
         ("run --accept -1", "fix:      Correct it; the key means: crashes per test"),
-        ("run --scenario all --exposure lead_brakes=abc", "exposure.lead_brakes"),
-        ("run --scenario all --exposure cut_off=1", "not among scenarios"),
+        ("run --exposure lead_brakes=abc", "found:    abc, of lead_brakes"),
+        ("run --scenario all --exposure leadbrakes=1", "fix:      Write --exposure lead_brakes=1."),
+        ("run --set seed=2 --exposure cut_out=1", "Add --scenario all"),
         *((f"compare --against-av idm --margin {wrong}", "margin") for wrong in ("1e308", "inf", "nan")),
     ],
 )

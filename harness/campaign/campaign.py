@@ -232,8 +232,8 @@ REFUSED = (
     ),
     Combination(
         "exposure", lambda c, _: bool(set(c.exposure) - set(c.scenarios or ())),
-        "of a scenario that is not among scenarios", "events per hour of those that are tested",
-        "Name it among scenarios, or delete it: one scenario alone has no rate per hour.",
+        "{exposure}, with scenarios: {scenarios}", "events per hour of those that are tested",
+        "Add --scenario all (scenarios: [cut_in, lead_brakes, cut_out]), or delete it: one alone has no rate per hour.",
     ),
     Combination(
         "environments",

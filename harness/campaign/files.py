@@ -32,7 +32,7 @@ from harness.campaign.yaml_text import read_yaml, yaml_text
 from harness.errors import CampaignError
 from harness.families import family_named
 from harness.files import real_path
-from harness.problems import did_you_mean, file_meant
+from harness.problems import did_you_mean, file_meant, listed
 
 SHIPPED_PANEL = Path(__file__).parents[1] / "scenarios" / "av_panel.yaml"
 _FILES = {
@@ -194,7 +194,7 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     few = difflib.get_close_matches(name, known, FEW_NAMES, cutoff=0.3) or known[:FEW_NAMES]
     more = f" … ({len(known)} names)" if len(few) < len(known) else ""
     expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(few)}{more}"
-    mend = in_python_file(text) or did_you_mean(name, [*files, *known]) or "Name one of them."
+    mend = in_python_file(text) or did_you_mean(name, [*files, *known]) or f"Name one of them: {listed(known)}."
     raise CampaignError(f"{option}{text}", found, expected, mend)
 
 

@@ -13,7 +13,8 @@ from harness.campaign.drivers import default_surrogates
 from harness.campaign.vehicle import AV_SOURCES, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml
 from harness.errors import CampaignError
-from harness.problems import MOST_SHOWN, describe_found, did_you_mean, in_words
+from harness.families import R157
+from harness.problems import MOST_SHOWN, describe_found, did_you_mean, in_words, listed
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -39,9 +40,11 @@ def validated(data: dict[str, Any], model: type[Model], place: Places) -> Model:
             if (alike := problems.get((where, found))) is not None and expected not in alike.expected:
                 expected = f"{alike.expected} or {expected}"
             if not (mend := parts["mend"]):  # of an unknown key that resembles none beside it
-                places = dict.fromkeys(each or "the top level" for each in _places_of(str(where[-1]), model, ""))
+                places = dict.fromkeys(each or "the top level" for each in places_of(str(where[-1]), model))
                 belongs = f"'{where[-1]}' belongs under {' or '.join(places)}."
                 mend = belongs if places else "Delete it, or correct its name."
+            elif mend[0] in "{[":  # what to write
+                mend = f"Write {where[-1]}: {mend.replace('[all]', f'[{listed(R157)}]')}."
             problems[where, found] = CampaignError(place(where), found, expected, mend)
     first, *more = problems.values()
     if not more:
@@ -62,16 +65,16 @@ def _path_of(loc: Sequence[str | int], data: Any) -> tuple[str | int, ...]:
     return tuple(path)
 
 
-def _places_of(key: str, kind: Any, prefix: str) -> Iterator[str]:
+def places_of(key: str, kind: Any, prefix: str = "") -> Iterator[str]:
     """Dotted paths of the sections of a type that know a key, names of one's own choice written as ``NAME``."""
     if not (isinstance(kind, type) and issubclass(kind, BaseModel)):
         for option in get_args(kind):
-            yield from _places_of(key, option, f"{prefix}.NAME" if get_origin(kind) is dict else prefix)
+            yield from places_of(key, option, f"{prefix}.NAME" if get_origin(kind) is dict else prefix)
         return
     if key in kind.model_fields:
         yield prefix
     for name, field in kind.model_fields.items():
-        yield from _places_of(key, field.annotation, f"{prefix}.{name}".lstrip("."))
+        yield from places_of(key, field.annotation, f"{prefix}.{name}".lstrip("."))
 
 
 def names_a_file(name: str) -> bool:

@@ -188,6 +188,10 @@ class AutomatedVehicle(Section):
     @model_validator(mode="before")
     @classmethod
     def _idm_when_nothing_is_named(cls, data: Any) -> Any:
+        if isinstance(data, str) and (data.endswith(".fmu") or data.startswith("sumo:")):  # as after --av
+            mend = f"{{fmu: {{file: {data}}}}}"
+            mend = f"{{sumo: {{carFollowModel: {data[5:]}}}}}" if data.startswith("sumo:") else mend
+            raise broken_rule("", f"the text {data[:60]!r}", "a section with keys such as fmu, sumo", mend)
         if not isinstance(data, dict) or any(data.get(name) is not None for name in AV_SOURCES):
             return data
         if forgotten := [name for name in AV_SOURCES if name in data]:

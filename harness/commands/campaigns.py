@@ -101,7 +101,7 @@ def run(
     folder: Path | None,
     *,
     scenario: str | None,
-    exposures: Sequence[str],
+    exposures: dict[str, float],
     workers: int | None,
     executor: str | None,
     resume: bool,
@@ -128,7 +128,12 @@ def run(
     limit = [] if accept is None else options.accepting(accept)
     where = [] if executor is None else [f"run.executor={executor}"]
     seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
-    given = [*options.of_scenario(scenario), *(f"exposure.{each}" for each in exposures), *seeds, *overrides]
+    given = [
+        *options.of_scenario(scenario),
+        *(f"exposure.{name}={value!r}" for name, value in exposures.items()),
+        *seeds,
+        *overrides,
+    ]
     if limit and (own := harness.load_campaign(campaign_file, given, av=av).accept) is not None:
         asked = own.model_dump(exclude_defaults=True)
         say(f"note: --accept {accept} replaces the limit of {campaign_file}: {asked}", err=True)
@@ -172,13 +177,14 @@ def _note_other_stop(folder: Path, campaign: Campaign) -> None:
 
 @contextmanager
 def _told_as_typed(limit: str | None) -> Iterator[None]:
-    """Let an error of what ``--accept`` has set name that; of 0.5r157-cc the driver alone would be twice the limit."""
+    """Let an error of what ``--accept`` has set name that, and what was meant by it."""
     try:
         yield
     except HarnessError as error:
         if limit is not None and re.match(r"(--set )?accept\.(times_reference|crash_rate_below)", error.where):
-            times = re.sub(r"^([\d.]+) ?([a-zA-Z].*)", r"\1*\2", limit)
-            error.where, error.mend = f"--accept {limit}", error.mend if times == limit else f"Write --accept {times}."
+            error.where, forms = f"--accept {limit}", "crashes per test, 3e-7, or a driver's: r157-cc or 0.5*r157-cc"
+            if meant := options.limit_meant(limit):
+                error.found, error.expected, error.mend = f"'{limit}'", forms, meant
         raise
 
 

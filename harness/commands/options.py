@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+import re
 from collections.abc import Callable
 from itertools import chain, count, takewhile
 from pathlib import Path
@@ -69,8 +72,31 @@ scenario_option = click.option(
     help="What happens in the tests: cut_in (default), lead_brakes or cut_out. `harness run`, `compare` and `check` "
     "also take several, with commas, or 'all': their answer is crashes per hour of driving.",
 )  # fmt: skip
+
+
+def _exposures(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, float]:
+    """Events per hour by scenario, as ``--exposure`` has them."""
+    from harness.campaign.sections import EXPOSURES
+    from harness.families import family_named
+
+    found = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        family_named(name, option := f"--exposure {text}")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            found[name] = math.nan
+        if not EXPOSURES[0] <= found[name] <= EXPOSURES[1]:
+            expected = "events per hour, from {:g} to {:g}".format(*EXPOSURES)
+            raise HarnessError(
+                option, f"{value or 'nothing'}, of {name}", expected, f"Write --exposure {name}=0.3, say."
+            )
+    return found
+
+
 exposure_option = click.option(
-    "--exposure", "exposures", metavar="SCENARIO=N", multiple=True,
+    "--exposure", "exposures", metavar="SCENARIO=N", multiple=True, callback=_exposures,
     help="Events per hour of driving, of one of several scenarios (of cut-outs those in scope, 0.4 % of all). May be "
     "given several times.",
 )  # fmt: skip
@@ -124,8 +150,23 @@ def accepting(limit: str) -> list[str]:
         keys, value = ("crash_rate_below", "times_reference"), f"{float(limit)!r}"
     except ValueError:
         times, _, driver = limit.rpartition("*")
-        keys, value = ("times_reference", "crash_rate_below"), f"{{driver: {driver}, at_most: {times or 1}}}"
+        keys, value = (
+            ("times_reference", "crash_rate_below"),
+            f"{{driver: {json.dumps(driver)}, at_most: {times or 1}}}",
+        )
     return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
+
+
+def limit_meant(limit: str) -> str:
+    """How to write what is no limit; empty where it has the form of one."""
+    if re.fullmatch(r"-?[\d.e-]+|([\d.]+\*)?[A-Za-z][\w.-]*", limit):
+        return ""
+    swapped = re.sub(r"^([A-Za-z][\w.-]*) ?[x×*] ?([\d.,]+%?)$", r"\2*\1", limit)
+    of = re.fullmatch(r"(\d+(?:[.,]\d+)?) ?(%?) ?(?:[x×*]|of|times)? ?((?!e-?\d)[A-Za-z][\w.-]*)?", swapped)
+    if of is None:
+        return "Write --accept 3e-7, which is per test, or --accept r157-cc, which may also be per hour."
+    times = float(of[1].replace(",", ".")) / (100.0 if of[2] else 1.0)
+    return f"Write --accept {times:g}*{of[3] or 'r157-cc'}."
 
 
 def run_folder(campaign: Campaign, *, resume: bool) -> Path:

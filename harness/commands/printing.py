@@ -96,7 +96,7 @@ def show_interrupted(command: str, signal_name: str | None) -> None:
 
 def holds_tests(folder: Path) -> bool:
     """Whether a run has finished something in a folder, or in one below it."""
-    with suppress(OSError, ValueError):
+    with suppress(OSError, ValueError, KeyError, TypeError):
         manifests = [json.loads(path.read_bytes()) for path in folder.rglob("manifest.json")]
         return any(each["n_episodes"] or each["before"] for each in manifests)
     return True  # what is there cannot be read
@@ -135,9 +135,40 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
     """Put what click says of a wrong call into the words of all errors."""
     usage = " ".join(context.get_usage().removeprefix("Usage: ").split())
     mend, found = f"See `{context.command_path} --help`.", error.format_message().rstrip(".")
+    if isinstance(error, click.NoSuchOption) and (instead := _instead_of(error.option_name, context.command)):
+        found, mend = f"No such option '{error.option_name}'", instead
+    elif isinstance(error, click.BadOptionUsage) and (option := _option(context.command, error.option_name)):
+        mend = f"Write {error.option_name} {(option.metavar or option.type.name).upper().split()[0]}."
     if "'export'" in found:  # which is like no command that exports
         found, mend = found.partition(".")[0], "Write the motion of a test by `harness replay DIR TEST --out FILE.csv`."
     return HarnessError(context.command_path, found, f"a call of the form: {usage}", mend)
+
+
+_INSTEAD = {
+    ("compare", "--resume"): "Leave it out: the same command with the same --out goes on.",
+    ("compare", "--exposure"): "Write --set exposure.lead_brakes=…",
+    ("compare", "--accept"): "Write --margin 0.1, by which B may be worse; `harness run` takes a limit.",
+}
+_PAGES, _ALSO_CALLED = ("--html", "--page", "--report"), {"tests": "episodes", "precision": "rhw"}
+
+
+def _instead_of(option: str, command: click.Command) -> str:
+    """What to write for an option that a command does not have; empty where nobody can tell."""
+    from harness.campaign.campaign import Campaign
+    from harness.campaign.models import places_of
+
+    if option in _PAGES:
+        return "Leave it out: the page is DIR/report.html, of every run."
+    key = option.lstrip("-").replace("-", "_")
+    key = _ALSO_CALLED.get(key, key)
+    places = (f"{each}.{key}".lstrip(".") for each in places_of(key, Campaign))
+    place = min(places, key=lambda at: at.count("."), default="")
+    written = f"Write --set {place}=…" if place and _option(command, "--set") else ""
+    return _INSTEAD.get((str(command.name), option), written)
+
+
+def _option(command: click.Command, name: str) -> click.Parameter | None:
+    return next((each for each in command.params if name in each.opts), None)
 
 
 def print_json(content: Any) -> None:

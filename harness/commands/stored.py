@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from shutil import which
@@ -55,7 +54,7 @@ def estimate(
     confidence: float | None,
     write: bool,
     environment: str | None,
-    exposures: Sequence[str],
+    exposures: dict[str, float],
     counts: bool,
     as_json: bool,
 ) -> None:
@@ -109,25 +108,13 @@ def estimate(
 
 
 def _estimate_hours(
-    folder: Path, exposures: Sequence[str], confidence: float | None, *, counts: bool, write: bool, as_json: bool
+    folder: Path, exposures: dict[str, float], confidence: float | None, *, counts: bool, write: bool, as_json: bool
 ) -> None:
     """What stored tests of several scenarios say, with other exposures."""
-    from harness.campaign.sections import EXPOSURES
     from harness.report.several import hour_lines
     from harness.runner.stored import estimate_families
 
-    given = {}
-    for each in exposures:
-        name, _, value = each.partition("=")
-        try:
-            given[name] = float(value)
-        except ValueError:
-            given[name] = math.nan
-        if not EXPOSURES[0] <= given[name] <= EXPOSURES[1]:
-            expected = "events per hour, from {:g} to {:g}".format(*EXPOSURES)
-            mend = "Write --exposure lead_brakes=0.3."
-            raise HarnessError("--exposure", f"{value or 'nothing'}, of {name}", expected, mend)
-    content, page = estimate_families(folder, given, confidence, counts=counts), None
+    content, page = estimate_families(folder, exposures, confidence, counts=counts), None
     if write:
         from harness.records.folder import write_sealed
         from harness.report.page import write_hours

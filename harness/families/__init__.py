@@ -6,12 +6,13 @@ The core knows families by this file alone. An installed package brings its own 
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
 from harness.errors import CampaignError
-from harness.problems import did_you_mean, listed
+from harness.problems import did_you_mean, listed, nearest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,5 +44,9 @@ def family_named(name: str, where: str = "scenario", more: Sequence[str] = ()) -
     if name not in known:
         names = [*known, *more]
         mend = did_you_mean(name, names) or "Write one of them, or install the package that brings it."
+        if where.startswith("--") and "?" in mend:
+            mend = f"Write {re.sub(r'[^ =,]+', lambda each: nearest(each[0], names) or each[0], where)}."
+        elif name == "all":
+            mend = f"Write scenarios: [{', '.join(R157)}], or --scenario all."
         raise CampaignError(where, f"'{name}'", f"a kind of events: {listed(names)}", mend)
     return known[name]

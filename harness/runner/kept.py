@@ -273,8 +273,8 @@ def require_few_failed(
     if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in by_kind(causes).most_common(1))
         enough = min(math.ceil(1e3 * causes.total() / n) / 1e3, 1.0)
-        few = f", or go on with --set {SHARE}={enough:g}" if enough < 0.2 else ""  # [assumed]
-        mend = f"Fix the AV (`harness av-check` looks at it in seconds){few}."
+        few = f"; or go on (`run`: --resume) with --set {SHARE}={enough:g}" if enough < 0.2 else ""  # [assumed]
+        mend = f"Fix the AV (`harness av-check` looks at it in seconds): a corrected one needs a new --out{few}."
         found, expected = f"{causes.total()} of {n} {what} failed{cause}", f"a share of at most {most:g}"
         mend += f" All causes are in the column 'failure' of {where}."
         raise TooManyFailedError(SHARE, found, expected, mend)
@@ -304,13 +304,13 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         raise refusal(found, f"a folder for this one ({resolved.content_hash})", mend)
     if not (manifest["n_episodes"] or manifest["before"]):  # it was interrupted before anything was finished
         return nothing
+    if manifest.get("controller_sha256") != resolved.controller_sha256:
+        found = "tests of this campaign; since then its controller, or a file that it is made of, has been changed"
+        mend = "A corrected controller needs a new --out; to compare, keep the old version under another name."
+        raise refusal(found, "the same controller for all tests of a run", mend)
     if not resume:
         mend = "Continue it with --resume, or choose another folder with --out."
         raise refusal("this campaign, already begun", "a new or empty folder", mend)
-    if manifest.get("controller_sha256") != resolved.controller_sha256:
-        found = "tests of this campaign; since then its controller, or a file that it is made of, has been changed"
-        mend = "Restore it, drive it anew into a new folder or, to compare, keep the old version under another name."
-        raise refusal(found, "the same controller for all tests of a run", mend)
     return manifest
 
 

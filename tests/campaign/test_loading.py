@@ -35,6 +35,16 @@ MISTAKES = (
     ("testin:\n  epsilon: 0.2", "testin", 2, "Did you mean 'testing'?"),
     ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
     ("testing: 5", "testing", 2, "a section with keys such as method"),
+    ("stop: 100", "stop", 2, "Write stop: {episodes: 100}."),
+    ("accept: r157-cc", "accept", 2, "Write accept: {times_reference: {driver: r157-cc}}."),
+    ("accept: 0.5*r157-cc", "accept", 2, "Write accept: {times_reference: {driver: r157-cc, at_most: 0.5}}."),
+    ("scenarios: all", "scenarios", 2, "Write scenarios: [cut_in, lead_brakes, cut_out]."),
+    ("exposure: 3", "exposure", 2, "Write exposure: {NAME: 3}."),
+    ("av: my_av.py:MyAV", "av", 2, "Write av: {controller: my_av.py:MyAV}."),
+    ("av: sumo:ACC", "av", 2, "Write av: {sumo: {carFollowModel: ACC}}."),
+    ("av: my_av.fmu", "av", 2, "Write av: {fmu: {file: my_av.fmu}}."),
+    ("av:\n  limits: {max_braking_mps2: 8}", "av.limits.max_braking_mps2", 3, "Did you mean 'min_acceleration_mps2'?"),
+    ("av:\n  limits: {min_acceleration_mps2: 8}", "av.limits.min_acceleration_mps2", 3, "min_acceleration_mps2: -8."),
     ("world:", "world", 2, "delete the key for its default"),
     ("stop:\n  rhw: 10", "stop.rhw", 3, "less than 10, or null"),
     ("stop:\n  rhw: 1e-320", "stop.rhw", 3, "0.0001, or null"),
@@ -58,6 +68,7 @@ BROKEN_RULES = (
     ("testing: {method: step_mixture, estimator: scv}\nrecords: {moments: none}", "records.moments", 3, "first_9"),
     ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.2}", "testing.alpha", 3, "sum to 1.1"),
     ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
+    ("scenario: all", "scenario", 2, "Write scenarios: [cut_in, lead_brakes, cut_out]"),
     ("scenarios:\n  - cut_in\n  - cutout", "scenarios.1", 4, "Did you mean 'cut_out'"),
     ("environment:\n  parameters: gone.yaml", "environment.parameters", 3, "a parameter file"),
     ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),
@@ -267,7 +278,7 @@ def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, ow
         ("mime.yaml", "no such file.* Did you mean 'mine.yaml'"),
         ("late-60ms", r"or one of late-600ms, [^;]{9,99} … \(\d+ names\).* Did you mean 'late-600ms'"),
         ("mine.yaml:idm", "format"),  # which is no panel
-        ("late-idm", "Name one of them"),  # 'late-600ms' is no misspelling away
+        ("late-idm", "Name one of them: idm, .*, r157-cc, .*, late-600ms"),  # 'late-600ms' is no misspelling away
     ],
 )
 def test_what_is_neither_campaign_nor_vehicle_says_what_was_meant(given, said, own):

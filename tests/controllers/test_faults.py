@@ -178,6 +178,7 @@ def test_to_go_on_is_offered_where_few_tests_failed(n, offered):
     with pytest.raises(TooManyFailedError) as caught:
         require_few_failed(Counter({"step: raises": 5}), n, Campaign(name="x"))
     assert ("--set run.max_failed_share=" in caught.value.mend) == offered
+    assert "needs a new --out" in caught.value.mend
 
 
 SHORT_MADE = ", limits: {construction_time_s: 0.2}"
